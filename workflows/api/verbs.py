@@ -47,7 +47,7 @@ def run(
     executor: Executor | None = None,
     memory: int | None = None,
 ) -> Result:
-    """Run a recipe and return the values of ``outputs``; None means the outputs that the recipe names.
+    """Run a recipe and return the results of the steps ``outputs``; None means the outputs that the recipe names.
 
     Args: device: one or several devices, ``cuda:0,cuda:1,cpu``, the preferred one first. watch: gets every `Event`.
     executor: computes the steps instead of this process. memory: largest number of bytes to use on each device.
@@ -67,7 +67,7 @@ def sweep(
     zip: bool = False,
     on_error: Literal["stop", "continue"] = "stop",
 ) -> Sweep:
-    """Run a recipe at every combination of the values of ``axes``, and return the results of all points.
+    """Run a recipe at every combination of the parameter values in ``axes``, and return the results of all runs.
 
     Args: axes: from a parameter or group to a list of values, or to a text such as ``"linspace(450 nm, 650 nm, 5)"``.
     zip: pair the values of the axes instead of combining them. on_error: ``"continue"`` lists a failed point as a row.
@@ -202,12 +202,12 @@ def study(
     from neusee.workflows.studies import run_study
 
     if kind not in run_study.KINDS:
-        raise ValueError(f"no study {kind!r}: write one of {', '.join(run_study.KINDS)}")
+        raise ValueError(f"there is no study {kind!r}: write one of {', '.join(run_study.KINDS)}")
     return run_study.study_recipe(kind, _read(recipe, changes), store, Path(out), command, progress, **options)
 
 
 def _read(recipe: Recipe | Named, changes: Changes) -> Recipe:
-    """Return a loaded recipe unchanged, or load a recipe by name or file with ``changes``."""
+    """Return a loaded recipe unchanged, or load the recipe that a name or file gives with ``changes``."""
     if not isinstance(recipe, Recipe):
         return load(recipe, _arguments(changes))
     if changes:
@@ -216,14 +216,14 @@ def _read(recipe: Recipe | Named, changes: Changes) -> Recipe:
 
 
 def _name(recipe: Named, verb: str) -> str:
-    """Return the name or file of a recipe, which the function ``verb`` needs; raise TypeError for a loaded recipe."""
+    """Return the name or file of a recipe for the function ``verb``; raise TypeError for a loaded recipe."""
     if isinstance(recipe, Recipe):
         raise TypeError(f"{verb} loads the recipe several times: pass the name or file of the recipe, and changes")
     return os.fspath(recipe)
 
 
 def _arguments(changes: Changes) -> list[str | Override]:
-    """Return ``changes`` as overrides for `load`; raise TypeError if ``changes`` is a string."""
+    """Return ``changes`` of a recipe as overrides for `load`; raise TypeError if ``changes`` is a string."""
     if isinstance(changes, str):
         raise TypeError(f"changes must be a mapping or a list of arguments: write changes=[{changes!r}]")
     return [*overrides_of(changes, Path.cwd())] if isinstance(changes, Mapping) else [*changes]

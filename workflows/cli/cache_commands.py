@@ -48,7 +48,7 @@ def gc(
     budget: Annotated[str, typer.Option("--budget", help="Largest size of the cache, such as 20 GB.")] = "",
     dry: Annotated[bool, typer.Option("--dry-run", help="Say what would be removed, and remove nothing.")] = False,
 ) -> None:
-    """Remove files that belong to no result, and results beyond a budget.
+    """Remove files that belong to no stored result, and results beyond a budget.
 
     Beyond the budget, the results that save the fewest seconds for each byte are removed first. Pinned results stay.
     """
@@ -58,21 +58,21 @@ def gc(
 
 @cache.command("pin")
 def pin(key: Key) -> None:
-    """Keep a result even if the cache exceeds its budget."""
+    """Keep a stored result even if the cache exceeds its budget."""
     with failing(ValueError):
         say(pin_lines(the_store(), key))
 
 
 @cache.command("unpin")
 def unpin(key: Key) -> None:
-    """Unpin a result, so that `gc` may remove the result."""
+    """Unpin a stored result, so that `cache gc` may remove the result."""
     with failing(ValueError):
         say(pin_lines(the_store(), key, pin=False))
 
 
 @cache.command("why")
 def why(key: Key) -> None:
-    """Print the origin of a result.
+    """Print the origin of a stored result.
 
     Also print the differences from the nearest earlier result.
     """
@@ -86,7 +86,7 @@ def why(key: Key) -> None:
 
 
 def ls_lines(store: Store) -> list[str]:
-    """Return a line for each result with its date, bytes, seconds, step, recipe and key, the newest last."""
+    """Return a line for each cached result with its date, bytes, seconds, step, recipe and key, the newest last."""
     entries = sorted(store.entries(), key=lambda entry: str(entry[1].get("date", "")))
     pins = store.pinned()
     rows = [_row(key, about, key in pins) for key, about in entries]
@@ -101,7 +101,7 @@ def ls_lines(store: Store) -> list[str]:
 
 
 def verify_lines(store: Store) -> tuple[list[str], int]:
-    """Read every stored value and picture; return a line for each damaged result, and their number."""
+    """Read every result in the cache; return a line for each damaged result, and the number of damaged results."""
     from neusee.workflows.store.derived_files import DerivedFiles
 
     files = DerivedFiles(store)
@@ -120,7 +120,10 @@ def verify_lines(store: Store) -> tuple[list[str], int]:
 
 
 def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list[str]:
-    """Remove files that belong to no result, and values beyond ``budget``; raise `ValueError` for a wrong budget."""
+    """Remove files that belong to no cached result, and cached values beyond ``budget``; return the lines to print.
+
+    Raises `ValueError` for a budget that is not a size.
+    """
     abouts = dict(store.entries())
     swept = store.gc(None if budget is None else parse_size(budget), dry)
     rows = [[*_row(key, abouts[key], False)[1:4], key[:8]] for key in swept.evicted if key in abouts]
@@ -132,7 +135,7 @@ def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list
 
 
 def pin_lines(store: Store, prefix: str, pin: bool = True) -> list[str]:
-    """Pin or unpin the value whose key begins with ``prefix``; raise `ValueError` unless there is exactly one."""
+    """Pin or unpin the cached value whose key begins with ``prefix``; raise `ValueError` for no or several matches."""
     keys = {key for key, about in store.entries() if is_kept(about)} if pin else store.pinned()
     named = sorted(key for key in keys if key.startswith(prefix.lower()))
     if len(named) != 1:
@@ -145,7 +148,7 @@ def pin_lines(store: Store, prefix: str, pin: bool = True) -> list[str]:
 
 
 def _picture_problem(files: DerivedFiles, key: str, about: dict[str, Any]) -> str:
-    """Check the file of a picture; return an empty text, or move a damaged file away and return the problem."""
+    """Check the file of a stored picture; if the file is damaged, move the file away and return the problem as text."""
     name = about.get("file")
     if not name or not is_kept(about) or files.find(key, os.path.basename(name)[len(key) :]) is not None:
         return ""
@@ -161,7 +164,7 @@ def _row(key: str, about: dict[str, Any], pinned: bool) -> list[str]:
 
 
 def _size(about: dict[str, Any]) -> int:
-    """Return the bytes of a result, or of the picture that an entry describes."""
+    """Return the size in bytes of a cached result, or of a stored picture."""
     size: int = about.get("file_bytes") or about.get("bytes") or 0
     return size
 

@@ -78,7 +78,7 @@ def recipe_lines() -> list[str]:
 
 
 def nodes_lines() -> list[str]:
-    """Return a line for each node with the first sentence of its docstring, by family."""
+    """Return a line for each node, sorted by family, with the first sentence of its docstring."""
     from neusee.workflows.recipe.step_declarations import all_nodes
 
     nodes = dict(all_nodes())
@@ -91,7 +91,7 @@ def nodes_lines() -> list[str]:
 
 
 def node_lines(name: str) -> list[str]:
-    """Return the help on one node, or the readings of the paper for `reading`, or the terms for `glossary`."""
+    """Return the help on one node; for `reading` the interpretations of the paper, for `glossary` the field's terms."""
     from neusee.workflows.recipe.step_declarations import all_nodes
 
     if name == "glossary":
@@ -132,7 +132,7 @@ def _parameters(node: Node) -> list[str]:
 
 
 def _kind(hint: Any) -> str:
-    """Describe a type in words, by its unit, its allowed texts, or the range of its numbers."""
+    """Describe a parameter's type in words: its unit, its allowed texts, or the range of its numbers."""
     from neusee.nodes import units
 
     for name, words in _UNITS_IN_WORDS.items():
@@ -181,7 +181,7 @@ def _uses(name: str) -> Iterator[tuple[str, Any]]:
 
 
 def _readings_of(step: Any) -> Iterator[str]:
-    """Yield the recipe key of each reading of the paper to which a parameter of ``step`` refers."""
+    """Yield each recipe key that chooses an interpretation of the paper and to which a parameter of ``step`` refers."""
     known = {row.path for row in READINGS}
     for value in (step.get("with") or {}).values():
         match = re.fullmatch(r"\$\{(\w+\.\w+)\}", str(value))
@@ -190,7 +190,7 @@ def _readings_of(step: Any) -> Iterator[str]:
 
 
 def _reading(path: str) -> list[str]:
-    """Return lines on a contradiction of the paper: its text, both readings, and the options that choose one."""
+    """Return lines about a contradiction in the paper: its text, both interpretations and their options."""
     row = next((r for r in READINGS if r.path == path), None)
     if row is None:
         return [path]

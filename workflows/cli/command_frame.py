@@ -23,7 +23,7 @@ DEFAULT = "first_light"
 
 
 def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int]:
-    """Return the name of the recipe, by default `first_light`, its changes, and the number of the first change.
+    """Return the recipe, by default `first_light`, and the changes in the arguments, and the first change's number.
 
     ``before`` is the number of arguments that stand before ``words`` on the command line.
     """
@@ -41,7 +41,7 @@ def _is_change(word: str) -> bool:
 
 
 def load(words: list[str] | None, *command: str, before: int = 0, exact: bool = False) -> tuple[Recipe, list[str]]:
-    """Return the recipe that ``words`` name and change, and the words of the command line that runs this recipe."""
+    """Return the recipe that the arguments ``words`` name and change, and the command line that runs this recipe."""
     name, changes, first = split(words, before)
     from neusee.workflows.recipe.loading import load as read
 
@@ -55,7 +55,7 @@ def load(words: list[str] | None, *command: str, before: int = 0, exact: bool = 
 
 @contextmanager
 def refusing() -> Iterator[None]:
-    """Print every mistake of a recipe and end the command if the block raises `RecipeError`."""
+    """Print every mistake of a recipe and end the command if the ``with`` block raises `RecipeError`."""
     from neusee.workflows.graph.diagnostics import RecipeError
 
     try:
@@ -67,7 +67,7 @@ def refusing() -> Iterator[None]:
 
 @contextmanager
 def failing(*errors: type[Exception], code: int = BAD, before: str = "") -> Iterator[None]:
-    """Print ``before`` and the message, and end the command with ``code``, if the block raises one of ``errors``."""
+    """If the ``with`` block raises one of ``errors``, print ``before`` and the error, and exit with ``code``."""
     try:
         yield
     except errors as error:
@@ -75,7 +75,7 @@ def failing(*errors: type[Exception], code: int = BAD, before: str = "") -> Iter
 
 
 def check_device(device: str) -> None:
-    """End the command if a device does not exist on this machine; ``device`` may be a list with commas."""
+    """End the command if this machine does not have ``device``, which may be a list with commas."""
     from neusee.workflows.engine.device_names import check_devices
 
     with failing(ValueError, before="--device "):
@@ -94,7 +94,7 @@ def fail(message: str, code: int = BAD) -> NoReturn:
 
 
 def the_store() -> Store:
-    """Open the store that ``$NEUSEE_CACHE`` names, or the default store."""
+    """Open the result store that the environment variable ``NEUSEE_CACHE`` names, or the default store."""
     from neusee.workflows.store.remote_store import open_store
 
     with failing(ValueError, ModuleNotFoundError, before="NEUSEE_CACHE: "):
@@ -102,14 +102,14 @@ def the_store() -> Store:
 
 
 def memory_limit(text: str) -> int | None:
-    """Return the bytes of ``--memory``, such as ``6 GB``; return None for an empty text."""
+    """Return the value of the option ``--memory``, such as ``6 GB``, in bytes, or None for an empty text."""
     with failing(ValueError, before="--memory: "):
         return parse_size(text) if text else None
 
 
 @contextmanager
 def executor_of(place: str, store: Store) -> Iterator[Executor | None]:
-    """Yield None for ``local``, or an executor on the cluster ``place`` that is closed after the block."""
+    """Yield None for ``local``, or an executor on the cluster ``place``, and close it after the ``with`` block."""
     if place == "local":
         yield None
         return

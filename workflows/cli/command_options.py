@@ -29,10 +29,10 @@ Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the fo
 
 
 def progress_lines(quiet: bool) -> Callable[[str], None]:
-    """Return a function that prints a line of progress, or ignores that line for ``quiet``."""
+    """Return a function that prints a line of progress, or that prints nothing if ``quiet`` is True."""
     return (lambda line: None) if quiet else partial(print, flush=True)
 
 
 def option_words(options: Mapping[str, Any]) -> list[str]:
-    """Return ``--name value`` for each option, and ``--name`` for True; leave out False, zero and empty values."""
+    """Return ``--name value``, or ``--name`` for True, for each option; omit options that are False, 0 or empty."""
     return [f"--{name}" if value is True else f"--{name} {value}" for name, value in options.items() if value]

@@ -23,14 +23,14 @@ study = typer.Typer(
 
 
 class Move(StrEnum):
-    """The choices of ``--move``: how the walkers of a calibration move."""
+    """The choices of ``--move``: the proposals for the Markov chain walkers of a calibration."""
 
     DE = "de"
     STRETCH = "stretch"
 
 
 class Points(StrEnum):
-    """The choices of ``--points``: how uncertain inputs are drawn."""
+    """The choices of ``--points``: how the values of uncertain inputs are sampled."""
 
     DRAWS = "draws"
     SOBOL = "sobol"
@@ -45,17 +45,16 @@ def accuracy(
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
-    """Plot error against run time.
+    """Plot the error of a recipe and of each step against the run time.
 
-    For the whole recipe and for each step, over tolerances and settings of accuracy; the page names the cheapest
-    setting for each error.
+    The tolerances and the settings of accuracy are varied; the page names the cheapest setting for each error.
     """
     _run("accuracy", words, quiet, out, seeds=seeds, quick=quick)
 
 
 @study.command()
 def stability(words: Words = None, quiet: Quiet = False, debug: Debug = False, out: Out = Path("runs")) -> None:
-    """Compare the steps with float64 in stiff and extreme cases.
+    """Compare the steps of a recipe with float64 in stiff and extreme cases.
 
     Values and gradients are compared: each case passes, warns or fails with its number. The exit code is 1 if
     a case fails.

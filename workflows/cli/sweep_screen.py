@@ -67,7 +67,7 @@ def run_sweep(
 
 
 def _opening(work: Sweeping) -> Iterator[str]:
-    """Yield the lines that appear before the first point runs."""
+    """Yield the lines that appear on the screen before a sweep starts."""
     recipe, shared = work.plan.recipe, work.sharing
     sizes = f" {'+' if work.paired else '×'} ".join(f"{axis.name}: {len(axis.coordinates)}" for axis in work.axes)
     yield f"neusee sweep: {recipe.title or recipe.name}"
@@ -81,7 +81,7 @@ def _opening(work: Sweeping) -> Iterator[str]:
 def _run_points(
     work: Sweeping, on_error: OnError, quiet: bool
 ) -> tuple[list[PointOutcome], SweepState, Exception | None]:
-    """Run and show the points of a sweep; return their outcomes, also after Ctrl-C or a failure."""
+    """Run a sweep and show its progress; return the outcome of each parameter set, also after Ctrl-C or a failure."""
     table = SweepTable(work.columns, len(work.plan.checked), mode_for(quiet))
     running = outcomes(work.plan, work.store, on_error, work.device, table.started, table.watch)
     try:
@@ -107,7 +107,7 @@ def _command(
 
 
 def _closing(result: Sweep, path: Path, again: Sequence[str], seconds: float) -> Iterator[str]:
-    """Yield the lines that appear after the last point."""
+    """Yield the lines that appear on the screen after the end of a sweep."""
     yield ""
     yield f"{counted(result)}  ({lasts(seconds)})"
     yield from (f"  {line}" for line in _failures(result))
@@ -122,7 +122,7 @@ def _failures(result: Sweep) -> Iterator[str]:
 
 
 class SweepTable(ProgressTable):
-    """The table of a sweep on the screen, with one row for each finished point."""
+    """The table of a sweep on the screen, with one row for each finished parameter set."""
 
     def __init__(self, columns: Sequence[AxisColumn], points: int, mode: Mode) -> None:
         super().__init__(mode)
@@ -137,15 +137,15 @@ class SweepTable(ProgressTable):
         self.widths = [max(4, 2 * count + 1), max(5, count), *widest, 6, 8, 12, 0]
 
     def started(self, point: Point) -> None:
-        """Record that a point of the sweep begins."""
+        """Record that the run of a parameter set of the sweep begins."""
         self.running, self.step = point, ""
 
     def watch(self, event: Event) -> None:
-        """Record that a step of the running point begins or ends."""
+        """Record that a step of the running parameter set begins or ends."""
         self.step = event.step if event.done is None else ""
 
     def finished(self, outcome: PointOutcome) -> None:
-        """Record the outcome of a point and show the row of that point."""
+        """Record the outcome of a parameter set and show its row in the table."""
         self.outcomes.append(outcome)
         self.running = None
         self.lines.append(self.cells(outcome))
@@ -155,7 +155,7 @@ class SweepTable(ProgressTable):
             self.show_error(lines, f"point {outcome.point.number}: {outcome.point.shown}\n{outcome.message}")
 
     def cells(self, outcome: PointOutcome) -> list[str]:
-        """Return the row of a point: its number, values, state, seconds, the remaining time and the first results."""
+        """Return the table row of a parameter set: number, values, state, seconds, remaining time and first results."""
         values = map(cell_text, point_cells(outcome.point, self.columns))
         numbers = list(headline(outcome.numbers).items())[:_NUMBERS]
         results = "  ".join(f"{name} {value}" for name, value in numbers)
@@ -163,12 +163,12 @@ class SweepTable(ProgressTable):
         return [done, str(outcome.point.number), *values, outcome.state, f"{outcome.seconds:.3f}", left, results]
 
     def live_rows(self) -> Iterator[tuple[list[str], str]]:
-        """Yield the rows of the last points, each with its state."""
+        """Yield the table rows of the last parameter sets, each with its state."""
         state = len(self.columns) + 2
         yield from ((line, line[state]) for line in self.lines[-_LAST:])
 
     def caption(self) -> str:
-        """Return the number of the running point, its step, and the remaining time."""
+        """Return the number of the running parameter set, its running step, and the remaining time as text."""
         if self.running is None:
             return ""
         left = self.outcomes[-1].left if self.outcomes else 0.0

@@ -1,4 +1,4 @@
-"""Changes of a loaded recipe: the final values of the recipe are written to a file, changed and checked again."""
+"""Changes of a loaded recipe: its final values are written to a file, changed by overrides and checked again."""
 
 from __future__ import annotations
 

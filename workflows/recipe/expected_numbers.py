@@ -1,4 +1,4 @@
-"""Expected numbers of a recipe that the user's changes leave valid; the others are not compared."""
+"""Selection of the expected numbers of a recipe that remain valid after the user's changes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, needed
 
 
 def unaffected_expectations(recipe: Recipe, written: Recipe) -> Recipe:
-    """Return a recipe without the expected numbers that are affected by changes to the recipe ``written``."""
+    """Return a changed recipe without the expected numbers that its changes to the recipe ``written`` affect."""
     same: set[str] = set()
     for name in needed(recipe, recipe.steps):
         if same.issuperset(recipe.steps[name].sources) and _alike(recipe, written, name):

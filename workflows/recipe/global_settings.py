@@ -17,7 +17,7 @@ _NUMBERS = {"seed": "must be a whole number of 0 or more", "tolerance": "must be
 
 
 def seed_and_tolerance(root: Value, references: References, diagnostics: list[Diagnostic]) -> tuple[int, float]:
-    """Return the seed and the tolerance of a recipe; a value that the recipe does not set is 0."""
+    """Return the random seed and the error tolerance of a recipe; each is 0 if the recipe does not set it."""
     numbers = dict.fromkeys(_NUMBERS, 0)
     for key in (key for key in _NUMBERS if key in root.items):
         value = references.resolve(root.items[key], Scope({}, key))
@@ -29,7 +29,7 @@ def seed_and_tolerance(root: Value, references: References, diagnostics: list[Di
 
 
 def outputs_of(root: Value, wiring: Wiring) -> tuple[str, ...]:
-    """Return the names of the steps in the recipe key ``outputs``, with the copies of each step for its items."""
+    """Return the names of all copies, such as ``psf[mask]``, of the steps in the recipe key ``outputs``."""
     given = root.items.get("outputs")
     if given is None or given.data in (None, "", [], {}):
         if given is not None or not get_close_matches("outputs", map(str, root.items)):  # else reported as unknown
@@ -45,7 +45,7 @@ def outputs_of(root: Value, wiring: Wiring) -> tuple[str, ...]:
 
 
 def expectations(root: Value, wiring: Wiring) -> tuple[Expectation, ...]:
-    """Return the expected numbers of a recipe, which are in the recipe key ``expect``."""
+    """Return the expected numbers in the key ``expect`` of a recipe."""
     given = root.items.get("expect")
     if given is None or given.data is None:
         return ()

@@ -1,4 +1,4 @@
-"""Cache of recipe graphs; a graph is valid while the recipe's steps, item names and nodes are unchanged.
+"""Cache of the step graphs of recipes; a graph is valid while the steps, their copies and nodes are unchanged.
 
 The node and the wires of a step depend on no other values, so that the points of a sweep share one graph. Parameters
 and files are checked for each point.
@@ -23,7 +23,7 @@ _graphs: dict[tuple[Value | None, Names], CachedGraph] = {}  #: by ``steps`` and
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CachedGraph:
-    """Steps and wires of a recipe without mistakes, as they are cached."""
+    """Cached steps of a recipe without mistakes, and the connections between the steps."""
 
     steps: dict[str, Declared]
     absent: dict[str, Value]
@@ -31,7 +31,7 @@ class CachedGraph:
 
 
 def cached_graph(root: Value) -> CachedGraph | None:
-    """Return the cached graph of a recipe, or None if the cache has no valid graph of the recipe."""
+    """Return the cached step graph of a recipe, or None if the cache has no valid graph of the recipe."""
     graph = _graphs.get((root.items.get("steps"), _names(root)))
     return graph if graph is not None and all(map(_current, graph.steps.values())) else None
 
@@ -39,7 +39,7 @@ def cached_graph(root: Value) -> CachedGraph | None:
 def cache_graph(
     root: Value, steps: dict[str, Declared], absent: dict[str, Value], wires: Mapping[str, Mapping[str, Wire]]
 ) -> None:
-    """Add the graph of a recipe without mistakes to the cache; omit wires that are references."""
+    """Add the step graph of a recipe without mistakes to the cache; omit inputs of steps that references set."""
     if any(_refers(step.value.items.get("node")) for step in steps.values()):
         return
     fixed = [name for step in steps.values() if not _refers(step.value.items.get("from")) for name in step.instances]

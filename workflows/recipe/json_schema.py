@@ -34,7 +34,7 @@ _NUMBER = r"(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
 
 def schema() -> Schema:
-    """Return the JSON schema of recipe files, which is also valid for the options of groups."""
+    """Return the JSON schema of recipe files, which is also valid for the option files of groups."""
     nodes = dict(all_nodes())
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -57,14 +57,14 @@ def schema() -> Schema:
 
 
 def _defaults() -> Schema:
-    """Return the schema of an entry of ``defaults``, which offers the packaged options and allows other names."""
+    """Return the JSON schema of an entry in ``defaults``, which suggests packaged options and allows other names."""
     offered = {group: {"enum": [option.name for option in options]} for group, options in groups().items()}
     options = {group: {"anyOf": [names, {"type": ["string", "null"]}]} for group, names in offered.items()}
     return {"type": "object", "properties": options, "minProperties": 1, "maxProperties": 1}
 
 
 def _step(nodes: Mapping[str, Node]) -> Schema:
-    """Return the schema of a step: the keys of all steps, and for each node its inputs and parameters."""
+    """Return the JSON schema of a recipe step: the keys of all steps, and the inputs and parameters of each node."""
     each: Schema = {"type": ["string", "array", "null"], "items": {"type": "string"}, "maxItems": 2}
     names: Schema = {"anyOf": [{"enum": list(nodes)}, REFERENCE]}
     return {
@@ -86,7 +86,7 @@ def _step(nodes: Mapping[str, Node]) -> Schema:
 
 
 def _inputs(node: Node) -> Schema:
-    """Return the schema of the key ``from`` in a step with a node."""
+    """Return the JSON schema of a step's key ``from``, which names the inputs of the step's node."""
     if not node.inputs:
         return {"type": "null"}
     all_items = {**_WIRE, "description": "all items"}
@@ -103,7 +103,7 @@ def _expectation() -> Schema:
 
 
 def _parameters(nodes: Mapping[str, Node]) -> Schema:
-    """Return the schema of the parameters of each node, by the name of the node."""
+    """Return the JSON schema of the parameters of each node, by the name of the node."""
     schemas = {}
     for name, node in nodes.items():
         model = node.params.model_json_schema(schema_generator=_Generator)
@@ -115,7 +115,7 @@ def _parameters(nodes: Mapping[str, Node]) -> Schema:
 
 
 def _training() -> Schema:
-    """Return the schema of the block ``train``, in which every key is optional."""
+    """Return the JSON schema of the block ``train`` of a recipe, in which every key is optional."""
     model = Training.model_json_schema(schema_generator=_Generator, ref_template="#/$defs/train.{model}")
     blocks = {f"train.{name}": block for name, block in model.pop("$defs").items()}
     for block in (model, *blocks.values()):
@@ -124,14 +124,14 @@ def _training() -> Schema:
 
 
 class _Generator(GenerateJsonSchema):
-    """Generator of JSON schemas that also allow quantities with units, references and distributions."""
+    """Generator of JSON schemas whose values may also be quantities with units, references and distributions."""
 
     def generate_inner(self, schema: Any) -> JsonSchemaValue:
         inner = super().generate_inner(schema)
         return {"anyOf": [inner, REFERENCE]} if schema["type"] in _REFERABLE else inner
 
     def function_before_schema(self, schema: core_schema.BeforeValidatorFunctionSchema) -> JsonSchemaValue:
-        """Return the schema of a quantity, which is a number with one of the units of the parameter."""
+        """Return the JSON schema of a physical quantity: a number with one of the units that the parameter allows."""
         read = schema["function"]["function"]
         known = [unit for scale in units._SCALE.values() for unit in scale if _takes(read, unit)]
         if not known:

@@ -1,4 +1,4 @@
-"""Loading of a recipe from a name or file and arguments, with a check that reports all mistakes at once."""
+"""Loading of a recipe from its name or file and from arguments, with a check that reports all mistakes at once."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from neusee.workflows.recipe.wiring import Wiring, cycles
 
 @dataclass(frozen=True, slots=True)
 class Titled:
-    """Name of a packaged recipe or of an option, with the title in the first line of its file."""
+    """Name of a packaged recipe or of an option of a group, with the title from the first line of its file."""
 
     name: str
     title: str
@@ -64,7 +64,7 @@ def load(
 
 
 def _as_written(name: str, folder: Path) -> Recipe:
-    """Return a recipe without overrides, from the cache while its files and nodes are unchanged."""
+    """Return a recipe without the user's overrides, from a cache while its files and nodes are unchanged."""
     composed = compose(name, (), folder)
     graph = cached_graph(composed.root)
     return check(composed) if graph is None else _checked(composed, graph)
@@ -72,7 +72,7 @@ def _as_written(name: str, folder: Path) -> Recipe:
 
 @functools.lru_cache(maxsize=16)
 def _checked(composed: Composed, graph: CachedGraph) -> Recipe:
-    """Return a composed recipe after a check; the result is cached by recipe and graph."""
+    """Return a composed recipe after a check of its values; the result is cached by recipe and step graph."""
     return check(composed)
 
 
@@ -107,7 +107,7 @@ def check(composed: Composed) -> Recipe:
 
 
 def _bind(wiring: Wiring, checker: Checker, known: Mapping[str, Mapping[str, Wire]]) -> Iterator[Step]:
-    """Yield every copy of every step with its parameters and wires; ``known`` contains the cached wires."""
+    """Yield every copy of every step with its parameters and inputs; ``known`` contains the cached inputs by copy."""
     checked: list[tuple[Step, Value, Value]] = []
     for step in wiring.steps.values():
         if not step.items:
@@ -133,7 +133,7 @@ def _bind(wiring: Wiring, checker: Checker, known: Mapping[str, Mapping[str, Wir
 
 
 def _value_before_run(step: Step) -> Any:
-    """Return the result of a step without inputs, or None if the parameters of the step are invalid."""
+    """Return the result of a step without inputs before the run, or None if the step's parameters are invalid."""
     try:
         return step.node(**step.params)
     except ValueError:
@@ -143,7 +143,7 @@ def _value_before_run(step: Step) -> Any:
 def _final_values(
     wiring: Wiring, bound: dict[str, Step], checker: Checker, uncertain: Uncertain | None
 ) -> dict[str, Setting]:
-    """Return the final values of a recipe by path: the written values, and after each step the defaults of its node."""
+    """Return the final values of a recipe by path: the written values and the default values of the steps' nodes."""
     settings: dict[str, Setting] = {}
     spare = wiring.references.spare
     for key, block in wiring.root.items.items():
@@ -185,7 +185,7 @@ def recipes() -> list[Titled]:
 
 
 def groups(beside: Path | None = None) -> dict[str, list[Titled]]:
-    """Return the options of all groups: packaged options, and files in folders ``beside`` the recipe of a user."""
+    """Return the options of all groups: the packaged options, and option files beside the recipe of a user."""
     folders = [folder for folder in (beside, packaged()) if folder]
     return {
         group: [_titled(next(p for f in folders if (p := f / group / f"{name}.yaml").is_file())) for name in names]

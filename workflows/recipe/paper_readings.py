@@ -1,4 +1,4 @@
-"""Contradictions in the paper: for each, the reading that the recipes choose and the reason for the choice.
+"""Contradictions in the paper of Peng et al., the interpretation that the recipes choose for each, and the reason.
 
 Source: Peng et al., "Learning to See Through Flare", ICCV 2025 workshops. The group ``reading`` makes each choice.
 """
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class Reading(NamedTuple):
-    """Contradiction in the paper: the recipe key, its coherent and its printed value, and the reason for the choice."""
+    """A contradiction in the paper: the recipe key, its coherent and printed value, and the reason for the choice."""
 
     path: str  #: of the recipe key
     number: str
@@ -110,7 +110,10 @@ READINGS = (
 
 
 def in_force(values: dict[str, object]) -> Iterable[tuple[Reading, str]]:
-    """Yield each contradiction that a recipe resolves, with ``coherent``, ``as printed`` or the recipe's own value."""
+    """Yield each contradiction in the paper that a recipe resolves, with the recipe's choice.
+
+    The choice is ``coherent``, ``as printed`` or the recipe's own value.
+    """
     for row in READINGS:
         if row.path in values:
             value = values[row.path]

@@ -25,7 +25,7 @@ _LONGEST = 40  #: largest number of characters of a value in a message
 
 @dataclass(slots=True)
 class Checker:
-    """Checker of the parameters of all steps, which collects diagnostics and notes."""
+    """Checker of the parameters of all steps in a recipe, which collects diagnostics and notes for the user."""
 
     diagnostics: list[Diagnostic]
     notes: dict[str, None] = field(default_factory=dict)
@@ -33,7 +33,7 @@ class Checker:
     files: dict[tuple[str | int, ...], str | list[str]] = field(default_factory=dict)
 
     def read(self, node: Node, given: Value, step: Location) -> dict[str, Any] | None:
-        """Return the validated parameters of a step with the defaults of its node, or None for a mistake."""
+        """Return the validated parameters of a step with the defaults of its node, or None if a parameter is wrong."""
         if given.data is not None and not isinstance(given.data, dict):
             message = f"must be a mapping of parameters, not {kind(given)}"
             self.diagnostics.append(Diagnostic(given.mark, given.name, message))
@@ -50,7 +50,7 @@ class Checker:
         return {name: getattr(model, name) for name in node.params.model_fields}
 
     def preflight(self, bound: Step, early: Mapping[str, Any], values: Mapping[str, Value], step: Value) -> None:
-        """Call the preflight check of a step's node; ``early`` contains the results known before the run, by step."""
+        """Check a step before a run with its node's own check; ``early`` holds the results that are known by then."""
         node, inputs = bound.node, {name: early.get(str(bound.wires.get(name))) for name in bound.node.preflight_inputs}
         if node.hooks.preflight is None:
             return
@@ -66,7 +66,7 @@ class Checker:
             self.diagnostics.append(Diagnostic(step.key, step.name, str(error)))
 
     def _plain(self, node: Node, name: str, value: Value) -> Any:
-        """Return a value as plain data; a path is relative to the folder of the YAML file that contains the path."""
+        """Return a parameter value as plain data, with a file path relative to the folder of its YAML file."""
         parts = value.data if isinstance(value.data, list) else [value]
         if not _is_file(node.hints.get(name)) or not all(isinstance(part.data, str) for part in parts):
             return value.plain
@@ -77,7 +77,7 @@ class Checker:
 
 
 def _is_file(hint: Any) -> bool:
-    """Return True if an annotation contains `IsFile` at any depth, so that the parameter is a path."""
+    """Return True if a parameter's type annotation contains `IsFile` at any depth, so that the parameter is a path."""
     extras = getattr(hint, "__metadata__", ())
     return any(isinstance(extra, IsFile) for extra in extras) or any(map(_is_file, get_args(hint)))
 
@@ -85,7 +85,7 @@ def _is_file(hint: Any) -> bool:
 def _problems(
     error: ValidationError, node: Node, values: Mapping[str, Value], given: Value, step: Location
 ) -> Iterator[Diagnostic]:
-    """Yield a diagnostic for each parameter that is wrong, unknown or missing."""
+    """Yield a diagnostic for each parameter of a step that is wrong, unknown or missing."""
     details = error.errors(include_url=False)
     strangers = [str(e["loc"][0]) for e in details if e["type"] == "extra_forbidden"]
     meant = {nearest(name, node.params.model_fields) for name in strangers}
@@ -100,7 +100,7 @@ def _problems(
             gone.setdefault(message, Diagnostic(values[name].key, f"{given.name}.{name}", message))
         elif e["type"] == "missing" and len(e["loc"]) == 1:
             if f"did you mean {name}?" not in meant and name not in now:
-                yield Diagnostic(step, f"{given.name}.{name}", f"is missing: {node.path} needs this parameter")
+                yield Diagnostic(step, f"{given.name}.{name}", f"missing parameter: {node.path} needs {name}")
         else:
             value = _deepest(values[name], e["loc"][1:])
             wrong.setdefault((value.mark, _said(value)), []).append(_message(e) + _in_si(e, value))
@@ -110,20 +110,20 @@ def _problems(
 
 
 def _deepest(value: Value, path: tuple[int | str, ...]) -> Value:
-    """Return the value at a path below ``value``, or the deepest value on the path that exists."""
+    """Return the value at a path of keys below ``value``, or the last value on the path that exists."""
     while path and (child := value.child(path[0])):
         value, path = child, path[1:]
     return value
 
 
 def _said(value: Value) -> str:
-    """Return the name and the text of a value, such as ``sensor.gain = -1``."""
+    """Return the name and the text of a recipe value, such as ``sensor.gain = -1``."""
     text = str(value.plain)
     return f"{value.name} = {text if len(text) <= _LONGEST else text[: _LONGEST - 1] + '…'}"
 
 
 def _message(error: ErrorDetails) -> str:
-    """Return the message of a pydantic error in words that tell the user what to write."""
+    """Return the message of a pydantic error, rewritten so that the user knows which value to write."""
     if error["type"] == "missing":
         return f"must have at least {int(error['loc'][-1]) + 1} values"
     text = error["msg"].removeprefix("Value error, ")
@@ -143,6 +143,6 @@ def _message(error: ErrorDetails) -> str:
 
 
 def _in_si(error: ErrorDetails, value: Value) -> str:
-    """Return a text with the value of a quantity in SI if the message has a limit, which is in SI."""
+    """Return a quantity in SI units as text for a message that contains a limit in SI units."""
     limit = next((v for key, v in error.get("ctx", {}).items() if key in ("gt", "ge", "lt", "le")), 0)
     return f" in SI, not {error['input']:.4g}" if limit and isinstance(value.data, str) else ""

@@ -1,4 +1,4 @@
-"""Declarations of the steps in a recipe: the node of each step, and the items for which the step is copied."""
+"""Declarations of the steps in a recipe: the node of each step, and the items, such as lasers, for its copies."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _ITEM = re.compile(r"[^\[\],\s]+")
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """Declaration of a step, from which one copy of the step is made for each item."""
+    """Declaration of a step, from which one copy of the step is made for each item, such as each laser."""
 
     name: str
     value: Value
@@ -54,7 +54,7 @@ class Declared:
 def declare(
     root: Value, references: References, diagnostics: list[Diagnostic]
 ) -> tuple[dict[str, Declared], dict[str, Value]]:
-    """Return the declared steps and the steps that are null; report mistakes in the declarations."""
+    """Return the declared steps of a recipe and the steps that are null; report mistakes in the declarations."""
     given = root.items.get("steps")
     if given is None or not isinstance(given.data, dict) or not given.data:
         mark = root.mark if given is None else given.mark
@@ -77,7 +77,7 @@ def _well_formed(name: str, value: Value, diagnostics: list[Diagnostic]) -> bool
         diagnostics.append(Diagnostic(value.key, value.name, "a step's name must consist of letters, digits, _ and -"))
         return False
     if not isinstance(value.data, dict):
-        diagnostics.append(Diagnostic(value.mark, value.name, f"must be a mapping or null, not {kind(value)}"))
+        diagnostics.append(Diagnostic(value.mark, value.name, f"a step must be a mapping or null, not {kind(value)}"))
         return False
     for key, part in value.data.items():
         if key not in _KEYS:
@@ -88,10 +88,10 @@ def _well_formed(name: str, value: Value, diagnostics: list[Diagnostic]) -> bool
 def _node(
     step: Value, find: Callable[[str], Node], references: References, diagnostics: list[Diagnostic]
 ) -> Node | None:
-    """Return the node that a step names, or None for a mistake; the function ``find`` returns a node by name."""
+    """Return the node that a step names, or None if the name is wrong; ``find`` returns a node by name."""
     given = step.items.get("node")
     if given is None:
-        diagnostics.append(Diagnostic(step.key, step.name, "has no node: write `node: family.name`"))
+        diagnostics.append(Diagnostic(step.key, step.name, "the step has no node: write `node: family.name`"))
         return None
     given = references.resolve(given, Scope({}, str(step.path[-1])))
     if broken(given):
@@ -104,7 +104,7 @@ def _node(
 
 
 def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str, ...] | None:
-    """Return the names of the lists of items in a step's key ``each``, at most two, or None for a mistake."""
+    """Return the names of the lists, such as ``lasers``, in a step's key ``each``, or None for a mistake."""
     given = step.items.get("each")
     if given is None or given.data is None:
         return ()
@@ -116,9 +116,9 @@ def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str,
         block = root.items.get(value.data) if isinstance(value.data, str) else None
         if block is None or value.data not in lists:
             hint = nearest(str(value.data), map(str, lists))
-            diagnostics.append(Diagnostic(value.mark, given.name, f"no list of items {value.data}; {hint}"))
+            diagnostics.append(Diagnostic(value.mark, given.name, f"there is no list of items {value.data}; {hint}"))
         elif value.data in dims or len(dims) == 2:
-            diagnostics.append(Diagnostic(value.mark, given.name, "must name one list of items or two different lists"))
+            diagnostics.append(Diagnostic(value.mark, given.name, "`each` needs one or two different lists of items"))
         else:
             dims.append(value.data)
             diagnostics += [
@@ -130,13 +130,13 @@ def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str,
 
 
 def device_of(step: Declared, references: References, scope: Scope, diagnostics: list[Diagnostic]) -> str:
-    """Return the device that a copy of a step requests, or an empty string for any device."""
+    """Return the device, such as ``gpu``, that a copy of a step requests, or an empty string for any device."""
     given = references.resolve(step.part("device"), scope)
     if broken(given) or given.data in ({}, None, "any"):
         return ""
     if not isinstance(given.data, str) or not _DEVICE.fullmatch(given.data):
         hint = "write any, cpu, gpu, cuda, cuda:1 or mps"
-        diagnostics.append(Diagnostic(given.mark, f"{given.name} = {given.plain}", f"is not a device: {hint}"))
+        diagnostics.append(Diagnostic(given.mark, f"{given.name} = {given.plain}", f"unknown device: {hint}"))
         return ""
     only = step.node.device if step.node else "any"
     if only != "any" and (only == "cpu") != (given.data == "cpu"):
@@ -146,7 +146,7 @@ def device_of(step: Declared, references: References, scope: Scope, diagnostics:
 
 
 def _is_item_list(block: Value) -> bool:
-    """Return True if a block is a list of items, which is a mapping of mappings."""
+    """Return True if a block of a recipe is a list of items such as ``lasers``, which is a mapping of mappings."""
     return isinstance(block.data, dict) and all(isinstance(item.data, dict) for item in block.data.values())
 
 
@@ -162,7 +162,7 @@ def find_node(name: str) -> Node:
     if attribute not in nodes and (now := instead(name)):
         raise LookupError(f"{name} {now}")
     if not nodes:
-        raise LookupError(f"no family {family}; {_elsewhere(attribute) or nearest(family, families())}")
+        raise LookupError(f"no family of nodes {family}; {_elsewhere(attribute) or nearest(family, families())}")
     if attribute not in nodes:
         hint = nearest(attribute, nodes).replace("did you mean ", f"did you mean {family}.")
         raise LookupError(f"no node {name}; {_elsewhere(attribute) or hint}")
@@ -170,26 +170,26 @@ def find_node(name: str) -> Node:
 
 
 def _elsewhere(attribute: str) -> str:
-    """Return a hint that lists the nodes of the same name in other families."""
+    """Return a hint with the nodes of other families that have the name of an unknown node."""
     names = [f"{family}.{attribute}" for family in families() if attribute in nodes_of(family)]
     return f"did you mean {' or '.join(names)}?" if names else ""
 
 
 def families() -> list[str]:
-    """Return the names of the families of nodes, without importing a family."""
+    """Return the names of the families of nodes, such as ``optics``, without importing a family."""
     packages = {info.name for info in pkgutil.iter_modules(neusee.nodes.__path__) if info.ispkg}
     loaded = (re.fullmatch(rf"{neusee.nodes.__name__}\.([a-z]\w*)", module) for module in list(sys.modules))
     return sorted(packages | {match[1] for match in loaded if match and nodes_of(match[1])})
 
 
 def nodes_of(family: str) -> dict[str, Node]:
-    """Return the nodes of a family by name."""
+    """Return the nodes of a family such as ``optics`` by name."""
     module = importlib.import_module(f"{neusee.nodes.__name__}.{family}")
     return {name: value for name, value in vars(module).items() if isinstance(value, Node)}
 
 
 def all_nodes() -> Iterator[tuple[str, Node]]:
-    """Yield the name and the node of every node in all families; recipes use these names."""
+    """Yield each node of all families with the name that recipes use, such as ``sensor.digitize``."""
     for family in families():
         for name, node in nodes_of(family).items():
             yield f"{family}.{name}", node

@@ -1,4 +1,4 @@
-"""Wiring of a recipe: the steps that feed each step, and a check of the types that steps return."""
+"""Connections between the steps of a recipe: the steps whose results each step reads, and a check of their types."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _WIRE = re.compile(r"\s*([^\[\]\s]+)\s*(?:\[([^\[\]]*)\])?\s*")
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """The steps of a recipe, and the wires between them."""
+    """The steps of a recipe, and the connections that pass the results of steps to the inputs of other steps."""
 
     root: Value
     steps: Mapping[str, Declared]
@@ -33,7 +33,7 @@ class Wiring:
     diagnostics: list[Diagnostic]
 
     def wires(self, step: Declared, items: tuple[str, ...]) -> dict[str, Wire]:
-        """Return the wires of one copy of a step by input, in the order of the node's inputs."""
+        """Return the steps that feed each input of one copy of a step, in the order of the node's inputs."""
         given = self.references.resolve(step.part("from"), step.scope(self.root, items))
         values = self._by_input(step.node, given) if step.node else None
         if step.node is None or values is None:
@@ -48,15 +48,18 @@ class Wiring:
         return wires
 
     def outputs(self, value: Value, path: str) -> tuple[str, ...]:
-        """Return the names of the steps that a value of ``outputs`` or ``expect`` names."""
+        """Return the names of all copies of the steps that a value of ``outputs`` or ``expect`` names."""
         return self._producers(value, path, {}) or ()
 
     def refuse(self, value: Value, path: str, message: str) -> None:
-        """Add a diagnostic at the location of a value."""
+        """Report a mistake at the location of a recipe value."""
         self.diagnostics.append(Diagnostic(value.mark, path, message))
 
     def _by_input(self, node: Node, given: Value) -> dict[str, Value] | None:
-        """Return the values in ``from`` by input, or None for a mistake; a single name feeds the first input."""
+        """Return the values in a step's key ``from`` by input, or None for a mistake.
+
+        A single name in ``from`` is for the first input.
+        """
         if given.data is BROKEN:
             return None
         if given.data is None:
@@ -76,22 +79,22 @@ class Wiring:
         return {str(name): value for name, value in given.data.items()}
 
     def _require(self, step: Declared, node: Node, name: str, given: Value) -> None:
-        """Report an input that the key ``from`` does not name, unless the input is optional."""
+        """Report an input of a node that the step's key ``from`` does not name, unless the input is optional."""
         if name in node.optional or (name == "stop" and became_input(node.path, map(str, step.part("with").items))):
             return  # the parameters of an old recipe are reported with the step that replaces them
         if not (isinstance(given.data, dict) and _misspelt(name, node, given)):
             mark = given.mark if given.items else step.value.key
             fix = f"write from: {{{name}: STEP}}{self._makers(needs(node, name))}"
-            self.diagnostics.append(Diagnostic(mark, given.name, f"{node.path} needs {name}: {fix}"))
+            self.diagnostics.append(Diagnostic(mark, given.name, f"{node.path} needs the input {name}: {fix}"))
 
     def _wire(self, step: Declared, node: Node, items: tuple[str, ...], name: str, value: Value) -> Wire:
-        """Return the wire of an input from its value in ``from``, or None for a mistake."""
+        """Return the steps that feed an input, from its value in the step's key ``from``, or None for a mistake."""
         many, path, parsed = takes_many(node, name), f"{step.value.name}.from.{name}", _parse(value)
         null = self.absent.get(parsed[0]) if parsed else None
         if value.data is None or null:
             if not many and name not in node.optional:
                 what = f"{parsed[0]}, which is null ({null.mark})" if parsed and null else "null"
-                self.refuse(value, path, f"{node.path} needs {name}, but it is wired to {what}")
+                self.refuse(value, path, f"{node.path} needs {name}, but the input is {what}")
             return () if many else None
         here = dict(zip(step.dims, items, strict=True))
         names = self._producers(value, path, here, self._makers(needs(node, name)))
@@ -110,7 +113,7 @@ class Wiring:
         return None
 
     def _producers(self, value: Value, path: str, here: Mapping[str, str], makers: str = "") -> tuple[str, ...] | None:
-        """Return the copies of a step that a wire names; ``here`` has the items of the step that reads the wire."""
+        """Return the copies of a step that a value names; ``here`` contains the items of the step that reads them."""
         parsed = _parse(value)
         if parsed is None or parsed[0] not in self.steps:
             self.refuse(value, path, self._unknown(value, makers))
@@ -124,7 +127,7 @@ class Wiring:
         return tuple(producer.instance(items) for items in itertools.product(*choices))
 
     def _unknown(self, value: Value, makers: str) -> str:
-        """Return the message for a value that does not name a step."""
+        """Return the error message for a value that should name a step but does not."""
         parsed = _parse(value)
         if parsed is None:
             what = value.data if isinstance(value.data, str) else kind(value)
@@ -138,7 +141,7 @@ class Wiring:
         return f"no step {name}; {hint if hint.startswith('did you mean') else f'check the name{makers}'}"
 
     def _chosen(self, producer: Declared, items: Sequence[str], value: Value, path: str) -> dict[str, str] | None:
-        """Return the items in the brackets of a wire, by the name of the list that contains each item.
+        """Return the items in the brackets of a name such as ``spot[mask,green]``, by the list that contains each item.
 
         A single item may be in any of the lists of the step.
         """
@@ -162,14 +165,14 @@ class Wiring:
         return [str(name) for name in self.root.items[dim].items]
 
     def _agree(self, node: Node, name: str, producer: Declared, value: Value, path: str) -> None:
-        """Report a step whose result does not have the type that an input needs."""
+        """Report a step whose result does not have the type that an input of another step needs."""
         needed, returned = needs(node, name), _returned(producer)
         if returned and needed and not _fits(returned, needed):
             message = f"{node.path} needs {_a(needed)}; {producer.name} returns {_a(returned)}{self._makers(needed)}"
             self.refuse(value, path, message)
 
     def _makers(self, needed: Sequence[type]) -> str:
-        """Return a hint with the steps that return a type, or an empty hint for a tensor."""
+        """Return a hint that names the steps whose results have a type, or an empty hint for the type ``Tensor``."""
         if not needed or all(n.__name__ == "Tensor" for n in needed):
             return ""
         makers = [name for s in self.steps.values() if _fits(_returned(s), needed) for name in s.instances]
@@ -179,7 +182,7 @@ class Wiring:
 
 
 def _parse(value: Value) -> tuple[str, list[str] | None] | None:
-    """Return the step and the items that a wire such as ``spot[mask,green]`` names, or None for another value."""
+    """Return the step name and the items in a text such as ``spot[mask,green]``, or None for any other value."""
     match = _WIRE.fullmatch(value.data) if isinstance(value.data, str) else None
     if match is None:
         return None
@@ -187,13 +190,13 @@ def _parse(value: Value) -> tuple[str, list[str] | None] | None:
 
 
 def _misspelt(name: str, node: Node, given: Value) -> bool:
-    """Return True if the key ``from`` has a misspelt form of an input's name, which is reported elsewhere."""
+    """Return True if a step's key ``from`` contains a misspelt form of an input's name."""
     strangers = [str(key) for key in given.items if key not in node.inputs]
     return any(nearest(stranger, node.inputs) == f"did you mean {name}?" for stranger in strangers)
 
 
 def takes_many(node: Node, name: str) -> bool:
-    """Return True if an input of a node takes a list of steps."""
+    """Return True if an input of a node takes the results of a list of steps."""
     return any(get_origin(hint) in _LISTS for hint in _options(node.hints.get(name)))
 
 
@@ -212,7 +215,7 @@ def _fits(returned: Iterable[type], needed: Iterable[type]) -> bool:
 
 
 def _options(hint: Any) -> list[Any]:
-    """Return the member types of an annotation, without None and ``Annotated``."""
+    """Return the types that a type annotation allows, without None and ``Annotated``."""
     if get_origin(hint) is Annotated:
         return _options(get_args(hint)[0])
     if get_origin(hint) in (Union, types.UnionType):
@@ -232,7 +235,7 @@ def _a(kinds: Sequence[type]) -> str:
 
 
 def cycles(steps: Mapping[str, Step], marks: Mapping[str, Location]) -> Iterator[Diagnostic]:
-    """Yield one diagnostic for each cycle of steps, with the lines of these steps."""
+    """Yield one diagnostic for each cycle of steps in a recipe, with the lines of these steps."""
     seen: set[frozenset[str]] = set()
     for loop in _loops({name: [s for s in step.sources if s in steps] for name, step in steps.items()}):
         names = list(dict.fromkeys(name.partition("[")[0] for name in loop))

@@ -127,5 +127,5 @@ def test_calibrate_study_and_train_hand_their_options_to_their_rooms(monkeypatch
 
 
 def test_an_unknown_kind_of_study_is_refused_with_those_there_are():
-    with pytest.raises(ValueError, match="no study 'acuracy': write one of accuracy, stability, leave-out"):
+    with pytest.raises(ValueError, match="there is no study 'acuracy': write one of accuracy, stability, leave-out"):
         neusee.study("laser_free", kind="acuracy")

@@ -247,7 +247,7 @@ def test_two_dimensions_make_item_ambiguous(mistakes):
 
 def test_references_that_run_in_a_circle_are_told_with_their_way(mistakes):
     text = swap("3.74 um", '"${optics.a}"').replace("  window", '  a: "${optics.b}"\n  b: "${optics.a}"\n  window')
-    assert mistakes(text) == ["mine.yaml:6:6 | optics.b | refers to itself: optics.a -> optics.b -> optics.a"]
+    assert mistakes(text) == ["mine.yaml:6:6 | optics.b | the value refers to itself: optics.a -> optics.b -> optics.a"]
 
 
 def test_all_mistakes_come_at_once_in_the_order_of_the_file(mistakes):

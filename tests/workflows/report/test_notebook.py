@@ -139,7 +139,7 @@ def test_groups_are_chosen_by_keyword():
         (
             {"sensor.bits": object(), "optics": {"window": {1.5: 2}}},
             [
-                "argument optics | optics.window | a key must be a name or an integer, not 1.5",
+                "argument optics | optics.window | a mapping's key must be a name or an integer, not 1.5",
                 "argument sensor.bits | sensor.bits | a recipe cannot contain a value of type object: give a number, "
                 "a string, True or False, None, a list or a mapping",
             ],
@@ -182,10 +182,10 @@ def test_a_step_says_where_it_wants_to_run(given):
 
 def test_a_wrong_device_is_located(refused, toy):
     assert refused(**{"optics.device": "cuda1"}) == [
-        "argument optics.device | optics.device = cuda1 | is not a device: write any, cpu, gpu, cuda, cuda:1 or mps"
+        "argument optics.device | optics.device = cuda1 | unknown device: write any, cpu, gpu, cuda, cuda:1 or mps"
     ]
     assert refused(**{"steps.raw.device": 3}) == [
-        "argument steps.raw.device | steps.raw.device = 3 | is not a device: write any, cpu, gpu, cuda, cuda:1 or mps"
+        "argument steps.raw.device | steps.raw.device = 3 | unknown device: write any, cpu, gpu, cuda, cuda:1 or mps"
     ]
     toy.digitize.device = "cpu"
     assert refused(**{"steps.raw.device": "mps"}) == [

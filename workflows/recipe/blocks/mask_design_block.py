@@ -1,4 +1,4 @@
-"""Settings of the mask design, which trains a mask without images."""
+"""Settings of the mask design, which optimises the point spread function of a mask without images."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _RATE = {"pixelwise": 0.05, "recipe_mask": 4e-3, "zernike": 0.1, "rings": 0.1, "
 
 
 def half_cosine(angle: float) -> float:
-    """Return the cosine factor on a learning rate, which falls from 1 at the angle 0 to 0 at the angle pi."""
+    """Return the factor (1 + cos(angle)) / 2 on a learning rate, which falls from 1 at 0 to 0 at the angle pi."""
     return 0.5 * (1 + math.cos(angle))
 
 
 class Weights(SettingsBlock):
-    """Weights of the terms in the loss of the mask design; each term is a mean over the bands."""
+    """Weights of the terms in the loss of the mask design; each term is a mean over the spectral bands."""
 
     lsr: Weight = 1.0  #: `losses.suppression_loss`
     bsr: Weight = 1.0  #: `losses.background_loss` of a point on the axis: the light that left the field
@@ -34,12 +34,12 @@ class Weights(SettingsBlock):
     @model_validator(mode="after")
     def _some(self) -> Weights:
         if not (self.lsr or self.bsr or self.contrast or self.wiener):
-            raise ValueError("every weight is 0: set lsr, bsr, contrast or wiener to a number above 0")
+            raise ValueError("every weight of the loss is 0: set lsr, bsr, contrast or wiener to a number above 0")
         return self
 
 
 class MaskSettings(SettingsBlock):
-    """Settings of the mask design, ``train.mask`` in a recipe: the kind of mask, the loss and the duration."""
+    """Settings of the mask design in the recipe key ``train.mask``: the kind of mask, the loss and the duration."""
 
     kind: Kind = "pixelwise"  #: `recipe_mask`: all samples of the recipe's own height map, from its formula or file
     iterations: Count = 300  #: iterations of Adam, or generations for five_half_rings
@@ -84,7 +84,7 @@ class MaskSettings(SettingsBlock):
     @model_validator(mode="after")
     def _rising(self) -> Self:
         if not self.slopes[0] < self.slopes[1]:
-            raise ValueError(f"slopes {self.slopes}: give the smaller slope first")
+            raise ValueError(f"slopes = {self.slopes}: give the smaller slope first")
         return self
 
     @property
@@ -94,14 +94,14 @@ class MaskSettings(SettingsBlock):
 
 
 class MaskTraining(MaskSettings):
-    """Settings of the mask design, with the names of the steps that the design uses."""
+    """Settings of the mask design, and the names of the recipe steps that the design uses."""
 
     height: str = "height"  #: the step whose height map is designed
     psf: str = "psf[mask]"
 
 
 class DesignError(ValueError):
-    """Error for settings from which no mask can be designed; the text names the setting and the fix."""
+    """Error for settings with which no mask can be designed; the message names the setting and the fix."""
 
 
 def need_steps(recipe_steps: Any, settings: MaskTraining) -> None:
@@ -113,5 +113,5 @@ def need_steps(recipe_steps: Any, settings: MaskTraining) -> None:
 
 
 def state_file(out: Path, recipe: str, key: str) -> Path:
-    """Return the path of the file that stores the state of an unfinished mask design; other runs keep this file."""
+    """Return the path of the file with the state of an unfinished mask design; other runs do not delete the file."""
     return out / f".{recipe}_mask_{key[:16]}.state"

@@ -19,7 +19,7 @@ Number = Annotated[int, Field(ge=1)]
 
 
 class SettingsBlock(BaseModel):
-    """Base class of a block of settings, in which an unknown key is a mistake."""
+    """Base class of a block of settings in a recipe; an unknown key in the block is a mistake."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -28,7 +28,7 @@ Settings = TypeVar("Settings", bound=SettingsBlock)
 
 
 def read_block(composed: Composed, key: str, model: type[Settings], plain: Any) -> tuple[Composed, Settings | None]:
-    """Return the recipe without its block ``key``, and the validated settings in that block.
+    """Return a recipe without its block ``key``, and the validated settings from that block.
 
     ``plain`` is the plain data of the block. Mistakes in the block add diagnostics, and the settings are None.
     """
@@ -40,7 +40,7 @@ def read_block(composed: Composed, key: str, model: type[Settings], plain: Any) 
 
 
 def _problem(block: Value, model: type[BaseModel], error: Any) -> Diagnostic:
-    """Return the diagnostic for a pydantic error, located at the innermost value that the error names."""
+    """Return the diagnostic for a pydantic error, with the location of the innermost value that the error names."""
     value = block
     for key in error["loc"]:
         value = value.child(key) or value
@@ -56,7 +56,7 @@ def _problem(block: Value, model: type[BaseModel], error: Any) -> Diagnostic:
 
 
 def _fields(model: type[BaseModel], path: Sequence[int | str]) -> list[str]:
-    """Return the names of the settings that a block allows at a path."""
+    """Return the names of the settings that a block of a recipe allows below a path of keys."""
     for key in path:
         if key in model.model_fields:
             annotation: Any = model.model_fields[str(key)].annotation

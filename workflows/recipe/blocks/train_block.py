@@ -29,25 +29,25 @@ class Network(SettingsBlock):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Return the options of the network that differ from the defaults, without the kind and the width."""
+        """Return the restoration network's options that differ from the defaults, without the kind and the width."""
         return self.model_dump(exclude={"kind", "width"}, exclude_defaults=True)
 
     @model_validator(mode="after")
     def _fits(self) -> Network:
         if self.options and self.kind != "fft_mamba":
-            raise ValueError(f"{', '.join(self.options)}: only fft_mamba has such options, not {self.kind}")
+            raise ValueError(f"{', '.join(self.options)}: only the network fft_mamba has such options, not {self.kind}")
         return self
 
 
 class Critics(SettingsBlock):
-    """Settings of the two critics: their width and the momenta of their optimiser."""
+    """Settings of the two critic networks of adversarial training: their width and the momenta of their optimiser."""
 
     width: Annotated[int, Field(ge=2)] = 64
     betas: tuple[Beta, Beta] = (0.0, 0.9)
 
 
 class Rates(SettingsBlock):
-    """Learning rates, which are halved once and then multiplied by a factor at intervals, down to a minimum."""
+    """Learning rates of a training, which are halved once and then reduced at intervals, down to a minimum."""
 
     weights: Annotated[float, Field(gt=0)] = 2e-4
     biases: Annotated[float, Field(gt=0)] = 4e-4
@@ -58,14 +58,14 @@ class Rates(SettingsBlock):
     least: Weight = 1e-6
 
     def share(self, iteration: int) -> float:
-        """Return the factor on the learning rates at an iteration of a stage; the first iteration is 0."""
+        """Return the factor on the learning rates at an iteration of a training stage; the first iteration is 0."""
         if iteration < self.halve:
             return 1.0
         return float(0.5 * self.factor ** ((iteration - self.halve) // self.every))
 
 
 class Stage(SettingsBlock):
-    """Settings of a training stage: its duration, batch size and loss weights; a weight of 0 omits a term."""
+    """Settings of a training stage: duration, batch size and weights of the loss terms; a weight of 0 omits a term."""
 
     iterations: Annotated[int, Field(ge=0)]
     batch: Number = 8
@@ -106,12 +106,12 @@ class Training(SettingsBlock):
 
     @property
     def learnt(self) -> tuple[int, ...]:
-        """Return the numbers of the training stages that are run."""
+        """Return the numbers (1, 2) of the training stages that run."""
         return tuple(sorted(n for n in self.stages if self.learn or n != 1))
 
     @property
     def design(self) -> MaskTraining:
-        """Return the settings of the mask design, with the steps that the stages of training use."""
+        """Return the settings of the mask design; it uses the same steps for the height and the PSF as the training."""
         return MaskTraining.model_construct(**dict(self.mask), height=self.learn, psf=self.psf)
 
     @property
@@ -121,7 +121,7 @@ class Training(SettingsBlock):
 
 
 def read_training(composed: Composed) -> tuple[Composed, Training | None]:
-    """Return the recipe without its block ``train``, and the settings in the block; report mistakes as diagnostics."""
+    """Return a recipe without its block ``train``, and the settings from the block; report mistakes as diagnostics."""
     block = composed.root.items.get(KEY)
     if block is None:
         return composed, None
@@ -129,12 +129,12 @@ def read_training(composed: Composed) -> tuple[Composed, Training | None]:
     if training is None or training.photographs is None or training.photographs.is_dir():
         return composed, training
     value = block.items["photographs"]
-    problem = Diagnostic(value.mark, value.name, f"{training.photographs} is not a folder")
+    problem = Diagnostic(value.mark, value.name, f"the path {training.photographs} is not a folder of photographs")
     return composed.with_problems([problem]), None
 
 
 def _plain(block: Value) -> Any:
-    """Return the block as plain data; a path is relative to the folder of the YAML file that contains the path."""
+    """Return the block ``train`` as plain data, with file paths relative to the folder of their YAML file."""
     plain = block.plain
     for outer, key in ((block, "photographs"), (block.items.get("mask"), "start")):
         value = outer.items.get(key) if outer else None

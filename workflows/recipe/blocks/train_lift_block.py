@@ -1,4 +1,4 @@
-"""Settings of the training of a lift from RGB to spectra, which form the block ``train_lift`` of a recipe."""
+"""Settings of the block ``train_lift`` of a recipe: the training of a network that estimates spectra from RGB."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ KEY = "train_lift"  #: key of the block in a recipe
 
 
 class LiftTraining(SettingsBlock):
-    """Settings of the training of a lift from RGB to spectra."""
+    """Settings of the training of a network that estimates spectra from RGB."""
 
     measured: str = "measured"
     picture: str = "picture"
@@ -40,6 +40,6 @@ class LiftTraining(SettingsBlock):
 
 
 def read_lift_training(composed: Composed) -> tuple[Composed, LiftTraining | None]:
-    """Return the recipe without its block ``train_lift``, and the settings in the block; report mistakes."""
+    """Return a recipe without its block ``train_lift``, and the settings from the block; report mistakes."""
     block = composed.root.items.get(KEY)
     return (composed, None) if block is None else read_block(composed, KEY, LiftTraining, block.plain)

@@ -1,4 +1,4 @@
-"""Which values of a recipe are probability distributions, and how are these values drawn?
+"""Which values of a recipe are probability distributions, and how are numbers sampled from them?
 
 Distributions that a recipe has in place of values, draws from them, and the parameters that read the drawn values.
 Nothing here runs a recipe at a draw, or infers a distribution from data.

@@ -1,4 +1,4 @@
-"""Joint distributions of several values, from draws or from a mean and covariance, and a reader of posterior files."""
+"""Joint distributions of several values, from samples or from mean and covariance, and a reader of posterior files."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ class Joint:
 
     @classmethod
     def of_draws(cls, names: Sequence[str], draws: FloatArray) -> Joint:
-        """Return the joint distribution of draws; raise ValueError if the draws are too few, non-finite or constant."""
+        """Return the joint distribution of random draws; raise ValueError for too few, non-finite or constant draws."""
         if len(draws) < _LEAST:
-            raise ValueError(f"{len(draws)} draws are too few: give {_LEAST} or more")
+            raise ValueError(f"the posterior has {len(draws)} draws, which are too few: give {_LEAST} or more")
         if not np.isfinite(draws).all():
-            raise ValueError("a draw is NaN or infinite: remove the draw")
+            raise ValueError("a draw of the posterior is NaN or infinite: remove this draw")
         if still := [name for name, x in zip(names, draws.T, strict=True) if np.ptp(x) == 0]:
-            raise ValueError(f"every draw of {still[0]} is the same: leave {still[0]} out")
+            raise ValueError(f"all draws of {still[0]} are equal: remove {still[0]} from the posterior")
         correlation = np.atleast_2d(np.corrcoef(_scores(draws).T))
         return cls(tuple(names), draws.mean(0), draws.std(0, ddof=1), _factor(correlation), draws)
 
@@ -60,15 +60,15 @@ class Joint:
         """Return a joint normal distribution; raise ValueError for an invalid correlation or standard deviation."""
         count = len(names)
         if correlation.shape != (count, count) or not np.allclose(correlation, correlation.T):
-            raise ValueError(f"the correlation must be a symmetric matrix of {count} x {count}")
+            raise ValueError(f"the correlation matrix must be symmetric and have the size {count} x {count}")
         if not (np.isfinite(sd) & (sd > 0)).all():
             raise ValueError("every standard deviation must be greater than 0")
         if not np.allclose(np.diag(correlation), 1.0) or np.linalg.eigvalsh(correlation)[0] < -1e-9:
-            raise ValueError("the correlation must have ones on its diagonal and no negative eigenvalue")
+            raise ValueError("the correlation matrix must have ones on its diagonal and no negative eigenvalue")
         return cls(tuple(names), mean, sd, _factor(correlation))
 
     def at(self, z: FloatArray) -> FloatArray:
-        """Transform standard normal numbers ``z`` to values of the distribution; both have the shape (…, name)."""
+        """Transform standard normal numbers ``z`` to draws of the joint distribution; both have the shape (…, name)."""
         score = z @ self.factor.T
         if self.draws is None:
             return np.asarray(self.mean + self.sd * score, np.float64)
@@ -79,7 +79,7 @@ class Joint:
         return np.stack(columns, -1)
 
     def numbers(self) -> FloatArray:
-        """Return the standard normal numbers (draw, name) from which `at` reproduces the draws."""
+        """Return the standard normal numbers (draw, name) from which `at` reproduces the draws of the distribution."""
         assert self.draws is not None
         return np.asarray(np.linalg.solve(self.factor, _scores(self.draws).T).T, np.float64)
 
@@ -111,7 +111,7 @@ class Joint:
 
 
 def _scores(draws: FloatArray) -> FloatArray:
-    """Return the normal scores (draw, name) of the ranks of draws; equal draws have the same rank."""
+    """Return the normal scores (draw, name) of random draws, computed from their ranks; equal draws share a rank."""
     from scipy.special import ndtri
     from scipy.stats import rankdata
 
@@ -124,7 +124,7 @@ def _factor(correlation: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Posterior:
-    """Posterior from a file: the joint distribution, and the kind and the unit of each value."""
+    """Posterior read from a file: the joint distribution of the values, and the kind and the unit of each value."""
 
     joint: Joint
     kinds: Mapping[str, str] = field(default_factory=dict)  #: of `neusee calibrate`: estimate, upper, lower, none
@@ -138,7 +138,7 @@ def read_posterior(path: Path) -> Posterior:
     if path.is_dir():
         path = path / "posterior.json"
     if not path.is_file():
-        raise ValueError(f"no such file: {path}; give {_FILES}")
+        raise ValueError(f"there is no posterior file {path}: give {_FILES}")
     try:
         if path.suffix == ".npz":
             return _drawn(*_headed(_arrays(path)))
@@ -148,11 +148,11 @@ def read_posterior(path: Path) -> Posterior:
             return _document(path)
     except (OSError, KeyError, TypeError, BadZipFile, UnicodeDecodeError) as error:
         raise ValueError(f"{path.name} cannot be read as a posterior: {error!r}") from None
-    raise ValueError(f"{path.name} is not a posterior: give {_FILES}")
+    raise ValueError(f"{path.name} is not a posterior file: give {_FILES}")
 
 
 def _document(path: Path) -> Posterior:
-    """Return the posterior of a file that `neusee calibrate` wrote, or of a summary by mean and standard deviation."""
+    """Return the posterior in a file of `neusee calibrate`, or in a file with means and standard deviations."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
@@ -161,7 +161,7 @@ def _document(path: Path) -> Posterior:
     except YAMLError as error:
         raise ValueError(f"{path.name} cannot be read: {' '.join(str(error).split())}") from None
     if not isinstance(doc, dict):
-        raise ValueError(f"{path.name} must contain a mapping")
+        raise ValueError(f"{path.name} must contain a mapping of keys to values")
     if "parameters" not in doc:
         return summary(doc)
     if doc.get("failed"):
@@ -176,14 +176,14 @@ def _document(path: Path) -> Posterior:
 
 
 def _headed(columns: Mapping[str, FloatArray]) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """Return the draws by name and the units by name, from headings such as ``gain [DN/e-]``."""
+    """Return the draws of each quantity and its unit, both by name, from column headings such as ``gain [DN/e-]``."""
     heads = {head: _HEAD.fullmatch(head) for head in columns}
     named = {m[1] if m else head: columns[head] for head, m in heads.items()}
     return named, {m[1]: m[2].strip() for m in heads.values() if m}
 
 
 def _drawn(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Posterior:
-    """Return the posterior with the given draws; draws of a gain in e-/DN are converted to DN/e-."""
+    """Return the posterior that consists of the given draws; convert draws of a gain in e-/DN to DN/e-."""
     with np.errstate(divide="ignore"):
         draws = [1.0 / x if units.get(name) == "e-/DN" else x for name, x in columns.items()]
     lengths = {len(x) for x in draws}
@@ -205,11 +205,11 @@ def _columns(path: Path) -> dict[str, FloatArray]:
     with path.open(newline="", encoding="utf-8") as file:
         header, *rows = list(csv.reader(file)) or [[]]
     if short := [n for n, row in enumerate(rows, 2) if len(row) != len(header)]:
-        raise ValueError(f"line {short[0]} must have {len(header)} values like the first line")
+        raise ValueError(f"line {short[0]} of the posterior file must have {len(header)} values like the first line")
     try:
         numbers = np.array(rows, np.float64).reshape(-1, len(header))
     except ValueError as error:
-        raise ValueError(f"the lines below the names must contain numbers: {error}") from None
+        raise ValueError(f"the lines below the column headings must contain numbers: {error}") from None
     return {name.strip(): numbers[:, i] for i, name in enumerate(header)}
 
 
@@ -221,7 +221,7 @@ def summary(given: Mapping[str, Any]) -> Posterior:
 
 def _normal(given: Mapping[str, Any]) -> Joint:
     if strange := sorted(set(given) - {"mean", "sd", "correlation", "covariance"}):
-        raise ValueError(f"{strange[0]} is unknown: give mean with sd and perhaps correlation, or mean with covariance")
+        raise ValueError(f"unknown key {strange[0]}: give mean, sd and perhaps correlation, or mean and covariance")
     if not isinstance(given.get("mean"), dict) or ("sd" in given) == ("covariance" in given):
         raise ValueError("a summary needs mean: {name: value}, and either sd: {name: value} or covariance: [[…], …]")
     names = [str(name) for name in given["mean"]]
@@ -233,7 +233,7 @@ def _normal(given: Mapping[str, Any]) -> Joint:
             raise ValueError(f"the covariance must be a matrix of {len(names)} x {len(names)} with positive variances")
         return Joint.of_normal(names, mean, sd, covariance / sd / sd[:, None])
     if not isinstance(given["sd"], dict) or set(map(str, given["sd"])) != set(names):
-        raise ValueError("sd must have the same names as mean")
+        raise ValueError("sd must have a value for each name in mean, and no other names")
     sd = np.array([_si(given["sd"][name]) for name in given["mean"]])
     correlation = _matrix(given["correlation"]) if "correlation" in given else np.eye(len(names))
     return Joint.of_normal(names, mean, sd, correlation)

@@ -1,4 +1,4 @@
-"""Nominal values of uncertain inputs: the values that a run uses in place of distributions and of a posterior.
+"""Nominal values of uncertain inputs, which a run uses in place of probability distributions and of a posterior.
 
 A run uses the median of a distribution and the value that ``posterior`` chooses; the study of uncertainty draws values.
 """
@@ -28,7 +28,7 @@ _FAR = 0.005  #: probability of each tail of a posterior in which a recipe's own
 
 @dataclass(frozen=True)
 class Standing:
-    """Comparison of a value in a recipe with the posterior of that value."""
+    """Comparison of a value in a recipe with the posterior distribution of that value."""
 
     path: str
     own: str  #: the recipe's own value
@@ -44,13 +44,13 @@ class Standing:
 
     @property
     def far(self) -> bool:
-        """Return True if the recipe's own value lies in the far tails of the posterior."""
+        """Return True if the recipe's own value lies in one of the two tails of the posterior with 0.5 % each."""
         return not _FAR <= self.below <= 1 - _FAR
 
 
 @dataclass(frozen=True)
 class Uncertain:
-    """The uncertain values of a recipe, with their distributions."""
+    """The uncertain values of a recipe, with their probability distributions."""
 
     composed: Composed  #: the recipe with a value in place of every distribution
     laws: Mapping[str, Law]  #: by path
@@ -62,15 +62,18 @@ class Uncertain:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the paths of all uncertain values."""
+        """Return the paths of all uncertain values of a recipe."""
         return (*self.laws, *(self.joint.names if self.joint else ()))
 
     def said(self, name: str) -> str:
-        """Return the distribution of a value as text, or the source of the posterior of that value."""
+        """Return the distribution of an uncertain value as text, or the source of the posterior with this value."""
         return self.laws[name].text if name in self.laws else f"posterior {self.source}"
 
     def at(self, values: Mapping[str, float]) -> Any:
-        """Return the checked recipe with the given values in SI; raise `RecipeError` for an invalid value."""
+        """Return the recipe with the given numbers in SI units in place of its uncertain values, after a check.
+
+        Raises `RecipeError` for an invalid value.
+        """
         from neusee.workflows.recipe.loading import check
 
         root = self.composed.root
@@ -81,7 +84,7 @@ class Uncertain:
 
 
 def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
-    """Return the recipe with a value in place of every distribution, and the uncertain values of the recipe or None."""
+    """Return a recipe with a number in place of every distribution, and its uncertain values, or None for none."""
     laws, root = dict[str, Law](), composed.root
     diagnostics = list(composed.diagnostics)
     for path, leaf in _laws(root):
@@ -105,7 +108,7 @@ def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
 
 
 def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
-    """Yield the path and the value of every distribution in a recipe; a value with aliases has several paths."""
+    """Yield the path and the value of every distribution in a recipe; a value with YAML aliases has several paths."""
     stack: list[tuple[Where, Value]] = [((key,), value) for key, value in root.items.items() if key != KEY]
     while stack:
         path, value = stack.pop()
@@ -115,7 +118,7 @@ def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
 
 
 def put(root: Value, path: Where, data: Any, mark: Location | None = None) -> Value:
-    """Return the recipe with the value at an existing path replaced by ``data``."""
+    """Return a recipe in which ``data`` replaces the value at an existing path."""
     if not path:
         return replace(root, data=data, mark=mark or root.mark)
     key = next(key for key in root.items if str(key) == str(path[0]))
@@ -123,7 +126,7 @@ def put(root: Value, path: Where, data: Any, mark: Location | None = None) -> Va
 
 
 class _Reader:
-    """Reader of the recipe key ``posterior``, which puts the values that a run uses into the recipe."""
+    """Reader of the recipe key ``posterior``, which replaces values of the recipe by values from the posterior."""
 
     def __init__(self, root: Value, laws: Mapping[str, Law], diagnostics: list[Diagnostic]) -> None:
         self.root, self.laws, self.diagnostics = root, laws, diagnostics
@@ -134,7 +137,7 @@ class _Reader:
         self.source = ""
 
     def read(self, given: Value) -> None:
-        """Read the posterior and put its values into the recipe; report each mistake with the location."""
+        """Read the posterior that a recipe names, and put its values into the recipe; report each mistake."""
         if given.data is None:
             return
         items = given.items if isinstance(given.data, dict) else {"file": given}
@@ -154,7 +157,7 @@ class _Reader:
             return summary({key: _flat(v) for key, v in items.items() if key in _SUMMARY})
         file = items.get("file")
         if file is None or not isinstance(file.data, str):
-            raise ValueError("write posterior: PATH, or posterior: {file: PATH, use: mean}")
+            raise ValueError("the posterior has no file: write posterior: PATH, or posterior: {file: PATH, use: mean}")
         self.source = file.data
         return read_posterior(Path(file.mark.folder) / Path(file.data).expanduser())
 
@@ -169,10 +172,10 @@ class _Reader:
         raise ValueError(f"use = {use}: write mean, nominal (the recipe's own value){number}")
 
     def _pairs(self, given: Value | None, posterior: Posterior) -> dict[str, str]:
-        """Return a dict from the path of each value in the recipe to the name of that value in the posterior."""
+        """Return the name in the posterior for each value that the recipe takes from it, by the value's recipe path."""
         names = posterior.joint.names
         if given is not None and not isinstance(given.data, dict):
-            raise ValueError("values: write {path of the recipe: name in the posterior}")
+            raise ValueError("values must be a mapping: write values: {path in the recipe: name in the posterior}")
         if given is not None:
             pairs = {path: str(name) for path, name in _flat(given).items()}
             if wrong := [name for name in pairs.values() if name not in names]:
@@ -185,14 +188,14 @@ class _Reader:
             if lost := [name for path, name in all_pairs.items() if path not in pairs]:
                 self.notes.append(f"this recipe does not have these values of the posterior: {', '.join(lost)}")
         if wrong := [path for path in pairs if self._value(path) is None]:
-            raise ValueError(f"values: the recipe has no value {wrong[0]}")
+            raise ValueError(f"values: the recipe has no value at the path {wrong[0]}")
         if not pairs:
             raise ValueError(f"no value of the recipe is in the posterior, which contains {', '.join(names)}")
         self._conventions(posterior, pairs)
         return pairs
 
     def _conventions(self, posterior: Posterior, pairs: Mapping[str, str]) -> None:
-        """Raise ValueError if the posterior has a gain without a unit, or a dark current for another exposure time."""
+        """Raise ValueError if a posterior has a gain without a unit, or a dark current for another exposure time."""
         for path, name in pairs.items():
             value = self._value(path)
             is_gain = value and isinstance(value.data, str) and value.data.strip().endswith(("e-/DN", GAIN_UNIT))
@@ -215,13 +218,13 @@ class _Reader:
             assert value is not None
             if path in self.laws or value.mark.line == 0:
                 if path in self.laws and value.mark.line:
-                    self._fail(value.mark, path, "has a distribution here and in the posterior: remove one of the two")
+                    self._fail(value.mark, path, "the value has a distribution here and in the posterior: remove one")
                 self.notes.append(f"{path} comes from the argument, not from the posterior")
                 continue
             try:
                 own, unit = read_any(value.data)
             except ValueError as error:
-                self._fail(value.mark, path, f"is in the posterior, but {error}")
+                self._fail(value.mark, path, f"the posterior contains this value, but {error}")
                 continue
             kept[path] = name
             self.units[path] = unit
@@ -231,7 +234,7 @@ class _Reader:
             self.joint = replace(joint, names=tuple(kept))
 
     def _stand(self, posterior: Posterior, path: str, name: str, own: float, use: str | int, mark: Location) -> None:
-        """Compare a value in the recipe with the posterior, and put the value that a run uses into the recipe."""
+        """Compare a value in the recipe with the posterior, and replace it by the value that a run uses."""
         joint, unit, kind = posterior.joint, self.units[path], posterior.kinds.get(name, "estimate")
         i = joint.names.index(name)
         used, why = own, "recipe"
@@ -255,7 +258,7 @@ class _Reader:
 
 
 def _flat(value: Value) -> Any:
-    """Return the values of a nested mapping by dotted path; return any other value as plain data."""
+    """Return the values of a nested YAML mapping by dotted path; return any other YAML value as plain data."""
     if not isinstance(value.data, dict):
         return value.plain
     return {dotted(leaf.path[len(value.path) :]): leaf.plain for leaf in value.leaves() if leaf is not value}
@@ -266,5 +269,5 @@ def _rounded(value: float, unit: str) -> str:
 
 
 def told(standings: Sequence[Standing]) -> list[dict[str, Any]]:
-    """Return comparisons of values with their posteriors as plain JSON."""
+    """Return comparisons of recipe values with their posteriors as data for JSON."""
     return [{**asdict(standing), "far": standing.far} for standing in standings]

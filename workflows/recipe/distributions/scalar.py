@@ -1,4 +1,4 @@
-"""Probability distribution of one value: ``normal(10.5 e-, 0.5 e-)`` in place of ``10.5 e-``."""
+"""Probability distribution of one recipe value, such as ``normal(10.5 e-, 0.5 e-)`` in place of ``10.5 e-``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CALL = re.compile(rf"({'|'.join(KINDS)})\((.*)\)", re.DOTALL)
 
 @dataclass(frozen=True)
 class Law:
-    """Probability distribution of one value, or of the reciprocal of a gain in e-/DN, with its two arguments in SI."""
+    """Probability distribution of a recipe value or, for a gain in e-/DN, of its reciprocal, with arguments in SI."""
 
     kind: str
     text: str  #: as written in the recipe
@@ -53,23 +53,23 @@ class Law:
 
     @property
     def median(self) -> float:
-        """Return the median of the distribution, which a run without draws uses."""
+        """Return the median of the distribution; a run uses the median unless it samples the distribution."""
         return float(self.at(np.zeros(())))
 
 
 def is_law(text: Any) -> bool:
-    """Return True if a value is a text that begins like a distribution, such as ``normal(``."""
+    """Return True if a recipe value is a text that begins with the name of a distribution, such as ``normal(``."""
     return isinstance(text, str) and _BEGIN.match(text) is not None
 
 
 def read_law(text: str) -> Law:
-    """Return the distribution that a text describes; raise ValueError with the correct form for an invalid text."""
+    """Return the probability distribution in a text; raise ValueError with the correct form for an invalid text."""
     match = _CALL.fullmatch(text.strip())
     if match is None:
-        raise ValueError("is not a complete distribution: write kind(…, …), in quotes inside [ ] or { }")
+        raise ValueError("the text is not a complete distribution: write kind(…, …), in quotes inside [ ] or { }")
     kind, arguments = match[1], [part.strip() for part in match[2].split(",")]
     if len(arguments) != 2 or not all(arguments):
-        raise ValueError(f"needs {' and '.join(KINDS[kind])}: write {kind}(…, …)")
+        raise ValueError(f"the distribution {kind} needs {' and '.join(KINDS[kind])}: write {kind}(…, …)")
     (first, unit, reciprocal), (second, other, also) = map(read_written, arguments)
     if kind == "lognormal":
         if other:

@@ -1,4 +1,4 @@
-"""Uncertain inputs of a recipe: draws of the uncertain values, and the step parameters that read these values."""
+"""Uncertain inputs of a recipe: random draws of their values, and the step parameters that use these values."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Index = tuple[int | str, ...]  #: path of a number in a parameter; empty for the
 
 @dataclass(frozen=True)
 class InputDraws:
-    """Draws of all uncertain inputs of a recipe."""
+    """Random draws of all uncertain inputs of a recipe."""
 
     z: FloatArray  #: (draw, input) independent standard normal numbers
     values: FloatArray  #: (draw, input) in SI
@@ -41,7 +41,7 @@ class Inputs:
 
     @classmethod
     def of(cls, recipe: Recipe, outputs: Sequence[str] | None = None) -> Inputs:
-        """Return the uncertain inputs that affect some outputs, by default the outputs of the recipe.
+        """Return the uncertain inputs of a recipe that affect ``outputs``, by default the recipe's own outputs.
 
         Raises ValueError for a recipe without uncertain values, and if no output depends on an uncertain value.
         """
@@ -65,17 +65,17 @@ class Inputs:
 
     @property
     def labels(self) -> list[str]:
-        """Return the label of each input, which shows whether the input is correlated with other inputs."""
+        """Return the label of each uncertain input; the label shows whether the input is correlated with others."""
         return [_label(self.uncertain, name) for name in self.names]
 
     @property
     def most(self) -> int | None:
-        """Return the largest possible number of independent draws, or None if there is no limit."""
+        """Return the largest possible number of independent draws of the inputs, or None if there is no limit."""
         joint = self.uncertain.joint
         return None if joint is None or joint.draws is None else len(joint.draws)
 
     def theta(self, values: Mapping[str, float]) -> dict[str, Any]:
-        """Return the parameters that read the inputs, by ``step.parameter``, for given values of the inputs."""
+        """Return the parameters that use uncertain inputs, by ``step.parameter``, for given values of the inputs."""
         parameters = {}
         for reader, inputs in self.readers.items():
             step, _, param = reader.rpartition(".")
@@ -85,13 +85,13 @@ class Inputs:
         return parameters
 
     def at(self, z: FloatArray) -> FloatArray:
-        """Transform standard normal numbers ``z`` to values of the inputs; both have the shape (draw, input)."""
+        """Transform standard normal numbers ``z`` to values of uncertain inputs; both have the shape (draw, input)."""
         columns = [law.at(z[:, i]) for i, law in enumerate(self.uncertain.laws.values())]
         joint = self.uncertain.joint
         return np.stack([*columns, *(joint.at(z[:, len(columns) :]).T if joint else ())], 1)
 
     def independent(self, count: int, seed: int) -> InputDraws:
-        """Return independent draws of the inputs; with the same seed, a larger count begins with the same draws."""
+        """Return independent random draws of the uncertain inputs; a larger ``count`` begins with the same draws."""
         z = np.random.default_rng([seed, 1]).standard_normal((count, len(self.names)))
         values, joint = self.at(z), self.uncertain.joint
         if joint is None or joint.draws is None:
@@ -102,7 +102,7 @@ class Inputs:
         return InputDraws(z, np.concatenate([values[: len(rows), :first], joint.draws[rows]], 1))
 
     def sobol(self, count: int, seed: int) -> InputDraws:
-        """Return draws from `SCRAMBLES` scrambled Sobol sequences; draw i comes from sequence i % SCRAMBLES."""
+        """Return input draws from `SCRAMBLES` scrambled Sobol sequences; draw i belongs to sequence i % SCRAMBLES."""
         from scipy.special import ndtri
         from scipy.stats import qmc
 
@@ -114,18 +114,18 @@ class Inputs:
         return InputDraws(z, self.at(z))
 
     def checked(self, values: FloatArray) -> None:
-        """Check the smallest and the largest value of each input; raise `RecipeError` for an invalid value."""
+        """Check the smallest and the largest draw of each uncertain input; raise `RecipeError` for an invalid value."""
         for name, column in zip(self.names, values.T, strict=True):
             for value in (float(column.min()), float(column.max())):
                 try:
                     self.uncertain.at({name: value})
                 except RecipeError as error:
-                    drawn = [replace(d, message=f"is drawn, but {d.message}") for d in error.diagnostics]
+                    drawn = [replace(d, message=f"the value is sampled, but {d.message}") for d in error.diagnostics]
                     raise RecipeError(drawn) from None
 
 
 def _only(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
-    """Return the uncertain values of a recipe, reduced to the values ``names``."""
+    """Return those uncertain values of a recipe whose paths are in ``names``."""
     laws = {name: law for name, law in uncertain.laws.items() if name in names}
     joint = uncertain.joint
     kept = [name for name in joint.names if name in names] if joint else []
@@ -133,7 +133,7 @@ def _only(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
 
 
 def _readers(recipe: Recipe, uncertain: Uncertain, name: str, outputs: Sequence[str]) -> Iterator[tuple[str, Index]]:
-    """Yield each parameter that reads the value ``name`` as ``step.parameter``, and the index of the value there."""
+    """Yield each ``step.parameter`` that uses the recipe value ``name``, and the value's index in the parameter."""
     if name in uncertain.laws:
         probe = float(uncertain.laws[name].at(np.array(_PROBE)))
     else:
@@ -142,18 +142,18 @@ def _readers(recipe: Recipe, uncertain: Uncertain, name: str, outputs: Sequence[
         probe = float(uncertain.joint.mean[i] + _PROBE * uncertain.joint.sd[i])
     changed: Recipe = uncertain.at({name: probe})
     if changed.steps.keys() != recipe.steps.keys() or changed.outputs != recipe.outputs:
-        raise ValueError(f"{name} changes the list of steps and therefore cannot be drawn")
+        raise ValueError(f"the value {name} changes the list of steps and therefore cannot be sampled")
     for step in needed(recipe, outputs):
         before, after = recipe.steps[step], changed.steps[step]
         for param, value in after.params.items():
             for index, new in _changed(before.params[param], value):
                 if not isinstance(new, float) or abs(new - probe) > 1e-9 * abs(probe):
-                    raise ValueError(f"{step}.{param} does not read {name} unchanged, so {name} cannot be drawn")
+                    raise ValueError(f"{step}.{param} does not use {name} unchanged, so {name} cannot be sampled")
                 yield f"{step}.{param}", index
 
 
 def _changed(before: Any, after: Any) -> Iterator[tuple[Index, Any]]:
-    """Yield the index of each difference between two values of a parameter, and the new value at that index."""
+    """Yield the index of each element in which two values of a parameter differ, and the new element."""
     if isinstance(after, list | tuple) and isinstance(before, list | tuple) and len(after) == len(before):
         for i, (a, b) in enumerate(zip(before, after, strict=True)):
             yield from (((i, *rest), new) for rest, new in _changed(a, b))

@@ -18,7 +18,7 @@ _NAME = re.compile(r"[\w-]+")
 
 @dataclass(frozen=True, slots=True)
 class Composed:
-    """A recipe composed from its files and arguments, with values that are not yet checked."""
+    """A recipe composed from its files and the arguments of the user, with values that are not yet checked."""
 
     name: str
     title: str
@@ -95,7 +95,10 @@ def shown(path: Path, folder: Path) -> str:
 
 
 def merge(below: Value, above: Value) -> Value:
-    """Return ``below`` updated with ``above``; a list, scalar or step with ``node`` in ``above`` replaces a value."""
+    """Merge the recipe value ``above`` into the recipe value ``below``, and return the result.
+
+    Mappings are merged key by key; a list, a scalar or a step with ``node`` replaces the value in ``below``.
+    """
     if not isinstance(below.data, dict) or not isinstance(above.data, dict) or _new_step(above):
         return above
     data = dict(below.data)
@@ -106,7 +109,7 @@ def merge(below: Value, above: Value) -> Value:
 
 @functools.lru_cache(maxsize=16)
 def _merged(parts: tuple[Value, ...]) -> Value:
-    """Merge the options of the groups and the recipe in order; the same parts give the same object from a cache."""
+    """Merge the options of the groups and the recipe in order; return the cached object if the parts are the same."""
     mark = parts[-1].mark
     return functools.reduce(merge, (part.without("defaults") for part in parts), Value({}, mark, mark, ()))
 
@@ -119,7 +122,7 @@ def _new_step(value: Value) -> bool:
 
 
 def groups_of(*folders: Path) -> dict[str, list[str]]:
-    """Return the names of the options by group; each folder of YAML files in one of ``folders`` is a group."""
+    """Return the names of the options of each group; a group is a folder of YAML files in one of ``folders``."""
     options: dict[str, set[str]] = {}
     for folder in folders:
         for path in folder.glob("*/*.yaml"):
@@ -130,7 +133,7 @@ def groups_of(*folders: Path) -> dict[str, list[str]]:
 def _choose(
     root: Value, overrides: list[Override], beside: Path, diagnostics: list[Diagnostic]
 ) -> tuple[list[Choice], list[Override]]:
-    """Return the options of the groups after overrides such as ``laser=six``, and the remaining overrides."""
+    """Return the option of each group after overrides such as ``laser=six``, and the overrides of single values."""
     choices = {choice.group: choice for choice in _defaults(root, diagnostics)}
     groups = groups_of(beside, packaged())
     rest = []
@@ -158,7 +161,7 @@ def _group_fault(o: Override, choices: Mapping[str, Choice]) -> str:
 
 
 def _defaults(root: Value, diagnostics: list[Diagnostic]) -> Iterator[Choice]:
-    """Yield the entries of the ``defaults`` list; report the entries that cannot be read."""
+    """Yield the entries in the list ``defaults`` of a recipe; report the entries that cannot be read."""
     given = root.items.get("defaults")
     if given is None:
         return
@@ -181,7 +184,7 @@ def _defaults(root: Value, diagnostics: list[Diagnostic]) -> Iterator[Choice]:
 
 
 def _option(choice: Choice, beside: Path, folder: Path, diagnostics: list[Diagnostic]) -> Value | None:
-    """Return the values of an option; a file in the folder of the recipe takes precedence over a packaged file."""
+    """Return the values of an option of a group; a file beside the recipe takes precedence over a packaged file."""
     names = (choice.group, str(choice.option))
     for above in dict.fromkeys((beside, packaged())):
         path = above / choice.group / f"{names[1]}.yaml"

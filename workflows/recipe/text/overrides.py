@@ -32,7 +32,7 @@ class Override:
 
 
 def read_override(text: str, mark: Location) -> Override:
-    """Return the override in an argument; the value is read as YAML, so that ``20 e-`` is a string."""
+    """Return the override in an argument such as ``a.b=1``; read its value as YAML: ``20 e-`` is a string."""
     match = _SYNTAX.fullmatch(text)
     if match is None:
         raise RecipeError([Diagnostic(mark, text, _HELP)])
@@ -42,9 +42,9 @@ def read_override(text: str, mark: Location) -> Override:
             raise RecipeError([Diagnostic(mark, text, f"~ removes a value and cannot set one: write ~{match['path']}")])
         return Override(text, sign, path, None, mark)
     if value is None:
-        raise RecipeError([Diagnostic(mark, text, f"has no value: write {text}=VALUE")])
+        raise RecipeError([Diagnostic(mark, text, f"the argument has no value: write {text}=VALUE")])
     if not value.strip():
-        raise RecipeError([Diagnostic(mark, text, f"has no value: write {text}VALUE, or {text}null for none")])
+        raise RecipeError([Diagnostic(mark, text, f"the value is empty: write {text}VALUE, or {text}null for none")])
     try:
         return Override(text, sign, path, parse(value, mark, path), mark)
     except RecipeError as error:
@@ -62,7 +62,7 @@ def apply(root: Value, override: Override, diagnostics: list[Diagnostic], groups
 
 
 def _follow(root: Value, path: tuple[str, ...]) -> tuple[Trail, tuple[str, ...]]:
-    """Return the values along a path with their keys, and the part of the path that does not exist."""
+    """Return the recipe values along a path with their keys, and the part of the path that does not exist."""
     trail: Trail = []
     here = root
     for n, part in enumerate(path):
@@ -76,7 +76,7 @@ def _follow(root: Value, path: tuple[str, ...]) -> tuple[Trail, tuple[str, ...]]
 
 
 def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], groups: Iterable[str]) -> str | None:
-    """Return the message for an invalid override, or None for a valid override."""
+    """Return the message for an invalid override of a recipe, or None for a valid override."""
     here = trail[-1][0]
     if not missing:
         return "exists already: remove the + to change the value" if o.sign == "+" else None
@@ -90,7 +90,7 @@ def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], gro
 
 
 def _implied(root: Value, path: tuple[str, ...]) -> bool:
-    """Return True if an override may set a missing path without a +: the path of a global key or of a key of a step."""
+    """Return True if an override may set a missing path without a ``+``, as for a global key or a key of a step."""
     if path[0] != "steps":
         return path[0] in RESERVED and (len(path) == 1 or path[0] in ("expect", "posterior"))
     steps = root.items.get("steps")
@@ -130,7 +130,7 @@ def _rebuild(trail: Trail, missing: tuple[str, ...], o: Override) -> Value:
 
 
 def _parsed_again(trail: Trail, missing: tuple[str, ...], o: Override) -> Value | None:
-    """Return the value of an override, parsed again if its path has integer keys."""
+    """Return the value of an override; parse the value again if the path of the override has integer keys."""
     keys = tuple(key for _, key in trail)
     path = (*keys[:-1], *map(_key, missing)) if missing else keys
     return o.value if o.value is None or path == o.path else parse(o.text.partition("=")[2], o.mark, path)
@@ -141,7 +141,7 @@ def _key(part: str | int) -> str | int:
 
 
 def arguments_in(value: Value) -> Iterator[Location]:
-    """Yield the locations of the arguments that changed a value within a list or a mapping."""
+    """Yield the location of each argument that changed a value within a list or a mapping of a recipe."""
     for child in value.items.values():
         if not child.mark.line:
             yield child.mark

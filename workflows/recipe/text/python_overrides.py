@@ -22,7 +22,7 @@ _LONGEST = 40  #: largest number of characters of a value in a message
 
 
 def overrides_of(values: Mapping[str, Any], folder: Path) -> list[Override]:
-    """Return the overrides in keyword arguments; raise one `RecipeError` for all invalid values."""
+    """Return the overrides that keyword arguments contain; raise one `RecipeError` for all invalid values."""
     overrides: list[Override] = []
     diagnostics: list[Diagnostic] = []
     for key, value in values.items():
@@ -37,7 +37,7 @@ def overrides_of(values: Mapping[str, Any], folder: Path) -> list[Override]:
 
 
 def _read(key: str, given: Any, mark: Location) -> Iterator[Override]:
-    """Yield the overrides in one keyword argument: one override for each value in a mapping."""
+    """Yield the overrides that one keyword argument contains: one override for each value in a mapping."""
     if key.startswith("~") and given is not None:
         raise RecipeError([Diagnostic(mark, key, f"~ removes a value and cannot set one: write {{{key!r}: None}}")])
     try:
@@ -70,7 +70,7 @@ def _override(named: Override, path: tuple[str, ...], given: Any) -> Override:
 
 
 def _value(given: Any, mark: Location, path: Where) -> Value:
-    """Return a `Value` with the data of a Python value and the location of its argument."""
+    """Return a recipe `Value` with the data of a Python value and the location of the argument that contains it."""
     if isinstance(given, Mapping):
         data = {_key(key, mark, path): _value(item, mark, (*path, str(key))) for key, item in given.items()}
         return Value(data, mark, mark, path)
@@ -90,4 +90,4 @@ def _value(given: Any, mark: Location, path: Where) -> Value:
 def _key(key: Any, mark: Location, path: Where) -> str | int:
     if isinstance(key, str | int) and not isinstance(key, bool) and key != "":
         return key
-    raise RecipeError([Diagnostic(mark, dotted(path), f"a key must be a name or an integer, not {key!r}")])
+    raise RecipeError([Diagnostic(mark, dotted(path), f"a mapping's key must be a name or an integer, not {key!r}")])

@@ -1,4 +1,4 @@
-"""References such as ``${sensor.gain}``: a value that copies another value of the recipe."""
+"""References such as ``${sensor.gain}``, by which a value of a recipe copies another value of the recipe."""
 
 from __future__ import annotations
 
@@ -21,13 +21,16 @@ _DEEPEST = 50  #: longest chain of references
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """The items of one copy of a step, to which ``${item.x}`` and ``${each.lasers.x}`` refer."""
+    """The items, such as a laser, of one copy of a step; ``${item.x}`` and ``${each.lasers.x}`` refer to them."""
 
     items: Mapping[str, Value]  #: by the name of the list of items
     step: str
 
     def find(self, parts: list[str]) -> tuple[Value | None, list[str], str]:
-        """Return the item to which a reference refers, the path below the item, and a message if no item fits."""
+        """Return the item to which a reference such as ``${item.x}`` refers, and the path below the item.
+
+        If no item fits, return None, an empty path and a message.
+        """
         dims = list(self.items)
         if parts[0] == "item" and len(dims) == 1:
             return self.items[dims[0]], parts[1:], ""
@@ -40,7 +43,7 @@ class Scope:
 
 
 class References:
-    """References of one recipe, with a record of the values that steps use."""
+    """Resolver of the references in a recipe, with a record of the values that the steps use."""
 
     def __init__(self, root: Value, diagnostics: list[Diagnostic]) -> None:
         self.root, self.diagnostics = root, diagnostics
@@ -51,7 +54,7 @@ class References:
         self.spare: set[Where] = set()  #: unused values of packaged options
 
     def resolve(self, value: Value, scope: Scope) -> Value:
-        """Return a value with all its references resolved; report a failed reference, whose value becomes `BROKEN`."""
+        """Return a recipe value with its references resolved; report a failed reference and return `BROKEN` for it."""
         if isinstance(value.data, dict):
             children = ((key, child, self.resolve(child, scope)) for key, child in value.data.items())
             return replace(value, data={key: replace(resolved, key=child.key) for key, child, resolved in children})
@@ -62,7 +65,7 @@ class References:
         return self._text(value, scope)
 
     def _text(self, value: Value, scope: Scope) -> Value:
-        """Return a string with its references resolved, beginning with the innermost reference."""
+        """Return a string of a recipe with its references resolved, beginning with the innermost reference."""
         text = value.data
         while match := _REFERENCE.search(text):
             target = self._target(match[1], value, scope)
@@ -74,7 +77,7 @@ class References:
                 return self._fail(value, f"${{{match[1]}}} is a list or a mapping: it cannot be part of a string")
             text = text[: match.start()] + _pasted(target.data) + text[match.end() :]
         if "${" in text:
-            return self._fail(value, "write a reference as ${block.name}")
+            return self._fail(value, "the reference is incomplete: write a reference as ${block.name}")
         return replace(value, data=text)
 
     def _target(self, text: str, origin: Value, scope: Scope) -> Value | None:
@@ -93,15 +96,15 @@ class References:
         return self._followed(target, scope, origin)
 
     def _followed(self, target: Value, scope: Scope, origin: Value) -> Value | None:
-        """Return the target of a reference with its own references resolved; report a cycle of references."""
+        """Return the target value of a reference, with its own references resolved; report a cycle of references."""
         if target.path in self.known:
             return self.known[target.path]
         if target.path in self.open:
             loop = [*self.open[self.open.index(target.path) :], target.path]
-            self._fail(origin, f"refers to itself: {' -> '.join(map(dotted, loop))}")
+            self._fail(origin, f"the value refers to itself: {' -> '.join(map(dotted, loop))}")
             return None
         if len(self.open) > _DEEPEST:
-            self._fail(origin, f"begins a chain of more than {_DEEPEST} references")
+            self._fail(origin, f"the value begins a chain of more than {_DEEPEST} references")
             return None
         self.open.append(target.path)
         value = self.resolve(target, scope if target.path[0] == "steps" else Scope({}, dotted(target.path)))
@@ -111,7 +114,7 @@ class References:
         return value
 
     def _missing(self, start: Value, parts: list[str], origin: Value, scope: Scope) -> None:
-        """Report a missing target: as a mistake in the item if other items have the target, else in the reference."""
+        """Report a reference to a missing value: at the item if other items have the value, else at the reference."""
         path = (*start.path, *parts)
         name = dotted(path)
         siblings = self.root.items[str(start.path[0])].items.values() if start.path else ()
@@ -130,7 +133,7 @@ class References:
         return replace(origin, data=BROKEN)
 
     def touch(self, value: Value, dims: Sequence[str]) -> None:
-        """Mark as used all values to which a step with an empty list of items refers, so that no value is reported."""
+        """Mark the values to which a step without copies refers as used, so that they are not reported as unused."""
         for text in _texts(value):
             for match in _REFERENCE.finditer(text.data):
                 parts = match[1].strip().split(".")
@@ -142,7 +145,7 @@ class References:
                 self.used |= {(dim, name, *rest) for dim, block in blocks for name in block}
 
     def finish(self) -> None:
-        """Report values that no step uses, and references without a target.
+        """Report values of the recipe that no step uses, and references to values that do not exist.
 
         An unused value with a name similar to a missing target is one mistake. A packaged option may set more values
         than a recipe uses: a camera needs the pixel pitch, a bench does not.
@@ -171,7 +174,7 @@ class References:
         return [v for v in leaves if not any(v.path[:n] in self.used for n in range(1, len(v.path) + 1))]
 
     def _meant(self, leaf: Value) -> Where | None:
-        """Return the path that an unused path probably means: the new name, or a similar path to which steps refer."""
+        """Return the path that a user probably meant by an unused path: its new name, or a similar path in use."""
         if now := new_name(leaf.name):
             return tuple(now.split("."))
         known = {*self.used, *(path for path, _ in self.lacking)}
@@ -180,12 +183,12 @@ class References:
 
 
 def _is_packaged(leaf: Value) -> bool:
-    """Return True if a value comes from a packaged option, and not from a recipe or an argument."""
+    """Return True if a value comes from a packaged option of a group, and not from a user's recipe or an argument."""
     return leaf.key.line > 0 and leaf.mark.line > 0 and Path(leaf.mark.folder).parent == packaged()
 
 
 def _nearest(path: Where, known: set[Where]) -> Where | None:
-    """Return the known path with the most similar last name, if possible in the same block."""
+    """Return the path in ``known`` with the last name most similar to that of ``path``, if possible in its block."""
     paths_by_name = {str(other[-1]): other for other in sorted(known, key=str)}
     beside = {str(other[-1]): other for other in known if other[:-1] == path[:-1]}
     for paths in (beside, paths_by_name):
@@ -199,7 +202,7 @@ BROKEN = type("Broken", (), {"__repr__": lambda self: "?", "__doc__": "Value of 
 
 
 def broken(value: Value) -> bool:
-    """Return True if a value, or a value within it, is `BROKEN`."""
+    """Return True if a value of a recipe, or a value within it, is `BROKEN` because a reference failed."""
     return value.data is BROKEN or any(map(broken, value.items.values()))
 
 

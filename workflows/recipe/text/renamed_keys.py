@@ -1,4 +1,4 @@
-"""Table of the old names of recipe keys, nodes and parameters with their present names, for messages."""
+"""Table of renamed recipe keys, nodes and parameters, with which messages give the new name for an old one."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ POSTERIOR_NAMES = {"pedestal": "offset", "dark_noise": "temporal_dark_noise"}
 
 
 def new_name(old: str) -> str | None:
-    """Return the present name of an old path or of a path below it, or None for a path that was never renamed."""
+    """Return the present name of an old recipe path, or None for a path that was never renamed."""
     parts = old.split(".")
     for n in range(len(parts), 0, -1):
         if now := _CALLED.get(".".join(parts[:n])):
@@ -80,17 +80,17 @@ def new_name(old: str) -> str | None:
 
 
 def instead(old: str) -> str:
-    """Return a message that says what to write instead of an old path, or an empty text for any other path."""
+    """Return a message that says what to write instead of an old recipe path, or an empty text for any other path."""
     if now := new_name(old):
         return f"is called {now} now"
     return _GONE.get(old, "")
 
 
 def became_input(node: str, parameters: Iterable[str]) -> bool:
-    """Return True if ``parameters`` contain parameters of the pupil grid, which the node now gets from an input."""
+    """Return True if a node's ``parameters`` contain those of the pupil grid, which is now an input of the node."""
     return node in _ON_A_GRID and not set(_GRID).isdisjoint(parameters)
 
 
 def old_names() -> tuple[str, ...]:
-    """Return all old paths in the table of renamed keys."""
+    """Return the old names of all renamed or removed recipe keys, nodes and parameters."""
     return (*_CALLED, *_GONE)

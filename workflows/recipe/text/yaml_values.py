@@ -40,27 +40,27 @@ class Value:
 
     @property
     def plain(self) -> Any:
-        """Return the value as plain Python data, without locations."""
+        """Return a YAML value as plain Python data, without the locations in the file."""
         if isinstance(self.data, dict):
             return {key: value.plain for key, value in self.data.items()}
         return [value.plain for value in self.data] if isinstance(self.data, list) else self.data
 
     @property
     def items(self) -> dict[Any, Value]:
-        """Return the children of a mapping or a list by key or index; return an empty dict for a scalar."""
+        """Return the values in a YAML mapping or list by key or index; return an empty dict for a scalar."""
         if isinstance(self.data, dict):
             return self.data
         return dict(enumerate(self.data)) if isinstance(self.data, list) else {}
 
     def child(self, name: str | int) -> Value | None:
-        """Return the child with a key or an index; an index may be written as a string."""
+        """Return the value at a key or an index of a mapping or a list; an index may be written as a string."""
         items = self.items
         if name not in items and isinstance(name, str) and name.isdecimal():
             name = int(name)
         return items[name] if name in items else next((v for key, v in items.items() if str(key) == str(name)), None)
 
     def below(self, path: Iterable[str | int]) -> Value | None:
-        """Return the value at a path below this value, or None if the path does not exist."""
+        """Return the value at a path of keys below this YAML value, or None if the path does not exist."""
         value: Value | None = self
         for name in path:
             value = value.child(name) if value else None
@@ -101,15 +101,18 @@ def dotted(path: Where) -> str:
 
 
 def read(path: Path, shown: str) -> Document:
-    """Read a YAML file; messages name the file as ``shown``. Raises one `RecipeError` with all mistakes of the file."""
+    """Return the content of a YAML file; error messages name the file as ``shown``.
+
+    Raises one `RecipeError` with all mistakes of the file.
+    """
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         before = error.object[: error.start].decode("utf-8", "replace")
         mark = Location(shown, before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1)
-        raise RecipeError([Diagnostic(mark, "", f"byte 0x{error.object[error.start]:02x} is not UTF-8")]) from None
+        raise RecipeError([Diagnostic(mark, "", f"the byte 0x{error.object[error.start]:02x} is not UTF-8")]) from None
     except OSError as error:
-        raise RecipeError([Diagnostic(Location(shown), "", f"cannot be read: {error.strerror}")]) from None
+        raise RecipeError([Diagnostic(Location(shown), "", f"the file cannot be read: {error.strerror}")]) from None
     return _document(text, shown, str(path.parent))
 
 
@@ -117,20 +120,20 @@ def read(path: Path, shown: str) -> Document:
 def _document(text: str, shown: str, folder: str) -> Document:
     root = parse(text, Location(shown, 1, 1, folder))
     if not isinstance(root.data, dict):
-        what = "is empty" if root.data is None else f"holds {kind(root)}"
+        what = "the file is empty" if root.data is None else f"the file contains {kind(root)}"
         raise RecipeError([Diagnostic(Location(shown, 1, 1), "", f"{what}: write a mapping, `key: value`")])
     first = text.lstrip().partition("\n")[0].strip()
     return Document(root, first.lstrip("# ") if first.startswith("#") else "")
 
 
 def parse(text: str, start: Location, path: Where = ()) -> Value:
-    """Read YAML text that begins at a location; all values in an argument have the location of the argument."""
+    """Return the values in a YAML text; ``start`` is the location of the text in a file, or an argument."""
     builder = _Builder(start)
     try:
         node = YAML(typ="safe", pure=True).compose(text)
         value = Value(None, start, start, path) if node is None else builder.value(node, path, start)
     except RecursionError:
-        raise RecipeError([Diagnostic(start, dotted(path), "is nested too deeply")]) from None
+        raise RecipeError([Diagnostic(start, dotted(path), "the YAML text is nested too deeply")]) from None
     except (YAMLError, YAMLStreamError) as error:
         raise RecipeError([_explain(error, text, start, path)]) from None
     if builder.diagnostics:
@@ -139,13 +142,13 @@ def parse(text: str, start: Location, path: Where = ()) -> Value:
 
 
 def kind(value: Value) -> str:
-    """Return the kind of a value in words, such as ``a list``."""
+    """Return the kind of a YAML value in words, such as ``a list``."""
     names = {dict: "a mapping", list: "a list", str: "a string", bool: "true or false", type(None): "nothing"}
     return names.get(type(value.data), "a number")
 
 
 class _Builder:
-    """Builder of the values in one YAML text, in which aliases copy values."""
+    """Builder of the values in one YAML text; an alias becomes a copy of the value to which it refers."""
 
     def __init__(self, start: Location) -> None:
         self.start = start
@@ -158,7 +161,7 @@ class _Builder:
     def value(self, node: Node, path: Where, key: Location) -> Value:
         mark, tag = self._mark(node), (node.tag or "").replace(_TAG, "!!")
         if tag not in _KNOWN:
-            return self._refuse(mark, path, f"unknown tag {tag}: remove the tag")
+            return self._refuse(mark, path, f"unknown YAML tag {tag}: remove the tag")
         if isinstance(node, ScalarNode):
             return Value(_scalar(node), mark, key, path)
         if id(node) in self.built:
@@ -166,7 +169,7 @@ class _Builder:
             self._refuse_many(self.aliased, _MOST_ALIASED, mark, path)
             return replace(_moved(self.built[id(node)], path), key=key)
         if id(node) in self.open:
-            return self._refuse(mark, path, "an alias refers to the value that contains the alias")
+            return self._refuse(mark, path, "a YAML alias refers to the value that contains the alias")
         self.open.add(id(node))
         data = self._mapping(node, path) if isinstance(node, MappingNode) else self._list(node, path)
         self.open.discard(id(node))
@@ -181,7 +184,7 @@ class _Builder:
             if key == "<<":
                 self._refuse(mark, path, "merge keys (<<) are not part of YAML 1.2: refer to values with ${…}")
             elif key is None:
-                self._refuse(mark, path, "a key must be a name or a whole number")
+                self._refuse(mark, path, "the key of a mapping must be a name or a whole number")
             elif key in data:
                 line = data[key].key.line
                 self._refuse(mark, (*path, key), f"given twice, first in line {line}" if line else "given twice")
@@ -193,7 +196,7 @@ class _Builder:
         return [self.value(child, (*path, i), self._mark(child)) for i, child in enumerate(node.value)]
 
     def _weigh(self, node: Node, value: Value) -> None:
-        """Count the values in a list or a mapping; raise `RecipeError` if aliases produce too many values."""
+        """Count the values in a YAML list or mapping; raise `RecipeError` if aliases produce too many values."""
         children = [v for pair in node.value for v in pair] if isinstance(node, MappingNode) else node.value
         self.size[id(node)] = 1 + sum(self.size.get(id(child), 1) for child in children)
         self._refuse_many(self.size[id(node)], _MOST, value.mark, value.path)
@@ -213,7 +216,7 @@ class _Builder:
 
 
 def _moved(value: Value, path: Where) -> Value:
-    """Return a copy of a value, and of all values in it, at another path."""
+    """Return a copy of a YAML value, and of all values within it, with another path."""
     data = value.data
     if isinstance(data, dict):
         data = {key: _moved(child, (*path, key)) for key, child in data.items()}
@@ -247,7 +250,7 @@ def number(text: str) -> int | float | str:
 
 
 def _key(node: Node) -> str | int | None:
-    """Return the key of a mapping as a name or a whole number, or None for another kind of key."""
+    """Return the key of a YAML mapping as a name or a whole number, or None for another kind of key."""
     if not isinstance(node, ScalarNode):
         return None
     key = _scalar(node)

@@ -85,7 +85,7 @@ def test_no_text_breaks_the_reader(text):
 @pytest.mark.parametrize(
     ("law", "message"),
     [
-        ("normal(10.5 e-)", "needs the mean and the standard deviation"),
+        ("normal(10.5 e-)", "the distribution normal needs the mean and the standard deviation"),
         ("normal(10.5 e-, 1 nm)", "must have the same unit"),
         ("normal(10.5 e-, 0 e-)", "greater than 0"),
         ("normal(10.5 e-, -1 e-)", "greater than 0"),
@@ -95,7 +95,7 @@ def test_no_text_breaks_the_reader(text):
         ("lognormal(10 e-, 0.9)", "factor"),
         ("uniform(3 e-, 3 e-)", "first value must be smaller"),
         ("loguniform(0 e-, 3 e-)", "greater than 0"),
-        ("normal(10 e-", "not a complete distribution"),
+        ("normal(10 e-", "the text is not a complete distribution"),
     ],
 )
 def test_a_law_that_is_none_is_refused_once_and_where_it_stands(law, message):
@@ -169,19 +169,19 @@ def test_values_that_are_one_and_the_same_are_drawn_as_such():
     [
         ("a.csv", "gain,offset\n1,2\n3\n", "line 3"),
         ("a.csv", "gain\n1\nx\n", "must contain numbers"),
-        ("a.csv", "gain\n" + "1\n" * 50, "is the same"),
-        ("a.csv", "gain\n1\n2\n", "2 draws"),
+        ("a.csv", "gain\n" + "1\n" * 50, "all draws of gain are equal"),
+        ("a.csv", "gain\n1\n2\n", "the posterior has 2 draws"),
         ("a.csv", "gain\n" + "nan\n" * 50, "finite"),
         ("a.json", "{", "cannot be read"),
-        ("a.json", "[1]", "must contain a mapping"),
-        ("a.json", '{"parameters": {"gain": {}}}', "no such file"),
+        ("a.json", "[1]", "must contain a mapping of keys to values"),
+        ("a.json", '{"parameters": {"gain": {}}}', "there is no posterior file"),
         ("a.yaml", "mean: {gain: 1}", "needs mean"),
-        ("a.yaml", "mean: {gain: 1}\nsd: {well: 1}", "sd must have the same names"),
+        ("a.yaml", "mean: {gain: 1}\nsd: {well: 1}", "sd must have a value for each name in mean"),
         ("a.yaml", "mean: {gain: 1}\nsd: {gain: 0}", "greater than 0"),
         ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 2], [2, 1]]", "eigenvalue"),
         ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 2], [1]]", "matrix"),
-        ("a.yaml", "mean: {a: 1}\nsd: {a: 1}\nwidth: 1", "width is unknown"),
-        ("a.txt", "1", "is not a posterior"),
+        ("a.yaml", "mean: {a: 1}\nsd: {a: 1}\nwidth: 1", "unknown key width"),
+        ("a.txt", "1", "is not a posterior file"),
         ("a.npz", "1", "cannot be read"),
     ],
 )
@@ -193,7 +193,7 @@ def test_a_file_that_is_no_posterior_is_refused(tmp_path, name, content, message
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(RecipeError, match="no such file"):
+    with pytest.raises(RecipeError, match="there is no posterior file"):
         load("first_light", [f"posterior={tmp_path / 'none'}"])
 
 
@@ -248,7 +248,7 @@ def test_an_argument_is_stronger_than_the_posterior(calibrated):
         ({"use": "median"}, "write mean, nominal"),
         ({"use": True}, "write mean, nominal"),
         ({"values": {"sensor.gain": "slope"}}, "slope is not in the posterior"),
-        ({"values": {"sensor.speed": "gain"}}, "no value sensor.speed"),
+        ({"values": {"sensor.speed": "gain"}}, "no value at the path sensor.speed"),
         ({"values": {"sensor.camera": "gain"}}, "neither a number nor a quantity"),
         ({"take": "mean"}, "unknown"),
     ],
@@ -285,7 +285,9 @@ def test_a_law_and_a_posterior_of_one_value_are_refused(calibrated, tmp_path):
         "outputs: [raw]",
     ]
     own.write_text("\n".join(text))
-    with pytest.raises(RecipeError, match=r"own.yaml:13.*sensor.gain +has a distribution here and in the posterior"):
+    with pytest.raises(
+        RecipeError, match=r"own.yaml:13.*sensor.gain +the value has a distribution here and in the posterior"
+    ):
         load(own)
 
 

@@ -162,8 +162,8 @@ def test_a_step_that_is_null_is_absent(composed):
             "argument 1 | scene=china | this recipe has no group scene; to add the group, write +scene=china",
         ),
         ("~scene", "argument 1 | ~scene | is not a group of this recipe; there are: laser, lens"),
-        ("lens.f", "argument 1 | lens.f | has no value: write lens.f=VALUE"),
-        ("lens.f=", "argument 1 | lens.f= | has no value: write lens.f=VALUE, or lens.f=null for none"),
+        ("lens.f", "argument 1 | lens.f | the argument has no value: write lens.f=VALUE"),
+        ("lens.f=", "argument 1 | lens.f= | the value is empty: write lens.f=VALUE, or lens.f=null for none"),
         ("lens.f=[1,2", "argument 1 | lens.f=[1,2 | is not YAML: expected ',' or ']', but got '<stream end>'"),
         ("~lens.f=1", "argument 1 | ~lens.f=1 | ~ removes a value and cannot set one: write ~lens.f"),
         ("=1", "argument 1 | =1 | is not an override: write path=value, +path=value, ~path or group=option"),
@@ -175,7 +175,7 @@ def test_a_step_that_is_null_is_absent(composed):
             "lens..f=1",
             "argument 1 | lens..f=1 | is not an override: write path=value, +path=value, ~path or group=option",
         ),
-        ("--lens", "argument 1 | --lens | has no value: write --lens=VALUE"),
+        ("--lens", "argument 1 | --lens | the argument has no value: write --lens=VALUE"),
     ],
 )
 def test_a_wrong_argument_is_shown_with_its_fix(composed, argument, problem):

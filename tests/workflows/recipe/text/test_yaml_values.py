@@ -95,15 +95,15 @@ def test_two_duplicates_are_two_problems():
         ("a: b: c\n", "f.yaml:1:5 / a second ':' on this line"),
         ("a: 1\n---\nb: 1\n", "a second document"),
         ("a: *nothing\n", "undefined alias"),
-        ("a: !!python/object:os.system ls\n", "unknown tag !!python/object:os.system"),
-        ("a: !mine 1\n", "unknown tag !mine"),
+        ("a: !!python/object:os.system ls\n", "unknown YAML tag !!python/object:os.system"),
+        ("a: !mine 1\n", "unknown YAML tag !mine"),
         ("b: &x {c: 1}\na: {<<: *x}\n", "f.yaml:2:5 / a / merge keys"),
-        ("? [a, b]\n: 1\n", "a key must be a name"),
-        ("1.5: a\n", "a key must be a name"),
+        ("? [a, b]\n: 1\n", "the key of a mapping must be a name or a whole number"),
+        ("1.5: a\n", "the key of a mapping must be a name or a whole number"),
         ("a: \x01\n", "f.yaml:1:4"),
-        ("a: &x {b: *x}\n", "an alias refers to the value that contains the alias"),
-        ("a: &x [*x]\n", "an alias refers to the value that contains the alias"),
-        ("a: " + "[" * 5000, "nested too deeply"),
+        ("a: &x {b: *x}\n", "a YAML alias refers to the value that contains the alias"),
+        ("a: &x [*x]\n", "a YAML alias refers to the value that contains the alias"),
+        ("a: " + "[" * 5000, "the YAML text is nested too deeply"),
     ],
 )
 def test_what_is_no_recipe_gets_a_located_message(text, message):
@@ -129,12 +129,12 @@ def test_a_bomb_of_aliases_is_refused_at_once():
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "f.yaml:1:1 is empty: write a mapping, `key: value`"),
-        (b"# a title alone\n", "f.yaml:1:1 is empty: write a mapping, `key: value`"),
-        (b"- 1\n- 2\n", "f.yaml:1:1 holds a list: write a mapping, `key: value`"),
-        (b"hello\n", "f.yaml:1:1 holds a string: write a mapping, `key: value`"),
-        (b"a: 1\nb: caf\xe9\n", "f.yaml:2:7 byte 0xe9 is not UTF-8"),
-        (None, "f.yaml cannot be read: No such file or directory"),
+        (b"", "f.yaml:1:1 the file is empty: write a mapping, `key: value`"),
+        (b"# a title alone\n", "f.yaml:1:1 the file is empty: write a mapping, `key: value`"),
+        (b"- 1\n- 2\n", "f.yaml:1:1 the file contains a list: write a mapping, `key: value`"),
+        (b"hello\n", "f.yaml:1:1 the file contains a string: write a mapping, `key: value`"),
+        (b"a: 1\nb: caf\xe9\n", "f.yaml:2:7 the byte 0xe9 is not UTF-8"),
+        (None, "f.yaml the file cannot be read: No such file or directory"),
     ],
 )
 def test_a_file_that_cannot_be_read_gets_one_message(tmp_path, content, message):

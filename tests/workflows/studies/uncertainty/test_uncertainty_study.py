@@ -71,7 +71,9 @@ def test_a_recipe_that_is_sure_of_all_has_nothing_to_draw():
 
 def test_a_draw_beyond_a_limit_is_refused_before_anything_runs(tmp_path):
     recipe = small("transfer", "sensor.read_noise=normal(1 e-, 1 e-)")
-    with pytest.raises(ValueError, match=r"argument 9 +sensor\.read_noise = -.* e- +is drawn, but must be greater"):
+    with pytest.raises(
+        ValueError, match=r"argument 9 +sensor\.read_noise = -.* e- +the value is sampled, but must be greater"
+    ):
         study_recipe("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "runs")
     assert not (tmp_path / "runs").exists()
 
