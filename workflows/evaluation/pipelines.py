@@ -147,7 +147,7 @@ def _words(pipeline: Pipeline) -> list[str]:
 
 
 def _takes(group: str, option: str) -> str:
-    """Return the name of the parameter for the file of a mask or restorer; raise `EvaluationRefused` if it has none."""
+    """Return the name of the file parameter of a mask or restorer; raise `EvaluationRefused` if there is none."""
     options = groups_of(packaged()).get(group, [])
     path = packaged() / group / f"{option}.yaml"
     if option == NONE or (option in options and not path.is_file()):

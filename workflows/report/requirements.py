@@ -15,7 +15,7 @@ _PARAMETER = re.compile(r"(?P<step>[^.]+)\.(?P<name>\w+)")
 
 
 class Missing(LookupError):
-    """Error for a figure or data file that reads a step which the recipe lacks or which the run does not compute."""
+    """Error for a step that a figure or data file reads, if the recipe lacks the step or the run does not need it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Creation of the folder of a run, which gets its name when it is complete, and of the link ``latest`` to it."""
+"""The folder of a run, which gets its final name when all files are written, and the link ``latest`` to this folder."""
 
 from __future__ import annotations
 

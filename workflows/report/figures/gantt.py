@@ -101,7 +101,7 @@ def _title(plan: Spans, ran: Spans) -> str:
 
 
 def _unit(seconds: float) -> tuple[float, str]:
-    """Return the factor from seconds to s, ms or µs, and the name of this unit, which suits the size of a time."""
+    """Return the unit (s, ms or µs) that suits the size of a time, as the factor from seconds and the name."""
     return (1.0, "s") if seconds >= 1.0 else (1e3, "ms") if seconds >= 1e-3 else (1e6, "µs")
 
 

@@ -94,7 +94,7 @@ class LiftLearner:
 
     @torch.no_grad()
     def validate(self) -> dict[str, Losses]:
-        """Return the mean errors of the spectra from the network and from a linear estimate, for untrained pictures."""
+        """Return the mean errors of the network and of a linear estimate, for pictures that are not in the training."""
         sums, count = dict[str, Losses](), self.settings.validation_batches
         for number in range(count):
             picture, cube = self.pairs("judge", number)

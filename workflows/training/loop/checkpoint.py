@@ -33,7 +33,7 @@ def write_whole(path: Path, data: bytes) -> None:
 
 @dataclass(frozen=True)
 class StateFile:
-    """The checkpoint file of a training, which is replaced atomically, so that a killed process leaves it complete."""
+    """The checkpoint file of a training, which is always complete because it is replaced atomically."""
 
     path: Path
 

@@ -34,7 +34,7 @@ _USUAL = (12.0, 18.0, 24.0, 30.0, 36.0, 1.0, 0.0)  #: parameters of a hand-desig
 
 @dataclass
 class LearntMask:
-    """The best mask that an optimisation found, and the losses at all iterations."""
+    """The best mask that an optimisation found, with its parameters, and the losses at all iterations."""
 
     height: Callable[[Stop], Tensor]
     loss: float

@@ -70,10 +70,10 @@ class Mesh:
         dist.all_gather_object(texts, about)
         for rank, other in enumerate(texts):
             if other != texts[0]:
-                raise MeshError(f"process 0 reads {texts[0]}, process {rank} {other}: use the same folder for all")
+                raise MeshError(f"process 0 is in {texts[0]}, process {rank} is in {other}: use one shared folder")
 
     def numbers(self, own: Mapping[str, float], names: Sequence[str], device: str) -> dict[str, float]:
-        """Sum losses or other numbers over all processes, and return the sums by name."""
+        """Sum the numbers with the given names, such as losses, over all processes, and return the sums by name."""
         if self.size == 1:
             return dict(own)
         total = torch.tensor([own.get(name, 0.0) for name in names], dtype=torch.float64, device=device)
