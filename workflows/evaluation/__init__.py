@@ -1,4 +1,4 @@
-"""Which mask and which restorer give the best pictures, over many scenes and laser strengths?
+"""How are masks and restorers compared over many scenes and laser strengths?
 
 Pipelines, scenes and points of an evaluation, confidence intervals, and the page of the comparison.
 Nothing here is trained; metrics are nodes.

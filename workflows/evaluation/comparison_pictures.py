@@ -1,4 +1,4 @@
-"""The comparison figure of the paper: one scene under each laser, with the plain lens and with every pipeline."""
+"""Pictures for the comparison figure of the paper: one scene with each laser, for each mask and restorer."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WEAKEST = 1e4  #: strength of the first laser in the figure of the paper
 
 @dataclass(frozen=True)
 class Panel:
-    """A column of the comparison figure: the pictures with one laser, in linear sRGB (3, y, x)."""
+    """A column of the figure that compares masks and restorers: pictures with one laser, in linear sRGB (3, y, x)."""
 
     case: str
     strength: float
@@ -31,7 +31,7 @@ class Panel:
 def panels(
     bench: EvaluationPoints, each: Sequence[PipelineRecipes], scene: Scene, strengths: Sequence[float]
 ) -> list[Panel]:
-    """Return the columns of the comparison figure, one for each laser and one without a laser.
+    """Return the columns of the figure that compares masks and restorers, one for each laser and one without a laser.
 
     The strengths of the lasers rise from 1e4, as in the paper, to the largest of ``strengths``.
     """

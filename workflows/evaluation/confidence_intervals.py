@@ -1,4 +1,4 @@
-"""Confidence intervals of means over scenes, and of differences from a reference in the same scenes."""
+"""Confidence intervals of mean image errors over scenes, and of the differences between two methods in these scenes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ METRICS = ("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "satura
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean and its 95 % confidence interval, whose limits are NaN if there are too few scenes."""
+    """A mean over scenes and its 95 % confidence interval, with NaN as limits if there are too few scenes."""
 
     mean: float
     low: float
@@ -27,18 +27,18 @@ class Interval:
 
     @property
     def half(self) -> float:
-        """Return the half-width of the interval."""
+        """Return the half-width of the confidence interval."""
         return (self.high - self.low) / 2
 
     @property
     def excludes_zero(self) -> bool:
-        """Return True if zero lies outside the interval."""
+        """Return True if zero lies outside the confidence interval."""
         return self.low > 0 or self.high < 0
 
 
 @dataclass(frozen=True)
 class MetricTable:
-    """The metrics of one pipeline, each as an array (scene, laser strength), with NaN for a scene without a laser."""
+    """The metrics of one mask and restorer as arrays (scene, laser strength), with NaN if a value is missing."""
 
     strengths: tuple[float, ...]
     values: Mapping[str, Numbers]
@@ -49,13 +49,13 @@ class MetricTable:
         return means
 
     def at(self, metric: str, strength: int) -> Numbers:
-        """Return the values of a metric at one laser strength, without scenes that have no value."""
+        """Return the values of a metric at one laser strength, one for each scene that has a value."""
         column: Numbers = self.values[metric][:, strength]
         return column[~np.isnan(column)]
 
 
 def mean(values: Sequence[float] | Numbers) -> Interval:
-    """Return the mean of values over scenes, with its confidence interval from Student's t distribution."""
+    """Return the mean over scenes of a metric, and its confidence interval from Student's t distribution."""
     x = np.asarray(values, dtype=np.float64)
     centre = float(x.mean()) if len(x) else math.nan
     if len(x) < 2:
@@ -67,7 +67,7 @@ def mean(values: Sequence[float] | Numbers) -> Interval:
 
 
 def gain(values: Numbers, reference: Numbers, seed: int) -> Interval:
-    """Return the relative decrease of the mean of a metric against the reference, such as 0.101 for 10.1 %.
+    """Return by which fraction the mean of a metric lies below the mean of the reference, such as 0.101 for 10.1 %.
 
     The interval comes from a bootstrap with the seed ``seed``, which draws the same scenes for both pipelines.
     """
@@ -84,7 +84,7 @@ def gain(values: Numbers, reference: Numbers, seed: int) -> Interval:
 
 
 def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict[str, Interval]:
-    """Return the decrease of L1 against the reference: absolute, relative, and relative for small pictures."""
+    """Return the decrease of L1 error against the reference: absolute, relative, and relative for small pictures."""
     own, other = values.scenes("l1"), reference.scenes("l1")
     return {
         "l1 less": mean(other - own),
@@ -94,7 +94,7 @@ def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict
 
 
 def metric_table(points: Sequence[Mapping[float, Mapping[str, float]]], strengths: Sequence[float]) -> MetricTable:
-    """Arrange the metrics of one pipeline as arrays (scene, laser strength)."""
+    """Arrange the metrics of one mask and restorer as arrays (scene, laser strength)."""
     each = {
         metric: np.array([[point.get(k, {}).get(metric, math.nan) for k in strengths] for point in points])
         for metric in METRICS

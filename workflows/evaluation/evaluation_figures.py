@@ -1,4 +1,4 @@
-"""Figures of an evaluation: pictures by laser, error by laser strength, laser suppression, and image contrast."""
+"""Figures of an evaluation of masks: pictures by laser, error by laser strength, laser suppression, and contrast."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LETTERS = 16  #: characters of the longest row name that stays on one line
 
 
 def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return the colour and the line style of each curve, by name of the pipeline or mask."""
+    """Return the colour and the line style of the curve of each mask, or of each mask with restorer."""
     count = len(_COLOURS)
     return {
         name: {"color": _COLOURS[i % count], "linestyle": _STYLES[i // count % len(_STYLES)]}
@@ -34,7 +34,10 @@ def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 @drawn
 def cases(panels: Sequence[Panel]) -> Any:
-    """Draw the true picture, the plain lens and every pipeline in rows, and the lasers in columns, on one scale."""
+    """Draw the pictures of the plain lens, and of every mask with restorer, in rows below the true picture.
+
+    The columns have different lasers. All pictures have the same scale.
+    """
     rows = list(panels[0].pictures)
     white = high(panels[0].pictures["truth"])
     figure, axes = canvas(1.95 * len(panels) + 0.6, 2.0 * len(rows) + 0.3, len(rows), len(panels))
@@ -57,7 +60,10 @@ def _broken(name: str) -> str:
 
 @drawn
 def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
-    """Draw the L1 error with its 95 % interval over the laser strength, for full-size and reduced pictures."""
+    """Draw the L1 error of every mask and restorer with its 95 % interval over the laser strength.
+
+    The left plot is for pictures of full size, the right plot for reduced pictures.
+    """
     figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
     looks = _looks(list(tables))
     titles = {"l1": "full size", "l1 small": f"shorter side {small} pixels"}
@@ -84,7 +90,7 @@ def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], nam
 
 
 def _places(values: Sequence[float]) -> list[float]:
-    """Return the positions of laser strengths on a logarithmic axis, with 0 one decade below the smallest."""
+    """Return the positions of laser strengths on a logarithmic axis, with strength 0 one decade below the others."""
     logs = [float(np.log10(k)) for k in values if k > 0]
     return [float(np.log10(k)) if k > 0 else (min(logs) - 1 if logs else 0.0) for k in values]
 
@@ -114,7 +120,7 @@ def curves(masks: Mapping[str, MaskOptics]) -> Any:
 
 @drawn
 def plane(masks: Mapping[str, MaskOptics]) -> Any:
-    """Draw the contrast of each mask over its mean LSR, and shade the region that no mask can reach."""
+    """Draw the image contrast of each mask over its mean laser suppression ratio, and shade what no mask can reach."""
     figure, axes = canvas(8.4, 5.2)
     ax = axes[0, 0]
     floor = float(np.mean([mask.floor.mean() for mask in masks.values()]))

@@ -1,4 +1,4 @@
-"""The report page of an evaluation, with tables, pictures and explanations."""
+"""The report page of an evaluation of masks and restorers, with tables, pictures and explanations."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def draw_pictures(result: EvaluationResult) -> dict[str, bytes]:
 
 
 def summary(result: EvaluationResult) -> dict[str, Any]:
-    """Return for each pipeline the mean and interval of every metric, and the improvement over the reference."""
+    """Return the mean and the interval of every metric, and the gain over the reference, for each mask and restorer."""
     return {
         p.name: {
             "mask": p.front,
@@ -47,7 +47,7 @@ def summary(result: EvaluationResult) -> dict[str, Any]:
 
 
 def rows(result: EvaluationResult) -> list[Sequence[Any]]:
-    """Return the rows of ``table.csv``, one for each pipeline, with the numbers of `summary`."""
+    """Return the rows of ``table.csv``, one for each mask and restorer, with the numbers from `summary`."""
     listed: list[Sequence[Any]] = []
     for p in result.pipelines:
         each = [mean(result.tables[p.name].scenes(metric)) for metric in METRICS] + list(
@@ -74,7 +74,7 @@ def lead(result: EvaluationResult) -> str:
 
 
 def sections(result: EvaluationResult, shown: Mapping[str, bytes]) -> list[Section]:
-    """Return all sections of the evaluation page."""
+    """Return all sections of the report page of an evaluation."""
     parts = [_crossed(result), _numbers(result), _compared(result)]
     text = """Mean over scenes and its 95 % interval. A scene without a laser counts only at the strength none, so
         that every scene of the other points has a laser."""

@@ -1,4 +1,4 @@
-"""The points of an evaluation: the metrics of one scene, at one laser strength, with one pipeline."""
+"""The evaluation points: the metrics of one scene at one laser strength with one pipeline (mask and restorer)."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ class PointRequest:
 
 
 class EvaluationPoints:
-    """The computation of the points of an evaluation, where results that points share are computed once."""
+    """The computation of evaluation points, in which a result that several evaluation points use is computed once."""
 
     def __init__(self, store: Store, small: int, device: str = "cpu") -> None:
         self.store, self.small, self.device = store, small, device
-        self.computed = 0  #: points that were not in the store
-        self.seconds = 0.0  #: computing time of these points
+        self.computed = 0  #: evaluation points that were not in the store
+        self.seconds = 0.0  #: computing time of these evaluation points
         self._code = Code(store.code_memo)
         self._functions: dict[tuple[str, str], Any] = {}
         #: by identity of a recipe; the recipe is kept too, so that no other recipe gets the same identity
@@ -60,7 +60,7 @@ class EvaluationPoints:
         self._kept = _SharedResults()
 
     def point(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
-        """Return the metrics of a point from the store, or else compute and store the metrics."""
+        """Return the metrics of an evaluation point from the store, or compute and store the metrics."""
         compute = partial(self._measure, pipeline, point)
         return compute_once(self.store, self.key(pipeline, point), dict, compute, {"step": "evaluate"}, small=True)
 
@@ -72,7 +72,7 @@ class EvaluationPoints:
         return numbers
 
     def values(self, pipeline: PipelineRecipes, point: PointRequest, more: Sequence[str] = ()) -> dict[str, Any]:
-        """Run a pipeline on one scene and laser, and return its outputs and the results of the steps ``more``."""
+        """Run a pipeline on one scene and laser, and return the outputs and the results of the steps ``more``."""
         outputs = (*pipeline.pipeline.outputs, *more)
         function = self._function(pipeline, point.lit, outputs)
         self._kept.turn(point)
@@ -83,14 +83,14 @@ class EvaluationPoints:
         return values
 
     def forget(self) -> None:
-        """Release from memory all results that depend on the laser."""
+        """Remove all results that depend on the laser from memory."""
         self._functions = {name: f for name, f in self._functions.items() if name[1] == NONE}
         used = {id(value) for f in self._functions.values() for value in f.fixed.values()}
         self._fixed = {key: value for key, value in self._fixed.items() if id(value) in used}
         self._kept.clear()
 
     def key(self, pipeline: PipelineRecipes, point: PointRequest) -> str:
-        """Return the cache key of a point, from the keys of its steps and the settings of the comparison."""
+        """Return the cache key of an evaluation point from the keys of its steps and the settings of the comparison."""
         recipe, outputs = pipeline.recipe(point.lit), pipeline.pipeline.outputs
         params: dict[str, dict[str, Any]] = {}
         for name, value in self._changed(recipe, point, outputs).items():
@@ -106,7 +106,7 @@ class EvaluationPoints:
         return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
 
     def _keys(self, recipe: Recipe, outputs: Iterable[str], scene: Scene | None = None) -> dict[str, str]:
-        """Return the cache key of each step; only steps that depend on the scene use the seed of the scene."""
+        """Return the cache key of each step, with the seed of the scene for all steps that depend on the scene."""
         keys = {"scene": scene.key(self._code)} if scene else {}
         live = dependents(recipe, keys)
         for name in needed(recipe, outputs):
@@ -133,7 +133,7 @@ class EvaluationPoints:
         return self._functions[name]
 
     def _changed(self, recipe: Recipe, point: PointRequest, outputs: Sequence[str]) -> dict[str, Any]:
-        """Return the parameters of a recipe that a point sets: drawn values, laser direction and laser strength."""
+        """Return the parameters that an evaluation point sets: sampled values, laser direction and laser strength."""
         inputs = self._inputs(recipe, outputs)
         changed = inputs.theta(point.scene.draw(inputs)) if inputs else {}
         if point.lit != NONE:
@@ -153,7 +153,7 @@ class EvaluationPoints:
         return self._drawn[key][1]
 
     def _share(self, function: Any, recipe: Recipe) -> None:
-        """Reuse the fixed results of earlier functions in a function, because results are shared by object identity."""
+        """Replace constant results in a recipe function by the equal results of an earlier function, to save memory."""
         keys = self._keys(recipe, function.fixed)
         for name, value in function.fixed.items():
             function.fixed[name] = self._fixed.setdefault(keys[name], value)
@@ -176,7 +176,7 @@ class EvaluationPoints:
 
 
 class _SharedResults:
-    """A cache of the results that successive points share, by scene and by laser strength."""
+    """A cache of results that successive evaluation points have in common, by scene and by laser strength."""
 
     def __init__(self) -> None:
         self._of_scene: dict[Any, tuple[Any, Any]] = {}
@@ -186,12 +186,12 @@ class _SharedResults:
         self._seed = 0
 
     def clear(self) -> None:
-        """Release all kept results from memory."""
+        """Remove all cached results from memory."""
         self._of_scene.clear()
         self._of_strength.clear()
 
     def turn(self, point: PointRequest) -> None:
-        """Begin a point, and release the results of all other scenes, lasers and strengths."""
+        """Begin an evaluation point, and remove the cached results of other scenes, lasers and laser strengths."""
         scene = (point.scene.number, point.scene.seed, point.scene.case)
         if scene != self._scene:
             self._of_scene.clear()
@@ -200,7 +200,7 @@ class _SharedResults:
         self._scene, self._strength, self._seed = scene, point.strength, point.scene.seed
 
     def caller(self, moved: set[str]) -> Callable[..., Any]:
-        """Return a function that computes a step, or reuses the step's result if the input objects are the same.
+        """Return a function that computes a step, or returns the cached result if the input objects are the same.
 
         ``moved`` names the steps that depend on the laser strength.
         """

@@ -1,4 +1,4 @@
-"""The result of an evaluation: the metrics of every pipeline in every scene, and statistics over the scenes."""
+"""The result of an evaluation: the metrics of every mask and restorer in every scene, and statistics over scenes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """The result of an evaluation: its scenes, points, statistics, masks and pictures."""
+    """The result of an evaluation: scenes, metrics by scene, statistics over scenes, masks and pictures."""
 
     recipe: Recipe
     scenes: Sequence[Scene]

@@ -1,4 +1,4 @@
-"""The scenes of an evaluation, each with a crop of a photograph, a laser direction and a seed of the noise."""
+"""The scenes of an evaluation, each with a crop of a photograph, a laser direction and a random seed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PHOTOGRAPH = "scene.photograph"
 
 @dataclass(frozen=True)
 class Scene:
-    """One scene of an evaluation; the file of its picture is read on first use."""
+    """One scene of an evaluation, whose photograph is read at the first use."""
 
     number: int
     case: str  #: name of the laser, or none
@@ -38,7 +38,10 @@ class Scene:
 
     @property
     def seed(self) -> int:
-        """Return the seed of noise and laser direction; a run of the recipe with this seed gives the same values."""
+        """Return the random seed for the noise and the laser direction of the scene.
+
+        A run of the recipe with this seed gives the same values.
+        """
         return self.recipe.seed + self.number
 
     @cached_property
@@ -61,21 +64,21 @@ class Scene:
         return digest("photograph", own, file_digest(self.path), list(self.shape), self.recipe.seed, self.number)
 
     def draw(self, inputs: Inputs) -> dict[str, float]:
-        """Draw the uncertain values of the scene, in SI; every mask, restorer and laser gets the same values."""
+        """Sample the uncertain values of the scene in SI units, equal for every mask, restorer and laser."""
         import numpy as np
 
         z = [np.random.default_rng([self.seed, stream_seed(0, name)]).standard_normal() for name in inputs.names]
         return dict(zip(inputs.names, map(float, inputs.at(np.array([z]))[0]), strict=True))
 
     def angle(self, recipe: Recipe) -> tuple[float, float]:
-        """Draw the direction cosines (y, x) of the laser from the distribution in the paper."""
+        """Sample the direction cosines (y, x) of the laser from the distribution in the paper."""
         step = recipe.steps[f"direction[{BEAM}]"]
         drawn = call(step, [], step.params, self.seed, "cpu")
         return float(drawn[0]), float(drawn[1])
 
 
 def scenes(recipe: Recipe, store: Store, root: Path | None, count: int) -> tuple[list[Scene], list[tuple[Path, str]]]:
-    """Return ``count`` scenes, which cycle through the lasers, and a list of unreadable photographs with reasons."""
+    """Return ``count`` scenes with the lasers in turn, and the photographs that cannot be read, with reasons."""
     broken: list[tuple[Path, str]] = []
     own = recipe.steps["scene"]
     shape = _shape(recipe)
@@ -101,5 +104,5 @@ def _shape(recipe: Recipe) -> tuple[int, int]:
     if shape is None and recipe.steps["scene"].node.path == _PHOTOGRAPH:
         raise EvaluationRefused("scene.shape is missing: write the size to crop from photographs, such as [768, 768]")
     if shape is None:
-        raise EvaluationRefused("the scene of the recipe has no shape: write a shape, such as scene.shape=[768, 768]")
+        raise EvaluationRefused("scene.shape is missing: write the size of the scene in pixels, such as [768, 768]")
     return int(shape[0]), int(shape[1])

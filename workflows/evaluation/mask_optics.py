@@ -1,4 +1,4 @@
-"""Figures of merit of a mask by wavelength: laser suppression, image contrast, and bounds of both."""
+"""Figures of merit of a mask by wavelength: laser suppression and image contrast, with their physical bounds."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class MaskOptics:
 def masks(
     each: Sequence[PipelineRecipes], store: Store, device: str, points: Mapping[str, Sequence[Mapping[float, Any]]]
 ) -> dict[str, MaskOptics]:
-    """Return the figures of merit of each mask by name, in the order of the pipelines."""
+    """Return the laser suppression and the image contrast of each mask, by name of the mask."""
     optics: dict[str, MaskOptics] = {}
     for pipeline in each:
         if pipeline.pipeline.front not in optics:

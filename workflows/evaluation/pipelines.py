@@ -1,4 +1,4 @@
-"""The pipelines of an evaluation, each of a mask and a restorer, with one recipe for each laser."""
+"""The pipelines that an evaluation compares: a mask and a restorer each, with one recipe for each laser."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class EvaluationRefused(ValueError):
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A mask in front of the lens, together with the restorer of the picture that the lens gives."""
+    """A mask in front of the lens, together with the method that restores the picture behind the lens."""
 
     mask: str  #: an option of `doe`
     restorer: str  #: an option of `restore`, or none
@@ -60,12 +60,12 @@ class Pipeline:
 
     @property
     def picture(self) -> str:
-        """Return the name of the step whose picture is compared with the true picture."""
+        """Return the name of the step that gives the picture to compare with the true picture."""
         return "developed[mask]" if self.restorer == NONE else "restored"
 
     @property
     def quality(self) -> str:
-        """Return the name of the step that compares the result with the true picture."""
+        """Return the name of the step that measures the error of a picture against the true picture."""
         return "developed_quality[mask]" if self.restorer == NONE else "restored_quality"
 
     @property
@@ -76,7 +76,7 @@ class Pipeline:
 
 @dataclass(frozen=True)
 class PipelineRecipes:
-    """A pipeline with one recipe for each laser; the recipes differ only in the wavelength of the laser."""
+    """A pipeline (mask and restorer) with one recipe for each laser, which differ only in the laser wavelength."""
 
     pipeline: Pipeline
     recipe: Callable[[str], Recipe]  #: returns the recipe of a laser by name
@@ -110,7 +110,7 @@ def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
 def compose_pipelines(
     recipe: str, changes: Sequence[str | Override], pipelines: Sequence[Pipeline], folder: Path
 ) -> list[PipelineRecipes]:
-    """Return each pipeline with its recipes; raise `EvaluationRefused` with the mistakes of all pipelines."""
+    """Return each pipeline (mask and restorer) with its recipes; raise `EvaluationRefused` with all mistakes."""
     fwhm = _fwhm(recipe, changes, folder)
     found: list[PipelineRecipes] = []
     wrong: dict[str, None] = {}
@@ -135,7 +135,7 @@ def _one_line(problem: Diagnostic) -> str:
 
 
 def _words(pipeline: Pipeline) -> list[str]:
-    """Return the overrides that set the mask and the restorer of a pipeline in a recipe."""
+    """Return the recipe arguments that set the mask and the restorer of a pipeline, such as ``doe=flat``."""
     words = [f"doe={pipeline.mask}"]
     if pipeline.height_file:
         words.append(f"doe.{_takes('doe', pipeline.mask)}={pipeline.height_file.absolute()}")
@@ -147,7 +147,7 @@ def _words(pipeline: Pipeline) -> list[str]:
 
 
 def _takes(group: str, option: str) -> str:
-    """Return the parameter that names the file of an option; raise `EvaluationRefused` if the option takes no file."""
+    """Return the name of the file parameter of a mask or restorer; raise `EvaluationRefused` if there is none."""
     options = groups_of(packaged()).get(group, [])
     path = packaged() / group / f"{option}.yaml"
     if option == NONE or (option in options and not path.is_file()):
@@ -160,7 +160,7 @@ def _takes(group: str, option: str) -> str:
 
 
 def _with_laser(recipe: str, words: Sequence[str | Override], fwhm: float, folder: Path, case: str) -> Recipe:
-    """Load a recipe with the laser ``case``, whose strength and direction are set later for each point."""
+    """Load a recipe with the laser ``case``; strength and direction are set later for each evaluation point."""
     laser = ""
     if (metres := CASES[case]) is not None:
         line = f"wavelength: {metres * 1e9:g} nm, fwhm: {fwhm * 1e9:g} nm"
@@ -169,7 +169,7 @@ def _with_laser(recipe: str, words: Sequence[str | Override], fwhm: float, folde
 
 
 def _fwhm(recipe: str, changes: Sequence[str | Override], folder: Path) -> float:
-    """Return the FWHM of the recipe's first laser in m, or 10 nm if the recipe has no laser."""
+    """Return the spectral width (FWHM) in m of the first laser of a recipe, or 10 nm if there is no laser."""
     try:
         steps = load(recipe, changes, folder).steps
     except RecipeError as error:

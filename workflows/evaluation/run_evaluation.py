@@ -1,4 +1,4 @@
-"""The evaluation of masks and restorers as in the paper, with the same scenes and laser strengths for each pair.
+"""The evaluation of masks and restorers as in the paper, with the same scenes and laser strengths for all.
 
     evaluate("first_light", read_pipelines("flat+none, five_half_rings+wiener", Path()), data=Path("photographs"))
 
@@ -91,7 +91,9 @@ def evaluate(
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
     if not strengths or min(strengths) < 0 or not all(map(np.isfinite, strengths)):
-        raise EvaluationRefused("--strengths: write finite multiples of saturation, 0 or more, such as 0,1e1,1e3,1e6")
+        raise EvaluationRefused(
+            "--strengths: write finite multiples of saturation that are not negative, such as 0,1e1,1e6"
+        )
     return tuple(sorted(set(map(float, strengths))))
 
 
@@ -116,7 +118,7 @@ def _points(
     strengths: Sequence[float],
     progress: Progress,
 ) -> dict[str, list[dict[float, PointNumbers]]]:
-    """Compute all points, grouped by laser because scenes with the same laser share optical results."""
+    """Compute all evaluation points laser by laser, because scenes with the same laser have common optical results."""
     points: dict[str, list[dict[float, PointNumbers]]] = {p.name: [{} for _ in shown] for p in each}
     before, order = "", [scene.case for scene in shown]
     for done, scene in enumerate(sorted(shown, key=lambda scene: order.index(scene.case)), 1):

@@ -1,4 +1,4 @@
-"""How is a result shown?
+"""How is the result of a run, a study or a training shown?
 
 Pages, pictures, tables, exported files, what a notebook shows and what the console prints.
 Nothing here decides what is computed, beyond the steps that a page reads.

@@ -1,6 +1,7 @@
-"""Screen output of a run: a live table on a terminal, plain lines elsewhere, then the result table.
+"""Screen output of a run: a table of the steps, updated during the run if stdout is a terminal, and the result table.
 
-Items of one step, such as ``spot[mask,green]``, share a line. All steps that were not needed share one line.
+Copies of a step, such as ``spot[mask,green]`` and ``spot[mask,red]``, share a line. All steps whose results no other
+step had to load share one line.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _WIDTHS = (5, 10, 9, 28, 0)  #: of the columns after the first
 
 @dataclass
 class Family:
-    """The items of one step, and the records of the finished items."""
+    """All copies of one step, such as ``psf[plain]`` and ``psf[mask]``, and the records of the finished copies."""
 
     name: str
     members: list[str]
@@ -39,11 +40,11 @@ class Family:
 
     @property
     def needed(self) -> list[StepRecord]:
-        """Return the records of the items that were needed."""
+        """Return the records of the copies of the step that the run computed, loaded or left out."""
         return [d for d in self.done if d.state != "not needed"]
 
     def cells(self) -> tuple[str, ...]:
-        """Return the table row of a step and its items, with the columns of `HEADER`."""
+        """Return the table row of all copies of a step, with the columns of `HEADER`."""
         done, count = self.needed, len(self.members)
         name = f"{self.name} ×{count}" if count > 1 else self.members[0]
         if not done:
@@ -59,18 +60,18 @@ class Family:
         return name, shown.device, self.state(), f"{ran:.3f}" if ran else "", output, check
 
     def state(self) -> str:
-        """Return the state of all items, such as ``run``, or the number of items in each state."""
+        """Return the common state of all copies of a step, such as ``run``, or the number of copies in each state."""
         states = Counter(str(d.state) for d in self.needed)
         return "".join(states) if len(states) == 1 else ", ".join(f"{n} {s}" for s, n in states.items())
 
 
 def mode_for(silent: bool) -> Mode:
-    """Return the mode of a table: silent on request, live on a terminal, plain elsewhere."""
+    """Return how a table is printed: ``silent`` on request, ``live`` (updated) on a terminal, else ``plain`` lines."""
     return "silent" if silent else "live" if sys.stdout.isatty() else "plain"
 
 
 class ProgressTable(ABC):
-    """A table that is shown on the screen during a ``with`` block."""
+    """A table on the screen that shows the progress of the code in a ``with`` block."""
 
     header: Sequence[str]
     widths: Sequence[int]  #: least widths of the columns of plain lines
@@ -81,11 +82,11 @@ class ProgressTable(ABC):
 
     @abstractmethod
     def live_rows(self) -> Iterable[tuple[Sequence[str], str]]:
-        """Return the cells and the state of each row of a live table."""
+        """Return the cells and the state of each row of a table that is updated on the terminal."""
 
     @abstractmethod
     def caption(self) -> str:
-        """Return the line below a live table."""
+        """Return the line of text below a table that is updated on the terminal."""
 
     def __enter__(self) -> Self:
         if self.mode == "live":
@@ -101,7 +102,7 @@ class ProgressTable(ABC):
             self._live.stop()
 
     def show_row(self, cells: Sequence[str]) -> None:
-        """Print a final row in plain mode; a live table shows its rows without this call."""
+        """Print a finished row as a line of text; do nothing if the table is updated on a terminal."""
         if self.mode != "plain":
             return
         columns = zip(self.header, cells, self.widths, strict=True)
@@ -109,7 +110,7 @@ class ProgressTable(ABC):
         print("  " + "  ".join(padded).rstrip(), flush=True)
 
     def show_error(self, plain: Iterable[str], live: str) -> None:
-        """Print an error: as the lines ``plain`` below plain rows, or as the text ``live`` above a live table."""
+        """Print an error: the lines ``plain`` to a file or pipe, or the text ``live`` above a table on a terminal."""
         if self.mode == "plain":
             print(*plain, sep="\n", flush=True)
         elif self.mode == "live":
@@ -128,7 +129,7 @@ class ProgressTable(ABC):
 
 
 class RunTable(ProgressTable):
-    """Table of the steps of a run; in plain mode, a step is printed after its last item."""
+    """Table of the steps of a run; outside a terminal, a step is printed when all its copies are finished."""
 
     header, numbers = HEADER, ("seconds",)
 
@@ -143,26 +144,26 @@ class RunTable(ProgressTable):
             print(f"  {self.caption()}")
 
     def watch(self, event: Event) -> None:
-        """Add an event of the engine to the table."""
+        """Update the table of steps with the start or the end of a step."""
         family = note(self.families, event)
         if event.done is not None and family.needed and len(family.done) == len(family.members):
             self.show_row(family.cells())
 
     def live_rows(self) -> Iterator[tuple[tuple[str, ...], str]]:
-        """Yield the cells and the state of each step that has begun."""
+        """Yield the table cells and the state of each step that has begun."""
         for family in self.families.values():
             if family.begun or family.needed:
                 cells = family.cells()
                 yield cells, "failed" if "LOOK" in cells[5] else cells[2]
 
     def caption(self) -> str:
-        """Return a sentence with the number of steps that were not needed."""
+        """Return a sentence with the number of steps that were neither computed nor loaded."""
         count = sum(d.state == "not needed" for f in self.families.values() for d in f.done)
         return f"{count} steps were not needed: the results that need them are in the cache" if count else ""
 
 
 def families(recipe: Recipe, names: Iterable[str]) -> dict[str, Family]:
-    """Group steps by the name before the bracket, in running order."""
+    """Group the steps of a run by the name before the bracket, in running order: ``psf[mask]`` belongs to ``psf``."""
     return {
         short: Family(short, members, unit_of(recipe.steps[members[0]].node.__doc__ or ""))
         for short, members in by_family(names).items()
@@ -170,7 +171,7 @@ def families(recipe: Recipe, names: Iterable[str]) -> dict[str, Family]:
 
 
 def note(families: dict[str, Family], event: Event) -> Family:
-    """Add an event to the items of its step, and return these items.
+    """Add the start or the end of one copy of a step to the group of all copies, and return this group.
 
     A second attempt of a run may have steps that the first attempt did not have.
     """
@@ -186,7 +187,7 @@ def note(families: dict[str, Family], event: Event) -> Family:
 
 
 def opening(recipe: Recipe, command: str) -> list[str]:
-    """Return the lines to print before a run: title, numbers of checked steps and parameters, and notes."""
+    """Return the lines to print before a run: recipe title, numbers of checked steps and parameters, and notes."""
     values = sum(len(step.params) for step in recipe.steps.values())
     nodes = len({step.node.path for step in recipe.steps.values()})
     checked = f"checked  {len(recipe.steps)} steps of {nodes} nodes, {values} parameters: all right"
@@ -195,7 +196,7 @@ def opening(recipe: Recipe, command: str) -> list[str]:
 
 
 def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str]:
-    """Return the lines to print after a run: steps left out, result table, verdict, page and commands to try."""
+    """Return the lines to print after a run: steps left out, result table, verdict, report path, next commands."""
     lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
     lines += [left_out_line(doc)] if doc["left_out"] else []
     rows = [[row["name"], *row["cells"]] for row in doc["table"]["rows"]]
@@ -211,7 +212,7 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str
 
 
 def left_out_line(doc: Mapping[str, Any]) -> str:
-    """Return one line with the steps that were left out and the upper bounds of the resulting changes."""
+    """Return one line with the steps that a run left out, and the upper bounds of the errors that this causes."""
     named: dict[str, float] = {}
     for row in doc["left_out"]:
         short = row["step"].partition("[")[0]

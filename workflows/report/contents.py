@@ -1,13 +1,13 @@
-"""Contents of the report of a run: figures, result table, data files, and the steps that these read.
+"""Contents of the report of a run: figures, result table and data files, and the steps whose results they show.
 
-Only this file names the steps of the camera graph. A need is a text that names the value of one argument:
+Only this file names the steps of the camera graph. A text names the source of one argument of a drawing function:
 
     psf[mask]                    the value of a step
-    spot[mask,*]                 a dictionary with the value of each item of a step
+    spot[mask,*]                 a dictionary with the value of each copy of a step
     psf[mask].pixel_pitch        a parameter of a step
     psf[mask]()                  a function: the node of a step with the parameters of the step
 
-A leading ``?`` marks an optional need: if the recipe lacks the step, the figure is drawn without this argument.
+A leading ``?`` marks an optional argument: if the recipe lacks the step, the figure is drawn without this argument.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A figure of the report: title, caption, drawing function, and the source of each argument of this function."""
+    """A figure of the report: title, caption, drawing function, and the steps that supply the function's arguments."""
 
     name: str
     title: str
@@ -113,7 +113,7 @@ FIGURES = (
 
 
 def _row(arm: str) -> dict[str, str]:
-    """Return the step that each column of the result table reads, for the ``plain`` lens or for the ``mask``."""
+    """Return the step whose result each column of the result table shows, for the ``plain`` lens or the ``mask``."""
     steps = {"peak/I_sat": "peak", "LSR": "lsr", "BSR": "bsr", "quality": "developed_quality", "saturated": "saturated"}
     return {column: f"{step}[{arm}]" for column, step in steps.items()}
 
@@ -144,12 +144,12 @@ FILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
 
 
 def wanted(recipe: Recipe) -> tuple[str, ...]:
-    """Return the outputs of a recipe, the steps of its expected numbers, and the steps that only the report shows."""
+    """Return the steps that a run must give: outputs of the recipe, sources of expected numbers and of the report."""
     promised = [e.step for e in recipe.expect]
     shown = [s for s in (*(s for row in TABLE.values() for s in row.values()), *SHOWN) if s in recipe.steps]
     return tuple(dict.fromkeys([*recipe.outputs, *promised, *shown]))
 
 
 def steps_of(recipe: Recipe) -> list[str]:
-    """Return every step that a run of ``recipe`` computes or loads, in running order."""
+    """Return every step that a run of ``recipe`` computes or loads from the cache, in running order."""
     return needed(with_substitutions(recipe, wanted(recipe)), wanted(recipe))

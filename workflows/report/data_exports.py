@@ -22,7 +22,7 @@ _VERSION = 1  #: version of the file formats; to be increased when a file is wri
 
 
 def exports(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
-    """Write the data files of a run; return the path of each file, and the reason for each missing file."""
+    """Write the data files of a run; return the paths of the files, and the reason for each file that is missing."""
     outputs = {step: step for step in result.recipe.outputs}
     contents = {**FILES, "outputs.safetensors": ("safetensors", outputs)}
     files = (
@@ -53,7 +53,7 @@ def safetensors(**values: Any) -> bytes:
 
 
 def exr(image: Tensor) -> bytes:
-    """Encode an image of three channels as float32 OpenEXR."""
+    """Encode an RGB image (3, y, x) as a float32 OpenEXR file."""
     import OpenEXR
 
     pixels = {"RGB": image.detach().cpu().float().permute(1, 2, 0).contiguous().numpy()}
@@ -81,7 +81,7 @@ def _chunk(name: bytes, body: bytes) -> bytes:
 
 
 def _written(suffix: str, write: Callable[[Path], Any]) -> bytes:
-    """Call ``write`` with the path of a temporary file, and return the bytes of this file."""
+    """Let the function ``write`` write a temporary file, and return the bytes of this file."""
     with TemporaryDirectory(prefix="neusee-") as folder:
         path = Path(folder) / f"file{suffix}"
         write(path)

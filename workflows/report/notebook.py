@@ -1,4 +1,4 @@
-"""HTML views of a recipe and of a result for a notebook: one small page that loads no other file."""
+"""HTML views of a recipe and of a run result in a Jupyter notebook, each as one page that loads no other file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _LONGEST = 100  #: characters of a value in a table, at most
 
 
 def numbers_of(result: Result) -> dict[str, float | list[float]]:
-    """Return the figures of merit that ``neusee run`` prints, by name; a figure for each band is a list."""
+    """Return the figures of merit of a run by name, as a number or as a list with one number for each band."""
     recipe = result.recipe.unsubstituted or result.recipe
     names = metrics_of(recipe, {*result.keys, *wanted(recipe)})
     absent = [name for name in names if name not in result.values]
@@ -42,7 +42,7 @@ def numbers_of(result: Result) -> dict[str, float | list[float]]:
 
 
 def arrays_of(value: Any) -> Any:
-    """Return ``value`` with a NumPy array in place of every tensor; bfloat16 becomes float32."""
+    """Replace every tensor in a nested value by a NumPy array; bfloat16 becomes float32."""
     import torch
     from torch import Tensor
 
@@ -58,12 +58,12 @@ def arrays_of(value: Any) -> Any:
 
 
 def result_line(result: Result) -> str:
-    """Return one line such as ``<result of first_light: restored, raw; 12 run, 3 cached in 0.31 s>``."""
+    """Return a run result as a line such as ``<result of first_light: restored, raw; 12 run, 3 cached in 0.31 s>``."""
     return f"<result of {result.recipe.name}: {', '.join(by_family(result.values))}; {_counts(result)}>"
 
 
 def result_html(result: Result) -> str:
-    """Return an HTML page with pictures, result table and states of steps; omit values that take over 2 s."""
+    """Return an HTML page with pictures, result table and steps of a run, without values that take over 2 s."""
     values = _at_hand(result, [*_of_table(result), *_of_overview().values()])
     return filled(
         "notebook.html.j2",
@@ -91,7 +91,7 @@ def _of_overview() -> dict[str, str]:
 
 
 def _at_hand(result: Result, steps: Iterable[str]) -> dict[str, Any]:
-    """Return the values of the ``steps`` that are stored or can be computed again within 2 s."""
+    """Return the results of those ``steps`` that are in the store or can be computed again within 2 s."""
     held = {name for name, key in result.keys.items() if name in result.values or result.store.has(key)}
     sources = {name: () if name in held else result.recipe.steps[name].sources for name in result.keys}
     kept: list[str] = []
@@ -114,7 +114,7 @@ def _took(result: Result, step: str) -> float:
 
 
 def _results(result: Result, values: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the result table without empty rows and columns, or an empty list if no cell has a value."""
+    """Return the result table of a run without empty rows and columns, or an empty list if all cells are empty."""
     found = table(result.recipe, {name: result.keys[name] for name in values}, values.__getitem__)
     rows = [[row["name"], *row["cells"]] for row in found["rows"] if any(row["cells"])]
     columns = ["", *found["columns"]]
@@ -132,7 +132,7 @@ def _outputs(result: Result) -> dict[str, Any]:
 
 
 def _looks(value: Any) -> tuple[str, str, str]:
-    """Return shape, type and range of a value; for a named tuple, return its scalars in place of the range."""
+    """Return shape, type and range of a result as text; for a named tuple, its numbers replace the range."""
     from neusee.nodes import TensorStats
 
     facts = TensorStats.of(value)
@@ -155,7 +155,7 @@ def _steps(result: Result) -> dict[str, Any]:
 
 
 def _pictures(values: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Encode the pictures of the camera overview, or up to four other images if a picture is missing."""
+    """Encode the pictures of the camera overview as PNG, or up to four other images if a picture is missing."""
     from neusee.workflows.report.figures.camera_overview import centre, high
 
     needs = _of_overview()
@@ -183,7 +183,7 @@ def _is_picture(value: Any) -> bool:
 
 
 def _picture(name: str, linear: Tensor, edge: int) -> dict[str, Any]:
-    """Return an image as PNG with at most ``edge`` pixels on a side, reduced in linear light before the encoding."""
+    """Encode a linear image as an sRGB PNG file, reduced to at most ``edge`` pixels on a side."""
     from kornia.geometry.transform import resize
     from PIL import Image
 
@@ -201,7 +201,7 @@ def _picture(name: str, linear: Tensor, edge: int) -> dict[str, Any]:
 
 
 def recipe_html(recipe: Recipe) -> str:
-    """Return an HTML page with the outputs, the changed values, the steps and all values of a recipe."""
+    """Return an HTML page with the outputs, the steps, and the changed and all other parameters of a recipe."""
     written = {name: s for name, s in recipe.config.settings.items() if not s.default and not name.startswith("steps.")}
     changed = {name: s for name, s in recipe.config.settings.items() if "argument " in s.source}
     lines = [recipe.title, f"gives {', '.join(by_family(recipe.outputs))}"]
@@ -220,7 +220,7 @@ def recipe_html(recipe: Recipe) -> str:
 
 
 def _graph(recipe: Recipe) -> dict[str, Any]:
-    """Return the table of the steps of a recipe; all items of one step share a row."""
+    """Return a table of the steps of a recipe; ``psf[plain]`` and ``psf[mask]``, copies of one step, share a row."""
     rows = []
     for family, names in by_family(recipe.steps).items():
         step = recipe.steps[names[0]]

@@ -1,4 +1,4 @@
-"""Lookup of the values, the parameters and the nodes of a recipe that a picture or a file needs."""
+"""Lookup of the results, parameters and functions of a recipe from which a figure or a data file is made."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _PARAMETER = re.compile(r"(?P<step>[^.]+)\.(?P<name>\w+)")
 
 
 class Missing(LookupError):
-    """Error for a step that the recipe lacks, or that no output of the run needs."""
+    """Error for a step that a figure or data file reads, if the recipe lacks the step or the run does not need it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """A function that calls the node of a step with any inputs and the parameters of the step."""
+    """A function that applies the node of a step, with the parameters of this step, to other inputs."""
 
     step: Step
 
@@ -36,7 +36,7 @@ class Bound:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The source of an argument: steps to read, a function that returns the argument, and a part of the cache key."""
+    """The source of an argument of a drawing function: steps to read, function of their results, and part of a key."""
 
     steps: tuple[str, ...]
     make: Any  #: a function of the values by step, which returns the argument
@@ -44,7 +44,10 @@ class Found:
 
 
 def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code) -> Found:
-    """Find the source of an argument from a text such as ``psf[mask]``; the module `contents` lists all forms."""
+    """Find the source of an argument of a drawing function in a recipe, from a text such as ``psf[mask]``.
+
+    The module `contents` lists all forms of this text.
+    """
     if need.endswith("()"):
         step = _step(need[:-2], recipe)
         params = [[name, plain(value)] for name, value in step.params.items()]
@@ -67,7 +70,7 @@ def _step(name: str, recipe: Recipe) -> Step:
 
 
 def _items(prefix: str, recipe: Recipe, keys: Mapping[str, str]) -> Found:
-    """Find the items of a step whose names begin with ``prefix``, such as ``spot[mask,``."""
+    """Find all copies of a step from the beginning of their names, such as ``spot[mask,``."""
     names = {n[len(prefix) : -1]: n for n in recipe.steps if n.startswith(prefix) and n in keys}
     if not names:
         raise Missing(f"the recipe has no step {prefix}…]")

@@ -27,7 +27,7 @@ _MOST = 4096  #: elements, at most, of a result whose numbers become rows
 
 
 def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
-    """Return every expected number of a recipe, with the number that the run gave."""
+    """Compare every number that a recipe expects with the number from the run, and return one row for each."""
     rows = []
     for e in recipe.expect:
         found: Any = value(e.step)
@@ -53,14 +53,14 @@ def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, An
 
 
 def _cell(found: Any, field: str, number: Callable[[Tensor, int], Any], form: str, band: int) -> str:
-    """Return the text of one number of a result, or an empty string if the result has no such field."""
+    """Return one number of a result as formatted text, or an empty string if the result lacks the field ``field``."""
     fields = {} if found is None else dict(_fields(found))
     tensor = fields.get(field) if field else next(iter(fields.values()), None)
     return "" if tensor is None else form.format(float(number(tensor, band)))
 
 
 def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, str]:
-    """Return the index and the name of the band nearest to the first laser, or to 550 nm without a laser."""
+    """Return index and name of the spectral band nearest to the first laser, or to 550 nm if there is no laser."""
     if BANDS not in keys:
         return 0, "the first band"
     prefix = LINES.removesuffix("*]")
@@ -70,7 +70,7 @@ def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, s
 
 
 def metrics(recipe: Recipe, keys: Mapping[str, str], value: Value) -> list[list[Any]]:
-    """Return a row (step, field, index, value) for each number of each small result of a metric."""
+    """Return the rows (step, field, index, value) of ``metrics.csv``, one for each number that a metric gave."""
     return [row for name in metrics_of(recipe, keys) for row in numbers_of(name, value(name))]
 
 
@@ -80,7 +80,7 @@ def metrics_of(recipe: Recipe, among: Container[str]) -> list[str]:
 
 
 def numbers_of(step: str, found: Any) -> list[list[Any]]:
-    """Return a row (step, field, index, value) for each number of a small result; a picture gives no rows."""
+    """Return a row (step, field, index, value) for each number in a result of at most 4096 elements."""
     rows: list[list[Any]] = []
     for field, tensor in _fields(found):
         if tensor.numel() <= _MOST and not tensor.is_complex():

@@ -1,4 +1,4 @@
-"""Folder of a run: the folder appears only when it is complete, and ``latest`` points to the newest folder."""
+"""The folder of a run, which gets its final name when all files are written, and the link ``latest`` to this folder."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ _ABANDONED = 3600.0  #: s without a change, after which an unfinished folder is 
 
 @dataclass
 class RunFolder:
-    """The folder of a run, with a temporary path until all files are written, and the final path afterwards."""
+    """The folder of a run, which has a temporary path until all files are written, and then its final path."""
 
     path: Path
 
     def write(self, name: str, content: str | bytes) -> Path:
-        """Write a file into the folder, create its parent folders, and return its path."""
+        """Write a file into the folder of a run, and return the path of the file."""
         path = self.path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content.encode() if isinstance(content, str) else content)
         return path
 
     def write_rows(self, name: str, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-        """Write a CSV file with a header line."""
+        """Write a CSV file with a header line into the folder of a run."""
         with (self.path / name).open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(header)
             writer.writerows(rows)
 
     def take(self, name: str, source: Path) -> None:
-        """Add a stored file to the folder as a hard link, or as a copy if the file system refuses the link."""
+        """Add a stored file to the folder of a run as a hard link, or as a copy if the file system refuses the link."""
         path = self.path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -48,7 +48,7 @@ class RunFolder:
 
 @contextmanager
 def new_run(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
-    """Yield a folder with a temporary name; rename the folder after the block, or remove the folder after an error."""
+    """Create a run folder with a temporary name; rename it after the ``with`` block, or remove it after an error."""
     root.mkdir(parents=True, exist_ok=True)
     _sweep(root)
     name = f"{date.today().isoformat()}_{recipe}_{key[:8]}"
@@ -65,7 +65,7 @@ def new_run(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
 
 
 def _sweep(root: Path) -> None:
-    """Remove unfinished folders in which no file has changed for an hour: their runs were killed."""
+    """Remove the unfinished folders of killed runs, in which no file has changed for an hour."""
     for part in root.glob(".*.part"):
         try:
             if time.time() - max(p.stat().st_mtime for p in (part, *part.rglob("*"))) > _ABANDONED:
@@ -75,7 +75,7 @@ def _sweep(root: Path) -> None:
 
 
 def _rename(part: Path, target: Path) -> Path:
-    """Rename a complete folder to the first free name: ``name``, ``name_2``, ``name_3`` …"""
+    """Rename the complete folder of a run to the first free name: ``name``, ``name_2``, ``name_3`` …"""
     number = 1
     while True:
         path = target if number == 1 else target.with_name(f"{target.name}_{number}")
@@ -89,7 +89,7 @@ def _rename(part: Path, target: Path) -> Path:
 
 
 def _point(root: Path, name: str) -> None:
-    """Make ``latest`` a symbolic link to the run ``name``, or a file with this text if links are not possible."""
+    """Make ``latest`` a symbolic link to the folder of a run, or a file with its name if links are not possible."""
     part = root / f".latest.{os.getpid()}"
     try:
         part.symlink_to(name, target_is_directory=True)

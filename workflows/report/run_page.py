@@ -1,6 +1,6 @@
-"""Document and HTML page of a run: numbers, records of the steps, pictures and provenance.
+"""The report of a run as JSON document and as HTML page: numbers, steps, pictures and provenance.
 
-`document` returns plain JSON, which a run stores beside the pictures as ``provenance.json``.
+`document` returns JSON values, which a run stores beside the pictures as ``provenance.json``.
 `page` needs this document and the pictures only, so that `rebuild` can write the page again.
 """
 
@@ -45,7 +45,7 @@ _SAMPLING = "The PSF is sampled at the pixel centres; one pixel centre lies on t
 def document(
     result: Result, command: Sequence[str], warnings: Iterable[str], missing: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Return all contents of the report of a run, apart from the pictures, as plain JSON."""
+    """Return the report of a run, apart from its pictures, as a document of JSON values."""
     recipe, done = result.recipe, list(result.done.values())
     found = expected(recipe, result.value)
     steps = [_step(d, result) for d in done]
@@ -84,14 +84,14 @@ def document(
 
 
 def page(doc: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
-    """Return a document and its pictures as one HTML page that loads no other file."""
+    """Return the report of a run, from its document and pictures, as one HTML page that loads no other file."""
     inline = {name: base64.b64encode(content).decode() for name, content in pictures.items()}
     shown = {**doc, "figures": [f for f in doc["figures"] if f["name"] in inline]}
     return filled("run_page.html.j2", doc=shown, pictures=inline)
 
 
 def rebuild(folder: Path) -> Path:
-    """Write the page of a run again from the document and the pictures in ``folder``; return the path of the page."""
+    """Write ``report.html`` of a run again, from the document and the pictures in ``folder``, and return its path."""
     doc = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
     pictures = {p.stem: p.read_bytes() for p in sorted((folder / "figures").glob("*.png"))}
     target = folder / "report.html"
@@ -102,7 +102,7 @@ def rebuild(folder: Path) -> Path:
 
 
 def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str]) -> str:
-    """Return one line with the counts of expected numbers that the run met and of checks that failed."""
+    """Return a sentence that counts the expected numbers that the run reproduced, and the checks that failed."""
     met = sum(e["ok"] for e in found)
     some = f"{met} of {len(found)} expected numbers within tolerance"
     numbers = some if found else "No expected numbers in this recipe"
@@ -111,7 +111,10 @@ def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str]) -> str:
 
 
 def state_counts(records: Iterable[StepRecord]) -> str:
-    """Return the number of steps in each state, such as ``12 run, 3 cached``; a step not needed counts as cached."""
+    """Return the number of steps in each state as text, such as ``12 run, 3 cached``.
+
+    A step whose result no other step had to load counts as cached.
+    """
     counts = Counter("cached" if done.state == "not needed" else str(done.state) for done in records)
     return (
         ", ".join(f"{counts[state]} {state}" for state in ("run", "cached", "left out") if counts[state])
@@ -144,7 +147,7 @@ def _step(done: StepRecord, result: Result) -> dict[str, Any]:
 
 
 def _planned(result: Result) -> float | None:
-    """Return the planned duration of a run (s), or None if the plan lacks a step that ran, or the cost of a step."""
+    """Return the predicted duration of a run in s, or None if the time of a step that ran was not predicted."""
     ran = [done for done in result.done.values() if done.state == "run"]
     if result.schedule is None or any(done.predicted is None for done in ran):
         return None
@@ -153,7 +156,7 @@ def _planned(result: Result) -> float | None:
 
 
 def _remembered(done: StepRecord, about: Mapping[str, Any]) -> StepRecord:
-    """Complete the record of a step that did not run from the metadata of its stored result."""
+    """Complete the record of a step that was not computed in this run with the metadata of its stored result."""
     checks = tuple(Check(text, ok) for text, ok in about.get("checks", ()))
     why = f"made {about['date'][:16].replace('T', ' ')} UTC"
     return replace(done, why=why, facts=facts_in(about), checks=checks, bytes=about["bytes"])
@@ -175,7 +178,7 @@ def _sampling(recipe: Recipe) -> list[str]:
 
 
 def _readings(recipe: Recipe) -> list[dict[str, str]]:
-    """Return a row for each contradiction of the paper, with the value that the recipe uses."""
+    """Return a table row for each contradiction in the paper, with the interpretation that the recipe uses."""
     values = {path: setting.value for path, setting in recipe.config.settings.items()}
     if not any(path.startswith("reading.") for path in values):
         return []
@@ -194,7 +197,7 @@ def _figures(missing: Mapping[str, str], ran: bool) -> list[dict[str, str]]:
 
 
 def _facts(result: Result) -> list[list[str]]:
-    """Return names and values of the software, the machine and the settings of the run."""
+    """Return a table of the software versions, the machine and the settings of a run."""
     import torch
 
     cores, threads = f"{os.cpu_count()} cores", f"{torch.get_num_threads()} threads"
@@ -213,7 +216,7 @@ def _facts(result: Result) -> list[list[str]]:
 
 
 def _inputs(recipe: Recipe) -> list[dict[str, str]]:
-    """Return a row for every file that a parameter of the recipe names."""
+    """Return parameter, name and digest of every input file of a recipe."""
     from neusee.workflows.keys.input_file_digest import file_digest
 
     return [

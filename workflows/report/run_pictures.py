@@ -1,4 +1,4 @@
-"""Pictures of a run: each picture is drawn once and stored under a key of the values that the picture shows."""
+"""Pictures of a run, each drawn once and stored under a cache key of the results that the picture shows."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TIMELINE = (
 
 @dataclass(frozen=True, slots=True)
 class DerivedFile:
-    """A file that the function ``make`` computes from results, with the source of each argument of this function."""
+    """A figure or data file of a run: the function ``make`` that computes it, and the source of each argument."""
 
     name: str
     suffix: str
@@ -46,7 +46,7 @@ Job = tuple[DerivedFile, str, Mapping[str, Found]]  #: a file, its key, and the 
 
 
 def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
-    """Draw the pictures of a run; return the path of each picture, and the reason for each missing picture."""
+    """Draw the pictures of a run; return the paths of the pictures, and the reason for each picture that is missing."""
     drawing = engine(*sorted({figure.draw.partition(":")[0] for figure in FIGURES}), "report.figures.recipe_graph")
     files = (DerivedFile(f.name, ".png", ("figure", f.draw, drawing), f.needs, _function(f.draw)) for f in FIGURES)
     paths, missing = files_of(files, result, shelf)
@@ -56,7 +56,7 @@ def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict
 def files_of(
     files: Iterable[DerivedFile], result: Result, shelf: DerivedFiles
 ) -> tuple[dict[str, Path], dict[str, str]]:
-    """Make the files that are not stored; return the path of each file, and the reason for each missing file."""
+    """Make the figures or data files that the store lacks; return all paths, and the reason for each missing file."""
     code, jobs, missing = Code(result.store.code_memo), list[Job](), dict[str, str]()
     for file in files:
         try:
@@ -70,7 +70,10 @@ def files_of(
 
 
 def timeline(result: Result) -> bytes | None:
-    """Draw the planned and the actual times of all steps; return None if no step ran. The picture is not stored."""
+    """Draw the predicted and the actual times of all steps of a run, or return None if no step ran.
+
+    The picture is not stored.
+    """
     ran = [done for done in result.done.values() if done.state == "run"]
     if not ran:
         return None
@@ -85,7 +88,7 @@ def timeline(result: Result) -> bytes | None:
 
 
 def _in_turn(known: Iterable[StepRecord]) -> tuple[Slot, ...]:
-    """Return a plan in which the steps of each lane follow each other, in the order in which the steps ran."""
+    """Return a schedule of predicted times in which the steps of each device follow each other as they ran."""
     end: dict[str, Slot] = {}
     slots = []
     for done in sorted(known, key=lambda done: done.began):
@@ -98,7 +101,7 @@ def _in_turn(known: Iterable[StepRecord]) -> tuple[Slot, ...]:
 
 
 def _arguments(needs: Mapping[str, str], result: Result, code: Code) -> dict[str, Found]:
-    """Find the source of each argument; omit an optional argument, marked by ``?``, if its step is missing."""
+    """Find the source of each argument of a drawing function; omit arguments marked by ``?`` whose step is missing."""
     found = {}
     for argument, need in needs.items():
         try:
@@ -110,7 +113,7 @@ def _arguments(needs: Mapping[str, str], result: Result, code: Code) -> dict[str
 
 
 def _made(jobs: Sequence[Job], result: Result, shelf: DerivedFiles, missing: dict[str, str]) -> dict[str, Path]:
-    """Make the files that are not stored from the values of one run; return the path of each file."""
+    """Compute the figures or data files that the store lacks from the results of a run, and return all paths."""
     paths = {file.name: path for file, key, _ in jobs if (path := shelf.find(key, file.suffix))}
     new = [job for job in jobs if job[0].name not in paths]
     steps = {step for _, _, found in new for x in found.values() for step in x.steps}
@@ -127,13 +130,13 @@ def _made(jobs: Sequence[Job], result: Result, shelf: DerivedFiles, missing: dic
 
 
 def _function(path: str) -> Callable[..., bytes]:
-    """Return the drawing function ``module:function``; its module is imported at the first call."""
+    """Return the drawing function named ``module:function``, whose module is imported at the first call."""
     module, _, name = path.partition(":")
     return lambda **arguments: getattr(importlib.import_module(f"neusee.workflows.{module}"), name)(**arguments)
 
 
 def _graph(result: Result, shelf: DerivedFiles, drawing: str) -> Path:
-    """Draw the graph with the states of all steps, and also the graph of a later run that loads all results."""
+    """Draw the graph of a run with the states of all steps, and in advance the graph of an identical later run."""
     states = {name: "cached" if done.state == "not needed" else str(done.state) for name, done in result.done.items()}
     again = {name: "left out" if state == "left out" else "cached" for name, state in states.items()}
     sources = {name: list(result.recipe.steps[name].sources) for name in result.done}

@@ -1,4 +1,4 @@
-"""Times of a run: computing time, time saved by the cache, and predicted time."""
+"""Times of a run: computing time, time that the cache saved, and predicted time."""
 
 from __future__ import annotations
 
@@ -14,12 +14,15 @@ COLUMNS = ("step", "node", "device", "lane", "state", "began", "seconds", "predi
 
 
 def rows(steps: Iterable[StepRow]) -> list[list[Any]]:
-    """Return the lines of ``timing.csv``: the values of `COLUMNS` for each step."""
+    """Return the rows of ``timing.csv``, one for each step of a run, with the values of `COLUMNS`."""
     return [[step[column] for column in COLUMNS] for step in steps]
 
 
 def timing(steps: Sequence[StepRow], planned: float | None = None) -> dict[str, Any]:
-    """Return predicted, planned, actual and saved seconds, and bytes read and written; each result counts once."""
+    """Return the total times of a run (predicted, actual, saved by the cache), and the bytes read and written.
+
+    Steps with the same result count once.
+    """
     ran = [s for s in steps if s["state"] == "run"]
     own = {s["key"] for s in ran}
     served = _once(s for s in steps if s["state"] in ("cached", "not needed") and s["key"] not in own)
@@ -44,7 +47,7 @@ def timing(steps: Sequence[StepRow], planned: float | None = None) -> dict[str, 
 
 
 def _once(steps: Iterable[StepRow]) -> list[StepRow]:
-    """Return one step for each result: a step that was read from the cache, or else the first step."""
+    """Return one step for each distinct result, with preference for a step whose result was read from the cache."""
     found: dict[str, StepRow] = {}
     for step in steps:
         if step["key"] not in found or step["state"] == "cached":
@@ -53,7 +56,7 @@ def _once(steps: Iterable[StepRow]) -> list[StepRow]:
 
 
 def said_of(found: Mapping[str, Any]) -> list[str]:
-    """Return the times and sizes from `timing` as sentences."""
+    """Return the times and the sizes in bytes of a run, which `timing` computed, as sentences."""
     lines = []
     if found["ran"]:
         lines.append(f"{found['ran']} of {found['steps']} steps ran: {_seconds(found['seconds'])} of computing time.")

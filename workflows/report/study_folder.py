@@ -1,4 +1,4 @@
-"""The folder of a study, of a calibration or of an evaluation: page, pictures, tables and provenance.
+"""The folder with the results of a study, a calibration or an evaluation: page, pictures, tables and provenance.
 
 run = StudyRun("stability", recipe, command)            # starts the clock
 document = run.document({"failed": 3})                  # the content of provenance.json
@@ -27,12 +27,12 @@ SHOWN = ("command", "date", "seconds", "versions")  #: values of the document th
 
 
 def silent(line: str) -> None:
-    """Ignore a line of progress."""
+    """Ignore a line of text about the progress of a study."""
 
 
 @dataclass(frozen=True)
 class StudyReport:
-    """The report of a study: title, lead and sections of the page, and pictures, tables and other files by name."""
+    """The report of a study: title, summary and sections of its page, and pictures, tables and other files by name."""
 
     title: str
     lead: str
@@ -44,7 +44,7 @@ class StudyReport:
     banner: str = ""  #: reason why the result must not be used
 
     def write(self, folder: RunFolder, document: Mapping[str, Any]) -> None:
-        """Write the page, the pictures, the tables, the other files, and ``document`` as ``provenance.json``."""
+        """Write the files of a study into a folder: page, pictures, tables, other files and ``provenance.json``."""
         for name, picture in self.pictures.items():
             if picture:
                 folder.write(f"figures/{name}.png", picture)
@@ -58,14 +58,14 @@ class StudyReport:
 
 
 class StudyRun:
-    """A study in progress; its clock starts when the object is created."""
+    """A study in progress, whose computing time is measured from the creation of this object."""
 
     def __init__(self, kind: str, recipe: Recipe, command: Sequence[str]) -> None:
         self.kind, self.recipe, self.command = kind, recipe, command
         self._began = time.perf_counter()
 
     def document(self, content: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the document of the study: command, date and seconds, then ``content``, then versions and recipe."""
+        """Return the provenance of a study as a document: command, date, run time, ``content``, versions and recipe."""
         return {
             "study": self.kind,
             "recipe": self.recipe.name,
@@ -78,7 +78,7 @@ class StudyRun:
         }
 
     def write(self, runs: Path, key: str, document: Mapping[str, Any], report: StudyReport, name: str = "") -> Path:
-        """Write the folder ``runs/<date>_<recipe>_<name>_<key>`` and return its path.
+        """Write the results of a study into the folder ``runs/<date>_<recipe>_<name>_<key>``, and return its path.
 
         Without ``name``, the folder has the kind of the study in its name.
         """
@@ -88,5 +88,5 @@ class StudyRun:
 
 
 def as_json(document: Mapping[str, Any]) -> str:
-    """Return a document as indented JSON."""
+    """Return the document of a study as indented JSON text."""
     return json.dumps(document, indent=1, ensure_ascii=False)

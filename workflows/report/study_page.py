@@ -1,4 +1,4 @@
-"""Page of a study: one HTML file of paragraphs, pictures and tables that loads no other file.
+"""The HTML page of a study, with paragraphs, pictures and tables, as one file that loads no other file.
 
 The page has a light mode, a dark mode and a print mode. A sign in each coloured cell repeats the meaning of the colour.
 """
@@ -18,7 +18,10 @@ Mark = Literal["pass", "warn", "fail"]
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a page: heading, text, picture and table. A blank line in the text begins a new paragraph."""
+    """A section of the HTML page of a study: heading, text, picture and table.
+
+    A blank line in the text begins a new paragraph.
+    """
 
     heading: str
     text: str
@@ -29,7 +32,7 @@ class Section:
 
 
 def page(title: str, lead: str, sections: Sequence[Section], provenance: Mapping[str, Any], banner: str = "") -> str:
-    """Return the HTML of a page; ``lead`` states the result, and a red ``banner`` says why it must not be used."""
+    """Return the HTML page of a study; a red ``banner`` gives the reason why the result must not be used."""
     return filled(
         "study_page.html.j2",
         title=title,
@@ -41,7 +44,7 @@ def page(title: str, lead: str, sections: Sequence[Section], provenance: Mapping
 
 
 def filled(template: str, **values: Any) -> str:
-    """Fill ``values`` into an HTML template of the folder ``templates``, and return the HTML."""
+    """Return the HTML that an HTML template of the folder ``templates`` gives for the given ``values``."""
     from jinja2 import Environment, StrictUndefined
 
     text = (Path(__file__).parent / "templates" / template).read_text(encoding="utf-8")
@@ -49,7 +52,7 @@ def filled(template: str, **values: Any) -> str:
 
 
 def said(value: Any) -> str:
-    """Return the text of a table cell: three digits of a real number, all digits of an integer, a dash for None."""
+    """Return the value of a table cell as text, with three digits of a real number and a dash for None."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -76,11 +79,12 @@ def _section(anchor: str, section: Section) -> dict[str, Any]:
 
 
 def _refuse_stray_marks(section: Section) -> None:
-    """Raise ValueError if a mark refers to a cell outside the table, where the mark would be invisible."""
+    """Raise ValueError if a pass, warn or fail mark belongs to a cell outside the table of its section."""
     for row, column in section.marks:
         if not (0 <= row < len(section.rows) and 0 <= column < len(section.rows[row])):
             raise ValueError(
-                f"{section.heading}: a mark at ({row}, {column}) is outside the table: mark a cell of the table"
+                f"{section.heading}: the pass, warn or fail mark at row {row}, column {column} is outside the table: "
+                "mark a cell of the table"
             )
 
 
@@ -93,7 +97,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _holds_numbers(cells: Sequence[Any]) -> bool:
-    """Return True if a column contains only numbers, apart from empty cells."""
+    """Return True if a table column contains at least one number and otherwise only numbers and empty cells."""
     filled_cells = [c for c in cells if c is not None]
     return bool(filled_cells) and all(map(_is_number, filled_cells))
 

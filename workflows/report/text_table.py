@@ -8,14 +8,17 @@ Rows = Sequence[Sequence[str]]
 
 
 def columns(rows: Rows, numbers: str = "<", gap: str = "  ") -> list[str]:
-    """Return a line for each row; ``numbers`` aligns all columns after the first, left (``<``) or right (``>``)."""
+    """Return a line of text for each table row, with the first column aligned left.
+
+    ``numbers`` aligns all other columns left (``<``) or right (``>``).
+    """
     widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
     forms = [f"{'<' if i == 0 else numbers}{width}" for i, width in enumerate(widths)]
     return [gap.join(f"{cell:{form}}" for cell, form in zip(row, forms, strict=True)).rstrip() for row in rows]
 
 
 def indented(rows: Rows) -> list[str]:
-    """Return an indented line for each row, with numbers aligned right and a dash for an empty cell."""
+    """Return an indented line of text for each table row, with numbers aligned right and a dash for an empty cell."""
     full = [[name, *(cell or "–" for cell in cells)] for name, *cells in rows]
     return [f"  {line}" for line in columns(full, ">", "   ")]
 

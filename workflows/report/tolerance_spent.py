@@ -1,4 +1,4 @@
-"""Use of the tolerance by a run: omitted steps, cheaper steps, error bounds and measured errors."""
+"""Account of the numerical errors that a run accepts within its tolerance: omitted and cheaper steps, error bounds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NORM = "root mean square over the largest element"
 
 
 def spent(result: Result) -> dict[str, Any]:
-    """Return the tolerance of a run, and the use of this tolerance, as plain JSON.
+    """Return the tolerance of a run, with the omitted and the cheaper steps and their errors, as JSON values.
 
     ``bounds`` has the error bound of each output, and of each input of a step without an error bound.
     ``measured`` has the error of each output relative to a run with ``--exact``, if the store has its results.
@@ -48,7 +48,7 @@ def spent(result: Result) -> dict[str, Any]:
 
 
 def said_of_economies(account: Mapping[str, Any]) -> str:
-    """Return one line with the replaced and the omitted steps, their error bounds, and the measured error."""
+    """Return one line of text with the steps that a run replaced or omitted to save time, and the resulting errors."""
     summed = [f"{e['step']} ({_within(e['bound'])})" for e in account["economies"] if e["instead"]]
     nothing = [f"{e['step']} (no error)" for e in account["economies"] if not e["instead"]]
     worst = max(account["bounds"].values(), default=0.0)
@@ -81,13 +81,13 @@ def _economy(result: Result, costs: Costs, each: Substitution) -> dict[str, Any]
 
 
 def _seconds(result: Result, costs: Costs, step: str) -> float | None:
-    """Return the seconds of the full step, estimated from earlier runs; return None if the step never ran."""
+    """Return the predicted time in s of a step that this run replaced or left out, or None if the step never ran."""
     estimate = costs.of(result.recipe.steps[step], ["cpu"])
     return estimate.seconds["cpu"] if estimate.known else None
 
 
 def _measured(result: Result) -> dict[str, float]:
-    """Return the error of each output relative to an exact run, if the store has the results of such a run."""
+    """Return the error of each output of a run relative to an exact run, if the store has results of an exact run."""
     recipe = result.recipe
     if recipe.exact or not (recipe.substitutions or _left_out(result)):
         return {}

@@ -41,7 +41,7 @@ def train(
     watch: Watch | None = None,
     mesh: Mesh = ALONE,
 ) -> Path:
-    """Run the stages of a training, or continue a stopped training, and return its folder.
+    """Train mask and restoration network in stages, or continue a stopped training, and return the result folder.
 
     Stage 0 designs the mask without images and replaces stage 1.
 
@@ -94,7 +94,7 @@ def _photographs(recipe: Recipe, settings: Training, needed: bool) -> Photograph
 
 
 def _key(recipe: Recipe, settings: Training, photographs: Photographs) -> str:
-    """Return a digest of all settings that can change the result of a training."""
+    """Return a digest of all settings that can change a trained network or mask, as a part of the folder name."""
     items = recipe.config.settings.items()
     values = {name: str(setting.value) for name, setting in items if not name.startswith(f"{KEY}.")}
     usual = {"mask"} if settings.mask == MaskSettings() else set()  # so that trainings of older versions continue
@@ -122,7 +122,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.learner.begin(self.settings.stages.get(self.stage, Stage(iterations=0)), self.stage == 1)
 
     def run_stages(self, stages: Sequence[int], command: Sequence[str]) -> None:
-        """Run the given stages of the training, and write the results."""
+        """Run the given stages of the training (1: mask and network, 2: network alone), and write the results."""
         if self.designed and 1 in stages:
             raise ValueError(f"the mask in {self.folder} was designed without images: continue with --stage 2")
         for number in stages:
@@ -131,7 +131,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
                 raise ValueError(f"there is no stage {number}: train.stages and train.learn define only {stages_left}")
             if number > self.stage:
                 first = f"run the {self._length} iterations of stage {self.stage} first, or --stage mask"
-                raise ValueError(f"stage {number} needs stage {self.stage}: {first}")
+                raise ValueError(f"stage {number} cannot begin before the end of stage {self.stage}: {first}")
             if number == self.stage:
                 self._run_stage()
         if self.rows.rows and self.writes:
@@ -146,7 +146,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         return self.settings.stages[self.stage].iterations
 
     def _run_stage(self) -> None:
-        """Train to the end of the present stage, and write the checkpoint from which the next stage begins."""
+        """Train to the end of the present stage, and write the checkpoint with which the next stage begins."""
         fixed = None if self.stage == 1 else frozen(self.recipe, self.settings, self.folder)
         parts = self.recipe, self.settings, self.photographs, self.store, self.device
         self.samples = TrainingStream(*parts, fixed, self.mesh)
@@ -159,26 +159,26 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.mesh.wait()  # until the first process has written the mask
 
     def iterate(self) -> Losses:
-        """Train on one batch of pictures, and return the losses and the present factor of the learning rates."""
+        """Train on one batch of pictures; return the losses, and the learning rate relative to its initial value."""
         rate = self.learner.set_rates(self.iteration)
         losses, self.seen = self.learner.iterate(self.samples, self.stage, self.iteration)
         return losses | {"rate": rate}
 
     def note(self, losses: Losses) -> None:
-        """Write the losses to TensorBoard, and pass the losses to the callback ``watch``."""
+        """Write the losses of the last training iteration to TensorBoard, and pass them to the callback ``watch``."""
         if self.board:
             for name, value in losses.items():
                 self.board.add_scalar(name, value, self._iterations_of_all_stages - 1)
         super().note(losses)
 
     def keep(self) -> None:
-        """Write the TensorBoard events, the table of losses and the checkpoint to disk."""
+        """Write TensorBoard events, loss table and checkpoint of a training to disk."""
         if self.board:
             self.board.flush()
         super().keep()
 
     def show(self) -> None:
-        """Write one image with a picture of the last batch, the restored picture and the true picture."""
+        """Write a PNG file with a picture of the last batch, its restoration and the true picture side by side."""
         sample = self.seen[0]
         with torch.no_grad():
             restored = self.learner.net(sample.picture[:1])[0].float()
@@ -217,7 +217,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
 
 
 def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:
-    """Return the recipe with the trained mask of the file ``mask.safetensors`` as a fixed mask."""
+    """Return the recipe with the trained mask from the file ``mask.safetensors`` as a fixed mask."""
     if settings.learn is None:
         return recipe
     file = folder / "mask.safetensors"

@@ -18,7 +18,7 @@ _GAP = 4  #: pixels between pictures
 
 @drawn
 def curves(rows: Sequence[Mapping[str, str]]) -> Any:
-    """Draw each loss over the iterations of both stages, in a pale colour, and its running median in full colour."""
+    """Draw each training loss and its running median over the iterations of both training stages."""
     names = [name for name in _SHOWN if any(row[name] for row in rows)]
     figure, axes = canvas(11.0, 2.4 * -(-len(names) // 2), -(-len(names) // 2), 2)
     first = 1 + max((int(r["iteration"]) for r in rows if r["stage"] == "1"), default=-1)
@@ -40,13 +40,13 @@ def curves(rows: Sequence[Mapping[str, str]]) -> Any:
 
 
 def running_median(values: Sequence[float]) -> list[float]:
-    """Return the running median of a sequence, in a window of about a twentieth of its length."""
+    """Return the running median of a sequence of numbers, in a window of about 1/20 of the sequence length."""
     half = max(1, len(values) // 40)
     return [statistics.median(values[max(0, i - half) : i + half + 1]) for i in range(len(values))]
 
 
 def strip(pictures: Sequence[Tensor]) -> Any:
-    """Place linear pictures (3, y, x) side by side, and return one 8-bit sRGB array (y, x, 3)."""
+    """Place pictures (3, y, x) in linear sRGB side by side, and return one 8-bit sRGB array (y, x, 3)."""
     gap = torch.ones(3, pictures[0].shape[-2], _GAP)
     parts = [part for picture in pictures for part in (picture.detach().cpu(), gap)][:-1]
     return (encoded(torch.cat(parts, -1)) * 255).round().astype("uint8")

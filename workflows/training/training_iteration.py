@@ -43,7 +43,7 @@ class Scales(NamedTuple):
 
 
 class Learner:
-    """The mask, the networks and the optimisers of a training, which are equal in all processes."""
+    """The mask, the networks and the optimisers of a training, with equal values in all processes."""
 
     def __init__(
         self, recipe: Recipe, settings: Training, device: str, designed: bool = False, mesh: Mesh = ALONE
@@ -58,12 +58,12 @@ class Learner:
         self.begin(Stage(iterations=0), learns=True)
 
     def _start(self, recipe: Recipe, learn: str) -> nn.Module:
-        """Return the mask of the step ``learn`` as a module with trainable parameters."""
+        """Return the mask of the recipe step ``learn`` as a PyTorch module with trainable parameters."""
         step = recipe.steps[learn]
         path = step.node.path
         if path not in PARAMETRISATIONS:
             text = f"{learn} is {path}, which has no trainable parameters; {nearest(path, PARAMETRISATIONS)}"
-            raise ValueError(f"train: {text}; or design it without images: --stage mask")
+            raise ValueError(f"train: {text}; or design a mask without images: --stage mask")
         stop = recipe.steps[str(step.wires["stop"])]
         self._stop = call(stop, [], stop.params, recipe.seed, "cpu")
         return PARAMETRISATIONS[path](self._stop, step.params, self._rng("element")).to(self.settings.dtype)
@@ -71,7 +71,7 @@ class Learner:
     def height(self) -> Tensor:
         """Return the height map (v, u) of the mask in m; raise ValueError if no mask is trained."""
         if self._stop is None:
-            raise ValueError("train.learn: no mask is trained")
+            raise ValueError("train.learn: this training has no trainable mask")
         height: Tensor = self.mask(self._stop)
         return height
 
@@ -94,7 +94,7 @@ class Learner:
         self._first = [[g["lr"] for g in o.param_groups] for o in (self.generator_optimizer, self.critic_optimizer)]
 
     def set_rates(self, iteration: int) -> float:
-        """Set the learning rates of this iteration, and return their factor relative to the initial learning rates."""
+        """Set the learning rates of a training iteration, and return the factor on the initial learning rates."""
         factor = self.settings.rates.share(iteration)
         for optimiser, first in zip((self.generator_optimizer, self.critic_optimizer), self._first, strict=True):
             for group, rate in zip(optimiser.param_groups, first, strict=True):
@@ -137,13 +137,13 @@ class Learner:
         return found, seen
 
     def _names(self) -> list[str]:
-        """Return the names of the losses of the present stage, in the same order in every process."""
+        """Return the names of the losses in the present training stage, in the same order in every process."""
         weights = {"BSR": self.stage.bsr, "reconstruction": self.stage.reconstruction,
                    "adversarial": self.stage.adversarial}  # fmt: skip
         return [*(["LSR"] if self.learns else []), "L1", *(name for name, weight in weights.items() if weight)]
 
     def _mask_suppression(self, shared: Shared, samples: TrainingStream) -> Losses:
-        """Backpropagate the laser suppression loss band by band, which saves memory, and return the mean LSR.
+        """Backpropagate the laser suppression loss band by band to save memory, and return the mean suppression ratio.
 
         Processes have different bands, or the same bands with smaller weights, so that each band counts once.
         """
@@ -163,7 +163,7 @@ class Learner:
         return loss
 
     def _restoration_terms(self, sample: Sample) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
-        """Return the weighted loss terms of a picture, the true picture, and the detached estimate of the network."""
+        """Restore a training picture; return its weighted loss terms, true picture and detached restored picture."""
         low = torch.autocast(device_kind(self.device), torch.bfloat16, self.settings.precision == "bfloat16")
         picture = sample.picture if self.learns else sample.picture.detach()
         with low:
@@ -184,7 +184,7 @@ class Learner:
         return terms, truth, Scales(estimate.coarse.detach(), estimate.fine.detach())
 
     def _train_critics(self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator) -> Losses:
-        """Train the critics to distinguish true from estimated pictures, with equal random numbers in every process."""
+        """Train the critics to distinguish true from restored pictures, with equal random numbers in all processes."""
         self.critic_optimizer.zero_grad(set_to_none=True)
         found, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
         for i in range(batch):
@@ -203,7 +203,7 @@ class Learner:
         return found
 
     def _move(self, optimiser: torch.optim.Optimizer, found: Mapping[str, float], parts: Sequence[nn.Module]) -> float:
-        """Clip the gradients, let the optimiser step, and return the largest gradient norm among the modules ``parts``.
+        """Clip the gradients of the modules ``parts``, apply one optimiser step, and return the largest gradient norm.
 
         The gradient of each module is clipped separately, because the laser suppression loss has a thousand times as
         large a gradient for the mask as for a network. Raises `NotFinite` before the step.

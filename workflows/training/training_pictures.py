@@ -1,4 +1,4 @@
-"""The numbered pictures for a training, each with its own scene, laser, sensor and noise.
+"""The numbered training pictures, each with its own scene, laser, sensor parameters and noise.
 
 Steps that depend neither on the mask nor on a drawn value are computed once, steps that depend only on the mask once
 in each iteration, and steps that depend on a scene, a drawn value or noise once for each picture. Gradients of steps
@@ -35,16 +35,16 @@ _SEEDS = 2**31
 
 @dataclass(frozen=True)
 class Sample:
-    """One training picture, or patches of the picture, with the true picture."""
+    """One training picture and the true picture, or patches of both."""
 
     picture: Tensor  #: (n, 3, y, x), the developed picture of the camera
     truth: Tensor  #: (n, 3, y, x), the true picture
     light: Tensor  #: (band,), the fraction of the light of the scene that the mask keeps
-    drawn: Mapping[str, Any]  #: the values that were drawn for the picture
+    drawn: Mapping[str, Any]  #: the values that were sampled for the picture
 
 
 class TrainingStream:
-    """The training pictures of a recipe whose mask is trained, or of the recipe ``frozen`` with a fixed mask."""
+    """The training pictures of a recipe, behind a mask that is trained or behind the fixed mask of ``frozen``."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class TrainingStream:
         drawn = dependents(recipe, noise | {settings.scene, *(name.rpartition(".")[0] for name in readers)}, order)
         learnt = dependents(recipe, {learn} if learn else (), order)
         if settings.psf in drawn:
-            raise ValueError(f"train.psf: {settings.psf} changes with each picture: name a PSF that is constant")
+            raise ValueError(f"train.psf: {settings.psf} changes with each picture: name a step with a constant PSF")
         self.shards = Shards.of(recipe, settings.psf, outputs, drawn | learnt, store, mesh)
         drawn |= self.shards.behind
         read = _sources(recipe, drawn) | {settings.psf}
@@ -84,7 +84,7 @@ class TrainingStream:
     def _divide(
         self, recipe: Recipe, learn: str | None, border: list[str], drawn: set[str], noise: set[str], store: Store
     ) -> None:
-        """Divide the recipe after the steps ``border``, the last steps that depend on the mask but on no picture."""
+        """Divide the recipe into steps that depend on the mask alone, up to ``border``, and steps for each picture."""
         settings = self.settings
         ways: dict[str, Any] = {"store": store, "device": self.device}
         read = self.shards.steps & _sources(recipe, drawn - self.shards.steps)
@@ -100,12 +100,14 @@ class TrainingStream:
         return Shared.of(results, self.shards, self._whole)
 
     def counted(self, name: str, here: int) -> tuple[int, int]:
-        """Return the total number of bands of a result, and the number of processes that compute each band."""
+        """Return the total number of spectral bands of a result, and the number of processes that compute each band."""
         by_band = name in self.shards.steps
         return (self.shards.count, self.mesh.data) if by_band else (here, self.mesh.size)
 
     def batch(self, shared: Shared, stage: int, first: int, count: int) -> Iterator[tuple[int, Sample]]:
-        """Yield this process's pictures of a batch of ``count`` pictures that begins at number ``first``, with indices.
+        """Yield index and picture for each picture of a training batch that this process completes.
+
+        The batch has ``count`` pictures and begins with the picture number ``first``.
 
         The caller must exhaust the iterator, because gradients return to all processes that computed a part.
         """
@@ -124,7 +126,7 @@ class TrainingStream:
                     yield mine, self._sample(values, begun[mine][2])
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
-        """Return the training picture of this number, which is the same in any order and in any process."""
+        """Return the training picture with the given number, which does not depend on order or process."""
         if self._pool is None:
             return self._alone(shared, stage, number % _SEEDS)
         number %= self._pool
@@ -137,7 +139,7 @@ class TrainingStream:
         return self._sample(self._each.alone({**shared, **theta}, noise), drawn)
 
     def _drawn(self, stage: int, number: int) -> tuple[dict[str, Any], int, dict[str, Any]]:
-        """Return the random inputs of a picture, the seed of its noise, and a record of all drawn values."""
+        """Sample the random inputs of a training picture; return the inputs, the noise seed, and all values by name."""
         rng = np.random.default_rng((self.seed, stage, number, 1))
         theta, drawn = dict(self._readers), dict[str, Any]()
         if self._inputs is not None:
@@ -153,7 +155,7 @@ class TrainingStream:
         return theta, noise, {**drawn, "noise": noise, "number": number}
 
     def _sample(self, values: Mapping[str, Any], drawn: Mapping[str, Any]) -> Sample:
-        """Return a training picture and the true picture, resized to ``train.size`` and cut into patches.
+        """Resize a training picture and the true picture to ``train.size``, and cut both into patches.
 
         Antialiased `kornia.geometry.transform.resize` lets stripes alias: at 2/3 of the size the finest stripes keep a
         contrast of 0.69 with kornia, and of 0.09 with `resize`.
@@ -165,7 +167,7 @@ class TrainingStream:
         return Sample(picture, truth, values[self.settings.light], drawn)
 
     def _patches(self, both: Tensor, seed: int) -> Tensor:
-        """Cut patches from a picture and the true picture at the same positions: (2, 3, y, x) -> (2, n, 3, y, x).
+        """Cut patches from a training picture and the true picture at the same positions, as a tensor (2, n, 3, y, x).
 
         A slice gives the same pixels as `kornia.geometry.transform.crop_by_indices` in a tenth of the time.
         """
@@ -181,7 +183,7 @@ class TrainingStream:
 
 
 def require_steps(recipe: Recipe, block: str, names: Sequence[str]) -> None:
-    """Raise ValueError unless the recipe has all steps ``names`` to which the block ``block`` refers."""
+    """Raise ValueError unless the recipe has all steps ``names``, which the settings block ``block`` names."""
     for name in names:
         if name not in recipe.steps:
             raise ValueError(f"{block}: the recipe has no step {name}; {nearest(name, recipe.steps)}")
@@ -190,7 +192,7 @@ def require_steps(recipe: Recipe, block: str, names: Sequence[str]) -> None:
 def _frame(recipe: Recipe, scene: str) -> tuple[int, int]:
     shape = recipe.steps[scene].params.get("shape")
     if shape is None:
-        raise ValueError(f"train: {scene} has no shape: set the shape in pixels, such as [96, 96]")
+        raise ValueError(f"train: the step {scene} has no shape: set {scene}.shape in pixels, such as [96, 96]")
     return shape[0], shape[1]
 
 

@@ -262,7 +262,7 @@ def test_weights_of_another_network_are_refused(tmp_path):
         (["--data", "nowhere"], "--data nowhere: this folder does not exist"),
         (["--data", "empty"], "--data empty: the folder contains no readable PNG or JPEG file"),
         (["--strengths", "0,lots"], "--strengths: lots is no number"),
-        (["--strengths", "-1"], "--strengths: write finite multiples of saturation"),
+        (["--strengths", "-1"], "--strengths: write finite multiples of saturation that are not negative"),
         (["--reference", "flat+wiener"], "--reference flat+wiener is not evaluated: write one of"),
         (["--pipelines", "flat"], "flat: write MASK+RESTORER"),
     ],

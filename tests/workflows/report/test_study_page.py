@@ -44,7 +44,7 @@ def test_cells_hold_numbers_to_three_digits_and_marks_as_classes():
 
 
 def test_a_mark_where_there_is_no_cell_is_refused():
-    with pytest.raises(ValueError, match=r"Cases: a mark at \(2, 0\)"):
+    with pytest.raises(ValueError, match=r"Cases: the pass, warn or fail mark at row 2, column 0 is outside the table"):
         made(marks={(2, 0): "fail"})
 
 

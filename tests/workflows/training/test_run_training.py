@@ -298,7 +298,7 @@ def test_what_is_not_a_number_stops_and_is_kept(tmp_path, tiny, monkeypatch):
 
 
 def test_the_second_stage_needs_the_first(tmp_path, tiny):
-    with pytest.raises(ValueError, match="stage 2 needs stage 1"):
+    with pytest.raises(ValueError, match="stage 2 cannot begin before the end of stage 1"):
         trained(tiny, tmp_path, [2])
 
 

@@ -1,4 +1,4 @@
-"""What does each picture of a run show?
+"""How are the figures of a run report drawn?
 
 Each picture is drawn by one function from values to a figure. All pictures share one style.
 Nothing here reads the cache; a formula of physics belongs to a node.

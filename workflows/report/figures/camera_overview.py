@@ -1,4 +1,4 @@
-"""Camera overview: the scene, its pictures through plain lens and mask, the restored picture and its error."""
+"""Camera overview: the scene, its pictures without and with mask, the restored picture and the restoration error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from neusee.workflows.report.figures.style import ORANGE, canvas, drawn, encoded
 def overview(
     *, truth: Tensor, plain: Tensor, mask: Tensor, restored: Tensor, spots: Mapping[str, Tensor] | None = None
 ) -> Any:
-    """Draw the true scene, its pictures through plain lens and mask, the restored picture and its error."""
+    """Draw the scene, its pictures without and with mask, the restored picture and the restoration error."""
     white = high(truth)
     pictures = {"truth": truth, "plain lens": plain, "with mask": mask, "restored": restored}
     figure, axes = canvas(13.0, 3.4, 1, 5)
@@ -32,13 +32,13 @@ def overview(
 
 
 def high(values: Tensor) -> float:
-    """Return the 99.5 % quantile of the values, but at least 1e-9."""
+    """Return the 99.5 % quantile of the pixel values of an image as white level, but at least 1e-9."""
     sample = values.detach().flatten()[:: max(1, values.numel() // 200_000)].float()
     return max(float(torch.quantile(sample, 0.995)), 1e-9)
 
 
 def centre(image: Tensor, like: Tensor) -> Tensor:
-    """Return the central part of an image with the size of ``like``; the optical axis stays at sample N // 2."""
+    """Crop the centre of an image to the size of the image ``like``; the optical axis stays at pixel N // 2."""
     top, left = (image.shape[d] // 2 - like.shape[d] // 2 for d in (-2, -1))
     if top < 0 or left < 0:
         raise ValueError(f"a picture of shape {tuple(image.shape)} is smaller than the scene, {tuple(like.shape)}")

@@ -1,4 +1,4 @@
-"""Gantt chart of the planned and the actual times of the steps: a row for each device, and a row for each step."""
+"""Gantt chart with the predicted and the actual times of the steps of a run, by device and by step."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from typing import Any
 from neusee.workflows.placement.heft_and_cpop import Schedule
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn
 
-Row = tuple[str, str, float, float]  #: step, lane, start in s since the run began, duration in s
-Spans = Mapping[str, tuple[str, float, float]]  #: lane, start in s and duration in s of each step
+Row = tuple[str, str, float, float]  #: step, device, start in s since the run began, duration in s
+Spans = Mapping[str, tuple[str, float, float]]  #: device, start in s and duration in s of each step
 
 _COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#56B4E9", "#8C6D1F", "#6A51A3", "#5F6B6D")
 _MOST = 80  #: largest number of rows of steps; only the longest steps have a row
-_STEP_HEIGHT, _LANE_HEIGHT = 0.2, 0.3  #: inches, of the row of a step and of a lane
+_STEP_HEIGHT, _LANE_HEIGHT = 0.2, 0.3  #: heights in inches of the row of a step and of the row of a device
 
 
 @drawn
 def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
-    """Draw the times of devices above and of steps below: hollow bars for the plan, solid bars for the run.
+    """Draw a Gantt chart by device and by step, with hollow bars for predicted times and solid bars for actual times.
 
-    ``rows`` may lack steps of the plan, and may have steps that the plan lacks.
+    ``rows``, the steps that ran, may lack steps of ``schedule`` and may contain further steps.
     """
     ran = {step: (lane, began, seconds) for step, lane, began, seconds in rows}
     plan = {slot.task: (slot.device, slot.start, slot.end - slot.start) for slot in schedule.slots}
@@ -45,13 +45,13 @@ def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
 
 
 def _shown(plan: Spans, ran: Spans) -> list[str]:
-    """Return the steps that have a row in the chart, in the order of their start."""
+    """Return the longest steps of a run, at most 80, in the order of their start."""
     longest = sorted({**plan, **ran}, key=lambda s: -max(plan.get(s, ("", 0, 0))[2], ran.get(s, ("", 0, 0))[2]))
     return sorted(longest[:_MOST], key=lambda s: (ran.get(s) or plan[s])[1])
 
 
 def _lanes(ax: Any, colour: Mapping[str, str], plan: Spans, ran: Spans, scale: float) -> None:
-    """Draw two rows for each device: the plan above, the run below."""
+    """Draw two rows of bars for each device: the predicted times of its steps above, the actual times below."""
     for y, lane in enumerate(colour):
         planned = [(start * scale, took * scale) for on, start, took in plan.values() if on == lane]
         done = [(start * scale, took * scale) for on, start, took in ran.values() if on == lane]
@@ -65,7 +65,7 @@ def _lanes(ax: Any, colour: Mapping[str, str], plan: Spans, ran: Spans, scale: f
 def _steps(
     ax: Any, steps: Sequence[str], plan: Spans, ran: Spans, colour: Mapping[str, str], scale: float, critical: set[str]
 ) -> None:
-    """Draw one row for each step, and write the planned and the actual duration at the right."""
+    """Draw one row for each step, and write the predicted and the actual duration of the step at the right."""
     right: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "va": "center"}
     for y, step in enumerate(steps):
         if step in plan:
@@ -101,7 +101,7 @@ def _title(plan: Spans, ran: Spans) -> str:
 
 
 def _unit(seconds: float) -> tuple[float, str]:
-    """Return the factor from seconds to a unit that suits a time, and the name of this unit."""
+    """Return the unit (s, ms or µs) that suits the size of a time, as the factor from seconds and the name."""
     return (1.0, "s") if seconds >= 1.0 else (1e3, "ms") if seconds >= 1e-3 else (1e6, "µs")
 
 

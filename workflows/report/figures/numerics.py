@@ -19,7 +19,7 @@ METHODS = ("shifted PSF, added", "scene and laser\nin one convolution")
 
 @drawn
 def error_time(*, step: Callable[..., Any], pupil: Pupil) -> Any:
-    """Draw the error of the PSF of one band against the run time on this machine, for each precision and window."""
+    """Draw the error of a computed PSF against run time, for each floating-point precision and PSF window size."""
     figure, axes = canvas(6.4, 4.2)
     ax = axes[0, 0]
     rows = precision_trial(step, pupil)
@@ -37,7 +37,7 @@ def error_time(*, step: Callable[..., Any], pupil: Pupil) -> Any:
 
 
 def precision_trial(step: Callable[..., Any], pupil: Pupil) -> list[tuple[str, int, float, float]]:
-    """Measure the time and the error of the PSF of the middle band, for each precision and window size.
+    """Measure run time and error of the PSF of the middle band, for each floating-point precision and PSF window size.
 
     The rows are (precision, window, seconds, error relative to the direct float64 sum).
     """
@@ -57,7 +57,7 @@ def precision_trial(step: Callable[..., Any], pupil: Pupil) -> list[tuple[str, i
 
 @drawn
 def stability(*, step: Callable[..., Any], psf: Psf) -> Any:
-    """Draw the float32 error of a laser that is added as a shifted PSF, or convolved together with the scene."""
+    """Draw the float32 error of two ways to add a laser to an image: as a shifted PSF, or before the convolution."""
     errors = laser_trial(step, psf)
     figure, axes = canvas(6.4, 3.6)
     ax = axes[0, 0]
@@ -81,7 +81,7 @@ def _verdict(error: float) -> tuple[str, str]:
 
 
 def laser_trial(step: Callable[..., Any], psf: Psf, size: int = 192) -> Tensor:
-    """Return the float32 error of a laser for each method and each strength, in the middle band of a random scene."""
+    """Return the float32 error of the image of a laser, for each way to add the laser and for each laser strength."""
     band, half = psf.intensity.shape[0] // 2, min(64, *(n // 2 for n in psf.intensity.shape[-2:]))
     top, left = (n // 2 - half for n in psf.intensity.shape[-2:])
     core = psf.intensity[band : band + 1, top : top + 2 * half, left : left + 2 * half]

@@ -1,4 +1,4 @@
-"""Pictures of the optics: height and phase of the mask, point-spread functions, suppression at each wavelength."""
+"""Figures of the optics: height and phase of the mask, point-spread functions, laser suppression by wavelength."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _WAVELENGTHS = (450e-9, 550e-9, 638e-9)  #: m, at which phase and PSF are drawn
 
 @drawn
 def height(*, pupil: Pupil) -> Any:
-    """Draw the height of the mask, and its wrapped phase at three wavelengths, over the clear aperture."""
+    """Draw maps of the mask height, and of the wrapped phase at three wavelengths, over the clear aperture."""
     figure, axes = canvas(13.0, 3.5, 1, 4)
     step = max(1, pupil.height.shape[-1] // 540)
     clear = pupil.aperture[::step, ::step] > 0
@@ -68,13 +68,13 @@ def _spot(ax: Any, psf: Psf, band: int, name: str, pitch: float, arm: str) -> An
 
 
 def _window(image: Tensor, size: int) -> Tensor:
-    """Return the middle ``size`` by ``size`` pixels; the optical axis stays at sample N // 2."""
+    """Return the middle ``size`` by ``size`` pixels of an image; the optical axis stays at pixel N // 2."""
     top, left = (n // 2 - size // 2 for n in image.shape[-2:])
     return image[top : top + size, left : left + size]
 
 
 def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
-    """Draw the encircled energy against the radius, relative to the clear pupil, at three wavelengths."""
+    """Draw the encircled energy of a PSF over the radius at three wavelengths, as a fraction of the pupil's light."""
     for wavelength, colour in zip(_WAVELENGTHS, (BLUE, "#00785A", "#B3261E"), strict=True):
         band, name = nearest(bands.centres, wavelength)
         share = metrics.encircled_curve(psf.intensity[band])
@@ -87,7 +87,7 @@ def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
 
 @drawn
 def suppression(*, lsr: Tensor, bands: Bands, psf: Psf, bsr: Tensor | None = None) -> Any:
-    """Draw laser and background suppression against wavelength, with the lower bound from energy conservation."""
+    """Draw laser and background suppression ratio (LSR, BSR) over wavelength, with the lower bound of the LSR."""
     figure, axes = canvas(11.0, 4.2, 1, 2)
     nm, left, right = nanometres(bands.centres), axes[0, 0], axes[0, 1]
     left.axhline(1.0, color="black", linewidth=0.8, linestyle=":", label="plain lens")

@@ -1,4 +1,4 @@
-"""Photon-transfer curve of the sensor: standard deviation against mean of simulated flat fields."""
+"""Figure of the photon-transfer curve: standard deviation over mean signal of simulated flat fields of the sensor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, VERMILION,
 
 @drawn
 def transfer(*, measured: Tensor) -> Any:
-    """Draw the photon-transfer curve from rows (signal DN, variance DN², predicted variance DN²).
+    """Draw the photon-transfer curve of a sensor from a table of signal DN, variance DN² and predicted variance DN².
 
     The first row is measured without light.
     """

@@ -1,4 +1,4 @@
-"""Graph of a recipe: one box for each step, coloured by the state of the step; items of one step share a box."""
+"""Figure of the graph of a recipe: one box for each step, in the colour of its state: run, cached or left out."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _WIDTH, _HEIGHT = 1.75, 0.66  #: inches, space for a box
 
 @drawn
 def graph(*, sources: Mapping[str, Iterable[str]], states: Mapping[str, str]) -> Any:
-    """Draw a box for each step, below the boxes of its sources; both arguments have keys such as ``psf[mask]``."""
+    """Draw the graph of a recipe: a box for each step, below the boxes of the steps whose results the step reads."""
     wires, looks, counts = grouped(sources, states)
     places = layout(wires)
     columns = max((x for x, _ in places.values()), default=0.0) + 1
@@ -41,7 +41,10 @@ def graph(*, sources: Mapping[str, Iterable[str]], states: Mapping[str, str]) ->
 def grouped(
     sources: Mapping[str, Iterable[str]], states: Mapping[str, str]
 ) -> tuple[dict[str, list[str]], dict[str, str], Counter[str]]:
-    """Return the sources, the state and the number of items of each step; a step ran if any of its items ran."""
+    """Return the sources, the state and the number of copies (such as ``psf[mask]``) of each step of a recipe.
+
+    The state is ``run`` if any copy of the step ran.
+    """
     family = {name: name.partition("[")[0] for name in sources}
     wires: dict[str, list[str]] = {f: [] for f in family.values()}
     looks: dict[str, str] = {}
@@ -54,7 +57,7 @@ def grouped(
 
 
 def layout(wires: Mapping[str, list[str]]) -> dict[str, tuple[float, int]]:
-    """Return the position (x, row) of each step: its depth decides the row, and its sources decide x."""
+    """Return the position (x, row) of each step in the figure of a graph, below and near the sources of the step."""
     depth = _depths(wires)
     rows: dict[int, list[str]] = {}
     for name, row in depth.items():
@@ -70,7 +73,7 @@ def layout(wires: Mapping[str, list[str]]) -> dict[str, tuple[float, int]]:
 
 
 def _depths(wires: Mapping[str, list[str]]) -> dict[str, int]:
-    """Return the row of each step, which is just above the first step that reads its result."""
+    """Return the row of each step in the figure of a graph, just above the first step that reads the result."""
     order = in_order(wires, wires)
     depth: dict[str, int] = {}
     for name in order:

@@ -1,4 +1,4 @@
-"""Spectra of three points of the scene, and the RGB values from which the spectra are reconstructed."""
+"""Figure of the spectra of three scene pixels, and of the RGB values from which these spectra are reconstructed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def spectra(
     responses: Tensor,
     lines: Mapping[str, Bands] | None = None,
 ) -> Any:
-    """Draw RGB values and spectra of three points of the scene, the illuminant, and the channels of the sensor."""
+    """Draw the spectra of three scene pixels, the illuminant, and the spectral responses of the sensor channels."""
     figure, axes = canvas(13.0, 4.4, 1, 3, width_ratios=(1.0, 1.35, 1.35))
     points = _points(scene)
     _scene(axes[0, 0], scene, points)
@@ -41,7 +41,7 @@ def spectra(
 
 
 def _points(scene: Tensor) -> list[tuple[int, int]]:
-    """Return (y, x) of the reddest, the greenest and the bluest point that is neither dark nor clipped."""
+    """Return (y, x) of the reddest, the greenest and the bluest pixel of the scene that is neither dark nor clipped."""
     inner = torch.nn.functional.avg_pool2d(scene[None].float(), 5, 1, 2)[0] if min(scene.shape[-2:]) >= 5 else scene
     lit = inner.amax(0)
     usable = (lit > 0.2 * lit.max()) & (lit < 0.9 * lit.max())
@@ -79,7 +79,7 @@ def _channels(ax: Any, illuminant: Tensor, responses: Tensor, bands: Bands) -> N
 
 
 def _lasers(ax: Any, lines: Mapping[str, Bands]) -> None:
-    """Draw a vertical line at the wavelength of each laser; three or more lasers share one label."""
+    """Draw a vertical line at the wavelength of each laser; one label stands for three or more lasers."""
     for number, (name, line) in enumerate(lines.items()):
         nm = mean_wavelength(line) * 1e9
         label = f"laser {name}, {nm:.0f} nm" if len(lines) < 3 else f"{len(lines)} lasers" if number == 0 else None

@@ -1,4 +1,4 @@
-"""Style of all figures: light background, colours for colour-blind readers, text of at least 9 points, PNG."""
+"""Style of all figures: colours for colour-blind readers, light background, text of at least 9 points, PNG format."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _RC: Mapping[str, Any] = {
 
 
 def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Any, Any]:
-    """Return a new figure of ``width`` by ``height`` inches, and the array of axes in this figure."""
+    """Return a new matplotlib figure of ``width`` by ``height`` inches, and the array of its axes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -79,11 +79,11 @@ def encoded(linear: Tensor) -> Any:
 
 
 def nanometres(metres: Tensor) -> Any:
-    """Convert a tensor of lengths in metres to a NumPy array in nanometres."""
+    """Convert a tensor of wavelengths in metres to a NumPy array in nanometres."""
     return metres.detach().double().cpu().numpy() * 1e9
 
 
 def nearest(centres: Tensor, metres: float) -> tuple[int, str]:
-    """Return the index of the band nearest to a wavelength, and the centre of this band as text, such as ``550 nm``."""
+    """Return the index of the spectral band nearest to a wavelength, and its centre as text, such as ``550 nm``."""
     band = int((centres - metres).abs().argmin())
     return band, f"{float(centres[band]) * 1e9:.0f} nm"

@@ -1,4 +1,4 @@
-"""Figures of the training of an RGB-to-spectra network: error curves, and estimated spectra beside true spectra."""
+"""Figures of the training of a network that estimates spectra from RGB: error curves, estimated and true spectra."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _COLOURS = {"mst_plus_plus": BLUE, "linear": ORANGE}
 
 @drawn
 def lift_curves(rows: Sequence[Mapping[str, str]]) -> Any:
-    """Draw each training error over the iterations, in a pale colour, and its running median in full colour."""
+    """Draw each training error and its running median over the iterations of the training."""
     figure, axes = canvas(11.0, 3.0, 1, len(_SHOWN))
     for ax, name in zip(axes.flat, _SHOWN, strict=True):
         values = [float(row[name]) for row in rows]
@@ -30,7 +30,7 @@ def lift_curves(rows: Sequence[Mapping[str, str]]) -> Any:
 
 @drawn
 def lifted_spectra(shown: Tensor, truth: Tensor, estimates: Mapping[str, Tensor], centres: Tensor) -> Any:
-    """Draw a picture, and the true (black) and estimated spectra at five of its pixels."""
+    """Draw a picture, and the true spectra (black) and the estimated spectra of five pixels of the picture."""
     figure, axes = canvas(13.0, 2.6, 1, 6)
     y, x = shown.shape[-2:]
     at = [(y * (2 * i + 1) // 10, x * (2 * ((3 * i) % 5) + 1) // 10) for i in range(5)]

@@ -1,4 +1,4 @@
-"""The network that estimates spectra from RGB, one iteration of its training, and the training data."""
+"""A network that estimates spectra from RGB, its training data, and one iteration of its training."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class Pairs:
         bands = recipe.steps[settings.measured].wires.get("bands")
         if not isinstance(bands, str):
             name = settings.measured
-            raise ValueError(f"train_lift.measured: {name} has no input `bands`: name a step of spectra.reflectances")
+            raise ValueError(f"train_lift.measured: {name} has no input `bands`: name a spectra.reflectances step")
         self._names, self._seed = (settings.picture, settings.cube), recipe.seed
         random = {name for name in needed(recipe, self._names) if recipe.steps[name].node.random}
         if not random:
-            raise ValueError(f"train_lift: the picture {settings.picture} never changes: draw it with spectra.leaves")
+            raise ValueError(f"train_lift: step {settings.picture} gives no random pictures: use a spectra.leaves step")
         known = recipe.run(store, [bands, settings.measured], device=device)
         self.bands: Bands = known[bands]
         self.measured: Tensor = known[settings.measured]
@@ -40,7 +40,10 @@ class Pairs:
         self._draw = as_function(recipe, outputs=self._names, store=store, device=device, redraw=random)
 
     def __call__(self, *number: object) -> tuple[Tensor, Tensor]:
-        """Return the training picture of this number and its true spectra; the same number gives the same picture."""
+        """Return the training picture with the given number and the true spectra of its pixels.
+
+        The same number always gives the same picture.
+        """
         values = self._draw({}, seed=stream_seed(self._seed, " ".join(map(str, ("lift", *number)))))
         picture, cube = (values[name] for name in self._names)
         return picture.float(), cube.float()
@@ -69,7 +72,10 @@ class LiftLearner:
         return {name: part for name, part in parts.items() if part}
 
     def iterate(self, iteration: int) -> Losses:
-        """Train on one batch and return the losses; raise `NotFinite` if a loss or the gradient is NaN or infinite."""
+        """Train the network on one batch of pictures, and return the losses.
+
+        Raises `NotFinite` if a loss or the gradient is NaN or infinite.
+        """
         batch, rate = self.settings.batch, self.settings.rate_at(iteration)
         for group in self.optimiser.param_groups:
             group["lr"] = rate
@@ -88,7 +94,7 @@ class LiftLearner:
 
     @torch.no_grad()
     def validate(self) -> dict[str, Losses]:
-        """Return the mean errors of the network and of the linear estimate on pictures that are not trained on."""
+        """Return the mean errors of the network and of a linear estimate, for pictures that are not in the training."""
         sums, count = dict[str, Losses](), self.settings.validation_batches
         for number in range(count):
             picture, cube = self.pairs("judge", number)
@@ -102,7 +108,7 @@ class LiftLearner:
         return sums
 
     def estimates(self, picture: Tensor) -> dict[str, Tensor]:
-        """Return two estimates of the spectra of a picture: from the network, and from the linear reconstruction."""
+        """Estimate the spectra of an RGB picture twice: with the network, and with a linear reconstruction."""
         linear = torch.einsum("bc,cyx->byx", self.linear, picture)
         return {
             "mst_plus_plus": lift_pictures(self.best, picture[None])[0].clamp_min(0),

@@ -1,4 +1,4 @@
-"""The training of a network that estimates spectra from RGB, from the settings to the file of weights."""
+"""The complete training of a network that estimates spectra from RGB, up to the file of its weights."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def train_lift(
     device: str = "cpu",
     watch: Watch | None = None,
 ) -> Path:
-    """Train MST++ with the block ``train_lift`` of a recipe, or continue a stopped training, and return its folder.
+    """Train the network MST++ to estimate spectra from RGB, or continue a stopped training; return the result folder.
 
     ``mst_plus_plus.safetensors`` holds the weights for `spectra.lift_mst_plus_plus`.
 
@@ -49,7 +49,7 @@ def train_lift(
 
 
 def _key(recipe: Recipe, settings: LiftTraining) -> str:
-    """Return a digest of all settings that can change the result of a training."""
+    """Return a digest of all settings that can change the trained weights, as a part of the folder name."""
     steps = {
         name: [
             recipe.steps[name].node.path,
@@ -72,7 +72,7 @@ class _LiftLoop(ResumableLoop[LiftLearner]):
         self.resume()
 
     def run_to_end(self, recipe: Recipe, command: Sequence[str]) -> None:
-        """Train to the last iteration and write the results; do nothing if the training is finished."""
+        """Train the network to the last iteration, and write the results; do nothing if the training is finished."""
         if self.iteration == self.settings.iterations and (self.folder / DOCUMENT).is_file():
             return
         if self.iteration < self.settings.iterations:
@@ -93,7 +93,7 @@ class _LiftLoop(ResumableLoop[LiftLearner]):
 
     @torch.no_grad()
     def show(self) -> None:
-        """Write a figure of one picture with its true and estimated spectra."""
+        """Write a figure of one picture with the true and the estimated spectra of its pixels."""
         picture, cube = self.learner.pairs("show", 0)
         centres = self.learner.pairs.bands.centres
         self.write_picture(

@@ -33,19 +33,19 @@ def write_whole(path: Path, data: bytes) -> None:
 
 @dataclass(frozen=True)
 class StateFile:
-    """A checkpoint file that is replaced atomically, so that a killed process never leaves an incomplete state."""
+    """The checkpoint file of a training, which is always complete because it is replaced atomically."""
 
     path: Path
 
     def write(self, state: Mapping[str, Any]) -> None:
-        """Replace the stored state by this state."""
+        """Write a training state to the checkpoint file, in place of the old state."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         memory = io.BytesIO()
         torch.save({"edition": _FORMAT, **state}, memory)
         write_whole(self.path, memory.getvalue())
 
     def read(self, device: str = "cpu", strict: bool = True) -> dict[str, Any]:
-        """Return the stored state, or an empty dictionary if there is no file.
+        """Return the training state from the checkpoint file, or an empty dictionary if there is no file.
 
         Raises ValueError for a file that cannot be read; if not ``strict``, an unreadable file counts as absent.
         """
@@ -54,7 +54,7 @@ class StateFile:
         try:
             state: dict[str, Any] = torch.load(self.path, map_location=device, weights_only=True)
             if state.get("edition", _FORMAT) != _FORMAT:
-                raise ValueError(f"the state has format {state['edition']}, not {_FORMAT}")
+                raise ValueError(f"the training state has format {state['edition']}, not {_FORMAT}")
             if "parts" in state:
                 state["parts"] = {_NAMES.get(name, name): part for name, part in state["parts"].items()}
         except (RuntimeError, KeyError, EOFError, OSError, ValueError, TypeError, AttributeError) as error:
@@ -73,7 +73,7 @@ class Rows:
         self._kept = 0
 
     def cut(self, stage: int, iteration: int, write: bool = True) -> None:
-        """Read the table of losses, and discard the rows from the given iteration on."""
+        """Read the loss table from its file, and discard the rows of the given iteration and of later iterations."""
         if self._path.exists():
             with self._path.open(newline="", encoding="utf-8") as file:
                 self.rows = [row for row in csv.DictReader(file) if _place(row) < (stage, iteration)]
@@ -82,12 +82,12 @@ class Rows:
             self.keep()
 
     def add(self, stage: int, iteration: int, losses: Mapping[str, float]) -> None:
-        """Append the losses of an iteration to the table in memory; `keep` writes the table to disk."""
+        """Append the losses of an iteration to the loss table in memory; the method `keep` writes the table to disk."""
         row = {"stage": stage, "iteration": iteration, **{name: f"{x:.6g}" for name, x in losses.items()}}
         self.rows.append({name: str(row.get(name, "")) for name in self._columns})
 
     def keep(self) -> None:
-        """Append the new rows to the file of losses; the first call writes the whole file."""
+        """Append the new rows of the loss table to its file; the first call writes the whole file."""
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, self._columns)
         if self._kept == 0:
@@ -102,7 +102,7 @@ class Rows:
 
 
 def _place(row: Mapping[str, str | None]) -> tuple[int, int]:
-    """Return the stage and iteration of a row, for sorting; an incomplete row comes last."""
+    """Return stage and iteration of a row of the loss table for sorting; an incomplete row comes last."""
     with suppress(ValueError, TypeError, KeyError):
         if None not in row.values():
             return int(row.get("stage") or 0), int(row["iteration"] or 0)
@@ -110,7 +110,7 @@ def _place(row: Mapping[str, str | None]) -> tuple[int, int]:
 
 
 def export(folder: Path, name: str, tensors: Mapping[str, torch.Tensor], about: dict[str, str] | None = None) -> None:
-    """Write tensors and their metadata to the file ``<name>.safetensors`` of a folder."""
+    """Write tensors and metadata to the file ``<name>.safetensors`` in a folder."""
     from safetensors.torch import save
 
     whole = {key: x.detach().cpu().contiguous() for key, x in tensors.items()}

@@ -1,4 +1,4 @@
-"""The training loop, in which a stopped training continues from its last checkpoint with bit-identical results."""
+"""The loop of every training; a stopped training continues from its last checkpoint with bit-identical results."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ L = TypeVar("L", bound=Learns)
 
 
 class ResumableLoop(ABC, Generic[L]):
-    """A training loop that writes a checkpoint, a table of losses, pictures and a final document into one folder.
+    """A training loop that writes a checkpoint, a table of losses, pictures and a final document into a folder.
 
     Among several processes, only the process with ``writes`` writes files. A training without stages is in stage 0.
     """
@@ -55,20 +55,20 @@ class ResumableLoop(ABC, Generic[L]):
 
     @abstractmethod
     def iterate(self) -> Losses:
-        """Compute one iteration and return the losses; raise `NotFinite` if a loss or gradient is NaN or infinite.
+        """Compute one training iteration and return the losses; raise `NotFinite` if a loss is NaN or infinite.
 
-        `NotFinite` is raised before the optimiser changes the weights.
+        `NotFinite` is raised for a gradient too, and always before the optimiser changes the weights.
         """
 
     @abstractmethod
     def show(self) -> None:
-        """Write a picture that shows the present output of the networks."""
+        """Write a picture that shows the output of the networks at the present iteration of the training."""
 
     def begin_stage(self) -> None:
         """Prepare networks and optimisers for the present stage of the training."""
 
     def resume(self) -> None:
-        """Load the checkpoint of an earlier process, or begin at the first iteration if there is no checkpoint."""
+        """Continue a training from its checkpoint file, or begin at the first iteration if there is no checkpoint."""
         state = self.state.read(self.device)
         self.stage, self.iteration = state.get("stage", self.stage), state.get("iteration", 0)
         self.begin_stage()
@@ -81,7 +81,7 @@ class ResumableLoop(ABC, Generic[L]):
             )
 
     def run(self, iterations: int, batch: int) -> None:
-        """Compute the remaining iterations of the present stage; the caller saves the state at the end."""
+        """Compute the remaining iterations of the present training stage; the caller saves the state at the end."""
         self.batch = batch
         while self.iteration < iterations:
             began = time.perf_counter()
@@ -100,12 +100,12 @@ class ResumableLoop(ABC, Generic[L]):
                 self.keep()
 
     def note(self, losses: Losses) -> None:
-        """Pass the losses of the last iteration to the callback ``watch``."""
+        """Pass the losses of the last training iteration to the callback function ``watch``."""
         if self.watch is not None:
             self.watch(self.stage, self.iteration, losses)
 
     def keep(self) -> None:
-        """Write the table of losses, and then the checkpoint.
+        """Write the loss table of a training to disk, and then the checkpoint.
 
         In this order a killed process can leave surplus rows, which `resume` removes, but no missing rows.
         """
@@ -114,7 +114,7 @@ class ResumableLoop(ABC, Generic[L]):
             self.state.write(self._packed())
 
     def write_picture(self, name: str, picture: bytes) -> None:
-        """Write a PNG file into the folder ``pictures`` of the training."""
+        """Write a PNG file into the folder ``pictures`` of a training."""
         (self.folder / "pictures").mkdir(exist_ok=True)
         write_whole(self.folder / "pictures" / f"{name}.png", picture)
 
@@ -131,7 +131,7 @@ class ResumableLoop(ABC, Generic[L]):
         return {"stage": self.stage, "iteration": self.iteration, **about, "parts": parts}
 
     def _dumped(self, error: NotFinite) -> ArithmeticError:
-        """Write the weights and the picture numbers that led to a NaN or infinity, and return the error to raise."""
+        """Write the weights and the picture numbers that led to a NaN or infinite loss, and return the error."""
         place = [self.stage, self.iteration] if self.stage else [self.iteration]
         dump = StateFile(self.folder / f"not_finite_{'_'.join(map(str, place))}.pt")
         first, count = self.iteration * self.batch, self.batch
@@ -145,7 +145,7 @@ class ResumableLoop(ABC, Generic[L]):
 
 
 def require_finite(numbers: Mapping[str, float]) -> None:
-    """Raise `NotFinite` if a number is NaN or infinite; the message names all such numbers."""
+    """Raise `NotFinite` if a loss or another named number is NaN or infinite; the message gives its name."""
     wrong = [name for name, x in numbers.items() if not abs(x) < float("inf")]
     if wrong:
         raise NotFinite(f"these numbers are NaN or infinite: {', '.join(wrong)}")

@@ -1,4 +1,4 @@
-"""The page of a designed mask, with its height map, its figures of merit by wavelength, and the losses."""
+"""The report page of a designed mask: height map, figures of merit by wavelength, and losses by iteration."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, byte
 
 @drawn
 def history(rows: Sequence[Mapping[str, float]]) -> Any:
-    """Draw the loss and its terms over the iterations, with one curve for each start of the optimisation."""
+    """Draw the loss of a mask design and the loss terms over the iterations, with a curve for each optimisation."""
     names = [name for name in dict.fromkeys(n for row in rows for n in row) if name not in ("start", "iteration")]
     figure, axes = canvas(3.6 * len(names), 3.2, 1, len(names))
     for ax, name in zip(axes[0], names, strict=True):
@@ -45,7 +45,7 @@ def history(rows: Sequence[Mapping[str, float]]) -> Any:
 
 
 def sections(bands: Mapping[str, Any], limits: Fabrication, shown: Mapping[str, bytes]) -> list[Section]:
-    """Return the sections of the page of a mask, from its figures of merit by band, its limits and its pictures."""
+    """Return the sections of the report page of a designed mask: pictures, figures of merit and fabrication limits."""
     columns = [[1e9 * value for value in bands["wavelength"]], *(bands[name] for name in _NAMES)]
     bounds = (
         "`even light` is the LSR of light that is spread evenly over the window of the PSF. "

@@ -1,4 +1,4 @@
-"""The design of a mask without training images: laser light is spread, and light and contrast of the scene are kept.
+"""The design of a mask without training images: the mask spreads laser light and keeps the contrast of the scene.
 
 The height map is optimised through the graph of the recipe with loss terms that depend on the mask alone. Then the
 figures of merit of the mask are computed on every band and at the full sampling of the recipe.
@@ -85,12 +85,12 @@ def design_in(
     Raises `DesignError` as `design` does; ValueError if stage 1 has begun to train a mask, or no mask is to be trained.
     """
     if training.learn is None:
-        raise ValueError("train.learn: write the name of the step whose mask is designed")
+        raise ValueError("train.learn is missing: write the name of the step whose mask is designed")
     if designed(folder):
         progress("the mask is already designed")
         return
     if (folder / "state.pt").exists():
-        raise ValueError(f"stage 1 has already begun in {folder}: remove this folder, or change a value of train.mask")
+        raise ValueError(f"training stage 1 has begun in {folder}: remove this folder, or change a value of train.mask")
     kept = StateFile(folder / "mask.state")
     DesignedMask.of(recipe, training.design, store, kept, progress, device).write(RunFolder(folder), command)
     kept.path.unlink(missing_ok=True)
@@ -98,7 +98,7 @@ def design_in(
 
 @dataclass(frozen=True)
 class DesignedMask:
-    """A designed mask: its height map at the sampling of the recipe, and its figures of merit."""
+    """A designed mask, with its height map on the pupil grid of the recipe, and its figures of merit."""
 
     terms: Terms
     learnt: LearntMask
@@ -159,7 +159,7 @@ class DesignedMask:
 
 
 def _at(recipe: Recipe, settings: MaskTraining) -> Recipe:
-    """Return the recipe with the parameters ``at``, such as a coarser sampling, that apply during the optimisation."""
+    """Return the recipe with the parameters that apply only during a mask optimisation, such as coarser sampling."""
     if not settings.at:
         return recipe
     try:
@@ -169,7 +169,7 @@ def _at(recipe: Recipe, settings: MaskTraining) -> Recipe:
 
 
 def _key(recipe: Recipe, settings: MaskTraining, store: Store | None) -> str:
-    """Return a digest of the recipe, the settings and the code, which together decide the bits of a designed mask."""
+    """Return a digest of everything that can change a designed mask: recipe, settings and code."""
     code = Code((store or Store()).code_memo)
     steps = [recipe.steps[name] for name in needed(recipe, [settings.psf, settings.plain])]
     nodes = sorted({step.node.fn.__module__ for step in steps} | _LEARNT_WITH)
@@ -186,7 +186,7 @@ def _key(recipe: Recipe, settings: MaskTraining, store: Store | None) -> str:
 
 
 def mask_figures(terms: Terms, height: Tensor) -> dict[str, Any]:
-    """Return LSR, BSR and contrast of a mask, with bounds of the contrast, by band and as means over the bands."""
+    """Return laser suppression, background suppression and contrast of a mask, by spectral band and as means."""
     with torch.no_grad():
         psf, plain = terms.psf(height), terms.plain()
         lsr, bsr = metrics.lsr(psf), metrics.bsr(psf.intensity, plain.intensity)

@@ -1,4 +1,4 @@
-"""The loss of a mask design and its terms, computed from the PSF that the recipe gives for a height map."""
+"""The loss function of a mask design and its terms, computed from the PSF of the mask."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ _FREE = "not limited"
 
 @dataclass(frozen=True)
 class Fabrication:
-    """The fabrication limits of a designed mask by name, where None means no limit."""
+    """The fabrication limits of a designed mask, such as its greatest height, by name; None stands for no limit."""
 
     values: Mapping[str, Any]
 
     @classmethod
     def of(cls, recipe: Recipe, settings: MaskTraining) -> Fabrication:
-        """Return the fabrication limits from the recipe's `doe.fabricate` step, and the smallest mask feature."""
+        """Return the fabrication limits of a mask from the `doe.fabricate` step of the recipe and from the settings."""
         steps = (recipe.steps[name] for name in needed(recipe, [settings.psf]))
         params = next((step.params for step in steps if step.node.path == "doe.fabricate"), {})
         limits = {name: params.get(name) for name in ("levels", "max_height", "wrap_at")}
         return cls({**limits, "feature": settings.feature})
 
     def rows(self) -> list[tuple[str, str]]:
-        """Return the name and the value of each fabrication limit as text."""
+        """Return the name and the value of each fabrication limit of a mask as text."""
         words = {"levels": "levels", "max_height": "greatest height", "wrap_at": "wrapped at one wave of",
                  "feature": "least feature"}  # fmt: skip
         texts = {name: _FREE if x is None else f"{x * 1e6:.4g} um" for name, x in self.values.items()}
@@ -50,7 +50,7 @@ class Fabrication:
 
 
 class Terms:
-    """The loss of a mask and its terms, on all bands of a recipe or on chosen bands."""
+    """The loss function of a mask design and its terms, for all spectral bands of a recipe or for chosen bands."""
 
     def __init__(self, recipe: Recipe, settings: MaskTraining, store: Store | None, device: str = "cpu") -> None:
         need_steps(recipe.steps, settings)
@@ -73,38 +73,38 @@ class Terms:
 
     @property
     def mask_step(self) -> Step:
-        """Return the step of the recipe whose height map the design replaces."""
+        """Return the step of the recipe whose height map is replaced by the designed mask."""
         return self.recipe.steps[self.settings.height]
 
     @property
     def stop(self) -> Stop:
-        """Return the aperture stop, with the pupil grid, that the step of the mask reads."""
+        """Return the aperture stop with the pupil grid on which the mask is computed."""
         if self._stop is None:
-            raise DesignError(f"height: the step {self.settings.height} has no input `stop`: name a step of doe")
+            raise DesignError(f"height: the step {self.settings.height} has no input `stop`: name the step of a mask")
         return self._stop
 
     def psf(self, height: Tensor, chosen: Sequence[int] | None = None) -> Psf:
-        """Return the PSF with this height map as mask, on the bands ``chosen`` or on all bands."""
+        """Return the PSF of a mask from its height map, for the spectral bands ``chosen`` or for all bands."""
         values = {self.settings.height: height, self._bands: _some(self.bands, chosen)}
         psf: Psf = self._function(values)[self.settings.psf]
         return psf
 
     def pupil(self, height: Tensor) -> Pupil:
-        """Return the pupil function with this height map as mask."""
+        """Return the pupil function of a mask from its height map."""
         name = self.recipe.steps[self.settings.psf].wires.get("pupil")
         if not isinstance(name, str):
-            raise DesignError(f"psf: the step {self.settings.psf} has no input `pupil`: name a step of optics.psf")
+            raise DesignError(f"psf: the step {self.settings.psf} has no input `pupil`: name an optics.psf step")
         function = as_function(self.recipe, self.settings.height, outputs=[name], device=str(self.device))
         pupil: Pupil = function({self.settings.height: height})[name]
         return pupil
 
     def plain(self, chosen: Sequence[int] | None = None) -> Psf:
-        """Return the PSF of the lens without a mask, on the bands ``chosen`` or on all bands."""
+        """Return the PSF of the lens without a mask, for the spectral bands ``chosen`` or for all bands."""
         psf: Psf = _some(self._plain, chosen)
         return psf
 
     def parts(self, height: Tensor, chosen: Sequence[int] | None = None) -> dict[str, Tensor]:
-        """Return the loss terms of nonzero weight by name, each as a mean over the bands."""
+        """Return the terms of the mask loss that have a weight above 0, by name, each as a mean over spectral bands."""
         psf, plain, settings = self.psf(height, chosen), self.plain(chosen), self.settings
         weights = settings.weights
         sums = {}
@@ -120,7 +120,7 @@ class Terms:
         return terms
 
     def _suppression(self, psf: Psf) -> Tensor:
-        """Return the laser suppression loss summed over bands, with a zero gradient below the threshold ``enough``."""
+        """Return the laser suppression loss summed over bands, which is constant below the setting ``enough``."""
         settings, count = self.settings, len(psf.intensity)
         loss: Tensor = losses.suppression_loss(psf, power=settings.power, log=settings.log)
         if settings.enough is None:
@@ -136,11 +136,11 @@ class Terms:
         return error
 
     def total(self, parts: dict[str, Tensor]) -> Tensor:
-        """Return the loss, which is the weighted sum of its terms."""
+        """Return the loss of a mask, which is the weighted sum of its terms."""
         return torch.stack([getattr(self.settings.weights, name) * term for name, term in parts.items()]).sum()
 
     def drawn(self, number: int) -> list[int] | None:
-        """Draw the bands of an iteration, one from each of equal parts of the spectrum; None stands for all bands."""
+        """Sample the spectral bands of an iteration, one in each equal part of the spectrum; None stands for all."""
         count, all_bands = self.settings.bands, len(self.bands.centres)
         if count is None or count >= all_bands:
             return None
@@ -149,7 +149,7 @@ class Terms:
         return [min(int(position), all_bands - 1) for position in positions]
 
     def even(self) -> list[int] | None:
-        """Return the indices of evenly spaced bands from the first to the last; None stands for all bands."""
+        """Return the indices of evenly spaced spectral bands, or None for all bands."""
         count, all_bands = self.settings.bands, len(self.bands.centres)
         if count is None or count >= all_bands:
             return None
@@ -165,7 +165,7 @@ def _bands_step(recipe: Recipe, psf: str) -> str:
 
 
 def _some(value: Any, chosen: Sequence[int] | None) -> Any:
-    """Return a value restricted to the bands ``chosen``, or the whole value for None."""
+    """Return the part of a PSF or other spectral value at the bands ``chosen``, or the whole value if None."""
     if chosen is None:
         return value
     rows = torch.tensor(list(chosen))

@@ -1,4 +1,4 @@
-"""Resumable optimisation of a mask by Adam or by differential evolution."""
+"""Optimisation of a mask by Adam or by differential evolution, which can continue after an interruption."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from neusee.workflows.training.loop.resumable_loop import Progress
 from neusee.workflows.training.mask_design.design_terms import Terms
 
 _APART = 7919  #: difference of the seeds of successive starts
-_USUAL = (12.0, 18.0, 24.0, 30.0, 36.0, 1.0, 0.0)  #: genes of a hand-designed mask of half-rings
+_USUAL = (12.0, 18.0, 24.0, 30.0, 36.0, 1.0, 0.0)  #: parameters of a hand-designed mask of half-rings
 
 
 @dataclass
 class LearntMask:
-    """The best mask that an optimisation found, and the losses at all iterations."""
+    """The best mask that an optimisation found, with its parameters, and the losses at all iterations."""
 
     height: Callable[[Stop], Tensor]
     loss: float
@@ -52,7 +52,7 @@ def learn(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
 
 
 def shape_of(terms: Terms, start: int) -> nn.Module:
-    """Return the trainable mask with the initial parameters of start number ``start``."""
+    """Return a trainable mask with the random initial parameters of the optimisation number ``start``."""
     settings = terms.settings
     shape = _free(terms, torch.Generator().manual_seed(settings.seed + _APART * start))
     return shape if settings.feature is None else Written(shape, settings.feature)
@@ -62,7 +62,7 @@ def _free(terms: Terms, rng: torch.Generator) -> nn.Module:
     settings, step = terms.settings, terms.mask_step
     if settings.kind == "recipe_mask":
         if step.node.path not in PARAMETRISATIONS:
-            raise DesignError(f"kind: {step.name} is {step.node.path}, which has no trainable parameters")
+            raise DesignError(f"kind: the step {step.name} ({step.node.path}) has no trainable parameters")
         return PARAMETRISATIONS[step.node.path](terms.stop, step.params, rng)
     if settings.kind == "pixelwise":
         return Pixels(settings.grid, settings.max_height, settings.scale, rng, _start(settings))
@@ -74,17 +74,17 @@ def _free(terms: Terms, rng: torch.Generator) -> nn.Module:
 
 
 def _start(settings: MaskTraining) -> Tensor | None:
-    """Return the height map from which the optimisation of pixels begins, read from the file ``start``."""
+    """Read the height map from which the optimisation of a pixelwise mask begins, or return None if no file is set."""
     if settings.start is None:
         return None
     height = read_height_map(settings.start, settings.max_height)
     if (deepest := float(height.max())) > settings.max_height:
-        raise DesignError(f"start: {settings.start.name} is {deepest * 1e6:.3g} um deep: set a larger max_height")
+        raise DesignError(f"start: mask {settings.start.name} is {deepest * 1e6:.3g} um deep: set a larger max_height")
     return height
 
 
 def rate(settings: MaskTraining, number: int) -> float:
-    """Return the learning rate of iteration ``number``, where iterations count from 0."""
+    """Return the learning rate of a mask optimisation at iteration ``number``, counted from 0."""
     done = number / settings.iterations
     if settings.schedule == "step":
         return settings.rate * 0.5 ** math.floor(5 * done)
@@ -117,7 +117,7 @@ def _descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
 def _one_start(
     terms: Terms, shape: nn.Module, start: int, state: dict[str, Any], file: StateFile, progress: Progress
 ) -> None:
-    """Optimise the mask from one start; add the losses and, every ``save_every`` iterations, the mask to ``state``."""
+    """Optimise a mask by Adam from one set of initial parameters, with a checkpoint every ``save_every`` iterations."""
     settings = terms.settings
     adam = torch.optim.Adam(shape.parameters(), lr=settings.rate)
     if "shape" in state:
@@ -156,7 +156,7 @@ def _losses_line(row: dict[str, float]) -> str:
 
 
 def _few(shape: nn.Module) -> dict[str, Any]:
-    """Return the parameters of a mask as lists, without matrices and without vectors of more than 1000 numbers."""
+    """Return the parameters of a mask as lists by name, without matrices and vectors of more than 1000 numbers."""
     inner: Any = shape.shape if isinstance(shape, Written) else shape
     state = {} if isinstance(inner, Drawn) else inner.state_dict()
     return {name: x.tolist() for name, x in state.items() if x.numel() <= 1000 and x.dim() == 1}
@@ -166,7 +166,7 @@ def _few(shape: nn.Module) -> dict[str, Any]:
 
 
 def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Tensor]:
-    """Return a function that computes the height map of half-rings with these genes on a pupil grid."""
+    """Return a function that computes the height map of a mask of half-rings from a vector of its parameters."""
     *slopes, side, turn = (float(gene) for gene in genes)
     given = {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": turn}
 
@@ -178,7 +178,10 @@ def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Ten
 
 
 class _LossOfGenes:
-    """The loss as a function of the genes; after an interruption, stored losses are returned without computation."""
+    """The loss of a mask of half-rings as a function of its parameter vector (genes).
+
+    When an interrupted optimisation continues, the stored losses are returned without computation.
+    """
 
     def __init__(self, terms: Terms, state: StateFile, progress: Progress) -> None:
         self.terms, self.state = terms, state
@@ -193,7 +196,7 @@ class _LossOfGenes:
                 height = half_ring_height(genes, self.terms.settings)(self.terms.stop)
                 loss = float(self.terms.total(self.terms.parts(height.to(self.terms.device), self.chosen)))
             if not math.isfinite(loss):
-                raise DesignError(f"mask {self.asked}: the loss with slopes {list(genes[:-2])} is NaN or infinite")
+                raise DesignError(f"mask number {self.asked}: the loss at slopes {list(genes[:-2])} is NaN or infinite")
             self.known.append(loss)
             if len(self.known) % (self.terms.settings.save_every * 10) == 0:
                 self.state.write({"values": self.known})
@@ -225,7 +228,10 @@ def _evolve(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
 def _population(
     loss: _LossOfGenes, bounds: Any, start: int, history: list[dict[str, float]], progress: Progress
 ) -> tuple[float, Any]:
-    """Evolve one population, and return its lowest loss and best genes; ``history`` gets a row for each generation."""
+    """Optimise a mask of half-rings by differential evolution; return the lowest loss and the best parameter vector.
+
+    ``history`` gets a row for each generation.
+    """
     import numpy as np
     from scipy.optimize import differential_evolution, minimize
 
@@ -262,12 +268,12 @@ def _population(
 
 
 def _steepest(terms: Terms) -> float:
-    """Return the Nyquist limit of the mask slopes, in waves at the rim, at the shortest wavelength of the recipe."""
+    """Return the steepest mask slope that the pupil grid can sample (Nyquist limit), in waves at the rim."""
     material, wavelength = terms.settings.material, terms.settings.wavelength
     turned = wave_height(material, wavelength) / wave_height(material, float(terms.bands.centres.min()))
     return float(terms.stop.diameter / (4 * terms.stop.pitch * turned))
 
 
 def _holds_usual(settings: MaskTraining) -> bool:
-    """Return True if the allowed slopes include the slopes of the hand-designed mask."""
+    """Return True if the allowed range of mask slopes includes the slopes of the hand-designed mask."""
     return settings.slopes[0] <= min(_USUAL[:5]) and settings.slopes[1] >= max(_USUAL[:5])

@@ -1,4 +1,4 @@
-"""Division of spectral bands among processes: the steps that are divided, and the later steps that need all bands.
+"""Division of the spectral bands of a training among processes, up to the first step that needs all bands.
 
 Each process computes its own bands of every step that works band by band, with the same bits as a single process. The
 first step that does not work band by band needs all bands: every process gathers the bands of the mask's PSF, and the
@@ -31,7 +31,7 @@ Port = Swapped | Sum
 
 @dataclass(frozen=True)
 class Shards:
-    """The steps of a recipe whose spectral bands are divided among processes, and the steps that need all bands."""
+    """The steps of a recipe whose spectral bands are divided among processes, and later steps that need all bands."""
 
     recipe: Recipe
     mesh: Mesh = ALONE
@@ -44,7 +44,10 @@ class Shards:
     def of(
         cls, recipe: Recipe, psf: str, outputs: Sequence[str], live: Collection[str], store: Store, mesh: Mesh
     ) -> Shards:
-        """Divide the bands of the ``live`` steps among the processes; raise MeshError if there are too few bands."""
+        """Divide the spectral bands of a recipe among the processes; raise MeshError if there are too few bands.
+
+        Only the steps ``live``, which are computed in each training iteration, are divided.
+        """
         if mesh.band == 1:
             return cls(recipe)
         spectral = _sampled(recipe, psf)
@@ -64,42 +67,42 @@ class Shards:
 
     @property
     def own(self) -> list[int]:
-        """Return the indices of the bands of this process."""
+        """Return the indices of the spectral bands that this process computes."""
         return own_bands(self.mesh, self.count)
 
     def call(self, step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
-        """Compute a step and return its result, which has only the bands of this process if the step is divided."""
+        """Compute a step, for the spectral bands of this process only if the step is divided, and return its result."""
         if step.name in self.steps:
             whole = [name for name in step.node.inputs if step.wires.get(name) not in self.steps]
             inputs = taken(step, inputs, self.own, whole)
         return call(step, inputs, params, seed, device)
 
     def gathered(self, name: str, value: Any) -> Any:
-        """Gather all bands of a step's result from all processes."""
+        """Return the result of a step with the spectral bands of all processes."""
         axis = self.axis(name)
         return with_band_tensors(value, [gathered(self.mesh, x, axis, self.count) for x in band_tensors(value)])
 
     def axis(self, name: str) -> int:
-        """Return the index of the tensor axis along which the result of a step has its bands."""
+        """Return the index of the tensor axis of the spectral bands in the result of a step."""
         bands = self.recipe.steps[name].node.bands
         assert bands is not None
         return bands["return"]
 
     def sent(self, name: str, value: Any) -> list[Tensor]:
-        """Return the tensors of a step's result that are sent to the process that owns the picture."""
+        """Return the tensors of a step's result that this process sends to the process that completes the picture."""
         if name not in self.rows:
             return band_tensors(value)
         part = channel_sums(value, self.rows[name][:, self.own])
         return [part.planes, part.flux]
 
     def ports(self, name: str, sent: Sequence[Tensor]) -> list[Port]:
-        """Return one exchange between processes for each of the tensors ``sent``: of bands, or of sums over bands."""
+        """Return an exchange object for each tensor of ``sent``, which exchanges spectral bands or sums over bands."""
         if name in self.rows:
             return [Sum(self.mesh), Swapped(self.mesh, -1, self.count)]
         return [Swapped(self.mesh, self.axis(name), self.count) for _ in sent]
 
     def received(self, name: str, like: Any, found: Sequence[Tensor]) -> Any:
-        """Return the result of a step, assembled from the tensors that other processes sent."""
+        """Assemble the result of a step with all spectral bands from the tensors that other processes sent."""
         if name not in self.rows:
             return with_band_tensors(like, found)
         planes, flux = found
@@ -119,7 +122,7 @@ def _by_band(recipe: Recipe, name: str, spectral: set[str]) -> bool:
 
 
 def _mixed(recipe: Recipe, name: str) -> bool:
-    """Return True if the result of a step is a low-rank cube, whose planes are mixtures of bands."""
+    """Return True if the result of a step is a low-rank cube, whose components mix all spectral bands."""
     while (kind := recipe.steps[name].node.hints["return"]) is not LowRankCube:
         step = recipe.steps[name]
         through = next((w for i in step.node.accepts_low_rank if isinstance(w := step.wires.get(i), str)), None)
@@ -149,7 +152,7 @@ def _count(recipe: Recipe, psf: str, spectral: set[str], store: Store, mesh: Mes
 def _asked(
     recipe: Recipe, name: str, outputs: Sequence[str], behind: Collection[str], live: Collection[str]
 ) -> Asked | None:
-    """Return the sums over bands that later steps read from an image, or None if other values are read."""
+    """Return the sums over spectral bands that later steps read from an image, or None if they read other values."""
     asked = None if name in outputs else asked_of(recipe, name, outputs)
     still = asked is not None and asked.bands not in live and asked.responses not in live
     return asked if asked is not None and still and set(behind).issuperset(asked.readers) else None

@@ -1,4 +1,4 @@
-"""Computation of training pictures by several processes, each of which has some of the spectral bands.
+"""Computation of training pictures by several processes, where each process computes some of the spectral bands.
 
 Every process computes its bands of every picture. Then the process that owns a picture receives all bands, or sums over
 the bands, and computes all later steps. Gradients return to all processes.
@@ -20,7 +20,7 @@ from neusee.workflows.training.parallel.shared_graph import Shared
 
 
 class Pictures:
-    """The steps that are computed for each training picture, divided at the steps that need all bands."""
+    """The steps for each training picture: first steps divided by spectral band among processes, later steps in one."""
 
     def __init__(
         self,
@@ -42,19 +42,19 @@ class Pictures:
             self._start = as_function(recipe, *first, outputs=self._cut, redraw=redraw, caller=shards.call, **run)
 
     def alone(self, theta: Theta, seed: int) -> dict[str, Any]:
-        """Compute one picture in this process alone, and return the outputs of the recipe."""
+        """Compute a training picture in this process alone, and return the outputs of the recipe."""
         return self._end(_only(theta, self._end.free), seed)
 
     @property
     def by_band(self) -> bool:
-        """Return True if the computation of each picture is divided by band among the processes."""
+        """Return True if the spectral bands of each training picture are divided among the processes."""
         return bool(self._cut)
 
     @contextmanager
     def together(
         self, shared: Shared, drawn: Mapping[int, tuple[Theta, int]], mine: int | None
     ) -> Iterator[dict[str, Any]]:
-        """Compute this process's bands of all pictures, and yield the outputs of picture ``mine``; None yields nothing.
+        """Compute this process's spectral bands of all pictures, and yield the outputs of the picture ``mine``, if any.
 
         When the ``with`` block ends, the gradients return to the processes that sent the bands.
         """
@@ -70,7 +70,7 @@ class Pictures:
 
 
 class _Cut:
-    """The intermediate results of several pictures, sent to the processes that own the pictures."""
+    """The intermediate results of several training pictures, sent to the process that completes each picture."""
 
     def __init__(self, begun: Sequence[Mapping[str, Any]], names: Sequence[str], shards: Shards) -> None:
         self._sent: list[tuple[Port, tuple[Tensor, ...], Tensor]] = []  #: exchange, sent tensors, received tensor
@@ -84,7 +84,10 @@ class _Cut:
             self.values[name] = shards.received(name, begun[0][name], leaves)
 
     def back(self) -> None:
-        """Send the gradients back to the processes that sent the bands; a process without a picture sends zeros."""
+        """Send the gradients of each picture back to the processes that computed the spectral bands of the picture.
+
+        A process without a picture sends zeros.
+        """
         roots: list[Tensor] = []
         grads: list[Tensor] = []
         for port, sent, leaf in self._sent:
@@ -102,7 +105,7 @@ def _live(recipe: Recipe, given: Sequence[str], outputs: Sequence[str]) -> list[
 
 
 def _used(recipe: Recipe, free: Sequence[str], outputs: Sequence[str]) -> list[str]:
-    """Return those of the steps and parameters ``free`` on which an output depends."""
+    """Return the steps and parameters from the list ``free`` on which an output of the recipe depends."""
     live = set(_live(recipe, free, outputs))
     return [name for name in free if (name if name in recipe.steps else name.rpartition(".")[0]) in live]
 

@@ -1,4 +1,4 @@
-"""The mesh of the processes that `torchrun` starts for one training, with the two axes data and band.
+"""The processes that `torchrun` starts for one training, arranged in a mesh with the axes data and band.
 
 Processes along the data axis have different pictures. Processes along the band axis share the optics of the same
 pictures by wavelength. Gradients are added over all processes, so that networks, optimisers and state stay equal in all
@@ -20,12 +20,12 @@ from torch import nn
 
 
 class MeshError(ValueError):
-    """Error for a process mesh that contradicts the number of processes, the recipe or the arguments."""
+    """Error for an argument ``--mesh`` that contradicts the number of processes, the recipe or another argument."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """One process of a mesh of ``data`` x ``band`` processes; the processes of a row divide the spectral bands."""
+    """The position of one training process in a mesh of ``data`` x ``band`` processes."""
 
     data: int = 1
     band: int = 1
@@ -39,12 +39,12 @@ class Mesh:
 
     @property
     def row(self) -> int:
-        """Return the index of this process along the data axis."""
+        """Return the index of this process along the data axis of the process mesh."""
         return self.rank // self.band
 
     @property
     def column(self) -> int:
-        """Return the index of this process along the band axis."""
+        """Return the index of this process along the band axis of the process mesh."""
         return self.rank % self.band
 
     @property
@@ -58,22 +58,22 @@ class Mesh:
     # --- messages among all ---------------------------------------------------------------------------------------
 
     def wait(self) -> None:
-        """Wait until all processes have called this method."""
+        """Wait until all processes of the mesh have called this method."""
         if self.size > 1:
             dist.barrier()
 
     def agree(self, about: str) -> None:
-        """Raise MeshError unless all processes pass the same text."""
+        """Raise MeshError unless all processes pass the same text, which states folder, stage and iteration."""
         if self.size == 1:
             return
         texts: list[Any] = [None] * self.size
         dist.all_gather_object(texts, about)
         for rank, other in enumerate(texts):
             if other != texts[0]:
-                raise MeshError(f"process 0 is at {texts[0]}, process {rank} at {other}: all need the same folder")
+                raise MeshError(f"process 0 is in {texts[0]}, process {rank} is in {other}: use one shared folder")
 
     def numbers(self, own: Mapping[str, float], names: Sequence[str], device: str) -> dict[str, float]:
-        """Return the numbers ``names``, each summed over all processes."""
+        """Sum the numbers with the given names, such as losses, over all processes, and return the sums by name."""
         if self.size == 1:
             return dict(own)
         total = torch.tensor([own.get(name, 0.0) for name in names], dtype=torch.float64, device=device)
@@ -81,7 +81,7 @@ class Mesh:
         return dict(zip(names, total.tolist(), strict=True))
 
     def add_gradients(self, parts: Iterable[nn.Module]) -> None:
-        """Replace each gradient by its sum over all processes, with one message for each dtype."""
+        """Replace the gradient of each module parameter by its sum over all processes."""
         if self.size == 1:
             return
         own = [p for part in parts for p in part.parameters()]
@@ -90,7 +90,7 @@ class Mesh:
 
 
 def _add(own: Sequence[nn.Parameter]) -> None:
-    """Sum gradients over all processes; a gradient that is None in every process stays None."""
+    """Sum the gradients of parameters over all processes; a gradient that is None in every process stays None."""
     there = torch.tensor([float(p.grad is not None) for p in own]).to(own[0])
     grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in own]
     flat = torch.cat([*(g.reshape(-1) for g in grads), there])
@@ -104,12 +104,12 @@ ALONE = Mesh()
 
 
 def processes() -> tuple[int, int]:
-    """Return the index of this process and the number of processes, as `torchrun` sets them in the environment."""
+    """Return index and number of the processes that `torchrun` started, from the variables RANK and WORLD_SIZE."""
     return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
 
 
 def shape_of(text: str, world: int) -> tuple[int, int]:
-    """Parse a mesh such as ``4x2`` as (4, 2), or an empty text as (world, 1).
+    """Parse a process mesh such as ``4x2`` as (4, 2), or an empty text as (world, 1).
 
     Raises MeshError for a malformed text, or unless the product is ``world``, the number of processes.
     """
@@ -133,7 +133,7 @@ def device_here(device: str) -> str:
 
 @contextmanager
 def joined(text: str, device: str) -> Iterator[Mesh]:
-    """Return a context in which this process belongs to the mesh ``text``, an argument of ``--mesh``.
+    """Return a context in which this process belongs to the process mesh ``text``, the argument of ``--mesh``.
 
     Raises MeshError if the mesh contradicts the number of processes.
     """

@@ -1,4 +1,4 @@
-"""Results that depend on the mask alone, and are computed once for all pictures of a training iteration."""
+"""Results that depend on the mask but on no picture, computed once for all pictures of a training iteration."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neusee.workflows.training.parallel.collectives import gathered_back
 
 @dataclass(frozen=True)
 class Shared:
-    """Results that depend on the mask alone, with detached copies that accumulate the gradients of all pictures."""
+    """Results that depend on the mask but on no picture, with detached copies that add up gradients of all pictures."""
 
     made: Mapping[str, Any]  #: results with their autograd graph, at the bands of this process
     values: Mapping[str, Any]  #: detached copies
@@ -25,7 +25,7 @@ class Shared:
 
     @classmethod
     def of(cls, made: Mapping[str, Any], shards: Shards | None = None, whole: Sequence[str] = ()) -> Shared:
-        """Detach results from their autograd graph, and gather all bands of the results ``whole``."""
+        """Detach results from the autograd graph, and gather all spectral bands of the results named in ``whole``."""
         leaves = {name: each_tensor(leaf, value) for name, value in made.items()}
         if shards is None or not leaves:
             return cls(made, leaves)
@@ -34,7 +34,7 @@ class Shared:
 
     @property
     def seen(self) -> Mapping[str, Any]:
-        """Return the detached copies that later steps read, with all bands where later steps need all bands."""
+        """Return the detached copies that later steps read; those in ``whole`` have all spectral bands."""
         return {**self.values, **self.whole}
 
     def back(self) -> None:
@@ -48,7 +48,7 @@ class Shared:
             torch.autograd.backward([x for x, _ in roots], [grad for _, grad in roots])
 
     def _to_own(self, name: str, own: Tensor, whole: Tensor) -> None:
-        """Sum the gradients at the bands of this process over all processes; one without a picture contributes zero."""
+        """Sum a gradient over all processes, and keep the part for the spectral bands of this process."""
         if not own.requires_grad:
             return
         assert self.shards is not None
@@ -63,7 +63,7 @@ def leaf(x: Tensor) -> Tensor:
 
 
 def _alike(value: Any, like: Any) -> Any:
-    """Copy ``requires_grad`` from the tensors of ``like`` to the tensors of ``value``, and return ``value``."""
+    """Set ``requires_grad`` of the tensors in ``value`` as in ``like``, and return ``value``."""
     for x, y in zip(tensors_in(value), tensors_in(like), strict=True):
         x.requires_grad_(y.requires_grad)
     return value

@@ -154,7 +154,7 @@ def test_pixels_start_from_the_relief_of_another_kind(recipe, store, tmp_path):
     given = how(iterations=8, grid=64, start=file, max_height=f"{1.2 * deep} um", learning_rate=1e-4)
     second = design(recipe, given, store, tmp_path, quiet)
     assert read(second)["loss"] < read(first)["loss"]
-    with pytest.raises(DesignError, match=r"start: mask.safetensors is .* deep: set a larger max_height"):
+    with pytest.raises(DesignError, match=r"start: mask mask.safetensors is .* deep: set a larger max_height"):
         design(recipe, how(iterations=1, start=file, max_height="1 um"), store, tmp_path, quiet)
 
 
@@ -201,7 +201,7 @@ def test_a_filter_leaves_the_same_wrong_of_all_bands_chosen_or_not(recipe, store
 
 def test_a_relief_that_is_not_learnt_is_refused(store, tmp_path):
     flat = load("plain_lens", SMALL)
-    with pytest.raises(DesignError, match=r"kind: height is doe.flat, which has no trainable parameters"):
+    with pytest.raises(DesignError, match=r"kind: the step height \(doe.flat\) has no trainable parameters"):
         design(flat, how(kind="recipe_mask", iterations=1), store, tmp_path, quiet)
 
 
