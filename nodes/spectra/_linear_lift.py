@@ -1,4 +1,4 @@
-"""Linear reconstruction of spectra from RGB (linear lifts)."""
+"""Linear estimates of reflectance spectra from RGB."""
 
 import functools
 from collections.abc import Callable
@@ -35,7 +35,7 @@ def lift_mallett(rgb: Tensor, bands: Bands) -> Tensor:
 
 @node(rtol=1e-6)
 def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
-    """Reconstruct the same reflectance as `spectra.lift_mallett`, as a low-rank cube of a few planes.
+    """Compute the result of `spectra.lift_mallett` as a low-rank cube: a sum of a few basis images times spectra.
 
     Pixels are computed block by block, so that the full cube is never in memory.
 
@@ -69,7 +69,7 @@ def lift_lmmse(rgb: Tensor, bands: Bands) -> Tensor:
 
 @node(rtol=1e-6)
 def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
-    """Reconstruct the same reflectance as `spectra.lift_lmmse`, as a low-rank cube of a few planes.
+    """Compute the result of `spectra.lift_lmmse` as a low-rank cube: a sum of a few basis images times spectra.
 
     Pixels are computed block by block, so that the full cube is never in memory.
 
@@ -87,7 +87,7 @@ def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Lo
 
 
 def _attach(lift: Node, low_rank: Node, matrix: Callable[[Bands], Tensor]) -> None:
-    """Attach the reference, the check and the low-rank form to a node that multiplies RGB by a matrix (band, 3)."""
+    """Attach a float64 reference, a check and a low-rank variant to a node that multiplies RGB by a matrix."""
 
     @lift.reference
     def lifted(rgb: Tensor, bands: Bands) -> Tensor:
@@ -108,7 +108,7 @@ def _attach(lift: Node, low_rank: Node, matrix: Callable[[Bands], Tensor]) -> No
 
 
 def lift_checks(result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None = None) -> list[Check]:
-    """Report how far the colours of reconstructed spectra are from the source colours, and how much was clipped.
+    """Report the colour error of spectra estimated from RGB, and the share of negative light that was clipped to 0.
 
     A large picture is sampled at some 100 000 pixels.
     """
@@ -118,7 +118,7 @@ def lift_checks(result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None
     off = float((to_srgb(bands.centres) @ spectra - colours).abs().max()) / scale
     checks = [
         Check(
-            f"colours of the spectra differ from the source colours by {off:.2g} of the brightest colour",
+            f"colours of the estimated spectra differ from the RGB input by {off:.2g} of the largest RGB value",
             float(result.min()) >= 0,
         )
     ]
@@ -136,14 +136,14 @@ def needs_rgb(rgb: Tensor) -> None:
 
 
 def _lifted(rgb: Tensor, matrix: Tensor) -> Tensor:
-    """Multiply a picture by a matrix, and set negative values to 0 in place to save memory."""
+    """Multiply an RGB picture by a matrix (band, 3), and set negative results to 0 in place to save memory."""
     needs_rgb(rgb)
     rgb = single(rgb)
     return torch.relu_(matrix.to(rgb) @ rgb.flatten(1)).reshape(-1, *rgb.shape[1:])
 
 
 def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> LowRankCube:
-    """Return reconstructed spectra as a low-rank cube.
+    """Estimate spectra from an RGB picture by a matrix (band, 3), and return the spectra as a low-rank cube.
 
     For a picture that requires a gradient, the full cube is computed, so that the gradient reaches the picture.
     """
@@ -172,7 +172,7 @@ def _solved(centres: tuple[float, ...]) -> Tensor:
 
 
 def lift_matrix(known: Tensor, centres: Tensor) -> Tensor:
-    """Return the matrix that estimates reflectance from linear sRGB, for spectra with the statistics of ``known``.
+    """Return the matrix that estimates reflectance from linear sRGB, fitted to the measured spectra ``known``.
 
     Shapes: known (spectrum, band) -> (band, 3) float64.
     """
