@@ -24,7 +24,7 @@ def lift_mallett(rgb: Tensor, bands: Bands) -> Tensor:
     a single pixel, without a gradient.
 
     Shapes: rgb (3, y, x) -> (band, y, x).
-    Units:  linear sRGB to reflectance; the lift is linear and keeps HDR values above 1.
+    Units:  linear sRGB to reflectance; the estimate is linear and keeps HDR values above 1.
     Error:  real paints: PSNR 31 dB (CAVE balloons); the result, rendered to sRGB under D65, is within 5e-3 of rgb.
             Negative results are clipped.
     Raises: ValueError where rgb is not (3, y, x) or bands leave 380 to 780 nm.
@@ -42,7 +42,7 @@ def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> 
     Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
             float64.
     Units:  planes and residuals are reflectances; the basis has no unit.
-    Error:  as `spectra.compress`, relative to the lift in float64; `lift_mallett` differs from that lift by round-off.
+    Error:  as `spectra.compress`, relative to `lift_mallett` in float64; float32 differs by round-off.
     Raises: ValueError where `lift_mallett` or `spectra.compress` raises ValueError.
     Source: as `lift_mallett`.
     """
@@ -56,9 +56,9 @@ def lift_lmmse(rgb: Tensor, bands: Bands) -> Tensor:
     W = C T^t (T C T^t)^-1 with C = E[s s^t] over the paints and the matrix T from reflectance under D65 to linear sRGB.
 
     Shapes: rgb (3, y, x) -> (band, y, x).
-    Units:  linear sRGB to reflectance; the lift is linear and keeps HDR values above 1.
+    Units:  linear sRGB to reflectance; the estimate is linear and keeps HDR values above 1.
     Error:  real paints: PSNR 33.3 dB, mean relative error 0.15 (CAVE balloons); the result, rendered to sRGB, is rgb
-            exactly, except where a negative result is clipped. White is lifted to the reflectance of white paint:
+            exactly, except where a negative result is clipped. White gets the reflectance of white paint:
             0.62 at 400 nm, 0.94 to 1.12 from 420 nm.
     Raises: ValueError where rgb is not (3, y, x), and where bands leave 380 to 780 nm or are too few or too close to
             distinguish colours.
@@ -76,7 +76,7 @@ def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Lo
     Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
             float64.
     Units:  planes and residuals are reflectances; the basis has no unit.
-    Error:  as `spectra.compress`, relative to the lift in float64; `lift_lmmse` differs from that lift by round-off.
+    Error:  as `spectra.compress`, relative to `lift_lmmse` in float64; float32 differs by round-off.
     Raises: ValueError where `lift_lmmse` or `spectra.compress` raises ValueError.
     Source: as `lift_lmmse`.
     """
