@@ -46,7 +46,7 @@ class TensorStats:
 
 
 def _measure(flat: Tensor) -> tuple[float, float, float, int]:
-    """Return minimum, maximum, sum and number of nonzero elements of a flat tensor, in parts that fit the cache."""
+    """Return minimum, maximum, sum and number of nonzero elements of a flat tensor, in parts for the CPU cache."""
     small = flat.dtype == torch.bool or (flat.is_floating_point() and flat.element_size() < 4)
     parts = []
     for part in torch.split(flat, _PART):
@@ -72,7 +72,7 @@ class ErrorBound:
 
     @property
     def share(self) -> float:
-        """Return the bound of the root mean square error, relative to the largest absolute element of the input."""
+        """Return the bound of the rms error of a node input, relative to the largest absolute element of the input."""
         if self.rms == 0.0:
             return 0.0
         top = max(abs(self.stats.min), abs(self.stats.max)) if self.stats else 0.0
@@ -80,5 +80,5 @@ class ErrorBound:
 
     @property
     def largest(self) -> float:
-        """Return the bound of the relative error of the largest element, or inf if no bound is known."""
+        """Return the bound of the relative error of the largest element of a node input, or inf if unknown."""
         return 0.0 if self.rms == 0.0 else math.inf if self.peak is None else self.peak

@@ -1,4 +1,4 @@
-"""Conversion and rejection of half-precision tensors, because float16 ends at 65504 photons."""
+"""Conversion and rejection of half-precision tensors, because float16 cannot hold more than 65504 photons."""
 
 import torch
 from torch import Tensor
@@ -23,7 +23,7 @@ def refuse_half(**lengths: Tensor) -> None:
 
 
 def refuse_not_finite(why: str, **values: Tensor | float) -> None:
-    """Raise ValueError for values (or sums of values) that are not finite; ``why`` is the consequence for the user."""
+    """Raise ValueError if a value or a sum of values is NaN or infinite; ``why`` tells the user the consequence."""
     for name, x in values.items():
         if not bool(torch.as_tensor(x).isfinite().all()):
             raise ValueError(f"{name} holds values that are not finite: {why}")

@@ -55,7 +55,7 @@ class Check:
 
 @dataclass(slots=True)
 class Hooks:
-    """The functions attached to a node (hooks); the decorator ``@digitize.check`` attaches the hook ``check``."""
+    """The functions attached to a node (hooks), such as ``check``, which ``@digitize.check`` attaches."""
 
     #: slow float64 form: same arguments, same result within ``rtol``
     reference: Callable[..., Any] | None = None
@@ -135,14 +135,14 @@ class Node:
             raise ValueError(f"{self.path}: before_run needs a node without inputs and without rng: omit before_run")
 
     def __call__(self, *inputs: Any, **params: Any) -> Any:
-        """Call the function of the node directly, without validation and without cache; gradients flow."""
+        """Call the function of the node directly, with gradients, without parameter validation and without cache."""
         return self.fn(*inputs, **params)
 
     def __repr__(self) -> str:
         return f"<node {self.path}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle a node as its module and name; the process that unpickles the node imports the code."""
+        """Pickle a node as module and name, so that the process that unpickles the node imports the code."""
         return _imported, (self.fn.__module__, self.fn.__name__)
 
     @functools.cached_property
@@ -163,7 +163,7 @@ class Node:
 
     @functools.cached_property
     def hints(self) -> dict[str, Any]:
-        """Return the type annotation of each argument and of ``return``, with the metadata of ``Annotated``."""
+        """Return the type annotation of each argument and of the result of the node, with ``Annotated`` metadata."""
         return get_type_hints(self.fn, include_extras=True)
 
     @functools.cached_property
@@ -181,7 +181,7 @@ class Node:
 
     @property
     def preflight_inputs(self) -> tuple[str, ...]:
-        """Return the names of the inputs that ``preflight`` accepts, for values that are known before the run."""
+        """Return the names of those inputs of the node that the hook ``preflight`` receives before the run."""
         hook = self.hooks.preflight
         return tuple(name for name in inspect.signature(hook).parameters if name in self.inputs) if hook else ()
 

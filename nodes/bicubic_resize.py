@@ -10,7 +10,7 @@ from neusee.nodes._half_precision import single
 
 
 def enlarge(image: Tensor, height: int, width: int) -> Tensor:
-    """Resample pictures (…, y, x) by bicubic interpolation, without a filter against aliasing on a coarser grid.
+    """Resample pictures (…, y, x) by bicubic interpolation without an antialiasing filter.
 
     Kornia's `resize` gives the same numbers, but on CUDA the sum of its gradient has no fixed order.
     """

@@ -15,7 +15,7 @@ OPTIONS = "neusee.options"  #: metadata key of the options of a network, which t
 
 
 def empty(make: Callable[[], Net]) -> Net:
-    """Return a network without memory for its tensors; the global random stream of torch is not used."""
+    """Build a network on the meta device, without memory for the tensors and without use of random numbers."""
     with torch.device("meta"):
         return make()
 
@@ -30,13 +30,13 @@ def loaded(make: Callable[[], Net], weights: Path) -> Net:
 
 
 def file_metadata(net: nn.Module) -> dict[str, str]:
-    """Return the metadata for the weights file of a network: the ``options`` of the network, if it has any."""
+    """Return the metadata for the weights file of a network: the ``options`` of the network as JSON, or nothing."""
     options = getattr(net, "options", None)
     return {} if options is None else {OPTIONS: json.dumps(options, sort_keys=True)}
 
 
 def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> None:
-    """Raise ParameterError unless a weights file has the tensor names, shapes and options of this network."""
+    """Raise ParameterError unless a weights file has the tensor names, shapes and options that a network requires."""
     from safetensors import SafetensorError, safe_open
 
     net = empty(make)
@@ -56,7 +56,7 @@ def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> Non
 
 
 def _same_options(trained: Mapping[str, Any], options: Mapping[str, Any], weights: Path) -> None:
-    """Raise ParameterError if the options of a weights file differ from the options of this network.
+    """Raise ParameterError if the options in a weights file differ from the options of the network to load.
 
     The tensor names and shapes can be equal all the same, and the network would compute other results.
     """

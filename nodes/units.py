@@ -40,7 +40,7 @@ def read_quantity(value: Any, si: str) -> float:
     if unit not in _SCALE[si]:
         raise ValueError(f"has the wrong unit {unit!r}: write one of {', '.join(_SCALE[si])}")
     if not math.isfinite(number):
-        raise ValueError("must be finite")
+        raise ValueError("the number must be finite")
     return _in_si(number, si, unit)
 
 
@@ -55,7 +55,7 @@ def _in_si(number: float, si: str, unit: str) -> float:
     if unit not in _RECIPROCAL:
         return number * _SCALE[si][unit]
     if number == 0:
-        raise ValueError("must be greater than 0")
+        raise ValueError("the number must be greater than 0")
     return 1.0 / number
 
 
@@ -80,7 +80,7 @@ def read_written(text: Any) -> tuple[float, str, bool]:
     if isinstance(text, bool) or match is None or (unit and not si):
         raise ValueError(f"{text} is neither a number nor a quantity, such as 0.5 or '1 um'")
     if not math.isfinite(float(match[1])):
-        raise ValueError(f"{text} is not finite")
+        raise ValueError(f"the number {text} is not finite")
     return float(match[1]) * (_SCALE[si][unit] if si else 1.0), si, unit in _RECIPROCAL
 
 
@@ -90,7 +90,7 @@ def _reader(si: str) -> BeforeValidator:
 
 def _finite(value: float) -> float:
     if not math.isfinite(value):
-        raise ValueError("must be finite")
+        raise ValueError("the number must be finite")
     return value
 
 
@@ -135,7 +135,7 @@ def _files(written: Any) -> list[Path]:
     inside = path.iterdir() if path.is_dir() else map(Path, glob(str(written)))
     files = sorted(each for each in inside if each.is_file() and not each.name.startswith("."))
     if not files:
-        raise ValueError(f"no such file, and no folder or pattern with a file: {path}")
+        raise ValueError(f"no such file, and no folder or pattern that matches a file: {path}")
     return files
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 class Bands(NamedTuple):
-    """The spectral bands of a scene (such as 31) or of one laser line (such as 5)."""
+    """The spectral bands of a scene (for example 31 bands) or of one laser line (for example 5 bands)."""
 
     centres: Tensor  #: (band,) float64, m
     widths: Tensor  #: (band,) float64, m
@@ -32,7 +32,7 @@ class Stop(NamedTuple):
 
 
 class Dirt(NamedTuple):
-    """The effect of dirt on the window, as transmission and optical path in the plane of the pupil."""
+    """The effect of dirt on the camera window, as transmission and optical path in the plane of the pupil."""
 
     amplitude: Tensor  #: (v, u) transmission of the field in [0, 1]
     path: Tensor  #: (v, u) added optical path, m
@@ -84,7 +84,7 @@ class Channels(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """Statistics of frames at several levels of flat illumination, from which sensor parameters are fitted.
+    """Statistics of flat-field frames at several illuminances, from which sensor parameters are fitted.
 
     A level with clipped or coarsely quantised numbers also has a histogram: a cell counts how often one number occurs
     in one level.

@@ -51,7 +51,7 @@ def _(psf: Psf, *, power: float = 8.0, log: bool = False) -> Tensor:
 
 @node()
 def background_loss(image: Tensor, plain_image: Tensor) -> Tensor:
-    """Sum over the bands the ratio of scene light with the plain lens to scene light with the mask.
+    """Sum over the bands the ratio of the scene light without the mask to the scene light with the mask.
 
     Shapes: image and plain_image (..., band, y, x) -> ().
     Units:  none; equal to the number of bands where no light is lost.

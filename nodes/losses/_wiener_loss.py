@@ -64,7 +64,7 @@ def _square(spectrum: Tensor) -> Tensor:
 
 
 def _counted(size: tuple[int, int], up_to: float | None) -> Tensor:
-    """Return True for the frequencies above 0 and up to ``up_to``, in the layout of `torch.fft.rfft2`."""
+    """Return True at the spatial frequencies above 0 and up to ``up_to``, in the layout of `torch.fft.rfft2`."""
     fy, fx = torch.fft.fftfreq(size[0], dtype=torch.float64), torch.fft.rfftfreq(size[1], dtype=torch.float64)
     square = fy[:, None].square() + fx.square()
     inside: Tensor = (square > 0) & (square <= (1.0 if up_to is None else up_to**2))

@@ -24,7 +24,7 @@ class Limits(NamedTuple):
 
 @node(rtol=1e-6)
 def limits(psf: Psf) -> Limits:
-    """Compute bounds of laser suppression, from evenly spread light, and of contrast, from Parseval's theorem.
+    """Compute a bound of laser suppression for evenly spread light, and bounds of contrast by Parseval's theorem.
 
     Light E in N pixels has a peak of at least E / N, and LSR = peak / p0. The mean of |OTF|**2 over all frequencies is
     the sum of PSF**2, which is at most peak times light. Over a share s of the frequencies the mean is at most 1 / s
@@ -43,7 +43,7 @@ def limits(psf: Psf) -> Limits:
 
 
 def _contrast_bound(kernel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the light of one band, its root mean square contrast, and the upper bound of this contrast."""
+    """Return the light in the PSF of one band, the rms contrast of this PSF, and an upper bound of the contrast."""
     dark = kernel.sum() <= _DARK  # false for NaN, so that NaN reaches the result
     kernel = kernel.where(~dark, 1.0)  # a root has no gradient at 0
     light, peak = kernel.sum(), kernel.amax()
@@ -55,8 +55,8 @@ def _contrast_bound(kernel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _(result: Limits, psf: Psf) -> list[Check]:
     low, high = float(result.floor.min()), float(result.floor.max())
     bounded = bool((result.rms <= result.bound * (1 + 1e-6)).all())
-    return [Check(f"LSR of evenly spread light {low:.3g} to {high:.3g}; rms contrast {float(result.rms.mean()):.3g}, "
-                  f"bound {float(result.bound.mean()):.3g}", bounded)]  # fmt: skip
+    return [Check(f"LSR {low:.3g} to {high:.3g} for even light; rms contrast {float(result.rms.mean()):.3g}, "
+                  f"upper bound {float(result.bound.mean()):.3g}", bounded)]  # fmt: skip
 
 
 # --- limits of any mask on this lens ----------------------------------------------------------------------------------
@@ -74,13 +74,16 @@ def least_lsr(psf: Psf) -> Tensor:
 
 
 def most_unsuppressed(psf: Psf) -> Tensor:
-    """Return the bound of the rms contrast, (band,), of a lossless mask with LSR 1; the bound scales with sqrt(LSR)."""
+    """Return the upper bound (band,) of the rms contrast of a lossless mask that does not suppress the laser.
+
+    The laser suppression ratio (LSR) of this mask is 1. For another ratio, the bound scales with sqrt(LSR).
+    """
     clear_peak = psf.clear_peak.double()
     return (clear_peak / shares(psf).to(clear_peak)).sqrt()
 
 
 def shares(psf: Psf) -> Tensor:
-    """Return the share of the sampled frequencies that lie below the cut-off of the lens: (band,) float64.
+    """Return the share of the sampled spatial frequencies below the cut-off of the lens: (band,) float64.
 
     The cut-off is sqrt(4 p0 / pi) cycles per pixel, where p0 is the peak of the clear lens.
     """
@@ -90,5 +93,5 @@ def shares(psf: Psf) -> Tensor:
 
 
 def most_contrast(unsuppressed: float, lsr: Tensor) -> Tensor:
-    """Scale the bound of the rms contrast at LSR 1 to each value of ``lsr``; the result is at most 1."""
+    """Return the upper bound of the rms contrast of a mask for each laser suppression ratio in ``lsr``."""
     return (unsuppressed * lsr.sqrt()).clamp_max(1.0)

@@ -1,4 +1,4 @@
-"""The brightest pixel of the sensor in multiples of saturation, and whether the pixel may be damaged."""
+"""Irradiance of the brightest pixel of the sensor, compared with saturation and with a damage threshold."""
 
 from typing import Annotated, Any, NamedTuple
 
@@ -44,7 +44,7 @@ def peak_irradiance(
     """
     sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency}
     if len(spots or ()) != len(lines or ()):
-        raise ValueError(f"{len(spots or ())} spots and {len(lines or ())} lines: give each spot its own `line` step")
+        raise ValueError(f"{len(spots or ())} spots and {len(lines or ())} laser lines: give one line for each spot")
     total = _in_wells(image, saturation(bands, **sensor, pixel_pitch=pixel_pitch, exposure=exposure) / level.cpu())
     for spot, line in zip(spots or (), lines or (), strict=True):
         total = total + _in_wells(spot, saturation(line, **sensor, pixel_pitch=pixel_pitch, exposure=exposure))
@@ -59,4 +59,8 @@ def _in_wells(irradiance: Tensor | Channels, saturating: Tensor) -> Tensor:
 
 @peak_irradiance.check
 def _(result: Peak, *inputs: Any, **params: Any) -> list[Check]:
-    return [Check(f"brightest pixel {float(result.irradiance):.3g} I_sat", not bool(result.damaged))]
+    return [
+        Check(
+            f"brightest pixel {float(result.irradiance):.3g} times the saturation irradiance", not bool(result.damaged)
+        )
+    ]

@@ -48,7 +48,9 @@ def quality(
     a, b = (_inside(x, border) for x in (estimate, truth))
     if min(a.shape[-2:]) < _WINDOW:
         size = f"{_WINDOW} x {_WINDOW}"
-        raise ValueError(f"{tuple(a.shape[-2:])} pixels inside the border: SSIM needs {size}: give a larger picture")
+        raise ValueError(
+            f"SSIM needs {size} pixels, not {tuple(a.shape[-2:])} inside the border: give a larger picture"
+        )
     absolute, square, alike = _sums(a, b, domain)
     psnr = -10.0 * (square / a.numel()).clamp_min(1e-20).log10()
     seen = a[..., _WINDOW - 1 :, _WINDOW - 1 :].numel()
@@ -95,7 +97,10 @@ def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _ssim(p: Tensor, q: Tensor) -> Tensor:
-    """Return SSIM at each pixel whose window lies inside the picture; on CUDA, TF32 is switched off."""
+    """Return the structural similarity (SSIM) at each pixel whose window lies inside the picture.
+
+    On CUDA, TF32 is switched off.
+    """
     from kornia.metrics import ssim
 
     pictures = (x.reshape(1, -1, *x.shape[-2:]) for x in (p, q))

@@ -58,7 +58,12 @@ def _contrast(kernel: Tensor, clear_peak: float) -> tuple[Tensor, Tensor, Tensor
 @mtf.check
 def _(result: Mtf, *inputs: Psf) -> list[Check]:
     rms, median = float(result.rms.mean()), float(result.median.mean())
-    return [Check(f"contrast rms {rms:.3g}, median {median:.3g}", bool((result.rms <= 1.0 + 1e-6).all()))]
+    return [
+        Check(
+            f"contrast of the PSF over frequencies: rms {rms:.3g}, median {median:.3g}",
+            bool((result.rms <= 1.0 + 1e-6).all()),
+        )
+    ]
 
 
 @node(rtol=1e-6)
@@ -79,14 +84,14 @@ def encircled(psf: Psf, *, pixel_pitch: PositiveLength, radius: PositiveLength) 
 @encircled.check
 def _(result: Tensor, *inputs: Psf, **params: float) -> list[Check]:
     low, high = float(result.min()), float(result.max())
-    return [Check(f"{low:.1%} to {high:.1%} of the light within the radius", high <= 1.01)]
+    return [Check(f"{low:.1%} to {high:.1%} of the light falls within the radius", high <= 1.01)]
 
 
 # --- as curves --------------------------------------------------------------------------------------------------------
 
 
 def encircled_curve(light: Tensor) -> Tensor:
-    """Return the light of one band within 0, 1, 2, … pixels from the axis, for an image (y, x): (radius,) float64."""
+    """Return the light of an image (y, x) within 0, 1, 2, … pixels of the optical axis, as (radius,) float64."""
     y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in light.shape)
     radius = torch.hypot(y[:, None], x[None, :]).ceil().long().flatten()
     rings = torch.zeros(int(radius.max()) + 1, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Pixels at the full well or at the largest number of the converter."""
+"""Count of pixels at the full well or at the largest output of the analogue-to-digital converter."""
 
 from typing import Any, NamedTuple
 
@@ -19,11 +19,11 @@ class Saturated(NamedTuple):
 
 @node(rtol=1e-6)
 def saturated(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Saturated:
-    """Count the pixels with a channel at the full well or at the largest number of the analogue-to-digital converter.
+    """Count the pixels with a channel at the full well or at the largest output of the analogue-to-digital converter.
 
     Shapes: raw (..., channel, y, x) -> two scalars, float64.
     Units:  raw DN; pixels.
-    Error:  a pixel within one DN of the full well counts as saturated, and so does one that is not a number.
+    Error:  a pixel within one DN of the full well counts as saturated, and so does a pixel that is NaN.
     Source: NeuSee, Eq. (SensorImage).
     """
     full = clipped(raw, full_well=full_well, gain=gain, bits=bits).any(-3)
@@ -33,11 +33,11 @@ def saturated(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> S
 
 @saturated.check
 def _(result: Saturated, *inputs: Tensor, **params: Any) -> list[Check]:
-    return [Check(f"{int(result.pixels)} saturated pixels, {float(result.share):.2%} of all")]
+    return [Check(f"{int(result.pixels)} saturated pixels, {float(result.share):.2%} of all pixels")]
 
 
 def clipped(raw: Tensor, *, full_well: float, gain: float, bits: int) -> Tensor:
-    """Return True for raw values at the full well, at the largest number of the converter, and for NaN."""
+    """Return True for raw values in DN at the full well or at the largest output of the converter, and for NaN."""
     full = int(full_well * gain - 0.5)
     marked: Tensor = ~(raw < max(1, min(2**bits - 1, full)))  # NaN counts as clipped
     return marked

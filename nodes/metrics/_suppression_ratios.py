@@ -1,4 +1,4 @@
-"""Suppression ratios of a mask: of the laser, LSR, and of the background, BSR."""
+"""Suppression ratios of a mask: laser suppression ratio (LSR) and background suppression ratio (BSR)."""
 
 import torch
 from torch import Tensor
@@ -26,13 +26,18 @@ def lsr(psf: Psf) -> Tensor:
 @lsr.check
 def _(result: Tensor, *inputs: Psf) -> list[Check]:
     floor = float(least_lsr(inputs[0]).max())
-    return [Check(f"LSR {float(result.min()):.3g} to {float(result.max()):.3g}", bool((result <= 1.05).all())),
-            Check(f"LSR of evenly spread light would be {floor:.2g}")]  # fmt: skip
+    return [
+        Check(
+            f"laser suppression ratio {float(result.min()):.3g} to {float(result.max()):.3g}",
+            bool((result <= 1.05).all()),
+        ),
+        Check(f"light spread evenly over the field would give a laser suppression ratio of {floor:.2g}"),
+    ]
 
 
 @node(rtol=1e-6, accepts_channel_sums=("image", "plain_image"))
 def bsr(image: Tensor | Channels, plain_image: Tensor | Channels) -> Tensor:
-    """Compute the background suppression ratio: scene light in the field, divided by the light with the plain lens.
+    """Compute the background suppression ratio: scene light with the mask divided by scene light without the mask.
 
     An image that is summed over its bands, `Channels`, still contains the light of each band.
 
@@ -45,7 +50,7 @@ def bsr(image: Tensor | Channels, plain_image: Tensor | Channels) -> Tensor:
     """
     (shape, kept), (plain_shape, plain) = _shape_and_light(image), _shape_and_light(plain_image)
     if shape != plain_shape:
-        raise ValueError(f"image {shape} and plain image {plain_shape} differ in shape: use one scene for both")
+        raise ValueError(f"image {shape} with and {plain_shape} without mask differ in shape: use one scene for both")
     dark = plain <= _DARK  # false for NaN, so that NaN reaches the result
     ratio: Tensor = torch.where(dark, 1.0, kept / plain.where(~dark, 1.0))
     return ratio
@@ -59,4 +64,9 @@ def _shape_and_light(image: Tensor | Channels) -> tuple[tuple[int, ...], Tensor]
 
 @bsr.check
 def _(result: Tensor, *inputs: Tensor | Channels) -> list[Check]:
-    return [Check(f"BSR {float(result.min()):.3f} to {float(result.max()):.3f}", bool((result <= 1.05).all()))]
+    return [
+        Check(
+            f"background suppression ratio {float(result.min()):.3f} to {float(result.max()):.3f}",
+            bool((result <= 1.05).all()),
+        )
+    ]

@@ -1,4 +1,4 @@
-"""Scaling and central cropping of a scene to the frame of a recipe."""
+"""Scaling and central cropping of a scene to the picture size in a recipe."""
 
 import math
 
@@ -8,7 +8,7 @@ from neusee.nodes.units import Shape
 
 
 def framed(scene: Tensor, shape: Shape | None) -> Tensor:
-    """Scale a scene (band, y, x) without distortion until it covers `shape`, then crop the centre: (band, *shape).
+    """Scale a scene (band, y, x) with equal aspect ratio until the scene covers `shape`, and crop the centre.
 
     Kornia's antialiased bilinear resampling has no overshoot, so that no value becomes negative. Kornia's `center_crop`
     would interpolate between pixels where the number of rows or columns to remove is odd.
@@ -31,7 +31,7 @@ def covering(size: tuple[int, int], shape: Shape) -> tuple[int, int]:
 
 
 def enlarged(size: tuple[int, int], shape: Shape | None) -> list[str]:
-    """Return a note for the user if a scene of this size must be enlarged to cover `shape`, else an empty list."""
+    """Return a note for the user if a scene of the given size must be enlarged to cover `shape`, else an empty list."""
     if shape is None:
         return []
     scale = max(shape[0] / size[0], shape[1] / size[1])

@@ -23,7 +23,7 @@ def cube_and_wavelengths(
         cube, known, _ = read_spectral(file)
         return cube, known
     if start is None or stop is None:
-        raise ValueError(f"{file.name} has no wavelengths: give start and stop")
+        raise ValueError(f"{file.name} has no wavelengths: give the first and the last wavelength in start and stop")
     values = np.load(file) if file.suffix == ".npy" else _mat(file, _cube_name(file, variable))
     scale = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else 1.0
     first = np.moveaxis(values, -1, 0) if layout == "y x band" else values
@@ -39,9 +39,9 @@ def size_and_type(file: Path, variable: str | None) -> tuple[tuple[int, ...], st
     elif file.suffix == ".mat":
         size, kind = _listed(file)[_cube_name(file, variable)]
     else:
-        raise ParameterError("file", f"{file.name} is not a .mat, .npy or .exr file: save the cube as one of these")
+        raise ParameterError("file", f"{file.name} is not a .mat, .npy or .exr file: save the cube in such a file")
     if len(size) != 3:
-        raise ParameterError("file", f"{file.name} holds an array of shape {size}: give a cube with three axes")
+        raise ParameterError("file", f"{file.name} holds an array of shape {size}: save a cube with three axes")
     return size, kind
 
 
@@ -49,7 +49,9 @@ def exr_size(file: Path) -> tuple[int, int]:
     """Read the numbers of rows and columns of a cube from the header of a spectral OpenEXR file."""
     _, names, size = exr_header(file)
     if not spectral_channels(names):
-        raise ParameterError("file", f"{file.name} has the channels {', '.join(names)}: none is named like T.550,0nm")
+        raise ParameterError(
+            "file", f"{file.name} has the channels {', '.join(names)}: none is spectral, such as T.550,0nm"
+        )
     return size
 
 
@@ -66,7 +68,7 @@ def _listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
 
 
 def _cube_name(file: Path, variable: str | None) -> str:
-    """Return the name of the requested variable of a .mat file, or of the only cube in the file."""
+    """Return the name of the variable of a .mat file that holds the cube: ``variable``, or the only cube."""
     variables = _listed(file)
     cubes = [name for name, (size, _) in variables.items() if len(size) == 3]
     if variable in variables:
@@ -74,7 +76,7 @@ def _cube_name(file: Path, variable: str | None) -> str:
     if variable is None and len(cubes) == 1:
         return cubes[0]
     problem = f"has no variable {variable!r}" if variable is not None else f"holds {len(cubes)} cubes"
-    raise ParameterError("variable", f"{file.name} {problem}: write one of {', '.join(variables)}")
+    raise ParameterError("variable", f"{file.name} {problem}: set variable to one of {', '.join(variables)}")
 
 
 def _mat(file: Path, variable: str) -> NDArray[Any]:

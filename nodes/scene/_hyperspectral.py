@@ -42,7 +42,7 @@ def hyperspectral(
     cube, known = cube_and_wavelengths(file, variable, start, stop, layout)
     require_range(bands.centres, known, f"{file.name} holds")
     if wrong := int((~torch.isfinite(cube)).sum()):
-        raise ValueError(f"{file.name} holds {wrong} values that are not finite: replace them by finite numbers")
+        raise ValueError(f"{file.name} holds {wrong} values that are not finite: replace NaN and infinity by numbers")
     mixed = (_interpolation(known, bands.centres).float() @ cube.flatten(1)).reshape(-1, *cube.shape[1:])
     return framed(mixed, shape).clamp_min_(0).to(bands.centres.device)
 
@@ -65,7 +65,9 @@ def _(
         raise ParameterError(name, text)
     size, kind = size_and_type(file, variable)
     if np.dtype(kind).kind not in "uf":
-        raise ParameterError("file", f"{file.name} holds values of type {kind}: save as float, uint8 or uint16")
+        raise ParameterError(
+            "file", f"{file.name} holds values of type {kind}: save the cube as float, uint8 or uint16"
+        )
     pixels = size[:2] if layout == "y x band" else size[1:]
     return enlarged((pixels[0], pixels[1]), shape)
 
@@ -73,7 +75,7 @@ def _(
 @hyperspectral.check
 def _(result: Tensor, bands: Bands, **params: Any) -> list[Check]:
     most = float(result.max())
-    return [Check(f"reflectance {float(result.min()):.3g} to {most:.3g}", most <= 1.5)]
+    return [Check(f"reflectance of the scene from {float(result.min()):.3g} to {most:.3g}", most <= 1.5)]
 
 
 def _interpolation(known: Tensor, wavelengths: Tensor) -> Tensor:

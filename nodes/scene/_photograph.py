@@ -11,7 +11,7 @@ from neusee.nodes.scene._crop_to_frame import enlarged, framed
 from neusee.nodes.units import DataFile, Shape
 
 _MODES = ("RGB", "L", "P", "1", "I", "I;16", "I;16B")
-_FIX = "convert it to 8- or 16-bit sRGB: magick {name} -alpha off -colorspace sRGB -depth 16 {stem}.png"
+_FIX = "convert the file to 8- or 16-bit sRGB: magick {name} -alpha off -colorspace sRGB -depth 16 {stem}.png"
 _ORIENTATION = 0x0112  #: EXIF tag
 _ROTATED = range(5, 9)  #: EXIF orientations that exchange width and height
 
@@ -57,17 +57,19 @@ def _(*, file: Path, shape: Shape | None = None) -> list[str]:
 @photograph.check
 def _(result: Tensor, **params: Any) -> list[Check]:
     clipped = float((result >= 1).any(0).float().mean())
-    return [Check(f"mean {float(result.mean()):.3f}, {clipped:.1%} of pixels are saturated", float(result.max()) > 0)]
+    return [
+        Check(f"mean value {float(result.mean()):.3f}, {clipped:.1%} of pixels are saturated", float(result.max()) > 0)
+    ]
 
 
 def _refuse(file: Path, image: Any) -> None:
     fix = _FIX.format(name=file.name, stem=file.stem)
     if image.format not in ("PNG", "JPEG", "MPO"):
-        raise ParameterError("file", f"{file} is {image.format}, not PNG or JPEG: {fix}, or use scene.exr")
+        raise ParameterError("file", f"{file} has the format {image.format}, not PNG or JPEG: {fix}, or use scene.exr")
     if "transparency" in image.info or image.mode.endswith("A"):
         raise ParameterError("file", f"{file} has transparency, which a scene cannot use: {fix}")
     if image.mode not in _MODES:
-        raise ParameterError("file", f"{file} has pixels of kind {image.mode}, not grey or RGB: {fix}")
+        raise ParameterError("file", f"{file} has pixels of type {image.mode}, not grey or RGB: {fix}")
 
 
 def _profile(image: Any) -> str:

@@ -1,4 +1,4 @@
-"""Photographs of a folder as scenes: search for readable files, and random crops that depend on a seed."""
+"""Search of a folder for readable photographs, and random crops of the photographs from a given seed."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class Photographs:
         paths, broken = list_photographs(root)
         if not paths:
             why = f"; {len(broken)} cannot be read, such as {broken[0][0]}: {broken[0][1]}" if broken else ""
-            raise ValueError(f"no photograph is below {root}{why}")
+            raise ValueError(f"the folder {root} holds no readable photograph{why}")
         return cls(tuple(paths), dict(broken))
 
     def crop(self, shape: tuple[int, int], seed: int, index: Index) -> Tensor:

@@ -54,7 +54,10 @@ def write_spectral(
 
     wavelengths = [float(w) for w in centres]
     if cube.ndim != 3 or len(wavelengths) != len(cube):
-        raise ValueError(f"cube has shape {tuple(cube.shape)}, not (band, y, x) with {len(wavelengths)} bands")
+        raise ValueError(
+            f"cube has shape {tuple(cube.shape)}, not (band, y, x) with {len(wavelengths)} bands: "
+            "give one wavelength for each band"
+        )
     quantity = "S0" if kind == "emissive" else "T"
     names = [quantity + "." + f"{w * 1e9:.6f}nm".replace(".", ",") for w in wavelengths]
     if len(set(names)) < len(names):
@@ -79,14 +82,14 @@ def read_spectral(path: Path | str) -> tuple[Tensor, Tensor, dict[str, Any]]:
         spectral = spectral_channels(list(channels))
         if not spectral:
             raise ValueError(
-                f"{path} has the channels {', '.join(channels)}: none is named like S0.550,0nm or T.550,0nm"
+                f"{path} has the channels {', '.join(channels)}: none has a name such as S0.550,0nm or T.550,0nm"
             )
         planes = [np.asarray(channels[name].pixels, dtype=np.float32) for name in spectral.values()]
     return torch.from_numpy(np.stack(planes)), torch.tensor(list(spectral), dtype=torch.float64), header
 
 
 def spectral_channels(names: Sequence[str]) -> dict[float, str]:
-    """Return the name of the channel of each wavelength in m, rising.
+    """Return the channel name for each wavelength in m of a spectral OpenEXR file, in rising order of wavelength.
 
     Reflectance channels are used only if the file has no emission channels.
     """

@@ -46,7 +46,7 @@ def _(*, low: float = 0.0, high: float = 1.0, **params: Any) -> list[str]:
 @targets.check
 def _(result: Tensor, *, low: float = 0.0, high: float = 1.0, **params: Any) -> list[Check]:
     least, most = float(result.min()), float(result.max())
-    return [Check(f"light from {least:.3g} to {most:.3g}", least >= low - 1e-6 and most <= high + 1e-6)]
+    return [Check(f"light of the target from {least:.3g} to {most:.3g}", least >= low - 1e-6 and most <= high + 1e-6)]
 
 
 def _slanted(y: Tensor, x: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Weighted sums over the bands of an image, for images stored as all bands or as channel sums."""
+"""Weighted sums of the spectral bands of an image, computed from the bands or from stored sums."""
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ _OFF = 1e-9  #: largest relative error of weights that are combined from the row
 
 
 def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
-    """Return the weighted sum of the bands of an image, with ``weights`` (..., band).
+    """Multiply the spectral bands of an image by ``weights`` (..., band), and return the sum over the bands.
 
     Raises ValueError if weights and image have different numbers of bands, or if no combination of the channel sums
     gives the weights.
@@ -25,7 +25,7 @@ def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
 
 
 def channel_sums(image: Tensor, rows: Tensor) -> Channels:
-    """Return the weighted sums of the bands of an image as `Channels`, one sum for each row of weights.
+    """Return weighted sums of the spectral bands of an image, one sum for each row of the matrix ``rows``.
 
     Shapes: image (..., band, y, x), rows (row, band). The sums carry no approximation error. The sums of a part of the
     bands are the contribution of these bands to the whole.
@@ -36,7 +36,7 @@ def channel_sums(image: Tensor, rows: Tensor) -> Channels:
 
 
 def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:
-    """Return the matrix M that satisfies ``weights = M rows``, by least squares in float64.
+    """Solve ``weights = M rows`` for the matrix M by least squares in float64.
 
     The gradient reaches the weights.
     """
@@ -46,19 +46,19 @@ def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:
     exact = weights.cpu().double()
     if exact.shape[-1] != known.shape[1]:
         counts = f"the weights have {exact.shape[-1]} bands and the sums of the image {known.shape[1]} bands"
-        raise ValueError(f"{counts}: use the same `bands` step for both")
+        raise ValueError(f"{counts}: compute weights and image from the same `bands` step")
     matrix: Tensor = exact @ inverse
     _require_combination(exact.detach(), matrix.detach() @ known)
     return matrix
 
 
 def _require_combination(exact: Tensor, combined: Tensor) -> None:
-    """Raise ValueError unless ``combined`` equals the ``exact`` weights within 1e-9 of the largest weight."""
+    """Raise ValueError unless the weights ``combined`` equal ``exact`` within 1e-9 of the largest weight."""
     off, most = (exact - combined).abs().flatten(0, -2), exact.abs().flatten(0, -2).amax(-1)
     if not bool((off.amax(-1) <= _OFF * most).all()):
         worst = float((off.amax(-1) / most.clamp_min(1e-300)).max())
         raise ValueError(
-            f"the image was summed over its bands with other weights: {worst:.2g} of the weights of this step lies "
-            "outside the span of the image's rows, and 1e-9 is allowed: compute the rows from the same `bands` and "
-            "`responses`, with a level that is equal in all bands, or keep the image of all bands"
+            f"the image was summed over its bands with other weights: the weights of this step differ by "
+            f"{worst:.2g} (relative error; at most 1e-9) from every combination of these weights: use the same `bands` "
+            "and `responses` for both, with a level that is equal in all bands, or keep the image of all bands"
         )

@@ -31,9 +31,10 @@ def full_well(electrons: Tensor, *, capacity: Well) -> Tensor:
 
 @full_well.skip_bound
 def _(electrons: TensorStats, *, capacity: float) -> float:
-    """Return the change if the full well is omitted: the loss of the brightest pixel over the largest result.
+    """Return the relative change of the brightest pixel if the step `sensor.full_well` is omitted.
 
-    The well is rounded to the dtype, and so differs from ``capacity`` by up to half a step of the dtype.
+    The change is relative to the largest result. The well is rounded to the dtype, and so differs from ``capacity`` by
+    up to half a step of the dtype.
     """
     dtype = torch.promote_types(getattr(torch, electrons.dtype), torch.float32)
     well = float(torch.tensor(capacity, dtype=dtype))
@@ -50,7 +51,7 @@ def _(electrons: ErrorBound, **params: Any) -> float:
 
 @full_well.check
 def _(result: Tensor, electrons: Tensor, *, capacity: float) -> list[Check]:
-    return [Check(f"{int(torch.count_nonzero(result >= capacity))} of {result.numel()} pixels are full")]
+    return [Check(f"{int(torch.count_nonzero(result >= capacity))} of {result.numel()} pixels reach the full well")]
 
 
 @node(rtol=0.0)
@@ -78,7 +79,7 @@ def digitize(
     if rounding == "nearest":  # the sum is exact; without a gradient, the rounded number is enough
         return ideal + (ideal.round() - ideal).detach() if ideal.requires_grad else ideal.round_()
     if rng is None:
-        raise ValueError("dithered_floor draws random numbers: give rng=torch.Generator()")
+        raise ValueError("rounding dithered_floor needs random numbers: give rng=torch.Generator()")
     dither = torch.rand(line.shape, generator=rng, device=rng.device, dtype=torch.float32).to(line) - 0.5
     whole = (line + dither).floor().clamp(0, 2**bits - 1)
     return ideal + (whole - ideal).detach()
@@ -105,7 +106,7 @@ def _(
 
 @digitize.propagate_error
 def _(electrons: ErrorBound, *, result: TensorStats, gain: float, **params: Any) -> float:
-    """Return the error bound of the digital numbers before rounding; the effect of rounding is not included.
+    """Return an error bound of the digital numbers, without the effect of rounding.
 
     A value near the middle of two numbers may be rounded to either number.
     """
@@ -121,7 +122,7 @@ def _(*, gain: float, bits: int = 16, **params: object) -> list[str]:
 @digitize.check
 def _(result: Tensor, *inputs: Tensor, bits: int = 16, **params: Any) -> list[Check]:
     high, low = (int(torch.count_nonzero(result == end)) / max(1, result.numel()) for end in (2**bits - 1, 0))
-    return [Check(f"{high:.2%} of pixels are at the largest number, {low:.2%} at 0 DN", high < 0.5)]
+    return [Check(f"{high:.2%} of pixels are at the largest digital number, {low:.2%} at 0 DN", high < 0.5)]
 
 
 @node(rtol=0.0)
@@ -137,7 +138,9 @@ def crop(image: Tensor, *, shape: Shape) -> Tensor:
     Source: NeuSee, Eq. (SensorImage).
     """
     if any(n > m for n, m in zip(shape, image.shape[-2:], strict=True)):
-        raise ValueError(f"a window of {tuple(shape)} exceeds an image of {tuple(image.shape[-2:])}: enlarge the scene")
+        raise ValueError(
+            f"window {tuple(shape)} is larger than image {tuple(image.shape[-2:])} in pixels: enlarge the scene"
+        )
     top, left = (m // 2 - n // 2 for n, m in zip(shape, image.shape[-2:], strict=True))
     return image[..., top : top + shape[0], left : left + shape[1]].contiguous()
 

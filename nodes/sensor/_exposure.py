@@ -67,12 +67,12 @@ def _(
 @expose.check
 def _(result: Tensor, *inputs: object, **params: object) -> list[Check]:
     low, high = float(result.min()), float(result.max())
-    return [Check(f"brightest pixel {high:.4g} photons", low >= -1e-3 * high)]
+    return [Check(f"the brightest pixel receives {high:.4g} photons", low >= -1e-3 * high)]
 
 
 @expose.propagate_error
 def _(irradiance: ErrorBound, *others: ErrorBound | None, result: TensorStats, **params: Any) -> float:
-    """Return the error bound of the photons from the relative errors of image and level.
+    """Return an error bound of the photons from the relative errors of the irradiance and of the factor `level`.
 
     No channel has a larger relative error, because light is not negative.
     """
@@ -83,12 +83,12 @@ def _(irradiance: ErrorBound, *others: ErrorBound | None, result: TensorStats, *
 def channel_weights(
     bands: Bands, responses: Tensor, level: Tensor | None, *, pixel_pitch: float, exposure: float
 ) -> Tensor:
-    """Return the photons in each channel for one unit of irradiance in each band: (channel, band) float64."""
+    """Return the photons per unit of irradiance in each band for each colour channel: (channel, band) float64."""
     lengths = {len(bands.centres), responses.shape[-1]} | (set() if level is None else {len(level)})
     if len(lengths) > 1:
         raise ValueError(
             f"bands {len(bands.centres)}, responses {tuple(responses.shape)}, level "
-            f"{None if level is None else tuple(level.shape)} differ in the number of bands: use one `bands` step"
+            f"{None if level is None else tuple(level.shape)} differ in the number of bands: use one step `bands`"
         )
     photons = photons_per_joule(bands.centres) * (exposure * pixel_pitch**2)
     weights = responses.double() * photons.to(responses.device)
@@ -108,7 +108,7 @@ def level(
     exposure: Time,
     rule: Literal["channel_sum", "per_band"] = "channel_sum",
 ) -> Tensor:
-    """Compute the factor from image values to irradiance for which the brightest pixel holds ``strength`` full wells.
+    """Compute the factor that scales an image to irradiance, so that the brightest pixel has ``strength`` full wells.
 
     The image is that of the plain lens, without mask.
 
@@ -145,7 +145,7 @@ def _(params: Mapping[str, Any]) -> bool:
 
 @level.propagate_error
 def _(plain_image: ErrorBound, *others: object, result: TensorStats, **params: Any) -> float:
-    """Return the error bound of the level, which depends on the error of the brightest pixel of the image."""
+    """Return an error bound of the scale factor `level` from the error of the brightest pixel of the image."""
     share = plain_image.largest
     return result.max * share / (1.0 - share) if share < 1.0 else math.inf
 
@@ -160,7 +160,7 @@ def _(*, strength: float, rule: str = "channel_sum", **params: object) -> list[s
 
 @node(rtol=1e-6, additive_inputs=[("lasers",), ("ghosts",)])
 def add_photons(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: list[Tensor] | None = None) -> Tensor:
-    """Add the photons of the scene, of every laser and of every ghost, which are mutually incoherent.
+    """Add the photons of the scene, of every laser and of every ghost image, which are mutually incoherent.
 
     Shapes: photons (..., channel, y, x), each laser and ghost the same -> (..., channel, y, x).
     Units:  photons.
@@ -173,7 +173,7 @@ def add_photons(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: lis
     for added in chain(lasers or (), ghosts or ()):
         if added.shape[-3:] != photons.shape[-3:]:
             raise ValueError(
-                f"light of shape {tuple(added.shape)} cannot be added to {tuple(photons.shape)}: "
+                f"laser light of shape {tuple(added.shape)} cannot be added to a scene of {tuple(photons.shape)}: "
                 "give laser and scene the same `shape`"
             )
         total = total + added
@@ -188,7 +188,7 @@ def _(photons: ErrorBound, *added: list[ErrorBound] | None, **params: Any) -> fl
 @add_photons.check
 def _(result: Tensor, photons: Tensor, *others: object, **params: object) -> list[Check]:
     scene, high = float(photons.max()), float(result.max())
-    return [Check(f"brightest pixel {high:.4g} photons, scene alone {scene:.4g}", high >= 0)]
+    return [Check(f"the brightest pixel receives {high:.4g} photons, and {scene:.4g} from the scene alone", high >= 0)]
 
 
 @expose.zero_bound
@@ -201,7 +201,7 @@ def _(
     pixel_pitch: float,
     exposure: float,
 ) -> float:
-    """Return an upper bound of the photons, from the largest irradiance and the largest response.
+    """Return an upper bound of the photons in a pixel, from the largest irradiance and the largest response.
 
     The bound is exact for a single band.
     """

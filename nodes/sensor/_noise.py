@@ -16,7 +16,7 @@ from neusee.nodes.units import Electrons, Fraction
 
 Distribution = Literal["gaussian", "poisson"]
 _PART = 1 << 15  #: elements; torch splits larger arrays among threads, which is slow on a busy machine
-_DARK = 1e-30  #: e-; smaller numbers count as 0, because the slope of the square root is unbounded near 0
+_DARK = 1e-30  #: e-; smaller numbers count as 0, because the gradient of the square root is unbounded near 0
 Spread = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
@@ -67,7 +67,7 @@ def _(*, mean: str = "additive", mean_shift: float = 0.0, **params: object) -> l
 def _(result: Tensor, photons: Tensor, **params: Any) -> list[Check]:
     low, high = float(photons.min()), float(photons.max())
     mean = float(result.sum(-1).sum(dtype=torch.float64)) / max(1, result.numel())
-    return [Check(f"mean signal {mean:.4g} e-", low >= -1e-4 * max(high, 1.0))]
+    return [Check(f"the mean signal is {mean:.4g} e- per pixel", low >= -1e-4 * max(high, 1.0))]
 
 
 @photon_noise.propagate_error
@@ -94,7 +94,7 @@ def _gaussian(counts: Tensor, rng: Generator) -> Tensor:
     lit = ~(counts <= _DARK)  # True for NaN, so that NaN reaches the result
     if not counts.requires_grad:
         return normal(counts, rng).mul_(counts.where(lit, 0.0).sqrt_())
-    sigma = counts.where(lit, 1.0).sqrt().where(lit, 0.0)  # at 0, the square root has no finite slope
+    sigma = counts.where(lit, 1.0).sqrt().where(lit, 0.0)  # at 0, the square root has no finite gradient
     return sigma * normal(counts, rng)
 
 
@@ -104,7 +104,7 @@ def _poisson(counts: Tensor, rng: Generator) -> Tensor:
 
 
 def _by_parts(compute: Callable[[Tensor], Tensor], whole: Tensor, rng: Generator) -> Tensor:
-    """Return exactly ``compute(whole)``, computed in parts that fit into the cache of the processor.
+    """Apply ``compute`` to parts of a tensor that fit into the CPU cache, with the same result as for the whole.
 
     The random numbers must not depend on the parts. Torch draws fewer than 16 normal numbers by another method, so no
     part is that short.
@@ -120,13 +120,13 @@ def _by_parts(compute: Callable[[Tensor], Tensor], whole: Tensor, rng: Generator
 
 
 def normal(like: Tensor, rng: Generator) -> Tensor:
-    """Draw standard normal numbers in the shape of ``like``, the same numbers for every precision."""
+    """Sample standard normal numbers in the shape of ``like``, with equal numbers in every precision."""
     return torch.randn(like.shape, generator=rng, device=rng.device, dtype=torch.float32).to(like)
 
 
 @node()
 def dark_current(electrons: Tensor, *, mean: Electrons, full_well: Well | None = None, rng: Generator) -> Tensor:
-    """Add the thermal electrons of one exposure, drawn from a Poisson distribution with the given mean.
+    """Add the thermal electrons of one exposure, sampled from a Poisson distribution with the given mean.
 
     ``full_well`` is used only to decide if the dark current is small enough to leave out: the electrons are compared
     with the signal up to the well, because a later step cuts off the signal of a laser above the well.
@@ -153,7 +153,7 @@ def _(electrons: TensorStats, *, mean: float, full_well: float | None) -> float:
 def read_noise(
     electrons: Tensor, *, offset: Electrons, read_noise: Electrons, full_well: Well | None = None, rng: Generator
 ) -> Tensor:
-    """Add the offset and the Gaussian noise of the amplifier.
+    """Add the offset and the Gaussian noise of the sensor amplifier to the electrons of each pixel.
 
     The temporal dark noise of EMVA 1288 includes read noise and dark current:
     sigma_d**2 = read_noise**2 + mean of the dark current. The dark signal mu_d of EMVA 1288 is offset + mean of the
@@ -180,7 +180,7 @@ def _(electrons: TensorStats, *, offset: float, read_noise: float, full_well: fl
 @dark_current.skip_scale
 @read_noise.skip_scale
 def _(electrons: TensorStats, *, full_well: float | None, **params: Any) -> float:
-    """Return the largest absolute number of electrons, or the full well if that is smaller."""
+    """Return the largest absolute number of electrons in a pixel, limited to the full well."""
     largest = max(abs(electrons.max), abs(electrons.min))
     return largest if full_well is None else min(largest, full_well)
 
@@ -192,9 +192,9 @@ def _(electrons: ErrorBound, **params: Any) -> float:
 
 
 def _share(shift: float, spread: float, electrons: TensorStats, full_well: float | None) -> float:
-    """Return the root mean square of the added electrons over the largest result or the well, whichever is smaller.
+    """Return the rms of the added electrons, divided by the largest signal or the full well, whichever is smaller.
 
-    The largest result is that of the brightest pixel, or that of the darkest pixel if the counts are below 0. The well
+    The largest signal is that of the brightest pixel, or that of the darkest pixel if the counts are below 0. The well
     alone is not enough, because a dark frame is only noise. The bound is exact for one mean and spread everywhere.
     """
     added = math.hypot(shift, spread)

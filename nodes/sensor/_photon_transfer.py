@@ -30,11 +30,11 @@ def photon_transfer(
     pixels: Count = 16384,
     rng: Generator,
 ) -> Tensor:
-    """Simulate the photon-transfer curve: the measured and the predicted variance at each level of the signal.
+    """Simulate the photon-transfer curve: measured and predicted variance against the mean signal.
 
-    Each level has two flat fields. The first level is dark; the other levels rise geometrically from one electron to
-    1.2 full wells. The frames are computed by the same nodes as a picture. The signal is the mean minus the dark
-    mean. The prediction is K^2 sigma_d^2 + sigma_q^2 + K (mean - dark mean).
+    Each level of illumination has two flat fields. The first level is dark. The other levels rise geometrically from
+    one electron to 1.2 full wells. The frames are computed by the same nodes as a picture. The signal is the mean minus
+    the dark mean. The prediction is K^2 sigma_d^2 + sigma_q^2 + K (mean - dark mean).
 
     Shapes: -> (level, 3) float64.
     Units:  gain K, DN/e-; result DN, DN2, DN2.
@@ -73,6 +73,6 @@ def _pair(one: Tensor, two: Tensor) -> tuple[float, float]:
 def _(result: Tensor, *, full_well: float, gain: float, **params: Any) -> list[Check]:
     middle = (result[:, 0] > 0.02 * full_well * gain) & (result[:, 0] < 0.7 * full_well * gain)
     if not bool(middle.any()):
-        return [Check("no level lies between 2 and 70 % of the full well, so the variance is not checked")]
+        return [Check("no flat field lies between 2 and 70 % of the full well, so the variance is not checked")]
     ratio = float((result[middle, 1] / result[middle, 2]).mean())
-    return [Check(f"measured variance is {ratio:.3f} of the predicted variance", abs(ratio - 1) < 0.1)]
+    return [Check(f"the measured variance is {ratio:.3f} times the predicted variance", abs(ratio - 1) < 0.1)]

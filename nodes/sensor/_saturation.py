@@ -53,7 +53,7 @@ def saturation(
 @saturation.check
 def _(result: Tensor, bands: Bands, **params: object) -> list[Check]:
     low, high = float(result.min()), float(result.max())
-    return [Check(f"saturation irradiance {low:.3e} to {high:.3e} W/m2", math.isfinite(low + high) and low > 0)]
+    return [Check(f"saturation irradiance from {low:.3e} to {high:.3e} W/m2", math.isfinite(low + high) and low > 0)]
 
 
 @node(rtol=1e-12)

@@ -1,4 +1,4 @@
-"""Spectra: bands, illuminants, channel responses, and reconstruction of spectra from RGB (lifts)."""
+"""Nodes for spectra: spectral bands, illuminants, channel responses, and estimates of spectra from RGB."""
 
 from neusee.nodes.spectra._bands import bands, filters, line, mean_wavelength
 from neusee.nodes.spectra._camera_colour import grain, render

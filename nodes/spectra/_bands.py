@@ -36,14 +36,18 @@ def bands(*, start: Wavelength, stop: Wavelength, count: Count) -> Samples:
 @bands.preflight
 def _(*, start: float, stop: float, **params: Any) -> list[str]:
     if not start < stop:
-        raise ParameterError("start", f"start {start * 1e9:g} nm must be below stop {stop * 1e9:g} nm: exchange them")
+        raise ParameterError(
+            "start", f"start {start * 1e9:g} nm must be below stop {stop * 1e9:g} nm: exchange start and stop"
+        )
     return []
 
 
 @bands.check
 def _(result: Samples, **params: Any) -> list[Check]:
     ends = f"{float(result.centres[0]) * 1e9:.4g} to {float(result.centres[-1]) * 1e9:.4g} nm"
-    return [Check(f"{len(result.centres)} bands, {ends}, {float(result.widths[0]) * 1e9:.3g} nm wide")]
+    return [
+        Check(f"{len(result.centres)} bands with centres from {ends}, each {float(result.widths[0]) * 1e9:.3g} nm wide")
+    ]
 
 
 @node(rtol=1e-12)
@@ -77,7 +81,7 @@ def _(*, centres: tuple[float, ...], widths: tuple[float, ...]) -> list[str]:
 @filters.check
 def _(result: Samples, **params: Any) -> list[Check]:
     low, high = float(result.centres.min()) * 1e9, float(result.centres.max()) * 1e9
-    return [Check(f"{len(result.centres)} filters, {low:.4g} to {high:.4g} nm")]
+    return [Check(f"{len(result.centres)} filters with centres from {low:.4g} to {high:.4g} nm")]
 
 
 @node(rtol=1e-9)

@@ -16,7 +16,7 @@ GrainDeviation = Annotated[float, Field(ge=0, le=1)]
 
 @node(rtol=1e-5)
 def render(reflectance: Tensor, bands: Bands) -> Tensor:
-    """Convert reflectance spectra under D65 to linear sRGB with the CIE 1931 observer.
+    """Convert reflectance spectra, lit by the illuminant D65, to linear sRGB with the CIE 1931 observer.
 
     Shapes: reflectance (..., band, y, x) -> (..., 3, y, x).
     Units:  reflectance to linear sRGB; white is (1, 1, 1) on exactly these bands (on 31 bands, `sd_to_XYZ` of
@@ -28,7 +28,7 @@ def render(reflectance: Tensor, bands: Bands) -> Tensor:
     if reflectance.ndim < 3 or reflectance.shape[-3] != len(bands.centres):
         raise ValueError(
             f"reflectance has shape {tuple(reflectance.shape)}, not (band, y, x) with {len(bands.centres)} bands: "
-            "compute both from the same `bands` step"
+            "compute reflectance and bands from the same `bands` step"
         )
     light = single(reflectance)
     return torch.einsum("cb,...byx->...cyx", to_srgb(bands.centres).to(light), light)
@@ -43,7 +43,7 @@ def _(reflectance: Tensor, bands: Bands) -> Tensor:
 
 @render.check
 def _(result: Tensor, *inputs: Any) -> list[Check]:
-    return [Check(f"linear sRGB {float(result.min()):.3g} to {float(result.max()):.3g}")]
+    return [Check(f"linear sRGB values from {float(result.min()):.3g} to {float(result.max()):.3g}")]
 
 
 @node(rtol=1e-5)
@@ -63,4 +63,4 @@ def grain(picture: Tensor, *, read: GrainDeviation = 1e-3, shot: GrainDeviation 
 
 @grain.check
 def _(result: Tensor, picture: Tensor, **params: Any) -> list[Check]:
-    return [Check(f"rms of the added noise {float((result - picture).std()):.3g}")]
+    return [Check(f"the rms of the added camera noise is {float((result - picture).std()):.3g}")]

@@ -47,7 +47,7 @@ def leaves(
     if spectra.ndim != 2 or spectra.shape[1] != len(bands.centres):
         raise ValueError(
             f"spectra have shape {tuple(spectra.shape)}, not (leaf, band) with {len(bands.centres)} bands: "
-            "compute both from the same `bands` step"
+            "compute spectra and bands from the same `bands` step"
         )
     fine = (_FINE * shape[0], _FINE * shape[1])
     top = _topmost(len(spectra), fine, _FINE * smallest, rng)
@@ -63,11 +63,11 @@ def leaves(
 @leaves.check
 def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
     low, high = float(result.min()), float(result.max())
-    return [Check(f"reflectance {low:.3g} to {high:.3g}", 0 <= low <= high <= 1)]
+    return [Check(f"reflectance of the picture from {low:.3g} to {high:.3g}", 0 <= low <= high <= 1)]
 
 
 def _topmost(count: int, size: tuple[int, int], smallest: float, rng: torch.Generator) -> Tensor:
-    """Draw random ellipses, and return the index of the topmost ellipse at each sample (y, x)."""
+    """Draw random overlapping ellipses, and return the index of the topmost ellipse at each sample (y, x)."""
     largest = max(min(size) / 2, smallest)
     share = _even(rng, count)
     radius = (smallest**-2 * (1 - share) + largest**-2 * share) ** -0.5
@@ -88,7 +88,7 @@ def _smooth(size: tuple[int, int], rng: torch.Generator) -> Tensor:
 
 
 def _lights(bands: Bands, share: float, rng: torch.Generator) -> Tensor:
-    """Draw a random daylight spectrum, and return the ratio to D65 in each band, scaled to a maximum of 1."""
+    """Return the ratio of a random daylight spectrum to D65 in each band, scaled to a maximum of 1."""
     chance, which = torch.rand(2, generator=rng, device=rng.device).tolist()
     centres = bands.centres
     if chance >= share:

@@ -35,7 +35,7 @@ def illuminant(bands: Bands, *, kind: Kind = "daylight", temperature: Temperatur
     power = table.over(bands)[0]
     if not float(power.mean()) > 0:
         low, high = float(edges.min()) * 1e9, float(edges.max()) * 1e9
-        raise ValueError(f"{kind} gives no light from {low:.4g} to {high:.4g} nm: choose other bands")
+        raise ValueError(f"illuminant {kind} gives no light from {low:.4g} to {high:.4g} nm: choose other bands")
     return (power / power.mean()).to(bands.centres.device)
 
 
@@ -53,7 +53,11 @@ def _(*, kind: str = "daylight", temperature: float = 6504.0) -> list[str]:
 def _(result: Tensor, bands: Bands, *, kind: str = "daylight", temperature: float = 6504.0) -> list[Check]:
     name = f"{kind} {temperature:g} K" if kind == "daylight" else kind
     peak = float(bands.centres[int(result.argmax())]) * 1e9
-    return [Check(f"{name}: power {float(result.min()):.2f} to {float(result.max()):.2f}, brightest at {peak:.4g} nm")]
+    return [
+        Check(
+            f"{name}: relative power {float(result.min()):.2f} to {float(result.max()):.2f}, largest at {peak:.4g} nm"
+        )
+    ]
 
 
 @node(bands={"reflectance": -3, "illuminant": 0, "return": -3}, accepts_low_rank=("reflectance",))
@@ -63,13 +67,14 @@ def illuminate(
     """Compute the radiance of a scene: reflectance times illuminant.
 
     `once` is physical; `twice` multiplies by the square of the illuminant, as the paper prints. In a `LowRankCube`,
-    only the basis spectra are multiplied and the planes stay unchanged.
+    only the basis spectra are multiplied, and the basis images stay unchanged.
 
     Shapes: reflectance (..., band, y, x), illuminant (band,) -> (..., band, y, x).
     Units:  relative spectral radiance; the radiance of a white scene has mean 1 over the bands.
     Error:  float32: 6e-8.
     Raises: ValueError where reflectance and illuminant differ in the number of bands.
-    Source: NeuSee, T_b and the CIE formula after T_b; `twice` is contradiction C5 in the reading of the paper.
+    Source: NeuSee, T_b and the CIE formula after T_b; `twice` is contradiction C5 in the list of ambiguous statements
+            of the paper.
     """
     _same_bands(reflectance, illuminant)
     power = illuminant if times == "once" else illuminant.square()
@@ -91,7 +96,7 @@ def _same_bands(reflectance: Tensor | LowRankCube, illuminant: Tensor) -> None:
     if len(shape) < 3 or illuminant.ndim != 1 or shape[-3] != len(illuminant):
         raise ValueError(
             f"reflectance {shape} and illuminant {tuple(illuminant.shape)} must have the shapes (band, y, x) and "
-            "(band,): compute both from the same `bands` step"
+            "(band,): compute reflectance and illuminant from the same `bands` step"
         )
 
 
@@ -116,6 +121,6 @@ def _(*, times: str = "once") -> list[str]:
 @illuminate.check
 def _(result: Tensor | LowRankCube, *inputs: Any, **params: Any) -> list[Check]:
     if isinstance(result, LowRankCube):
-        return [Check(f"{len(result.planes)} planes for {len(result.basis)} bands")]
+        return [Check(f"{len(result.planes)} basis images for {len(result.basis)} bands")]
     low = float(result.min())
-    return [Check(f"radiance {low:.3g} to {float(result.max()):.4g}", low >= 0)]
+    return [Check(f"scene radiance from {low:.3g} to {float(result.max()):.4g}", low >= 0)]

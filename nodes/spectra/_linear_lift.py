@@ -1,4 +1,4 @@
-"""Linear reconstruction of spectra from RGB (linear lifts)."""
+"""Linear estimates of reflectance spectra from RGB."""
 
 import functools
 from collections.abc import Callable
@@ -24,7 +24,7 @@ def lift_mallett(rgb: Tensor, bands: Bands) -> Tensor:
     a single pixel, without a gradient.
 
     Shapes: rgb (3, y, x) -> (band, y, x).
-    Units:  linear sRGB to reflectance; the lift is linear and keeps HDR values above 1.
+    Units:  linear sRGB to reflectance; the estimate is linear and keeps HDR values above 1.
     Error:  real paints: PSNR 31 dB (CAVE balloons); the result, rendered to sRGB under D65, is within 5e-3 of rgb.
             Negative results are clipped.
     Raises: ValueError where rgb is not (3, y, x) or bands leave 380 to 780 nm.
@@ -35,14 +35,14 @@ def lift_mallett(rgb: Tensor, bands: Bands) -> Tensor:
 
 @node(rtol=1e-6)
 def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
-    """Reconstruct the same reflectance as `spectra.lift_mallett`, as a low-rank cube of a few planes.
+    """Compute the result of `spectra.lift_mallett` as a low-rank cube: a sum of a few basis images times spectra.
 
     Pixels are computed block by block, so that the full cube is never in memory.
 
     Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
             float64.
     Units:  planes and residuals are reflectances; the basis has no unit.
-    Error:  as `spectra.compress`, relative to the lift in float64; `lift_mallett` differs from that lift by round-off.
+    Error:  as `spectra.compress`, relative to `lift_mallett` in float64; float32 differs by round-off.
     Raises: ValueError where `lift_mallett` or `spectra.compress` raises ValueError.
     Source: as `lift_mallett`.
     """
@@ -56,9 +56,9 @@ def lift_lmmse(rgb: Tensor, bands: Bands) -> Tensor:
     W = C T^t (T C T^t)^-1 with C = E[s s^t] over the paints and the matrix T from reflectance under D65 to linear sRGB.
 
     Shapes: rgb (3, y, x) -> (band, y, x).
-    Units:  linear sRGB to reflectance; the lift is linear and keeps HDR values above 1.
+    Units:  linear sRGB to reflectance; the estimate is linear and keeps HDR values above 1.
     Error:  real paints: PSNR 33.3 dB, mean relative error 0.15 (CAVE balloons); the result, rendered to sRGB, is rgb
-            exactly, except where a negative result is clipped. White is lifted to the reflectance of white paint:
+            exactly, except where a negative result is clipped. White gets the reflectance of white paint:
             0.62 at 400 nm, 0.94 to 1.12 from 420 nm.
     Raises: ValueError where rgb is not (3, y, x), and where bands leave 380 to 780 nm or are too few or too close to
             distinguish colours.
@@ -69,14 +69,14 @@ def lift_lmmse(rgb: Tensor, bands: Bands) -> Tensor:
 
 @node(rtol=1e-6)
 def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
-    """Reconstruct the same reflectance as `spectra.lift_lmmse`, as a low-rank cube of a few planes.
+    """Compute the result of `spectra.lift_lmmse` as a low-rank cube: a sum of a few basis images times spectra.
 
     Pixels are computed block by block, so that the full cube is never in memory.
 
     Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
             float64.
     Units:  planes and residuals are reflectances; the basis has no unit.
-    Error:  as `spectra.compress`, relative to the lift in float64; `lift_lmmse` differs from that lift by round-off.
+    Error:  as `spectra.compress`, relative to `lift_lmmse` in float64; float32 differs by round-off.
     Raises: ValueError where `lift_lmmse` or `spectra.compress` raises ValueError.
     Source: as `lift_lmmse`.
     """
@@ -87,7 +87,7 @@ def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> Lo
 
 
 def _attach(lift: Node, low_rank: Node, matrix: Callable[[Bands], Tensor]) -> None:
-    """Attach the reference, the check and the low-rank form to a node that multiplies RGB by a matrix (band, 3)."""
+    """Attach a float64 reference, a check and a low-rank variant to a node that multiplies RGB by a matrix."""
 
     @lift.reference
     def lifted(rgb: Tensor, bands: Bands) -> Tensor:
@@ -108,7 +108,7 @@ def _attach(lift: Node, low_rank: Node, matrix: Callable[[Bands], Tensor]) -> No
 
 
 def lift_checks(result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None = None) -> list[Check]:
-    """Report how far the colours of reconstructed spectra are from the source colours, and how much was clipped.
+    """Report the colour error of spectra estimated from RGB, and the share of negative light that was clipped to 0.
 
     A large picture is sampled at some 100 000 pixels.
     """
@@ -118,7 +118,7 @@ def lift_checks(result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None
     off = float((to_srgb(bands.centres) @ spectra - colours).abs().max()) / scale
     checks = [
         Check(
-            f"colours of the spectra differ from the source colours by {off:.2g} of the brightest colour",
+            f"colours of the estimated spectra differ from the RGB input by {off:.2g} of the largest RGB value",
             float(result.min()) >= 0,
         )
     ]
@@ -136,14 +136,14 @@ def needs_rgb(rgb: Tensor) -> None:
 
 
 def _lifted(rgb: Tensor, matrix: Tensor) -> Tensor:
-    """Multiply a picture by a matrix, and set negative values to 0 in place to save memory."""
+    """Multiply an RGB picture by a matrix (band, 3), and set negative results to 0 in place to save memory."""
     needs_rgb(rgb)
     rgb = single(rgb)
     return torch.relu_(matrix.to(rgb) @ rgb.flatten(1)).reshape(-1, *rgb.shape[1:])
 
 
 def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> LowRankCube:
-    """Return reconstructed spectra as a low-rank cube.
+    """Estimate spectra from an RGB picture by a matrix (band, 3), and return the spectra as a low-rank cube.
 
     For a picture that requires a gradient, the full cube is computed, so that the gradient reaches the picture.
     """
@@ -172,7 +172,7 @@ def _solved(centres: tuple[float, ...]) -> Tensor:
 
 
 def lift_matrix(known: Tensor, centres: Tensor) -> Tensor:
-    """Return the matrix that estimates reflectance from linear sRGB, for spectra with the statistics of ``known``.
+    """Return the matrix that estimates reflectance from linear sRGB, fitted to the measured spectra ``known``.
 
     Shapes: known (spectrum, band) -> (band, 3) float64.
     """

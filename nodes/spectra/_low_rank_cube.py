@@ -1,4 +1,4 @@
-"""Low-rank approximation of a spectral cube by a few planes and their spectra, with an upper bound of the error."""
+"""Low-rank approximation of a spectral cube: a sum of a few basis images times spectra, with an error bound."""
 
 from typing import Annotated
 
@@ -17,7 +17,7 @@ Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: relative to the l
 def compress(cube: Tensor, *, within: Share = 1e-6) -> LowRankCube:
     """Approximate a spectral cube by the fewest principal components that keep the error within a bound.
 
-    A grey scene needs one plane. A linear lift from RGB needs three planes, or a few more where pixels are clipped.
+    A grey scene needs one basis image. A linear estimate from RGB needs three, or a few more if pixels are clipped.
 
     Shapes: cube (band, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
             float64, residual_map (y, x).
@@ -38,9 +38,9 @@ def compress(cube: Tensor, *, within: Share = 1e-6) -> LowRankCube:
 
 
 def as_low_rank_cube(flat: LowRankCube, cube: Tensor) -> LowRankCube:
-    """Reshape the flat planes of a low-rank cube to pictures of the size of ``cube``.
+    """Reshape the flattened basis images of a low-rank cube to the rows and columns of ``cube``.
 
-    If ``cube`` requires a gradient, the planes are computed anew as projections of ``cube``.
+    If ``cube`` requires a gradient, the basis images are computed anew as projections of ``cube``.
     """
     if cube.requires_grad:
         planes = torch.tensordot(flat.basis.T.to(cube), cube, 1)
@@ -65,10 +65,10 @@ def _(cube: Tensor, *, within: float = 1e-6) -> LowRankCube:
 
 @compress.check
 def plane_checks(result: LowRankCube, *inputs: object, **params: object) -> list[Check]:
-    """Report the number of planes of a `LowRankCube`, and its error relative to the full cube."""
+    """Report the number of basis images of a low-rank cube, and the error relative to the full spectral cube."""
     rms, most = (
         float(x[-1].max()) / max(float(result.residual_max[0].max()), 1e-300)
         for x in (result.residual_rms, result.residual_max)
     )
-    count = f"{len(result.planes)} planes for {len(result.basis)} bands"
-    return [Check(f"{count}: error {rms:.2g} rms, maximum {most:.2g}, relative to the largest element")]
+    count = f"{len(result.planes)} basis images for {len(result.basis)} bands"
+    return [Check(f"{count}: error {rms:.2g} rms, {most:.2g} at most, relative to the largest element of the cube")]

@@ -56,7 +56,7 @@ def reflectances(
 @reflectances.preflight
 def _(*, sets: tuple[Set, ...] = ("charts",), files: tuple[Path, ...] | None = None) -> list[str]:
     if not sets and not files:
-        raise ParameterError("files", f"neither sets nor files are given: {_FILES}")
+        raise ParameterError("files", f"the parameters sets and files are both empty: {_FILES}")
     for file in files or ():
         _read(file)
     return []
@@ -64,7 +64,12 @@ def _(*, sets: tuple[Set, ...] = ("charts",), files: tuple[Path, ...] | None = N
 
 @reflectances.check
 def _(result: Tensor, bands: Bands, **params: Any) -> list[Check]:
-    return [Check(f"{len(result)} spectra, {float(result.min()):.3g} to {float(result.max()):.3g}", len(result) > 3)]
+    return [
+        Check(
+            f"{len(result)} spectra, reflectance {float(result.min()):.3g} to {float(result.max()):.3g}",
+            len(result) > 3,
+        )
+    ]
 
 
 _SETS: dict[str, Callable[[], tuple[Table, ...]]] = {
@@ -98,13 +103,13 @@ def _known(file: Path, stamp: int) -> Table:
 
 
 def _wrong(wavelengths: Numbers, values: Numbers) -> str:
-    """Return the reason why numbers cannot be wavelengths and reflectances, or an empty text."""
+    """Return the reason why arrays from a file cannot be wavelengths and reflectances, or an empty text if they can."""
     if wavelengths.ndim != 1 or values.ndim != 2 or values.shape[1] != len(wavelengths) or values.size == 0:
         return f"{wavelengths.shape} wavelengths and {values.shape} reflectances: write (spectrum, wavelength)"
     if not (np.isfinite(wavelengths).all() and np.isfinite(values).all()):
-        return "some numbers are not finite"
+        return "some wavelengths or reflectances are NaN or infinite"
     if len(wavelengths) < 2 or not (np.diff(wavelengths) > 0).all() or wavelengths[0] < 100:
-        return "at least two rising wavelengths in nm are needed"
+        return "the file needs at least two wavelengths in nm, in rising order"
     if values.max() > _MOST or values.min() < -0.1:
         return f"values from {values.min():.3g} to {values.max():.3g} are not reflectances: write 1 for white, not 100"
     return ""

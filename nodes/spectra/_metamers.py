@@ -29,7 +29,7 @@ def metamers(
     blacks: Strength = 0.5,
     rng: torch.Generator,
 ) -> Tensor:
-    """Draw random reflectance spectra: mixtures of measured spectra, each with a metameric black added.
+    """Generate random reflectance spectra: mixtures of measured spectra, each with a metameric black added.
 
     A layer of thickness p turns a reflectance s into s^p (Beer and Lambert), which makes colours paler or deeper than
     measured. A metameric black is a measured spectrum minus the linear estimate from its colour: a black changes the
@@ -64,7 +64,8 @@ def metamers(
 def _(*, thickness: tuple[float, float] = (0.5, 2.0), **params: Any) -> list[str]:
     if thickness[0] > thickness[1]:
         raise ParameterError(
-            "thickness", f"the thinnest layer {thickness[0]:g} is above the thickest {thickness[1]:g}: exchange them"
+            "thickness",
+            f"the first thickness {thickness[0]:g} exceeds the second {thickness[1]:g}: exchange the two numbers",
         )
     return []
 
@@ -72,7 +73,7 @@ def _(*, thickness: tuple[float, float] = (0.5, 2.0), **params: Any) -> list[str
 @metamers.check
 def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
     low, high = float(result.min()), float(result.max())
-    return [Check(f"{len(result)} spectra, {low:.3g} to {high:.3g}", 0 <= low <= high <= 1)]
+    return [Check(f"{len(result)} random spectra, reflectance {low:.3g} to {high:.3g}", 0 <= low <= high <= 1)]
 
 
 def metameric_blacks(spectra: Tensor, known: Tensor, bands: Bands) -> Tensor:
@@ -86,9 +87,9 @@ def metameric_blacks(spectra: Tensor, known: Tensor, bands: Bands) -> Tensor:
 
 
 def _mixtures(known: Tensor, count: int, mixed: int, thickness: tuple[float, float], rng: torch.Generator) -> Tensor:
-    """Draw random mixtures of measured spectra, as layers of log-uniform thickness.
+    """Mix measured spectra at random, and apply a random layer thickness to each mixture (Beer and Lambert).
 
-    One spectrum dominates most mixtures.
+    The thickness is log-uniform. One spectrum dominates most mixtures.
     """
     options = {"generator": rng, "device": rng.device, "dtype": torch.float64}
     weights = -torch.rand(count, mixed, **options).clamp_min(1e-12).log()  # type: ignore[call-overload]
@@ -106,7 +107,7 @@ def _drawn(of: int, shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
 
 
 def _limits(base: Tensor, black: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the smallest and the largest factor, (spectrum, 1), for which ``base + factor * black`` is in [0, 1]."""
+    """Return the smallest and the largest factor that keep each spectrum ``base + factor * black`` in [0, 1]."""
     to_white, to_dark = (1.0 - base) / black, -base / black
     high = torch.where(black > 0, to_white, torch.where(black < 0, to_dark, torch.inf))
     low = torch.where(black > 0, to_dark, torch.where(black < 0, to_white, -torch.inf))

@@ -1,4 +1,4 @@
-"""Reconstruction of spectra from linear RGB to 31 bands by the network MST++."""
+"""Estimates of spectra in 31 bands from linear RGB by the neural network MST++."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -56,14 +56,16 @@ def _(*, weights: Path | None = None, untrained: str = "refuse", **params: Any) 
         _fitting(weights)
         return []
     if untrained == "refuse":
-        text = "MST++ has no weights: give the file of its checkpoint, choose another lift, or set untrained: allow"
+        text = (
+            "MST++ has no weights: give a checkpoint file in weights, use spectra.lift_lmmse, or set untrained: allow"
+        )
         raise ParameterError("weights", text)
-    return ["MST++ is untrained: its spectra have no meaning"]
+    return ["MST++ is untrained: the spectra have no meaning"]
 
 
 @lift_mst_plus_plus.check
 def _(result: Tensor, rgb: Tensor, bands: Bands, *, weights: Path | None = None, **params: Any) -> list[Check]:
-    noise = [] if weights is not None else [Check("MST++ is untrained: its spectra have no meaning", False)]
+    noise = [] if weights is not None else [Check("MST++ is untrained: the spectra have no meaning", False)]
     return lift_checks(result, rgb, bands) + noise
 
 
@@ -79,10 +81,11 @@ def lift_pictures(network: nn.Module, rgb: Tensor) -> Tensor:
 
 
 def start_mst_plus_plus(rng: torch.Generator, linear: Tensor | None = None) -> MSTPlusPlus:
-    """Return an MST++ network to train, which starts with random layers or as a linear lift.
+    """Return an MST++ network for training, with random weights or with the weights of a linear estimate.
 
-    ``linear`` is the matrix (31, 3) of the linear lift. The skip connection around the body then has this matrix, and
-    the last layer starts at 0. Training adds the corrections that image structure and a non-linear estimate allow.
+    ``linear`` is the matrix (31, 3) of the linear estimate of spectra from RGB. The skip connection around the body
+    then has this matrix, and the last layer starts at 0. Training adds the corrections that image structure and a
+    non-linear estimate allow.
     """
     network = _untrained("allow", rng).requires_grad_(True).train()
     if linear is not None:
@@ -99,7 +102,7 @@ def need_mst_plus_plus_bands(bands: Bands) -> None:
     if len(centres) != BANDS or float((centres - published).abs().max()) > 0.5e-9:
         raise ValueError(
             f"MST++ gives {BANDS} bands from 400 to 700 nm, not {len(centres)} from {float(centres[0]) * 1e9:.4g} to "
-            f"{float(centres[-1]) * 1e9:.4g} nm: use the bands of MST++, or choose another lift"
+            f"{float(centres[-1]) * 1e9:.4g} nm: use these 31 bands, or another node such as spectra.lift_lmmse"
         )
 
 
@@ -115,7 +118,7 @@ def _loaded(weights: Path) -> nn.Module:
 
 def _untrained(untrained: str, rng: torch.Generator) -> MSTPlusPlus:
     if untrained != "allow":
-        raise ValueError("MST++ has no weights: give the file of its checkpoint, or set untrained: allow")
+        raise ValueError("MST++ has no weights: give a checkpoint file in weights, or set untrained: allow")
     network = _empty().to_empty(device=rng.device)
     for name, tensor in network.named_parameters():
         if name.endswith(("rescale", "norm.weight")):
@@ -128,7 +131,7 @@ def _untrained(untrained: str, rng: torch.Generator) -> MSTPlusPlus:
 
 
 def _fitting(weights: Path) -> dict[str, Tensor]:
-    """Return the tensors of a checkpoint file; raise ParameterError unless names and shapes fit MST++."""
+    """Read the tensors of a checkpoint file, and raise ParameterError unless names and shapes fit the network MST++."""
     found = {name.removeprefix("module."): tensor for name, tensor in _read(weights).items()}
     network = _empty().state_dict()
     wrong = [name for name in network if name not in found or found[name].shape != network[name].shape]
@@ -154,5 +157,5 @@ def _read(weights: Path) -> dict[str, Tensor]:
         raise ParameterError("weights", f"{weights} holds no tensors that can be read safely: {why}") from None
     state = content.get("state_dict", content) if isinstance(content, dict) else content
     if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
-        raise ParameterError("weights", f"{weights} is not a state dict: save model.state_dict()")
+        raise ParameterError("weights", f"{weights} is not a state dict: save the output of model.state_dict()")
     return state

@@ -33,7 +33,7 @@ class MSTPlusPlus(nn.Module):
 
 
 class Stage(nn.Module):
-    """A stage of MST++: a U-Net of spectral attention with two levels and a residual connection."""
+    """A stage of MST++: a U-Net with spectral attention, two downsampling steps and a residual connection."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -96,7 +96,7 @@ class SpectralAttention(nn.Module):
         return result
 
     def _across(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return query and key of the attention, each band normalised to unit length over all pixels."""
+        """Return the queries and keys of the attention, with each band normalised to unit length over all pixels."""
         query, key = (F.normalize(to(pixels).transpose(1, 2), dim=-1) for to in (self.to_q, self.to_k))
         return query, key
 

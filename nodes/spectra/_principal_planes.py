@@ -1,4 +1,4 @@
-"""Principal components of the spectra of a cube, computed and verified in blocks of pixels."""
+"""Principal components of a spectral cube, computed and verified in blocks of pixels."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -26,7 +26,7 @@ class Source(NamedTuple):
 
 
 def few_planes(source: Source, within: float) -> LowRankCube:
-    """Approximate a cube by the fewest principal components that keep the root mean square error within a bound.
+    """Approximate a spectral cube by the fewest principal components that keep the rms error within a bound.
 
     The bound ``within`` is relative to the largest element. The planes and the map of errors are flat, with all pixels
     in one row. Raises ValueError for NaN.
@@ -66,9 +66,9 @@ def _largest_and_products(source: Source, scale: float = 1.0) -> tuple[Tensor, T
 
 
 def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the planes of a cube, and the largest error of the approximation in each band and at each pixel.
+    """Project a spectral cube on the axes of principal components, and return the largest error by band and by pixel.
 
-    The planes have the precision of the source.
+    The first returned value holds the basis images, in the precision of the source.
     """
     planes = torch.empty(axes.shape[1], source.pixels, dtype=source.dtype, device=axes.device)
     last, off = axes.new_zeros(source.bands), planes.new_empty(source.pixels)
@@ -82,10 +82,11 @@ def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
-    """Return the root mean square error of each band for approximations by the first 0, 1, 2, ... planes.
+    """Return the rms error of each band if a spectral cube is approximated by its first k principal components.
 
-    The error is that of the omitted planes plus the round-off of the planes. ``power`` holds the mean products of the
-    bands. The round-off of these products counts as part of the error.
+    The rows of the result are for k = 0, 1, 2 and so on. The error is that of the omitted components plus the round-off
+    of the basis images. ``power`` holds the mean products of the bands. The round-off of these products counts as part
+    of the error.
     """
     each = axes.square() * ((power @ axes) * axes).sum(0).clamp_min(0)
     after = torch.cat([each.flip(1).cumsum(1).flip(1), torch.zeros_like(each[:, :1])], 1)[:, : count + 1].T
@@ -96,10 +97,10 @@ def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
 
 
 def _rest(most: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -> Tensor:
-    """Return a bound of the largest error of each band for approximations by the first 0, 1, 2, ... planes.
+    """Return a bound of the largest error of each band if a cube is approximated by its first k principal components.
 
-    The errors of no plane and of all planes are measured. In between, the bound adds the omitted planes to the error
-    of all planes.
+    The rows of the result are for k = 0, 1, 2 and so on. The errors with no component and with all components are
+    measured. In between, the bound adds the omitted components to the error with all components.
     """
     each = basis.abs() * torch.maximum(planes.amax(1), -planes.amin(1)).double()
     last = last + 4 * torch.finfo(torch.float64).eps * (most + each.sum(1))  # round-off of the measurement

@@ -1,4 +1,7 @@
-"""Measured spectra from colour-science, interpolated to bands; wavelengths are in m, all values float64."""
+"""Measured spectra from the package colour-science, interpolated to spectral bands.
+
+Wavelengths are in m, and all values are float64.
+"""
 
 import functools
 from typing import NamedTuple
@@ -19,9 +22,9 @@ class Table(NamedTuple):
     values: Tensor  #: (spectrum, sample)
 
     def at(self, centres: Tensor) -> Tensor:
-        """Interpolate the spectra of the table linearly at the centres of bands: (spectrum, band), on the CPU.
+        """Interpolate the spectra of the table linearly at the centres of spectral bands.
 
-        The spectra are constant beyond the first and last sample.
+        The result is (spectrum, band), on the CPU. The spectra are constant beyond the first and last sample.
         """
         x = centres.detach().cpu().double()
         right = torch.searchsorted(self.wavelengths, x).clamp(1, len(self.wavelengths) - 1)
@@ -30,10 +33,10 @@ class Table(NamedTuple):
         return self.values[:, right - 1] * (1 - share) + self.values[:, right] * share
 
     def over(self, bands: Bands) -> Tensor:
-        """Average the linearly interpolated spectra of the table over each band: (spectrum, band).
+        """Average each linearly interpolated spectrum of the table over each spectral band.
 
-        The spectra are 0 beyond the first and last sample. Colour-science samples spectra at points, which changes the
-        energy of the lines of a lamp by 10 %.
+        The result is (spectrum, band). The spectra are 0 beyond the first and last sample. Colour-science samples
+        spectra at points, which changes the energy of the lines of a lamp by 10 %.
         """
         centres, half = bands.centres.detach().cpu().double(), bands.widths.detach().cpu().double() / 2
         thin = half <= 1e-13
@@ -42,7 +45,7 @@ class Table(NamedTuple):
         return torch.where(thin, self.at(centres) * inside, mean)
 
     def _below(self, limits: Tensor) -> Tensor:
-        """Integrate the linearly interpolated spectra exactly, from the first sample up to each limit."""
+        """Return the exact integral of each linearly interpolated spectrum from the first sample to each limit."""
         steps = self.wavelengths.diff()
         areas = ((self.values[:, 1:] + self.values[:, :-1]) / 2 * steps).cumsum(1)
         whole = torch.cat([torch.zeros_like(areas[:, :1]), areas], 1)
@@ -102,7 +105,7 @@ def paints() -> tuple[Table, ...]:
 
 @functools.cache
 def gamut_samples(name: str) -> Table:
-    """Return the test reflectances of a colour-rendering index: the 99 of CIE 2017, or the 15 of NIST CQS 9.0."""
+    """Return the test reflectances of a colour-rendering index: 99 of CIE 2017, or 15 of NIST CQS 9.0."""
     import colour
 
     if name == "CQS":
@@ -124,13 +127,15 @@ def to_srgb(centres: Tensor) -> Tensor:
 def require_range(
     wavelengths: Tensor, known: Tensor | tuple[float, float], source: str, fix: str = "choose bands inside that range"
 ) -> None:
-    """Raise ValueError for wavelengths outside the range of a source of spectra.
+    """Raise ValueError if the wavelengths of bands lie outside the range of a table or file of spectra.
 
     ``known`` has the range in m. ``source`` starts the message, such as "D65 is tabulated from".
     """
     low, high, first, last = (float(x) * 1e9 for x in (wavelengths.min(), wavelengths.max(), known[0], known[-1]))
     if low < first - _ROUNDING or high > last + _ROUNDING:
-        raise ValueError(f"bands from {low:.4g} to {high:.4g} nm, but {source} {first:.4g} to {last:.4g} nm: {fix}")
+        raise ValueError(
+            f"the bands reach from {low:.4g} to {high:.4g} nm, but {source} {first:.4g} to {last:.4g} nm: {fix}"
+        )
 
 
 def _table(spectra: object) -> Table:

@@ -31,7 +31,7 @@ def test_lsr_check_names_the_floor():
     psf = Psf(torch.full((1, 10, 10), 0.01), torch.tensor([0.1], dtype=torch.float64))
     lines = lsr.hooks.check(lsr(psf), psf)
     assert lines[0].ok
-    assert lines[1].text == "LSR of evenly spread light would be 0.1"
+    assert lines[1].text == "light spread evenly over the field would give a laser suppression ratio of 0.1"
     assert not lsr.hooks.check(torch.tensor([1.2]), psf)[0].ok
 
 
@@ -56,7 +56,7 @@ def test_a_full_pixel_counts_whether_well_or_converter_ends_first(gain, unit, bi
     raw = digitize(full_well(electrons, capacity=25500.0), rounding=rounding, rng=rng, **sensor)
     found = saturated(raw, full_well=25500.0, **sensor)
     assert (float(found.pixels), float(found.share)) == (2.0, 0.5)
-    assert saturated.hooks.check(found)[0].text == "2 saturated pixels, 50.00% of all"
+    assert saturated.hooks.check(found)[0].text == "2 saturated pixels, 50.00% of all pixels"
 
 
 def test_a_pixel_with_one_full_channel_counts_once():
@@ -88,11 +88,11 @@ def test_scene_and_lasers_add():
     even = saturation(visible, **SENSOR)[:, None, None].expand(2, 4, 4).float()
     both = peak_irradiance(scene, visible, factor, [even, even], [visible, visible], **SENSOR)
     assert float(both.irradiance) == pytest.approx(4.7, rel=1e-5)
-    assert peak_irradiance.hooks.check(both)[0].text == "brightest pixel 4.7 I_sat"
+    assert peak_irradiance.hooks.check(both)[0].text == "brightest pixel 4.7 times the saturation irradiance"
 
 
 def test_every_spot_needs_its_line():
-    with pytest.raises(ValueError, match="1 spots and 0 lines"):
+    with pytest.raises(ValueError, match="1 spots and 0 laser lines"):
         peak_irradiance(torch.ones(1, 2, 2), bands(5e-7), torch.ones(1), [torch.ones(1, 2, 2)], [], **SENSOR)
 
 
@@ -117,7 +117,7 @@ def test_peak_and_bsr_of_channels_are_those_of_all_bands():
     torch.testing.assert_close(bsr(kept, both[0]), bsr(kept, scene), rtol=1e-12, atol=0)
     with pytest.raises(ValueError, match="differ in shape"):
         bsr(both[0], scene[:, :3])
-    with pytest.raises(ValueError, match="lies outside the span of the image's rows"):
+    with pytest.raises(ValueError, match="from every combination of these weights"):
         peak_irradiance(channels(scene, rows(visible, seen)[:1]), visible, factor, **SENSOR)
     assert (peak_irradiance.accepts_channel_sums, peak_irradiance.needs_band_invariant, bsr.accepts_channel_sums) == (
         ("image",),

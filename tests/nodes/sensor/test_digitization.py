@@ -83,7 +83,7 @@ def test_the_bound_of_the_full_well_is_true(values, capacity):
 
 def test_full_well_counts():
     (line,) = full_well.hooks.check(torch.tensor([5.0, 9.0, 9.0]), torch.zeros(3), capacity=9.0)
-    assert line.text == "2 of 3 pixels are full"
+    assert line.text == "2 of 3 pixels reach the full well"
 
 
 @settings(max_examples=60, deadline=None)
@@ -105,5 +105,5 @@ def test_check_of_the_converter():
     assert not digitize.hooks.check(torch.full((4,), 255.0), torch.zeros(4), bits=8)[0].ok
     assert (
         digitize.hooks.check(torch.tensor([0.0, 1.0, 2.0, 255.0]), bits=8)[0].text
-        == "25.00% of pixels are at the largest number, 25.00% at 0 DN"
+        == "25.00% of pixels are at the largest digital number, 25.00% at 0 DN"
     )

@@ -63,7 +63,7 @@ def test_the_smallest_experiment(levels, pixels):
     points = curve(gain=1 / 0.37, levels=levels, pixels=pixels)
     assert points.shape == (levels, 3)
     assert torch.isfinite(points).all()
-    assert "no level" in photon_transfer.hooks.check(points, full_well=25500.0, gain=1 / 0.37)[0].text or levels > 2
+    assert "no flat" in photon_transfer.hooks.check(points, full_well=25500.0, gain=1 / 0.37)[0].text or levels > 2
 
 
 def test_check_judges_the_slope():

@@ -39,7 +39,7 @@ def test_filters_are_the_bands_of_their_list():
     assert result.centres.tolist() == [500 * NM, 450 * NM, 633 * NM]
     assert result.widths.tolist() == [10 * NM, 25 * NM, 1 * NM]
     assert result.weights.tolist() == [1, 1, 1]
-    assert filters.hooks.check(result)[0].text == "3 filters, 450 to 633 nm"
+    assert filters.hooks.check(result)[0].text == "3 filters with centres from 450 to 633 nm"
 
 
 def test_one_width_is_that_of_all_filters():

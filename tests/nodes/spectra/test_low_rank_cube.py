@@ -145,7 +145,7 @@ def test_darkness_is_one_plane_of_nothing():
     assert len(found.planes) == 1
     assert not bool(found.planes.any())
     assert not bool(found.residual_max.any())
-    assert "1 planes for 5 bands" in compress.hooks.check(found)[0].text
+    assert "1 basis images for 5 bands" in compress.hooks.check(found)[0].text
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-160, 1e160, 1e300])
@@ -187,7 +187,7 @@ def test_the_gradient_of_the_planes_reaches_the_cube():
 
 def test_the_check_says_how_many():
     found = compress(rand(1, 4, 4) * rand(6, 1, 1))
-    assert compress.hooks.check(found)[0].text.startswith("1 planes for 6 bands: error ")
+    assert compress.hooks.check(found)[0].text.startswith("1 basis images for 6 bands: error ")
 
 
 @settings(max_examples=20, deadline=None)
@@ -210,7 +210,7 @@ def test_light_falls_on_a_mixture_as_on_the_cube(times):
         assert bool((left(found, lit, r) <= found.residual_max[r] * (1 + 1e-9)).all())
     for one, exact in zip(found, illuminate.hooks.reference(mixed, power, times=times), strict=True):
         torch.testing.assert_close(one, exact)
-    assert "planes for 5 bands" in illuminate.hooks.check(found)[0].text
+    assert "basis images for 5 bands" in illuminate.hooks.check(found)[0].text
 
 
 def test_a_mixture_of_other_bands_is_refused():
@@ -224,7 +224,7 @@ def test_rows_are_photons_of_each_channel_and_wells():
     assert found.shape == (4, 31)
     torch.testing.assert_close(found[:3], seen * SCENE.centres, rtol=1e-15, atol=0)
     torch.testing.assert_close(found[3], SCENE.centres, rtol=0, atol=0)
-    assert rows.hooks.check(found)[0].text == "4 rows of weights for 31 bands, rank 4"
+    assert rows.hooks.check(found)[0].text == "4 weighted sums over 31 bands; the matrix of weights has rank 4"
     assert torch.equal(rows(SCENE, seen, well=False), found[:3])
     with pytest.raises(ValueError, match="same `bands` step"):
         rows(Bands(*(v[:5] for v in SCENE)), seen)
@@ -248,7 +248,7 @@ def test_a_lift_to_planes_is_the_lift_whether_clipped_or_not(lift, within):
         assert float(found.residual_rms[-1].max()) <= within * float(cube.max())
         assert len(found.planes) == len(compress(cube, within=within).planes)
         assert len(found.planes) == len(lift.low_rank_form.hooks.reference(colours, SCENE, within=within).planes)
-    assert "planes for 31 bands" in lift.low_rank_form.hooks.check(found)[0].text
+    assert "basis images for 31 bands" in lift.low_rank_form.hooks.check(found)[0].text
 
 
 def test_a_lift_to_planes_learns_and_refuses_what_is_no_picture():

@@ -210,7 +210,7 @@ def test_bands_beyond_a_file_and_nothing_at_all_are_refused(tmp_path):
     path = written(tmp_path, "csv", [450.0, 550.0, 700.0], [[0.5, 0.6, 0.7]])
     with pytest.raises(ValueError, match="holds 450 to 700 nm"):
         reflectances(SCENE, files=(path,))
-    with pytest.raises(ParameterError, match="neither sets nor files"):
+    with pytest.raises(ParameterError, match="sets and files are both empty"):
         reflectances.hooks.preflight(sets=())
     with pytest.raises(ParameterError, match="exchange"):
         metamers.hooks.preflight(thickness=(2.0, 1.0))

@@ -319,7 +319,7 @@ def test_photographs_are_found_and_broken_ones_said(photographs, tmp_path):
     assert [path.name for path in found.broken] == ["broken.jpg", "1.png"]
     assert len({float(p.sum()) for p in pictures}) > 10
     (tmp_path / "none").mkdir()
-    with pytest.raises(ValueError, match="no photograph"):
+    with pytest.raises(ValueError, match="holds no readable photograph"):
         Photographs.under(tmp_path / "none")
 
 
