@@ -1,4 +1,4 @@
-"""Cold runs of a recipe: each run starts with an empty store and computes every needed step."""
+"""Cold runs of a recipe, which start with an empty store and compute every step that the outputs depend on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from neusee.workflows.store.result_store import Store
 
 @contextmanager
 def cold(store: Store) -> Iterator[Store]:
-    """Yield a temporary store that has only the code digests of ``store``, and delete it afterwards."""
+    """Yield a temporary store with the code digests of ``store`` and no results, and delete the temporary store."""
     with TemporaryDirectory(prefix="neusee-") as folder:
         if os.path.isfile(store.code_memo):
             shutil.copyfile(store.code_memo, Path(folder) / store.code_memo.name)
@@ -33,7 +33,7 @@ def run_cold(recipe: Recipe, store: Store, device: str = "cpu") -> Result:
 
 
 def key_parts(recipe: Recipe, code: Code, device: str = "cpu") -> list[Any]:
-    """Return the parts of a store key that identify a run: the keys of the outputs, the tolerance and ``exact``."""
+    """Return the parts of a store key that identify a run: output keys, tolerance, and True for a full computation."""
     keys: dict[str, Key] = {}
     for name in needed(recipe, recipe.outputs):
         keys[name], _ = key_of(recipe.steps[name], keys, recipe.seed, code, device)

@@ -1,4 +1,4 @@
-"""Studies of a recipe: accuracy, stability, omissions, calibration and uncertainty.
+"""Studies of a recipe: accuracy, stability, left-out steps, calibration and uncertainty.
 
     study_recipe("accuracy", load("first_light"))       error against run time, over tolerances and settings
     study_recipe("stability", load("first_light"))      stiff and extreme cases against float64

@@ -49,7 +49,7 @@ class Line:
 def work_precision(
     lines: Sequence[Line], pareto_front: Sequence[tuple[float, float]], tolerance: float, title: str
 ) -> Any:
-    """Draw error against run time: a line for each parameter, the Pareto front, and a ring at the recipe itself."""
+    """Draw error against run time: a line for each parameter, the Pareto front, and a ring at the recipe's settings."""
     figure, axes = canvas(10.0, 7.0)
     ax = axes[0, 0]
     styles = _styles(line.name for line in lines)
@@ -71,7 +71,7 @@ def work_precision(
 
 @drawn
 def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
-    """Draw error against run time in ms for each step, with a dotted line at the run time of the step's reference."""
+    """Draw error against run time in ms for each step, with a dotted line at the time of the reference node."""
     columns = min(3, len(diagrams))
     rows = -(-len(diagrams) // columns)
     figure, axes = canvas(3.9 * columns + 0.4, 3.5 * rows + 0.7, rows, columns)
@@ -136,7 +136,7 @@ def _draw_diagram(diagram: Diagram, errors: Sequence[float] = (), seconds: Seque
 
 
 def _axis_limits(values: Sequence[float], least: float, margin: float) -> tuple[float, float]:
-    """Return axis limits that leave a margin around all values and have a ratio of at least ``least``."""
+    """Return the limits of a logarithmic axis: a margin around all values, and a ratio of at least ``least``."""
     low, high = min(values) / margin, max(values) * margin
     wider = math.sqrt(max(1.0, least / (high / low)))
     return low / wider, high * wider

@@ -40,7 +40,7 @@ rounding can shift all later random numbers, and the errors then include the noi
 
 @dataclass(frozen=True)
 class AccuracyResult:
-    """The result of the accuracy study: the measured points and the measured steps of a recipe."""
+    """The result of the accuracy study: error and run time of a recipe at each setting, and of its slow steps."""
 
     recipe: Recipe
     points: tuple[WorkPrecisionPoint, ...]
@@ -60,19 +60,19 @@ def machine_line() -> str:
 
 
 def summary_line(point: WorkPrecisionPoint) -> str:
-    """Return the line of progress of a point: parameter, setting, run time and error."""
+    """Return a line of progress about one measured setting: parameter, setting, run time and error."""
     return f"{point.trial.name}: {point.found.refused or f'{point.seconds:.3g} s, error {point.error:.2g}'}"
 
 
 def choices(points: Points) -> list[ToleranceChoice]:
-    """Return for each tolerance the point that the engine chose and the cheapest point within the tolerance."""
+    """Return the engine's choice for each tolerance, and the quickest measured setting within the tolerance."""
     sound = [p for p in points if p.sound]
     asked = ((p.trial.value, p) for p in sound)
     return [ToleranceChoice(value, p, cheapest(sound, value)) for value, p in asked if value is not None]
 
 
 def count_missed(points: Points) -> int:
-    """Return how many tolerances are exceeded by more than the rounding error of the full computation."""
+    """Return the number of tolerances that the measured error exceeds by more than the rounding error."""
     return sum(not c.held and not _beyond_rounding(c, points) for c in choices(points))
 
 
@@ -113,14 +113,14 @@ def _whole(points: Points) -> WorkPrecisionPoint | None:
 
 
 def _beyond_rounding(choice: ToleranceChoice, points: Points) -> bool:
-    """Return True if a tolerance is exceeded by at most the rounding error of the full computation."""
+    """Return True if the measured error exceeds the tolerance, but by at most the rounding error."""
     whole = _whole(points)
     rounding = _NO_WORSE * whole.most if whole else 0.0
     return not choice.held and choice.chosen.most <= choice.tolerance + rounding
 
 
 def pictures(result: AccuracyResult) -> dict[str, bytes]:
-    """Return the diagrams of the page by name, as PNG bytes."""
+    """Return the diagrams of the accuracy study's page by name, as PNG bytes."""
     drawn = {}
     sound = [p for p in result.points if p.sound]
     if sound:
@@ -137,7 +137,7 @@ def pictures(result: AccuracyResult) -> dict[str, bytes]:
 
 
 def sections(result: AccuracyResult, drawn: Mapping[str, bytes]) -> list[Section]:
-    """Return the sections of the page; ``drawn`` has the PNG bytes of each diagram by name."""
+    """Return the sections of the accuracy study's page; ``drawn`` has the PNG bytes of each diagram by name."""
     seeds = _SEEDS.format(result.seeds) if result.seeds > 1 else _ONE_SEED
     if result.seeds > 1 and any("poisson" in step.params.values() for step in result.recipe.steps.values()):
         seeds += " " + _POISSON
@@ -241,13 +241,13 @@ def _lines(recipe: Recipe, points: Points) -> list[Line]:
 
 
 def _dot(p: WorkPrecisionPoint, recipe: Recipe) -> Dot:
-    """Return the dot of a point, without a label at the recipe's own settings, where all lines of the diagram meet."""
+    """Return the dot of a measured setting, without a label at the recipe's own settings, where all lines meet."""
     label = "" if p.trial.recipe is recipe else p.trial.label
     return Dot(p.seconds, p.error, label, min(p.by_seed), p.most, p.trial.own)
 
 
 def _diagram(s: StepTried) -> tuple[str, list[Line], float]:
-    """Return the diagram of a step: the title, a line for each kind of variant, and the reference's run time in s."""
+    """Return the data of a step's diagram: title, a line for each changed property, and the reference's time in s."""
     names = dict.fromkeys(f.line for f in s.variants)
     lines = [Line(n, [Dot(f.seconds, f.error, f.label) for f in s.variants if f.line == n], n == USED) for n in names]
     on = f"\non {s.found.cut_inputs}" if s.found.cut_inputs else ""

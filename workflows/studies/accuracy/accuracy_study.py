@@ -48,7 +48,7 @@ def study(
     are left, and the next study measures them. Raises: `ValueError` if ``seeds`` is less than 1.
     """
     if seeds < 1:
-        raise ValueError(f"seeds={seeds}: the study of accuracy needs at least one seed, such as seeds=3")
+        raise ValueError(f"seeds={seeds}: the accuracy study needs at least one random seed, such as seeds=3")
     study_run = StudyRun("accuracy", recipe, command)
     cache = PointCache(finest(recipe), store, seeds, device)
     result = _measure(recipe, cache, progress, quick, math.inf if budget is None else time.monotonic() + budget)
@@ -58,7 +58,7 @@ def study(
 
 
 def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
-    """Yield the settings to measure: each tolerance, the full computation, and each setting of each parameter."""
+    """Yield the settings to measure: each tolerance, the full computation, and each value of each varied parameter."""
     asked = sorted({*(_FEWER if quick else TOLERANCES), recipe.tolerance}, reverse=True)
     for tolerance in asked:
         other = replace(recipe, tolerance=tolerance, exact=False)
@@ -96,14 +96,14 @@ def _measure(recipe: Recipe, cache: PointCache, progress: Progress, quick: bool,
 
 
 def _may_wait(trial: Trial, cache: PointCache) -> bool:
-    """Return True if a setting can be left to a later study: it belongs to a parameter and is not measured yet."""
+    """Return True if a later study may measure the setting: it varies a parameter and has no measurement yet."""
     if trial.recipe is None or trial.line in (TOLERANCE, KEEP_ALL):
         return False
     return not cache.store.has(cache.key(trial.recipe))
 
 
 def _slow_steps(recipe: Recipe, points: Sequence[WorkPrecisionPoint]) -> Iterator[tuple[Recipe, str, float]]:
-    """Yield (recipe, name, share of run time) of each slow step, and of slow steps that the engine substitutes."""
+    """Yield (recipe, step name, share of run time) of each slow step, and of slow steps that replace other steps."""
     whole = next((p.found.steps for p in points if p.trial.line == KEEP_ALL), {})
     for name, share in steps_that_matter(recipe, whole):
         yield recipe, name, share

@@ -26,7 +26,7 @@ _FEWER_SCALES = (0.75, 1.5)
 
 @dataclass(frozen=True)
 class Change:
-    """A setting of a recipe value, as overrides of the recipe; the recipe's own setting has no overrides."""
+    """One value to try for a recipe parameter, as overrides of the recipe (none for the recipe's own value)."""
 
     label: str
     overrides: tuple[str, ...]
@@ -34,7 +34,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Knob:
-    """A value of a recipe, or several values that change together, and the settings to measure."""
+    """A recipe parameter, or several parameters that change together, with the values to measure."""
 
     name: str  #: path in the recipe, such as ``optics.bands``
     what: str
@@ -43,7 +43,7 @@ class Knob:
 
 @dataclass(frozen=True)
 class Knobs:
-    """The values of a recipe that can be varied, and the reasons why other values cannot be varied."""
+    """The parameters of a recipe that can be varied, and the reasons why other parameters cannot be varied."""
 
     found: tuple[Knob, ...]
     without: tuple[str, ...]
@@ -59,7 +59,7 @@ class _Place:
 
 
 def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
-    """Return the values of ``recipe`` that trade accuracy for run time; ``quick`` gives each value fewer settings."""
+    """Return the recipe parameters that trade accuracy for run time; ``quick`` selects fewer values of each."""
     found: list[Knob] = []
     without: list[str] = []
     for what, turned in (
@@ -77,7 +77,7 @@ def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
 
 
 def finest(recipe: Recipe) -> Recipe:
-    """Return the recipe without omissions and with every step in its best precision; the sampling does not change."""
+    """Return the recipe with all steps computed in full and in their best precision, at the same sampling."""
     best = [f"{place.path}={allowed_words(place.steps[0], 'precision')[-1]}" for place in _places(recipe, "precision")]
     return replace(changed(recipe, best) if best else recipe, exact=True)
 
@@ -118,7 +118,7 @@ def _windows(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
 
 
 def _precisions(recipe: Recipe) -> Iterator[Knob | str]:
-    """Yield one knob for the precisions of all steps, because double precision in one step alone improves no result."""
+    """Yield one parameter for the precisions of all steps, because double precision in one step improves no result."""
     if places := _places(recipe, "precision"):
         words = allowed_words(places[0].steps[0], "precision")
         path = ", ".join(p.path for p in places)
@@ -126,18 +126,18 @@ def _precisions(recipe: Recipe) -> Iterator[Knob | str]:
 
 
 def _knob(path: str, settings: Sequence[tuple[Any, str, tuple[str, ...]]], own: Any) -> Knob:
-    """Return the knob of the value at ``path`` from settings (value, label, overrides) and the recipe's own value."""
+    """Return the varied parameter at ``path`` with its ``settings`` (value, label, overrides); ``own`` is unchanged."""
     return Knob(path, "", tuple(Change(label, () if value == own else how) for value, label, how in settings))
 
 
 def allowed_words(step: Step, parameter: str) -> tuple[str, ...]:
-    """Return the words that a parameter accepts, such as names of precisions; nodes list the coarsest word first."""
+    """Return the words that a parameter accepts, the coarsest first, such as the names of precisions."""
     hint = step.node.hints[parameter]
     return tuple(map(str, get_args(hint))) if get_origin(hint) is Literal else (str(step.params[parameter]),)
 
 
 def _places(recipe: Recipe, parameter: str, gives: type | None = None, beside: str = "") -> list[_Place]:
-    """Return where the recipe sets ``parameter``, for steps of return type ``gives`` that also have ``beside``."""
+    """Return the recipe paths that set ``parameter``, for steps that return ``gives`` and also have ``beside``."""
     found: dict[str, _Place] = {}
     for name in needed(recipe, recipe.outputs):
         step = recipe.steps[name]
@@ -153,7 +153,7 @@ def _places(recipe: Recipe, parameter: str, gives: type | None = None, beside: s
 
 
 def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
-    """Return the recipe path at which a step's parameter is written, or None if the value differs from item to item."""
+    """Return the recipe path that sets a step's parameter, or None if repetitions of the step have different values."""
     path = f"steps.{step.name.partition('[')[0]}.with.{parameter}"
     while True:
         setting = recipe.config.settings.get(path)

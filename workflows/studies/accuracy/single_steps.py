@@ -1,4 +1,4 @@
-"""Run time and error of several variants of single steps, compared with the reference of the node.
+"""Run time and error of variants of single steps, such as another precision, compared with a reference.
 
 A variant is the step as used, in another precision, with another allowed error, with a smaller window of the PSF, or
 left out. If the reference takes too long, all variants are measured on the middle of the pictures and on fewer bands.
@@ -57,7 +57,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class StepMeasurement:
-    """The variants of a step with their errors and times, as plain values that the store can keep."""
+    """The errors and run times of a step's variants, in types that the store can save."""
 
     variants: list[dict[str, Any]] = field(default_factory=list)
     reference: float = 0.0  #: s
@@ -80,7 +80,7 @@ class StepTried:
 
 
 def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tuple[str, float]]:
-    """Return (slowest item, share of the run time) of each step whose items take more than `SHARE` of the run time."""
+    """Return (slowest repetition, share of the run time) of each step that takes more than `SHARE` of the run time."""
     items: dict[str, list[str]] = defaultdict(list)
     for name in seconds:
         if name in recipe.steps:
@@ -91,7 +91,7 @@ def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tupl
 
 
 def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: float) -> StepTried:
-    """Measure the variants of a step on inputs so small that the reference takes at most about ``patience`` seconds."""
+    """Measure variants of a step on inputs so small that the reference takes at most about ``patience`` seconds."""
     step = recipe.steps[name]
     if step.node.hooks.reference is None:
         return StepTried(name, step.node.path, share, StepMeasurement(refused="the node has no reference"))
@@ -131,7 +131,7 @@ def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> 
 
 
 def _largest(step: Step, inputs: list[Any], seed: int, patience: float) -> tuple[Cut, Any, float] | None:
-    """Return the largest input size that the reference computes in ``patience`` s, with the result and the seconds."""
+    """Return the largest input size for which the reference takes about ``patience`` s, the result and the time."""
     best: tuple[Cut, Any, float] | None = None
     for size in _CUTS:
         if best is not None and best[2] * _GROWTH > patience:
@@ -153,7 +153,7 @@ def _variants(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[
 
 
 def _calls(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Callable[[], Any]]:
-    """Return for each variant (changed property, new value) a function that computes the step."""
+    """Return functions that compute variants of a step, by (changed property, new value)."""
     node = step.node
     calls: dict[tuple[str, str], Callable[[], Any]] = {(USED, ""): partial(_call, step, node, inputs, seed)}
     own = step.params.get("precision")
@@ -188,7 +188,7 @@ def _centred(x: Tensor, axis: int, count: int) -> Tensor:
 
 
 def _compared_value(value: Any) -> Any:
-    """Return the part of a result to compare: the full cube of a low-rank cube, or the planes and flux of channels."""
+    """Return the tensors of a step's result to compare, for example all bands of a low-rank spectral cube."""
     if isinstance(value, LowRankCube):
         return torch.einsum("bk,kyx->byx", value.basis.to(value.planes), value.planes)
     return (value.planes, value.flux) if isinstance(value, Channels) else value
@@ -206,7 +206,7 @@ def _time_once(compute: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def _median_time(compute: Callable[[], Any]) -> tuple[Any, float]:
-    """Return the result and the median time of several calls, without a short first call that only builds tables."""
+    """Call a function several times; return the result and the median run time, without a short first call."""
     value, seconds = _time_once(compute)
     times = [] if seconds < _LONG_ENOUGH else [seconds]
     while len(times) < _TIMES and sum(times) < _LONG_ENOUGH:
@@ -218,7 +218,7 @@ def _median_time(compute: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def cut_inputs(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
-    """Crop each picture in ``inputs`` to its middle, and keep fewer bands if the node declares the axis of bands."""
+    """Crop each picture in ``inputs`` to its middle, and keep fewer spectral bands if the node names the band axis."""
     side, bands = size
     parts = []
     for name, value in zip(node.inputs, inputs, strict=True):
@@ -242,7 +242,7 @@ def _middle(x: Tensor, side: int) -> Tensor:
 
 
 def _fewer_bands(value: Any, axis: int, bands: int) -> Any:
-    """Return ``value`` with only ``bands`` of its bands, evenly spaced."""
+    """Return ``value`` with only ``bands`` of its spectral bands, evenly spaced."""
     if isinstance(value, Tensor):
         count = value.shape[axis]
         if count <= bands:

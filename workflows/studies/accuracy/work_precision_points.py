@@ -47,7 +47,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class PointMeasurement:
-    """Errors and run times of a recipe, as plain values that the store can keep."""
+    """Errors of the outputs and run times of a recipe, in types that the store can save."""
 
     errors: dict[str, list[float]] = field(default_factory=dict)  #: by output, one for each seed
     seconds: list[float] = field(default_factory=list)  #: of the engine, one for each cold run
@@ -71,22 +71,22 @@ class WorkPrecisionPoint:
 
     @property
     def by_seed(self) -> list[float]:
-        """Return the error of the worst output for each seed."""
+        """Return the largest error over all outputs for each random seed."""
         return [max(column) for column in zip(*self.found.errors.values(), strict=True)]
 
     @property
     def error(self) -> float:
-        """Return the error of the worst output, as the median over the seeds."""
+        """Return the largest error over all outputs, as the median over the random seeds."""
         return median(self.by_seed) if self.by_seed else float("inf")
 
     @property
     def most(self) -> float:
-        """Return the largest error over all outputs and seeds, which must be within the tolerance."""
+        """Return the largest error over all outputs and random seeds, which must be within the tolerance."""
         return max(self.by_seed, default=float("inf"))
 
     @property
     def sound(self) -> bool:
-        """Return True if the recipe was run and compared with the reference."""
+        """Return True if the recipe ran and its outputs were compared with the reference."""
         return bool(self.found.errors and self.found.seconds)
 
 
@@ -102,7 +102,7 @@ class PointCache:
         self._warm = False
 
     def point(self, trial: Trial) -> WorkPrecisionPoint:
-        """Return the measured point of a setting; measure the point if the store does not have it."""
+        """Return the errors and run times of a setting; measure the setting if the store has no measurement of it."""
         recipe = trial.recipe
         if recipe is None:
             return WorkPrecisionPoint(trial, PointMeasurement(refused=trial.refused))
@@ -111,7 +111,7 @@ class PointCache:
         return WorkPrecisionPoint(trial, found)
 
     def time_again(self, point: WorkPrecisionPoint, number: int) -> WorkPrecisionPoint:
-        """Return the point with the time of cold run ``number`` added, or the same point if its first run was slow."""
+        """Add the time of cold run ``number`` to the run times of a point, unless its first run was slow."""
         recipe, seconds = point.trial.recipe, point.found.seconds
         if recipe is None or not seconds or seconds[0] >= _QUICK:
             return point
@@ -123,7 +123,7 @@ class PointCache:
         return run_cold(recipe, self.store, self.device).seconds
 
     def key(self, recipe: Recipe) -> str:
-        """Return the store key of a point: a digest of recipe, reference, engine, seeds, device and machine."""
+        """Return the store key of a measurement: a digest of recipe, reference, engine, seeds, device and machine."""
         both = [key_parts(r, self._code, self.device) for r in (recipe, self.reference)]
         return digest("accuracy", both, self.seeds, self.device, engine(), machine())
 
@@ -154,7 +154,7 @@ class PointCache:
         return PointMeasurement(errors, [result.seconds], sum(ran.values()), load, result.proof.worst, ran)
 
     def _warm_up(self, recipe: Recipe) -> None:
-        """Import libraries, read code and run the recipe once, because the first run of a process takes longer."""
+        """Run the recipe once without timing, because the first run of a process imports libraries and reads code."""
         self.truth(0)
         for step in with_substitutions(recipe, recipe.outputs).steps.values():
             self._code.digest(step.node.fn.__module__)

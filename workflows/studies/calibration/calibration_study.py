@@ -1,4 +1,4 @@
-"""The calibration study: tests of a posterior by simulated sensors, and its sensitivity to the prior."""
+"""The calibration study: tests of a posterior on simulated sensors, and sensitivity of the posterior to the prior."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class CalibrationStudyResult:
 
     @property
     def short(self) -> int:
-        """Return the number of simulations whose chain is too short for its autocorrelation time."""
+        """Return the number of simulations whose Markov chain is too short for its autocorrelation time."""
         return sum(not s.refused and not s.independent for s in self.simulations)
 
     @property
@@ -56,7 +56,7 @@ class CalibrationStudyResult:
 
     @property
     def failed(self) -> int:
-        """Return the number of criteria that fail: two for each parameter, and three for all simulations together."""
+        """Return the number of failed criteria, of two for each parameter and three for the set of simulations."""
         return sum(v.failed for v in self.rank_tests) + bool(self.refused) + bool(self.short) + bool(self.stranded)
 
 
@@ -96,7 +96,7 @@ def _simulate_all(simulator: SensorSimulator, count: int, progress: Progress) ->
 
 
 def _sensitivity(recipe: Recipe, move: str) -> tuple[Sensitivity | None, str]:
-    """Return the sensitivity of the recipe's own posterior to the prior, or None and the reason."""
+    """Return the sensitivity of the recipe's posterior to the prior, or None and the reason why there is none."""
     with TemporaryDirectory(prefix="neusee-") as folder:
         problem = SensorPosterior.of(recipe, Store(folder))
     mode = find_mode(problem, initial_theta(problem))

@@ -23,7 +23,7 @@ _NOT_KEPT = Path("/dev/null/not kept")  #: a file that never exists, because a s
 
 @dataclass(frozen=True)
 class PosteriorDraws:
-    """Draws from a posterior, and measures of the quality of their chain."""
+    """Draws from a posterior, and measures of the quality of the Markov chain."""
 
     samples: FloatArray  #: (draw, free parameter)
     tau: float = 0.0  #: steps, the longest autocorrelation time of any coordinate
@@ -34,7 +34,7 @@ class PosteriorDraws:
 def walk_draws(
     problem: SensorPosterior, mode: LaplaceFit, seed: int, how: str = "de", count: int = DRAWS
 ) -> PosteriorDraws:
-    """Return ``count`` random draws from a chain with the move ``how``, thinned to one step per autocorrelation time.
+    """Return ``count`` posterior draws from a Markov chain that is thinned to one step per autocorrelation time.
 
     The chain starts and walks as in `emcee_sampler.sample`. It ends sooner, because a simulation needs few draws.
     """
@@ -56,6 +56,6 @@ def walk_draws(
 
 
 def _steady(chain: FloatArray) -> bool:
-    """Return True if the standard deviations are alike in both halves of a chain (step, walker, free parameter)."""
+    """Return True if both halves of a Markov chain (step, walker, free parameter) have similar standard deviations."""
     early, late = (half.reshape(-1, half.shape[-1]).std(0) for half in np.array_split(chain, 2))
     return bool(((late < _ALIKE * early) & (early < _ALIKE * late)).all())

@@ -16,7 +16,7 @@ _TAIL = 0.05  #: probability beyond a limit
 
 @dataclass(frozen=True)
 class ParameterSensitivity:
-    """The estimate of one parameter, and the estimates with each prior twice as wide."""
+    """The estimate of one parameter, and its estimates after the prior of each parameter is made twice as wide."""
 
     name: str
     kind: str  #: one of `identifiability.KINDS`; for `upper` and `lower` the value is a limit of 95 %
@@ -50,7 +50,7 @@ def sensitivity(problem: SensorPosterior, samples: FloatArray, kinds: Mapping[st
 
 
 def _weights(z: FloatArray) -> FloatArray:
-    """Return normalised weights at ``z``: the ratio of the normal densities with standard deviations 2 and 1."""
+    """Return normalised importance weights of draws ``z`` for a normal prior of standard deviation 2 instead of 1."""
     log = 0.5 * (1.0 - 0.25) * z**2
     ratios = np.exp(log - log.max())
     weights: FloatArray = ratios / ratios.sum()

@@ -74,7 +74,7 @@ def _rank_test(name: str, sound: Sequence[SensorSimulation], parameters: int) ->
 
 
 def coverage_limits(count: int) -> tuple[float, float]:
-    """Return limits that the coverage of a correct posterior exceeds in 1 of 1000 studies of ``count`` simulations."""
+    """Return limits for the coverage of intervals, which a correct posterior exceeds in 1 of 1000 studies."""
     if count in _ROUNDED:
         return _ROUNDED[count]
     low, high = chance_band(count, SHARE, _CERTAIN)
@@ -91,7 +91,7 @@ def chance_band(count: int, share: float, certain: float) -> tuple[float, float]
 
 @drawn
 def ranks(rank_tests: Sequence[RankTest]) -> Any:
-    """Draw a histogram of the ranks of each parameter, with the band that contains 99 % of bins of uniform ranks."""
+    """Draw a histogram of the ranks of each parameter's true values, with the 99 % band of uniform ranks."""
     columns = min(3, len(rank_tests))
     rows = -(-len(rank_tests) // columns)
     figure, axes = canvas(3.4 * columns, 2.4 * rows + 0.4, rows, columns, sharex=True)

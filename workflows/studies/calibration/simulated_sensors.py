@@ -48,7 +48,7 @@ _TAIL = 0.05  #: share of the draws beyond either end of the interval whose cove
 
 @dataclass(frozen=True)
 class SensorSimulation:
-    """The result of one simulated sensor, as plain values that the store can keep."""
+    """The result of the calibration of one simulated sensor, in types that the store can save."""
 
     truth: dict[str, float]
     rank: dict[str, int] = field(default_factory=dict)  #: number of draws below the truth
@@ -119,7 +119,7 @@ class SensorSimulator:
         return replace(ranked, kinds=identified.kinds, seconds=time.perf_counter() - began)
 
     def _levels(self, truth: Mapping[str, float], seed: int) -> Sufficient:
-        """Simulate frames of a sensor with the parameters ``truth``, and return the statistics of the frames."""
+        """Simulate frames of a sensor with the parameters ``truth``, and return statistics of each light level."""
         values = {f"{step}.{name}": x for step in self.exposed for name, x in truth.items()}
         recipe = replace(self.recipe, seed=seed)
         with TemporaryDirectory(prefix="neusee-") as folder, torch.no_grad():
@@ -128,7 +128,7 @@ class SensorSimulator:
         return levels
 
     def _functions(self, store: Store) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-        """Return two likelihood functions of levels and parameters: without and with deviances and slopes."""
+        """Return the likelihood as a function of light levels and parameters, first without and then with deviances."""
         step = self.recipe.steps[self.nominal.step]
         free = [self._source, *(f"{step.name}.{name}" for name in self.nominal.names)]
 

@@ -1,4 +1,4 @@
-"""The leave-out study: the error of each omission of a recipe, and the run time of simpler scenes."""
+"""The leave-out study: the error of a recipe with steps left out, and the run time of simpler scenes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _HELD = {True: "holds", False: "fails"}
 
 @dataclass(frozen=True)
 class LeaveOutResult:
-    """The result of the leave-out study: errors of outputs and omissions, and run times of scenes."""
+    """The result of the leave-out study: errors of outputs, errors of left-out steps, and run times of scenes."""
 
     output_errors: Sequence[OutputError]
     rows: Sequence[OmissionRow]
@@ -33,14 +33,14 @@ class LeaveOutResult:
 
     @property
     def failed(self) -> int:
-        """Return how many outputs and omissions exceed their error bounds."""
+        """Return how many outputs and left-out steps exceed their error bounds."""
         return sum(not output.holds for output in self.output_errors) + sum(not row.holds for row in self.rows)
 
 
 def study(
     recipe: Recipe, store: Store, runs: Path, command: Sequence[str], progress: Progress, contents: bool = True
 ) -> Path:
-    """Measure the error of every omission of ``recipe`` and, with ``contents``, the run time of simpler scenes."""
+    """Measure the error of leaving out steps of ``recipe`` and, with ``contents``, the run time of simpler scenes."""
     study_run = StudyRun("leave-out", recipe, command)
     comparison = OmissionComparison(recipe, store)
     output_errors, rows = comparison.output_errors(), []

@@ -1,4 +1,4 @@
-"""Comparison of each omission with the full computation: error bound, measured error and saved run time.
+"""Comparison of a recipe with and without left-out steps: error bound, measured error and saved run time.
 
 The full computation is the recipe without omissions. It is compared with the recipe with all omissions that the engine
 chooses, and with one omission alone. The recipe with the chosen omissions is also compared with the same recipe after
@@ -34,7 +34,7 @@ _ROUNDING = 2e-7  #: rounding error of a sum in float32, relative to its largest
 
 @dataclass(frozen=True)
 class OmissionRow:
-    """One omission with its bound, its measured errors relative to the largest element, and the saved run time."""
+    """The effect of left-out steps: error bound, errors relative to the largest element, and saved run time."""
 
     name: str
     kind: str
@@ -51,7 +51,7 @@ class OmissionRow:
 
 @dataclass(frozen=True)
 class OutputError:
-    """The error of an output of the recipe with the chosen omissions, relative to the full computation."""
+    """The error of one output after the engine has left out steps, relative to the full computation."""
 
     output: str
     bound: float | None  #: error bound that the engine proved
@@ -61,7 +61,7 @@ class OutputError:
 
 
 class OmissionComparison:
-    """The runs to compare: the full computation, the recipe with the chosen omissions, and a run for each omission."""
+    """The runs to compare: all steps computed, the engine's choice of steps left out, and each step left out alone."""
 
     def __init__(self, recipe: Recipe, store: Store) -> None:
         self.recipe, self.store = recipe, store
@@ -75,7 +75,7 @@ class OmissionComparison:
         return facts_in(self.store.about(self.truth.keys[step])) or TensorStats.of(self.truth.value(step))
 
     def output_errors(self) -> list[OutputError]:
-        """Return the error of each output of the recipe with the chosen omissions."""
+        """Return the error of each output after the engine has left out its choice of steps."""
         errors = []
         for name in self.recipe.outputs:
             value, reference = self.chosen.values[name], self.truth.values[name]
@@ -85,7 +85,7 @@ class OmissionComparison:
         return errors
 
     def rows(self) -> Iterator[OmissionRow]:
-        """Yield the row of each omission; measure the omission if the store does not have the row."""
+        """Yield the errors and saved run time of each omission of steps; measure the omissions that are not stored."""
         for omission in self.found:
             alone = omission.applied_to(self.full)
             key, compute = self._key(omission, alone), partial(self._row, omission, alone)
@@ -110,14 +110,14 @@ class OmissionComparison:
         )
 
     def _reached(self, omission: Omission, alone: Recipe, changed: bool) -> tuple[dict[str, float], float | None]:
-        """Return the error of each output with one omission alone, and the change when the omission is undone."""
+        """Return the error of each output with one omission of steps, and the change when this omission is undone."""
         if not changed:
             return dict.fromkeys(self.recipe.outputs, 0.0), 0.0 if omission.taken else None
         outputs = _errors(self.recipe.outputs, alone.outputs, run(alone, self.store), self.truth)
         return outputs, self._back(omission) if omission.taken else None
 
     def _holds(self, omission: Omission, bound: float, pair: tuple[Any, Any], result: Result) -> bool:
-        """Return True if the error is within the bound: the rms for noise and band sums, else the largest error."""
+        """Return True if the bound holds for the rms error (noise and band sums) or the largest error (all others)."""
         if omission.kind == "stands in":  # both computations have a documented error of their own
             steps = [self.full.steps[name] for name in omission.exchange]
             cheaper = [result.recipe.steps[name] for name in omission.exchange.values()]
@@ -129,7 +129,7 @@ class OmissionComparison:
         return largest_error(*pair) <= bound * (1 + 1e-5) + (_ROUNDING if bound else 0.0)
 
     def _back(self, omission: Omission) -> float:
-        """Return the change of the worst output when one of the chosen omissions is undone."""
+        """Return the largest change of an output when one of the engine's omissions of steps is undone."""
         recipe = self.full
         for other in reversed(self.found):  # from the last, because the input that is handed on may be left out too
             if other.taken and other is not omission:
@@ -158,14 +158,14 @@ def _errors(names: Sequence[str], others: Sequence[str], result: Result, truth: 
 
 
 def _bounds(omission: Omission, result: Result) -> dict[str, float]:
-    """Return the error bound at each compared step: the stated bound, or for sums over bands the proved bound."""
+    """Return the error bound of each compared step: the stated bound, or for sums over bands the proved bound."""
     if omission.kind != "stands in":
         return dict.fromkeys(omission.at, omission.bound)
     return {name: bound for name in omission.at if (bound := result.proof.of(name)) is not None}
 
 
 def least_error(value: Tensor, reference: Tensor) -> float:
-    """Return a lower limit of the relative root mean square error over all noise, estimated from one draw.
+    """Return a lower limit of the relative root mean square error over all noise, estimated from one noisy result.
 
     Each pixel counts as a draw. If a few large pixels dominate the mean square error, the standard error of the mean is
     as large as the mean. The largest element is random too, so four standard

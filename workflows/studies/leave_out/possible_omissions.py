@@ -1,4 +1,4 @@
-"""The possible omissions of a recipe, each as a change of the full computation.
+"""The ways to leave out steps of a recipe, each as a change of the recipe that computes every step.
 
 There are three kinds. ``handed on``: a step whose node bounds its effect is left out, and the first input of the step
 takes the place of its result. ``not added``: light or dirt whose largest element is bounded is not added. ``stands
@@ -28,7 +28,7 @@ Kind = Literal["handed on", "not added", "stands in"]
 
 @dataclass(frozen=True)
 class Omission:
-    """An omission: steps of a recipe that can be left out or replaced by cheaper steps."""
+    """One way to save run time: steps of a recipe that can be left out or replaced by cheaper steps."""
 
     name: str
     kind: Kind
@@ -40,7 +40,7 @@ class Omission:
     beside: tuple[Step, ...] = ()  #: replacing steps that are not in the recipe
 
     def applied_to(self, recipe: Recipe) -> Recipe:
-        """Return ``recipe`` changed by this omission and by nothing else."""
+        """Return ``recipe`` with this omission of steps and no other change."""
         readers = set(recipe.steps) if self.kind != "stands in" else set(self.at)
         steps = {**recipe.steps, **{step.name: step for step in self.beside}}
         for name in readers & recipe.steps.keys():
@@ -50,7 +50,7 @@ class Omission:
         return replace(recipe, steps={name: steps[name] for name in order}, outputs=outputs)
 
     def value_of(self, step: str) -> str:
-        """Return the step whose result takes the place of the result of ``step`` in a recipe with this omission."""
+        """Return the name of the step whose result replaces the result of ``step`` after this omission of steps."""
         return self.exchange.get(step, step) if self.kind == "handed on" else step
 
     def _wires(self, reader: Step) -> Mapping[str, Wire]:
@@ -66,7 +66,7 @@ def _exchanged(wire: Wire, exchange: Mapping[str, str]) -> Wire:
 
 
 def omissions(full: Recipe, chosen: Result, facts_of: FactsOf) -> Iterator[Omission]:
-    """Yield every omission of the full computation ``full`` whose error has a bound."""
+    """Yield each way to leave out steps of the full computation ``full`` for which the error has a bound."""
     order = needed(full, full.outputs)
     yield from _stand_ins(full, order, chosen)
     for name in order:
@@ -97,7 +97,7 @@ def _not_added(recipe: Recipe, order: list[str], name: str, facts_of: FactsOf) -
 
 
 def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omission]:
-    """Yield the omission that replaces all images by sums over bands.
+    """Yield the `Omission` that computes sums over spectral bands instead of images of all bands.
 
     All images are replaced together, because two images that a step compares must be computed in the same way.
     """
@@ -113,7 +113,7 @@ def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omiss
 
 
 def _adding(recipe: Recipe, order: list[str], name: str) -> tuple[str, ...]:
-    """Return the steps that read the result of step ``name`` if all of them only add the result, else no steps."""
+    """Return the steps that read the result of step ``name``, or no steps if any of these does more than add it."""
     readers = [recipe.steps[n] for n in order if name in recipe.steps[n].sources]
     return tuple(reader.name for reader in readers) if all(_only_adds(reader, name) for reader in readers) else ()
 
@@ -124,7 +124,7 @@ def _only_adds(reader: Step, name: str) -> bool:
 
 
 def _largest(step: Step, facts_of: FactsOf) -> float:
-    """Return the node's bound of the largest element of a step's result, from statistics of the step's inputs."""
+    """Return an upper bound of the largest element of a step's result, from statistics of the step's inputs."""
     assert step.node.hooks.zero_bound is not None
     facts = [_facts(step.wires.get(name), facts_of) for name in step.node.inputs]
     try:
@@ -138,7 +138,7 @@ def _facts(wire: Wire, facts_of: FactsOf) -> TensorStats | list[TensorStats | No
 
 
 def _share(largest: float, recipe: Recipe, at: tuple[str, ...], facts_of: FactsOf) -> float:
-    """Return ``largest`` over the largest element of the results of steps ``at``; infinity if a result is no tensor."""
+    """Return ``largest`` over the largest element of the results of steps ``at``, infinity for non-tensor results."""
     if largest == 0:
         return 0.0
     if any(recipe.steps[name].node.hints.get("return") is not Tensor for name in at):

@@ -70,7 +70,7 @@ def scenes(recipe: Recipe) -> dict[str, Recipe | str]:
 
 
 def _changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
-    """Return ``recipe`` with the overrides, without the values that no step reads after these changes."""
+    """Apply overrides to ``recipe``, and remove the recipe values that no step reads any more."""
     try:
         return changed(recipe, overrides)
     except RecipeError as error:
@@ -96,7 +96,7 @@ def _overrides(recipe: Recipe) -> Mapping[str, Sequence[str]]:
 
 
 def _window_steps(recipe: Recipe) -> set[str]:
-    """Return the names of the steps that compute dirt and ghosts, and of the steps that need such a result."""
+    """Return the names of the steps that compute window dirt or ghosts, and of steps that require these results."""
     window = {name for name, step in recipe.steps.items() if step.node.path in _WINDOW}
     for name, step in recipe.steps.items():
         needs = {w for i, w in step.wires.items() if isinstance(w, str) and i not in step.node.optional}

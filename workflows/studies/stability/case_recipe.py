@@ -27,7 +27,7 @@ _SMALLER = {"pixels": 256, "levels": 6, "grid": 16, "width": 4}  #: limits of ot
 
 
 def with_losses(recipe: Recipe) -> dict[str, Step]:
-    """Return the steps of the recipe, with extra steps for losses and related nodes that take the same inputs."""
+    """Return the steps of the recipe, and extra steps that compute losses and related results from the same inputs."""
     steps = dict(recipe.steps)
     for name, step in recipe.steps.items():
         for path, params in _COMPARES.get(step.node.path, ()):
@@ -42,7 +42,7 @@ def with_losses(recipe: Recipe) -> dict[str, Step]:
 
 
 def with_size(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:
-    """Return the steps with fewer pixels, pupil samples and bands; pupil diameters do not change."""
+    """Reduce the pixels, pupil samples and spectral bands of the steps, and keep the pupil diameters."""
     sides = [side for step in steps.values() for name in ("shape",) for side in step.params.get(name) or ()]
     part = size.pixels / max(sides, default=size.pixels)
     return {name: replace(step, params=_smaller(step, size, part)) for name, step in steps.items()}
@@ -63,7 +63,7 @@ def _smaller(step: Step, size: Size, part: float) -> dict[str, Any]:
 
 
 def with_parameters(steps: Mapping[str, Step], case: Case) -> dict[str, Step]:
-    """Return the steps with the parameter values that a case changes."""
+    """Return the steps with the parameter values of an extreme case."""
     return {name: replace(step, params=_changed(step, case)) for name, step in steps.items()}
 
 
@@ -90,7 +90,7 @@ class CaseRecipe:
 
     @classmethod
     def of(cls, recipe: Recipe, case: Case, code: Code) -> CaseRecipe:
-        """Return the recipe of a case with the key of each step; results that the case changes have other keys."""
+        """Return the recipe of an extreme case and the store key of each step; changed results have other keys."""
         steps = with_parameters(with_size(with_losses(recipe), case.size), case)
         chain = cls(recipe, case, steps)
         for name in in_order({n: s.sources for n, s in steps.items()}, steps):
@@ -140,7 +140,7 @@ def _put(step: Step, case: Case) -> Any:
 
 
 def unchanged_steps(chain: CaseRecipe, usual: CaseRecipe) -> Iterator[str]:
-    """Yield the steps that have the same inputs and parameters in an extreme case as in the usual case."""
+    """Yield the steps with the same inputs and parameters in an extreme case as in the recipe without changes."""
     if chain.case is usual.case or chain.case.inputs or chain.case.alike:
         return
     for name, step in chain.steps.items():

@@ -1,4 +1,4 @@
-"""The test of one step in one extreme case: errors of its result and of its gradient, relative to float64.
+"""The test of one step in one extreme case: errors of result and gradient, relative to a float64 computation.
 
 The reference is the node's own reference, or the node's function on the same inputs in float64, with the same random
 numbers. The bound of the result is the node's ``rtol`` times the largest element of the reference. The bound of the
@@ -36,7 +36,7 @@ _HALVES = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
 
 @dataclass(frozen=True)
 class Cell:
-    """The test result of one step in one extreme case: a mark, the errors of result and gradient, and the bounds."""
+    """The test result of one step in one extreme case: pass, warn or fail, and errors of result and gradient."""
 
     mark: Mark
     note: str
@@ -51,7 +51,7 @@ class _Refused(Exception):
 
 
 class _CountedInSingle(TorchFunctionMode):
-    """A PyTorch mode that draws float64 Poisson counts from the mean rounded to single precision."""
+    """A PyTorch function mode that samples float64 Poisson counts with the mean rounded to single precision."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func is torch.poisson and args[0].dtype == torch.float64:
@@ -60,7 +60,7 @@ class _CountedInSingle(TorchFunctionMode):
 
 
 def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell | None:
-    """Test a step in a case and return its mark and errors; return None if the case changes no input of the step."""
+    """Test a step in an extreme case and return the test result, or None if the case changes no input of the step."""
     given = _changed_inputs(inputs, case)
     if given is None:
         return None
@@ -73,7 +73,7 @@ def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell
 
 
 def _changed_inputs(inputs: Sequence[Any], case: Case) -> list[Any] | None:
-    """Return the inputs with the case's change of pictures, or None if the inputs have no picture to change."""
+    """Return a step's inputs with the pictures changed for an extreme case, or None if no input is a picture."""
     given = list(inputs)
     if case.alike:
         if len(given) < 2 or not all(isinstance(x, Tensor) and _is_picture(x) for x in given[:2]):
@@ -101,7 +101,7 @@ def _run(step: Step, fn: Any, inputs: Sequence[Any], seed: int, **params: Any) -
 
 
 def _as_used(step: Step, inputs: Sequence[Any], seed: int) -> Any:
-    """Compute the step as in a run and return the result; raise `_Refused` if the step raises `ValueError`."""
+    """Compute a step with its own parameters and return its result; raise `_Refused` for a `ValueError`."""
     try:
         return _run(step, step.node.fn, inputs, seed)
     except ValueError as error:
@@ -138,7 +138,7 @@ def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
 
 
 def _marked(error: float, bound: float, slope: float | None, steeper: float) -> Cell:
-    """Compare errors with their bounds: pass up to half of the bounds, warn up to the bounds, fail beyond."""
+    """Return the outcome of a test: pass if errors are below half of their bounds, warn up to the bounds, else fail."""
     used = [error / bound] if slope is None else [error / bound, slope / steeper]
     within = all(share <= 1.0 for share in used)  # NaN is not within its bound
     near = within and max(used) > _NEAR
@@ -168,7 +168,7 @@ def _over(a: Tensor, b: Tensor, floor: float) -> float:
 
 
 def _dim_error(value: Any, truth: Any) -> float:
-    """Return the largest error of elements far darker than the brightest element, relative to the largest of them."""
+    """Return the largest error of the dim elements of a result, relative to the brightest dim element."""
     worst = 0.0
     for a, b in zip(tensors_in(value), tensors_in(truth), strict=True):
         dim = b.abs() < _DIM * b.abs().max() if b.is_floating_point() and b.ndim >= 2 else None
@@ -206,7 +206,7 @@ def _slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
 
 
 def _slight(picture: Tensor) -> float:
-    """Return the least scale of a gradient error: the gradient of a normalised mean, or the least normal number."""
+    """Return the least divisor of a gradient error: the gradient of a normalised mean, or the least normal number."""
     top = float(picture.detach().double().abs().max())
     return max(1.0 / (picture.numel() * max(top, _LEAST)), torch.finfo(picture.dtype).tiny)
 
@@ -237,7 +237,7 @@ def _slopes(inputs: list[Any], fn: Any, ids: list[int] | None = None) -> list[Te
 
 
 def _weighed(value: Any) -> Tensor | None:
-    """Return a weighted sum of all differentiable results, each scaled to about 1; the weights are always the same."""
+    """Return the sum of all differentiable results, each scaled to about 1 and multiplied by fixed random weights."""
     parts = [(x.double() * _weight(x) / _near(x)).sum() for x in tensors_in(value) if x.requires_grad]
     return torch.stack(parts).sum() if parts else None
 
@@ -256,7 +256,7 @@ def _near(x: Tensor) -> float:
 
 
 def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed: int) -> Cell:
-    """Return a cell that fails if the result of a step hides NaN or infinity in one of the input pictures."""
+    """Return a test result that fails if a step's result does not show NaN or infinity of an input picture."""
     notes = [_one_seen(step, _with_one_changed(i, inputs, given), seed) for i in range(len(_pictures(inputs)))]
     hidden = [note for note in notes if note.startswith("hidden")]
     stated = stated_words(step.node, case.name)
@@ -266,7 +266,7 @@ def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed:
 
 
 def _one_seen(step: Step, given: list[Any], seed: int) -> str:
-    """Return a note on how a step treats NaN or infinity: refused, seen in the result, as a large number, or hidden."""
+    """Return how a step treats NaN or infinity in an input: refused, seen in the result, as a large number, hidden."""
     with torch.no_grad():
         try:
             value = _as_used(step, given, seed)

@@ -34,7 +34,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Case:
-    """An extreme case: the changes that it makes to a recipe. Each case is one row of the grid."""
+    """An extreme case for the test of a recipe: changed parameters, results or inputs. Each case is one row of a grid."""
 
     name: str
     what: str  #: the extreme property
@@ -80,7 +80,7 @@ def _peak_of(top: float) -> Callable[[Tensor], Tensor]:
 
 
 def _lamp(scene: Tensor) -> Tensor:
-    """Return the scene with one lamp in the middle that is a million times brighter than the rest."""
+    """Return the scene with a lamp in the middle, a million times brighter than the rest of the scene."""
     return middle(1.0)(scene * (1e-6 / scene.max()))
 
 
@@ -107,7 +107,7 @@ def _closed(pupil: Pupil) -> Pupil:
 
 
 def _off_axis(share: float) -> Callable[[Params], tuple[float, float]]:
-    """Return a function for the angle of a laser whose spot is ``share`` sensor widths off the centre along x."""
+    """Return a function that computes the angle of a laser whose spot is ``share`` sensor widths from the centre."""
     return lambda p: (0.0, share * field_of_view(p["focal_length"], p["pixel_pitch"], p["shape"])[1])
 
 

@@ -1,4 +1,4 @@
-"""The picture of the stability study: a grid with the mark and the error of each node in each case."""
+"""The picture of the stability study: a grid with the outcome and the error of each node in each extreme case."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Entry = tuple[str, str, str, Cell]  #: group, case, node, cell
 
 @drawn
 def grid_picture(entries: Sequence[Entry]) -> Any:
-    """Draw the grid of marks and errors: a row for each case and a column for each node, with losses last."""
+    """Draw the grid of test outcomes and errors: a row for each extreme case, a column for each node, losses last."""
     cases = list(dict.fromkeys((group, case) for group, case, _, _ in entries))
     nodes = sorted({node for _, _, node, _ in entries}, key=lambda n: (n.startswith("losses."), n))
     panels = max(1, -(-len(nodes) // _ACROSS))
@@ -50,7 +50,7 @@ def _panel(ax: Any, entries: Sequence[Entry], cases: list[tuple[str, str]], node
 
 
 def cell_text(cell: Cell) -> str:
-    """Return the text of a cell of the grid: a sign for warn or fail, and the error nearest to its bound."""
+    """Return the text of one test in the grid: a sign for warn or fail, and the error that is nearest to its bound."""
     sign = {"pass": "", "warn": "!", "fail": "×"}[cell.mark]
     if cell.error is None:
         short = "r" if cell.note.startswith("refused") else "s" if "seen" in cell.note else "–"

@@ -40,7 +40,7 @@ names the cause. An empty cell: the step has the inputs of the usual case, or no
 
 @dataclass(frozen=True)
 class GridCell:
-    """One cell of the grid, with the case, the step and the node that were tested."""
+    """One test result with the extreme case, the step and the node that were tested."""
 
     case: Case
     step: str
@@ -49,7 +49,7 @@ class GridCell:
 
     @property
     def severity(self) -> tuple[int, float]:
-        """Return a sort key, largest for the worst cell: rank of the mark, then the largest ratio of error to bound."""
+        """Return a sort key, largest for the worst result: the outcome, then the largest ratio of error to bound."""
         cell = self.cell
         pairs = ((cell.error, cell.bound), (cell.slope, cell.slope_bound))
         shares = [error / bound for error, bound in pairs if error is not None and bound]
@@ -64,7 +64,7 @@ def study(
     progress: Progress,
     cases: Sequence[Case] = CASES,
 ) -> Path:
-    """Test every step of ``recipe`` and its losses in every case, and return the folder with the results."""
+    """Test every step of ``recipe`` and its losses in every extreme case, and return the folder with the results."""
     study_run = StudyRun("stability", recipe, command)
     with one_thread():
         rows = list(_rows(recipe, store, cases, progress))
@@ -97,7 +97,7 @@ def _row(chain: CaseRecipe, same: set[str], store: Store, own: str) -> Iterator[
 
 
 def _judge(chain: CaseRecipe, name: str) -> dict[str, Any]:
-    """Return the fields of a cell, or an empty dict if an earlier step failed or the case changes no input."""
+    """Return the test result of a step as a dict, empty if an earlier step failed or the case changes no input."""
     try:
         inputs = chain.inputs(name)
         with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""The outputs of a recipe at draws of its uncertain inputs; steps that depend on no input are computed only once."""
+"""The outputs of a recipe for random values of its uncertain inputs; steps without these inputs run only once."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _NARROW = 8  #: a tensor of two axes counts as a picture if both are longer
 
 
 class OutputDraws:
-    """The outputs of a recipe at draws of its uncertain inputs; the store keeps the numbers of each draw."""
+    """The outputs of a recipe for random values of its uncertain inputs; the store keeps the numbers of each draw."""
 
     def __init__(self, inputs: Inputs, store: Store, device: str = "cpu", workers: int = 0) -> None:
         self.inputs, self.store, self.device = inputs, store, device
@@ -54,18 +54,18 @@ class OutputDraws:
 
     @cached_property
     def _function(self) -> Any:
-        """Compute the steps that depend on no input, and return the recipe as a function of the inputs."""
+        """Compute the steps that depend on no uncertain input, and return the recipe as a function of the inputs."""
         free = tuple(self.inputs.readers)
         return as_function(self.inputs.recipe, *free, outputs=self.outputs, store=self.store, device=self.device)
 
     def ready(self) -> float:
-        """Compute the steps that depend on no input, and return the run time in seconds."""
+        """Compute the steps that depend on no uncertain input, and return the run time in seconds."""
         began = time.perf_counter()
         _ = self._function
         return time.perf_counter() - began
 
     def numbers(self, values: FloatArray) -> list[Numbers]:
-        """Return all numbers of the outputs at each draw (draw, input); compute draws that the store does not have."""
+        """Return all numbers in the outputs for each draw of the inputs; compute draws that the store does not have."""
         keys = [self.key(row) for row in values]
         found = [kept and kept["numbers"] for kept in map(self._kept, keys)]
         lacking = [i for i, numbers in enumerate(found) if numbers is None]
@@ -74,7 +74,7 @@ class OutputDraws:
         return [numbers for numbers in found if numbers is not None]
 
     def pictures(self, values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
-        """Return mean and standard deviation of every picture among the outputs; store the numbers of each draw too."""
+        """Return mean and standard deviation of each output picture over the draws, and store each draw's numbers."""
         keys = [self.key(row) for row in values]
         whole = digest("uncertainty pictures", keys)
         if (first := self._kept(keys[0])) is not None and not first["pictures"]:
@@ -93,7 +93,7 @@ class OutputDraws:
         return {name: (total.mean, total.sd) for name, total in sums.items()}
 
     def key(self, row: FloatArray) -> str:
-        """Return the store key of a draw: a digest of the keys of the outputs in a run with the drawn values."""
+        """Return the store key of one draw: a digest of the output keys of a run with the sampled input values."""
         recipe = self.inputs.recipe
         keys = self._keys(self.inputs.theta(self._named(row)))
         outputs = [[name, keys[name]] for name in self.outputs]
@@ -101,7 +101,7 @@ class OutputDraws:
         return digest("uncertainty draw", engine("studies.uncertainty.output_draws"), outputs, within)
 
     def _keys(self, theta: Mapping[str, Any]) -> dict[str, str]:
-        """Return the key of each step at the inputs ``theta``, or without inputs, of steps that depend on no input."""
+        """Return the store keys of steps that depend on the inputs ``theta``; if ``theta`` is empty, of other steps."""
         recipe, keys = self.inputs.recipe, dict(self._fixed) if theta else {}
         by_step: dict[str, dict[str, Any]] = {}
         for reader, value in theta.items():
@@ -130,7 +130,7 @@ class OutputDraws:
         return numbers
 
     def _results(self, rows: Sequence[FloatArray]) -> Iterator[dict[str, Any]]:
-        """Yield the outputs at each draw in order; ``self.workers`` threads compute one draw each at the same time."""
+        """Yield the outputs for each draw of the inputs, in order; ``self.workers`` threads compute in parallel."""
         if not rows:
             return
         self.ready()
@@ -151,7 +151,7 @@ class OutputDraws:
                 found: dict[str, Any] = self._function(self.inputs.theta(values))
         except (RuntimeError, ValueError) as error:
             at = ", ".join(f"{name} = {value:.6g}" for name, value in values.items())
-            raise ValueError(f"the recipe fails with {at}: {error}") from error
+            raise ValueError(f"the recipe fails at the input values {at}: {error}") from error
         return found
 
     def _named(self, row: FloatArray) -> dict[str, float]:
@@ -200,7 +200,7 @@ class _Sum:
 
 @cache
 def _keep_memory() -> None:
-    """Make the process reuse the memory of a draw for the next draw, because a new allocation takes too long.
+    """Make the process reuse freed memory, because a new allocation for each draw takes too long.
 
     The setting works with glibc only, and lasts for the rest of the process.
     """

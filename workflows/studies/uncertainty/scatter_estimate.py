@@ -1,4 +1,4 @@
-"""Means and standard deviations of quantities over draws, and the standard errors of the standard deviations."""
+"""Means and standard deviations of quantities over random draws, and standard errors of the standard deviations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sobol indices, computed with SALib: the share of each independent input in the variance of a number."""
+"""Sobol indices, computed with SALib: the share of each independent input in an output's variance."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def indices(names: Sequence[str], z: FloatArray, y: FloatArray, seed: int) -> So
 
 
 def _fit(z: FloatArray, y: FloatArray) -> tuple[FloatArray, float]:
-    """Fit the polynomial; return its coefficients and the share of the variance that it predicts (PRESS)."""
+    """Fit a Hermite polynomial; return the coefficients and the share of the variance that it predicts (PRESS)."""
     many = _count(z.shape[1], 2)
     terms = _terms(z, many if many * _BY_TERM <= len(z) else _count(z.shape[1], 1))
     fitted = np.asarray(np.linalg.lstsq(terms, y, rcond=None)[0], np.float64)

@@ -1,4 +1,4 @@
-"""Pictures of the uncertainty study: tornado diagrams, bands of curves, histograms, and images with deviations."""
+"""Pictures of the uncertainty study: tornado diagrams, curves with bands, histograms, and means of images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ALONG = 200  #: signals of a photon-transfer curve
 
 @drawn
 def tornado(swings: Mapping[str, Sequence[tuple[str, float, float]]], middles: Mapping[str, float]) -> Any:
-    """Draw a tornado diagram of each number: its values with one input at the 5 % and at the 95 % quantile."""
+    """Draw a tornado diagram of each output number: the values with one input at its 5 % and its 95 % quantile."""
     columns = min(2, len(swings))
     rows = -(-len(swings) // columns)
     most = max(map(len, swings.values()))
@@ -97,7 +97,7 @@ def _band(ax: Any, below: Any, x: FloatArray, draws: FloatArray, colour: str, na
 
 
 def _at_one_signal(draws: FloatArray, column: int) -> tuple[FloatArray, FloatArray]:
-    """Return signal levels that all draws reach, and the curve of each draw interpolated at these levels."""
+    """Return signals that the curves of all draws reach, and the curve of each draw interpolated at these signals."""
     lit = draws[:, 1:]
     ends = float(lit[..., 0].clip(1e-9).min(1).max()), float(lit[..., 0].max(1).min())
     signal = np.geomspace(*ends, _ALONG)
@@ -110,7 +110,7 @@ def _at_one_signal(draws: FloatArray, column: int) -> tuple[FloatArray, FloatArr
 
 @drawn
 def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) -> Any:
-    """Draw a histogram of each number over all draws, and a line at the value for all inputs at their medians."""
+    """Draw a histogram of each output number over all draws, and a line at the value for median inputs."""
     columns = min(3, len(draws))
     rows = -(-len(draws) // columns)
     figure, axes = canvas(3.6 * columns, 2.5 * rows, rows, columns)
@@ -129,7 +129,7 @@ def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) ->
 
 @drawn
 def pictures(found: Mapping[str, tuple[Tensor, Tensor]]) -> Any:
-    """Draw the mean of each picture, and its standard deviation averaged over the channels."""
+    """Draw the mean of each output picture over the draws, and the standard deviation averaged over the colours."""
     figure, axes = canvas(9.6, 4.2 * len(found), len(found), 2)
     for (left, right), (name, (mean, sd)) in zip(axes, found.items(), strict=True):
         white = high(mean.clamp_min(0))

@@ -51,17 +51,17 @@ class UncertaintyResult:
 
     @property
     def strange(self) -> list[str]:
-        """Return the names of quantities that are NaN or infinite in at least one draw."""
+        """Return the names of output quantities that are NaN or infinite in at least one draw."""
         return [name for name, x in self.values.items() if not np.isfinite(x).all()]
 
     @property
     def failed(self) -> int:
-        """Return the number of quantities with NaN or infinity, plus one if the requested error is exceeded."""
+        """Return the number of quantities with NaN or infinity, plus 1 if a standard deviation is too inaccurate."""
         return len(self.strange) + (not self.error <= self.wanted)
 
     @property
     def input_rows(self) -> list[dict[str, Any]]:
-        """Return the name, label, distribution, mean and standard deviation of each input."""
+        """Return the name, label, distribution, mean and standard deviation of each uncertain input."""
         rows = []
         for name, label, x in zip(self.inputs.names, self.inputs.labels, self.points.values.T, strict=True):
             row = {"name": name, "label": label, "law": self.inputs.uncertain.said(name)}
@@ -70,12 +70,12 @@ class UncertaintyResult:
 
     @property
     def numbers(self) -> list[str]:
-        """Return the names of varying scalar quantities, only one for each group of proportional quantities."""
+        """Return the names of scalar quantities that vary between draws, one from each group of proportional ones."""
         return list(self.swings)
 
 
 def draw_pictures(result: UncertaintyResult) -> dict[str, bytes]:
-    """Draw the pictures of the page, and return them by name as PNG bytes."""
+    """Draw the pictures of the uncertainty study's page, and return the pictures by name as PNG bytes."""
     shown = {}
     numbers = result.numbers[:_MOST]
     if numbers:
@@ -93,7 +93,7 @@ def draw_pictures(result: UncertaintyResult) -> dict[str, bytes]:
 
 
 def _curves(result: UncertaintyResult) -> tuple[dict[str, tuple[FloatArray, dict[str, FloatArray]]], str] | None:
-    """Return the abscissa and the draws of each varying curve by step, and the label of the abscissa."""
+    """Return the curves that vary between draws, with their abscissas, by step, and the label of the abscissa."""
     wavelengths = _wavelengths_nm(result)
     curves: dict[str, tuple[FloatArray, dict[str, FloatArray]]] = {}
     spectral = True
@@ -138,7 +138,7 @@ def lead(result: UncertaintyResult) -> str:
 
 
 def sections(result: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Section]:
-    """Return the sections of the page; ``shown`` has the PNG bytes of each picture by name."""
+    """Return the sections of the uncertainty study's page; ``shown`` has the PNG bytes of each picture by name."""
     parts = [_inputs(result), *_posterior(result), _numbers(result, shown.get("numbers"))]
     parts += _moves(result, shown.get("tornado"))
     if "bands" in shown:

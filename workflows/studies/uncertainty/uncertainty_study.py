@@ -40,7 +40,7 @@ def study(
     workers: int = 0,
     device: str = "cpu",
 ) -> Path:
-    """Draw inputs until the relative error of every standard deviation is below ``error``, at most ``most`` times.
+    """Sample inputs, up to ``most`` times, until all output standard deviations are known to the relative ``error``.
 
     On the CPU, ``workers`` draws are computed at once; 0 means one for each core. Returns the folder with the results.
     """
@@ -62,7 +62,7 @@ def _points(inputs: Inputs, seed: int, most: int, points: str) -> InputDraws:
 
 
 def _ends(inputs: Inputs) -> FloatArray:
-    """Return inputs (run, input): all at their medians, then each input alone at its 5 % and at its 95 % quantile."""
+    """Return the input values of each run: all at their medians, then one input at its 5 % and at its 95 % quantile."""
     count = len(inputs.names)
     z = np.concatenate([np.zeros((1, count)), *(np.stack([-Z_90 * e, Z_90 * e]) for e in np.eye(count))])
     return inputs.at(z)
@@ -99,7 +99,7 @@ def _measure(
 def _swings(
     inputs: Inputs, ends: Sequence[Numbers], values: Mapping[str, FloatArray], scattered: Mapping[str, Scatter]
 ) -> dict[str, list[tuple[str, float, float]]]:
-    """Return each number's values with one input at its 5 % and 95 % quantile; skip numbers proportional to others."""
+    """Return each output number with one input at its 5 % and 95 % quantile; skip numbers proportional to others."""
     found: dict[str, list[tuple[str, float, float]]] = {}
     for name, x in values.items():
         known = np.isfinite(x).all() and np.isfinite([end[name] for end in ends]).all()
