@@ -21,7 +21,7 @@ _WORDS = {"b": "b EXPOSURE_NS PHOTONS", "d": "d EXPOSURE_NS [0]", "n": "n BITS W
 
 @dataclass
 class _Level:
-    """The entries of a descriptor for one level."""
+    """The entries of an EMVA 1288 descriptor for one light level."""
 
     line: int
     photons: float
@@ -117,7 +117,7 @@ def _parsed(path: Path) -> _Measurement:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the number and the text of each line that is neither empty nor a comment."""
+    """Yield the number and the text of each descriptor line that is neither empty nor a comment."""
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
         if line.strip() and not line.lstrip().startswith("#"):
@@ -145,7 +145,7 @@ def _take(measurement: _Measurement, kind: str, rest: str, folder: Path, line: i
 
 
 def _level(line: int, kind: str, numbers: list[float]) -> _Level:
-    """Return the level that a line describes; raise ValueError for an invalid exposure or number of photons."""
+    """Return the light level of a descriptor line; raise ValueError for an invalid exposure or number of photons."""
     exposure, photons = (*numbers, 0.0)[:2] if kind == "d" else numbers
     if not 0 < exposure < float("inf") or not (0 < photons < float("inf") if kind == "b" else photons == 0):
         raise ValueError

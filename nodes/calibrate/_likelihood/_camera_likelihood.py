@@ -156,7 +156,7 @@ def _signal(signal: Tensor, top: float, camera: _Camera) -> _Signal:
 
 
 def _used(levels: Levels, share: float) -> tuple[Tensor, float, float]:
-    """Return the indices of the levels to fit, the brightest of their signals, DN, and the shortest dark exposure."""
+    """Return the indices of the light levels to fit, their largest signal in DN, and the shortest dark exposure."""
     dark, whole = levels.photons == 0, ~_piled(levels)
     if not bool((dark & whole).any()):
         raise ValueError("no dark level is free of clipped numbers, so the offset of the camera is unknown: "
@@ -183,7 +183,7 @@ def _used(levels: Levels, share: float) -> tuple[Tensor, float, float]:
 
 
 def _piled(levels: Levels) -> Tensor:
-    """Return a mask of the levels whose histogram was kept because numbers pile up at an end of the range."""
+    """Return a mask of the light levels with a histogram because numbers pile up at an end of the range."""
     counted, at_zero = (torch.zeros_like(levels.mean, dtype=torch.bool) for _ in range(2))
     counted[levels.cell_level] = True
     at_zero[levels.cell_level[levels.cell_value == 0]] = True

@@ -161,7 +161,7 @@ def test_what_is_no_stack_is_refused(shape):
 def test_what_has_no_variance_is_refused():
     with pytest.raises(ValueError, match="give two frames"):
         one(torch.zeros(1, 4, 4), "temporal")
-    with pytest.raises(ValueError, match="one number has no variance"):
+    with pytest.raises(ValueError, match="one pixel value has no variance"):
         one(torch.zeros(2, 1, 1), "steady")
     with pytest.raises(ValueError, match="no variance"):
         one(torch.zeros(1, 1, 1))
