@@ -54,7 +54,7 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
         raise ValueError("the offset of the camera is unknown without dark frames: give frames without light")
     if int((~dark).sum()) < 2:
         raise ValueError(
-            f"{int((~dark).sum())} lit level(s) cannot define a line: give at least two of different light"
+            f"{int((~dark).sum())} lit level(s) cannot define a line: give two or more different light levels"
         )
     nearest = (levels.exposure[~dark, None] - levels.exposure[dark]).abs().argmin(1)
     lit = without_histograms(levels, ~dark)
@@ -64,7 +64,7 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
     used = (mean <= share * full).nonzero().squeeze(1)
     if len(set(lit.photons[used].tolist())) < 2:
         raise ValueError(f"{len(used)} lit level(s) below {share:.0%} of saturation ({float(full):.4g} DN above the "
-                         "dark level) cannot define a line: give at least two of different light there")  # fmt: skip
+                         "dark level) cannot define a line: give two or more different light levels there")  # fmt: skip
     gain, response = _slope(mean[used], variance[used]), _slope(lit.photons[used], mean[used])
     if not (float(gain) > 0 and float(response) > 0):
         raise ValueError(f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN/photon are not positive: more "

@@ -60,7 +60,7 @@ def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpr
     full = SensorPosterior.of(recipe, store)
     if not isinstance(full.levels, Levels):
         raise ValueError(
-            f"{recipe.name} has a likelihood of identical pixels: use calibrate.camera for models of the response"
+            f"the likelihood of {recipe.name} assumes identical pixels: use the node calibrate.camera instead"
         )
     terms = [name for name in TERMS if name in full.names]
     _check_levels(full, full.levels, terms)
@@ -88,7 +88,7 @@ def _check_levels(problem: SensorPosterior, levels: Levels, terms: list[str]) ->
 
 
 def _without(recipe: Recipe, weighing: str, terms: list[str]) -> Recipe:
-    """Return the recipe with the response ``terms`` fixed at zero in the prior and in the likelihood step ``weighing``."""
+    """Return the recipe with the response ``terms`` fixed at zero in the prior and the likelihood step ``weighing``."""
     steps = dict(recipe.steps)
     for name, step in steps.items():
         if step.node.path == "calibrate.camera_prior":

@@ -80,7 +80,9 @@ def _(*, file: Sequence[Path], **rest: object) -> list[str]:
 def _(result: Levels, **params: Any) -> list[Check]:
     dark = int((result.photons == 0).sum())
     return [
-        Check(f"{len(result.mean)} levels, {dark} dark, exposures up to {float(result.exposure.max()):.3g} s", dark > 0)
+        Check(
+            f"{len(result.mean)} levels ({dark} dark), exposures up to {float(result.exposure.max()):.3g} s", dark > 0
+        )
     ]
 
 
@@ -88,11 +90,11 @@ def _reduced(name: str, measurement: _Measurement, level: _Level, scatter: Tempo
     numbers = stack([image for _, image in level.images])
     if measurement.shape and numbers.shape[1:] != measurement.shape:
         raise ValueError(
-            f"{name}:{level.line}: images of {numbers.shape[1:]}, but the descriptor says {measurement.shape} (y, x)"
+            f"{name}:{level.line}: image shape {numbers.shape[1:]}, but descriptor shape {measurement.shape} (y, x)"
         )
     if int(numbers.max()) >= 2**measurement.bits:
         raise ValueError(
-            f"{name}:{level.line}: an image holds {numbers.max()} DN, more than the {measurement.bits} bits of line n"
+            f"{name}:{level.line}: a pixel of {numbers.max()} DN exceeds the {measurement.bits} bits given in line n"
         )
     reduced: Levels = reduce(torch.from_numpy(numbers), photons=level.photons, exposure=level.exposure, scatter=scatter)
     return reduced
@@ -108,10 +110,10 @@ def _parsed(path: Path) -> _Measurement:
             raise ValueError(f"{path.name}:{number}: {why}") from None
     for level in measurement.levels:
         if len(level.images) < 2:
-            raise ValueError(f"{path.name}:{level.line}: {len(level.images)} image(s): a level needs at least two")
+            raise ValueError(f"{path.name}:{level.line}: {len(level.images)} image(s): a light level needs two or more")
     if not measurement.levels:
         raise ValueError(
-            f"{path.name}: no line begins with 'b' or 'd', so there is no level: give an EMVA 1288 descriptor"
+            f"{path.name}: no line begins with 'b' or 'd', so there is no light level: give an EMVA 1288 descriptor"
         )
     return measurement
 
@@ -128,7 +130,7 @@ def _take(measurement: _Measurement, kind: str, rest: str, folder: Path, line: i
     """Add the content of one line of a descriptor to the measurement."""
     if kind == "i":
         if not measurement.levels:
-            raise ValueError("an image stands before the first level: begin a level with a line 'b' or 'd'")
+            raise ValueError("an image precedes the first light level: begin the level with a line 'b' or 'd'")
         measurement.levels[-1].images.append((line, folder / rest.replace("\\", "/")))
         return
     if kind not in _WORDS:

@@ -92,7 +92,7 @@ def levels(parts: list[Levels]) -> Levels:
 @levels.check
 def _(result: Levels, *inputs: object) -> list[Check]:
     dark, counted = int((result.photons == 0).sum()), len(set(result.cell_level.tolist()))
-    return [Check(f"{len(result.mean)} levels, {dark} dark, {counted} with a histogram")]
+    return [Check(f"{len(result.mean)} light levels, {dark} dark, {counted} with a histogram")]
 
 
 def histogram(frames: Tensor) -> tuple[Tensor, Tensor]:

@@ -165,12 +165,12 @@ def _used(levels: Levels, share: float) -> tuple[Tensor, float, float]:
     signal = levels.mean - levels.mean[shortest]
     lit = ~dark
     if not bool(lit.any()):
-        raise ValueError("0 lit levels: give at least two of different light")
+        raise ValueError("there are no lit levels: give two or more different light levels")
     full = float(signal[lit][levels.variance[lit].argmax()])
     used = whole & (dark | (signal <= share * full))
     if len(set(levels.photons[used & lit].tolist())) < 2:
         raise ValueError(f"{int((used & lit).sum())} lit level(s) below {share:.0%} of saturation ({full:.4g} DN above "
-                         "the dark level): give at least two of different light there")  # fmt: skip
+                         "the dark level): give two or more different light levels there")  # fmt: skip
     top = float(signal[used].max())
     if top <= 0:
         raise ValueError(f"the brightest level is {top:.4g} DN above the dark level, which must be positive: check "

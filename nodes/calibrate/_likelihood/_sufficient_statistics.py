@@ -56,7 +56,7 @@ def sufficient(levels: Levels) -> Sufficient:
 def _(result: Sufficient, *inputs: Levels) -> list[Check]:
     counted = len(set(result.cell_level.tolist()))
     return [
-        Check(f"{len(result.mean)} levels, {counted} with a histogram, {len(result.cell_level)} histogram cells in all")
+        Check(f"{len(result.mean)} light levels, {counted} with a histogram, {len(result.cell_level)} histogram bins")
     ]
 
 

@@ -182,4 +182,4 @@ def test_levels_are_joined_in_their_order():
 def test_checks_say_what_was_found():
     part = one(torch.full((2, 2, 2), 9.0))
     assert reduce.hooks.check(part)[0].text == "mean 9 DN, variance 0 DN2, histogram of 1 numbers"
-    assert levels.hooks.check(levels([part, part]))[0].text == "2 levels, 0 dark, 2 with a histogram"
+    assert levels.hooks.check(levels([part, part]))[0].text == "2 light levels, 0 dark, 2 with a histogram"
