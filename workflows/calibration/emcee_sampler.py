@@ -139,7 +139,7 @@ def _alive(problem: SensorPosterior, mode: LaplaceFit, walkers: int, rng: np.ran
 
 
 def autocorrelation_time(chain: FloatArray) -> float:
-    """Return the longest autocorrelation time of all coordinates of a chain (step, walker, free), in steps."""
+    """Return the longest autocorrelation time of the coordinates in a chain (step, walker, parameter)."""
     with np.errstate(invalid="ignore"):
         tau = float(np.max(emcee.autocorr.integrated_time(chain, tol=0, has_walkers=True)))
     return tau if np.isfinite(tau) else float(len(chain))  # NaN for walkers that never move

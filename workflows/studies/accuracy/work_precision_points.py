@@ -1,4 +1,4 @@
-"""Points of a work-precision diagram: the run time of a cold run and the errors of the outputs."""
+"""Points of a diagram of error against run time: the time of a cold run and the errors of the outputs."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class PointMeasurement:
 
 @dataclass(frozen=True)
 class WorkPrecisionPoint:
-    """A point of a work-precision diagram: a setting of the recipe and its measurement."""
+    """A point of a diagram of error against run time: a setting of the recipe and its measurement."""
 
     trial: Trial
     found: PointMeasurement
@@ -111,7 +111,7 @@ class PointCache:
         return WorkPrecisionPoint(trial, found)
 
     def time_again(self, point: WorkPrecisionPoint, number: int) -> WorkPrecisionPoint:
-        """Add the time of cold run ``number`` to the run times of a point, unless its first run was slow."""
+        """Return a measurement with the time of cold run ``number`` added, or unchanged if the first run was slow."""
         recipe, seconds = point.trial.recipe, point.found.seconds
         if recipe is None or not seconds or seconds[0] >= _QUICK:
             return point

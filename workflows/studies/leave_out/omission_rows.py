@@ -158,7 +158,7 @@ def _errors(names: Sequence[str], others: Sequence[str], result: Result, truth: 
 
 
 def _bounds(omission: Omission, result: Result) -> dict[str, float]:
-    """Return the error bound of each compared step: the stated bound, or for sums over bands the proved bound."""
+    """Return the error bound of each compared step: the bound that its node states, or that the engine proves."""
     if omission.kind != "stands in":
         return dict.fromkeys(omission.at, omission.bound)
     return {name: bound for name in omission.at if (bound := result.proof.of(name)) is not None}

@@ -175,7 +175,7 @@ def test_levels_are_joined_in_their_order():
     assert found.cell_value[found.cell_level == 2].tolist() == [9.0]
     again = levels([levels(parts[:1]), levels(parts[1:])])
     assert all(torch.equal(a, b) for a, b in zip(found, again, strict=True))
-    with pytest.raises(ValueError, match="no levels"):
+    with pytest.raises(ValueError, match="no light levels"):
         levels([])
 
 
