@@ -138,7 +138,7 @@ def _facts(wire: Wire, facts_of: FactsOf) -> TensorStats | list[TensorStats | No
 
 
 def _share(largest: float, recipe: Recipe, at: tuple[str, ...], facts_of: FactsOf) -> float:
-    """Return the ratio of ``largest`` to the largest element in the results of steps ``at``; infinity if not tensors."""
+    """Return ``largest`` over the largest element in the results of steps ``at``, or infinity if not tensors."""
     if largest == 0:
         return 0.0
     if any(recipe.steps[name].node.hints.get("return") is not Tensor for name in at):
