@@ -54,7 +54,7 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
         raise ValueError("the offset of the camera is unknown without dark frames: give frames without light")
     if int((~dark).sum()) < 2:
         raise ValueError(
-            f"{int((~dark).sum())} lit level(s) cannot define a line: give at least two of different light"
+            f"{int((~dark).sum())} lit level(s) cannot define a line: give two or more different light levels"
         )
     nearest = (levels.exposure[~dark, None] - levels.exposure[dark]).abs().argmin(1)
     lit = without_histograms(levels, ~dark)
@@ -64,7 +64,7 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
     used = (mean <= share * full).nonzero().squeeze(1)
     if len(set(lit.photons[used].tolist())) < 2:
         raise ValueError(f"{len(used)} lit level(s) below {share:.0%} of saturation ({float(full):.4g} DN above the "
-                         "dark level) cannot define a line: give at least two of different light there")  # fmt: skip
+                         "dark level) cannot define a line: give two or more different light levels there")  # fmt: skip
     gain, response = _slope(mean[used], variance[used]), _slope(lit.photons[used], mean[used])
     if not (float(gain) > 0 and float(response) > 0):
         raise ValueError(f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN/photon are not positive: more "
@@ -99,7 +99,7 @@ def _(result: LeastSquares, levels: Levels, **params: float) -> list[Check]:
 
 
 def without_histograms(levels: Levels, which: Tensor) -> Levels:
-    """Return the levels that an index or a mask selects, without their histograms."""
+    """Return the light levels that an index or a mask selects, without their histograms."""
     return Levels._make([*(x[which] for x in levels[:6]), *(x[:0] for x in levels[6:])])
 
 
@@ -109,7 +109,7 @@ def _slope(x: Tensor, y: Tensor) -> Tensor:
 
 
 def _error(x: Tensor, own: Tensor, dark: Tensor, which: Tensor) -> Tensor:
-    """Return the standard error of `_slope`; ``which`` is the index of the dark level subtracted from each point."""
+    """Return the standard error of a fitted slope; ``which`` gives the dark level subtracted from each point."""
     shared = torch.zeros(int(which.max()) + 1, dtype=x.dtype, device=x.device).index_add_(0, which, x * dark.sqrt())
     return (x.square() @ own + shared.square().sum()).sqrt() / (x @ x)
 
@@ -119,7 +119,7 @@ def _shortest_dark(levels: Levels, dark: Tensor) -> Tensor:
 
 
 def _dark_noise(levels: Levels, dark: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the temporal dark noise without rounding, and the standard error, DN: infinite for a noise of 0."""
+    """Return the temporal dark noise without rounding noise and its standard error (infinite for 0 noise), in DN."""
     variance, freedom = (x[_shortest_dark(levels, dark)] for x in (levels.variance, levels.degrees_of_freedom))
     noise = (variance - _QUANTIZATION).clamp_min(0.0).sqrt()
     return noise, torch.where(noise > 0, variance / (2 * freedom).sqrt() / noise, math.inf)

@@ -22,7 +22,7 @@ _LEAST = 0.1  #: DN², the variance at which a level without scatter is drawn
 
 @drawn
 def transfer(measured: FloatArray, predicted: FloatArray, whole: NDArray[np.bool_]) -> Any:
-    """Draw the photon-transfer curve, and the distance of each level from the prediction of the posterior.
+    """Draw the photon-transfer curve, and the deviation of each light level from the posterior's prediction.
 
     ``measured`` (2, level) has mean and variance, and ``predicted`` (2, draw, level) mean and variance of a repeated
     measurement. ``whole`` (level,) is False for levels that the well or the converter clips.

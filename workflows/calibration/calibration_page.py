@@ -47,7 +47,7 @@ class ParameterEstimate:
 
     @property
     def text(self) -> str:
-        """Return the estimate or the limit as text with unit, or a text for a parameter that has neither."""
+        """Return the estimate or limit of a parameter as text with its unit, or say that the frames give neither."""
         if self.kind == "estimate":
             return f"{with_uncertainty(self.mean, self.sd)} {self.unit}".rstrip()
         if self.kind == "none":
@@ -58,7 +58,7 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """The results of a calibration: mode, identifiability, chains, checks and models of the response."""
+    """The results of a calibration: posterior mode, identifiability, Markov chains, checks and camera responses."""
 
     problem: SensorPosterior
     mode: LaplaceFit
@@ -69,16 +69,16 @@ class CalibrationResult:
 
     @property
     def params(self) -> Mapping[str, Any]:
-        """Return the parameters that the recipe gives to the step of the likelihood."""
+        """Return the parameters that the recipe gives to the step that computes the likelihood."""
         return self.problem.recipe.steps[self.problem.step].params
 
     @property
     def draws(self) -> Mapping[str, FloatArray]:
-        """Return the draws (ensemble, step, walker) of each parameter by name."""
+        """Return the posterior draws (ensemble, step, walker) of each sensor parameter by name."""
         return {name: x.numpy() for name, x in self.problem.parameters(self.chains.draws).items()}
 
     def rows(self) -> list[ParameterEstimate]:
-        """Return the estimate of each parameter."""
+        """Return the posterior estimate of each sensor parameter."""
         rows = zip(self.draws.items(), self.mode.shares.tolist(), strict=True)
         return [self._estimate(name, draws, narrower) for (name, draws), narrower in rows]
 
@@ -116,7 +116,7 @@ def banner(result: CalibrationResult) -> str:
 
 
 def lead(result: CalibrationResult) -> str:
-    """Return the opening of the page: estimates, values to state, and directions that are not determined."""
+    """Return the opening of a calibration's page: estimates, values to report, and undetermined parameters."""
     values = [f"{_words(row.name)} {row.text}" for row in result.rows()]
     estimated = [m for m in result.models if result.identifiability.kinds[m.name] == "estimate"]
     stated = [f"{_words(m.name)} {_between(m.stated)}" for m in estimated]
@@ -136,7 +136,7 @@ def _words(name: str) -> str:
 
 
 def sections(result: CalibrationResult) -> list[Section]:
-    """Return the sections of the page: parameters, checks, identifiability and pictures."""
+    """Return the sections of a calibration's page: parameters, checks, identifiability and pictures."""
     models = (_models,) if result.models else ()
     return [part(result) for part in (_parameters, *models, _checks, _not_determined, _curve, _corner, _chains)]
 
@@ -207,7 +207,7 @@ def _curve(result: CalibrationResult) -> Section:
 
 
 def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:
-    """Return the mean and the variance of all digital numbers of each level, including numbers counted one by one."""
+    """Return the mean and the variance of all digital numbers of each light level, including histograms."""
     if isinstance(levels, Levels):
         return levels.mean.numpy(), levels.variance.numpy()
     at, value, count = (x.numpy() for x in levels[-3:])

@@ -1,4 +1,4 @@
-"""Draws from the posterior of a sensor with emcee: four ensembles of walkers, until the chains are long enough.
+"""Sampling of a sensor's posterior with emcee: four ensembles of walkers, until the chains are long enough.
 
 Only this file and `ensembles` import emcee. After each round all draws are written in emcee's HDF5 format. A killed run
 continues from the last round and gives the same draws, to the last bit, as a run that never stopped.
@@ -46,7 +46,7 @@ class Chains:
 
     @property
     def flat(self) -> FloatArray:
-        """Return the draws of all ensembles in one array (draw, free)."""
+        """Return the draws of all ensembles in one array (draw, free parameter)."""
         return self.draws.reshape(-1, self.draws.shape[-1])
 
 
@@ -73,7 +73,7 @@ def sample(
     wanted: int = 1000,
     progress: Progress = silent,
 ) -> Chains:
-    """Draw until every chain is 50 autocorrelation times long and the effective sample size is at least ``wanted``.
+    """Sample until each chain is 50 autocorrelation times long and the effective sample size is at least ``wanted``.
 
     ``file`` keeps the draws; if the file exists, the chains continue from its last step.
     """
@@ -100,7 +100,7 @@ def _longest_time(runs: Sequence[Walk], steps: int | None = None) -> float:
 
 
 def _round(iteration: int) -> tuple[int, int]:
-    """Return the numbers of steps of two successive rounds, the second of which is the first to reach ``iteration``."""
+    """Return the numbers of steps at which two successive rounds of sampling end, before and after ``iteration``."""
     before, steps = 0, _FIRST
     while steps < iteration:
         before, steps = steps, int(_GROWTH * steps)
@@ -125,7 +125,7 @@ def start_ensemble(
 
 
 def _alive(problem: SensorPosterior, mode: LaplaceFit, walkers: int, rng: np.random.Generator) -> FloatArray:
-    """Return starting points (walker, free) near the mode, except points where the posterior is almost zero."""
+    """Return starting points (walker, parameter) near the posterior mode, where the posterior is not almost zero."""
     points = np.empty((0, len(mode.theta)))
     for _ in range(50):
         drawn = mode.draw(4 * walkers, rng)
@@ -139,7 +139,7 @@ def _alive(problem: SensorPosterior, mode: LaplaceFit, walkers: int, rng: np.ran
 
 
 def autocorrelation_time(chain: FloatArray) -> float:
-    """Return the longest autocorrelation time of all coordinates of a chain (step, walker, free), in steps."""
+    """Return the longest autocorrelation time of the coordinates in a chain (step, walker, parameter)."""
     with np.errstate(invalid="ignore"):
         tau = float(np.max(emcee.autocorr.integrated_time(chain, tol=0, has_walkers=True)))
     return tau if np.isfinite(tau) else float(len(chain))  # NaN for walkers that never move
@@ -184,7 +184,7 @@ def _keep(file: Path, backends: Sequence[Any], progress: Progress) -> None:
 
 
 def _write(file: Path, backends: Sequence[Any]) -> None:
-    """Write all ensembles to one file with an atomic rename."""
+    """Write the draws of all ensembles to one file with an atomic rename."""
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_suffix(f".{os.getpid()}.part")
     try:

@@ -35,7 +35,7 @@ class Walk:
         return int(self.backend.iteration)
 
     def prepare(self, steps: int, weigh: Weigh) -> None:
-        """Reserve memory for ``steps`` more steps, and load the walkers' state after the last step."""
+        """Reserve memory for ``steps`` more steps of the walkers, and load their state after the last step."""
         if self.initial_theta is not None and self.iteration == 0:
             self._state = emcee.State(self.initial_theta.copy(), log_prob=weigh(self.initial_theta))
         else:
@@ -52,7 +52,7 @@ class Walk:
         self._accepted = np.zeros(len(self._part), dtype=bool)
 
     def propose(self, part: int) -> FloatArray:
-        """Return the proposed coordinates (walker, free) for one part of the walkers."""
+        """Return the proposed coordinates (walker, free parameter) for one part of the walkers."""
         sets = [self._state.coords[self._part == other] for other in range(self.move.nsplits)]
         others = sets[:part] + sets[part + 1 :]
         self._proposed, self._factors = self.move.get_proposal(sets[part], others, self.random)

@@ -1,4 +1,4 @@
-"""Identifiability of a sensor's parameters: which parameters the measured levels determine, before any sampling."""
+"""Identifiability of a sensor's parameters: the parameters that the measured light levels determine."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _REASONS = {
 
 @dataclass(frozen=True)
 class Identifiability:
-    """The parameters, and the directions in parameter space, that the levels determine or leave to the prior."""
+    """The parameters and parameter combinations that the measured light levels determine or leave to the prior."""
 
     kinds: dict[str, str]  #: one of `KINDS` for each parameter
     directions: Sequence[str]  #: a sentence for each direction that the levels do not determine
@@ -43,12 +43,12 @@ class Identifiability:
 
     @property
     def estimated(self) -> tuple[str, ...]:
-        """Return the names of the parameters whose values the levels determine."""
+        """Return the names of the parameters whose values the measured light levels determine."""
         return tuple(name for name, kind in self.kinds.items() if kind == "estimate")
 
 
 def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
-    """Find the parameters that the levels determine, by singular values of the derivatives of the levels."""
+    """Find the parameters that the light levels determine, by singular values of the levels' derivatives."""
     _, s, v = np.linalg.svd(mode.scaled_slopes)
     s = np.concatenate([s, np.zeros(len(v) - len(s))])
     kinds = {n: "estimate" if own else "none" for n, own in zip(problem.names, _own(s, v), strict=True)}
@@ -69,7 +69,7 @@ def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
 
 
 def _own(s: FloatArray, v: FloatArray) -> FloatArray:
-    """Return an array (free,) that is True for parameters that the levels determine rather than the priors.
+    """Return an array that is True for each free parameter that the light levels determine rather than the priors.
 
     The posterior of such a parameter is less than a third as wide as its prior, and hardly widens with doubled priors.
     """
@@ -79,7 +79,7 @@ def _own(s: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def _sorted_out(weak: FloatArray) -> Sequence[FloatArray]:
-    """Return orthogonal weak directions: first the directions of a single parameter, then all others.
+    """Return orthogonal directions of undetermined parameters: first single parameters, then combinations.
 
     A mixture of weak directions is weak too, so that any basis of the same space is allowed.
     """
@@ -90,7 +90,7 @@ def _sorted_out(weak: FloatArray) -> Sequence[FloatArray]:
 
 
 def _limit(problem: SensorPosterior, mode: LaplaceFit, name: str) -> str:
-    """Return the kind of limit that the levels set on a parameter, with all other parameters at the mode."""
+    """Return the limit that the light levels set on a parameter (upper, lower, none), with all others at the mode."""
     at = problem.names.index(name)
     z = np.repeat(problem.whitened(mode.theta)[None], 2, 0)
     z[:, at] = _FAR, -_FAR
@@ -102,7 +102,7 @@ def _limit(problem: SensorPosterior, mode: LaplaceFit, name: str) -> str:
 
 
 def _together(parts: Sequence[tuple[str, float]]) -> str:
-    """Return a text about several parameters that the levels determine only in combination."""
+    """Return a text about several parameters that the light levels determine only in combination."""
     first = max(parts, key=lambda part: abs(part[1]))
     rest = [(name, bool(x * first[1] > 0)) for name, x in parts if name != first[0]]
     more, less = ([_plain(name) for name, same in rest if same is up] for up in (True, False))

@@ -18,7 +18,7 @@ _ENOUGH, _SOFT, _LEAST = 0.3, 0.1, 0.02  #: effective sample fractions: to stop,
 
 
 def draw_samples(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Return samples, and for each sample the logarithm of the posterior over the proposal density.
+    """Return importance samples, and for each sample the logarithm of posterior density over proposal density.
 
     The proposal is Student's t distribution; its mean and covariance start at those of the mode and are fitted to the
     weighted samples. Raises: `ValueError` if the effective sample size stays too small.
@@ -45,7 +45,7 @@ def draw_samples(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Gene
 
 
 def weights(log: FloatArray) -> FloatArray:
-    """Return the normalised weight of each sample from the logarithms of the weights; the sum of weights is 1."""
+    """Return importance weights with a sum of 1 from the logarithms of unnormalised weights."""
     weight = np.exp(log - log.max())
     normalized: FloatArray = weight / weight.sum()
     return normalized

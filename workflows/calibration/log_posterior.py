@@ -69,22 +69,22 @@ class SensorPosterior:
         return self.coordinates.names
 
     def parameters(self, samples: FloatArray) -> dict[str, Tensor]:
-        """Convert samples (..., free) to parameters by name, each of shape (...)."""
+        """Convert sampler coordinates (..., free parameter) to parameter values by name, each of shape (...)."""
         return self.coordinates.parameters(torch.from_numpy(np.ascontiguousarray(samples)))
 
     def theta(self, parameters: Mapping[str, float | Tensor]) -> FloatArray:
-        """Convert parameters by name to coordinates (..., free)."""
+        """Convert parameter values by name to sampler coordinates (..., free parameter)."""
         coordinates: FloatArray = self.coordinates.place(parameters).numpy()
         return coordinates
 
     def likelihood(self, samples: FloatArray) -> Likelihood:
-        """Return the likelihood of the measured levels at samples (walker, free)."""
+        """Return the likelihood of the measured light levels at samples (walker, free parameter)."""
         with torch.no_grad(), one_thread():
             likelihood: Likelihood = self.weigh_in_full(self._named(self.parameters(samples)))[self.step]
         return likelihood
 
     def log_posterior(self, samples: FloatArray) -> FloatArray:
-        """Return the log posterior density (walker,) at samples (walker, free), up to a constant."""
+        """Return the log posterior density at samples (walker, free parameter), up to a constant."""
         with torch.no_grad(), one_thread():
             parameters = self.parameters(samples)
             total = self.weigh(self._named(parameters))[self.step].log + self.coordinates.log_prior(parameters)
@@ -92,7 +92,7 @@ class SensorPosterior:
         return log
 
     def whitened(self, samples: FloatArray) -> FloatArray:
-        """Return samples (..., free) as distances from the middle of the prior, in standard deviations of the prior."""
+        """Convert samples to distances from the middle of the prior, in standard deviations of the prior."""
         whitened: FloatArray = self.coordinates.whitened(self.parameters(samples)).numpy()
         return whitened
 

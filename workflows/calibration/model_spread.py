@@ -1,4 +1,4 @@
-"""Values and intervals for a camera of unknown response, from the posteriors with several models of the response."""
+"""Parameter intervals for a camera of unknown response, from posteriors with several models of the response."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class IntervalEstimate:
 
 @dataclass(frozen=True)
 class ModelSpread:
-    """The posterior of one parameter with each model of the response, and the interval to state."""
+    """The posterior of one parameter with each model of the camera's response, and the interval to report."""
 
     name: str
     models: tuple[IntervalEstimate, ...]  #: the posterior with 0, 1, 2 terms of the response, as far as they are free
@@ -43,7 +43,7 @@ _Posterior = dict[str, tuple[float, float]]  #: mean and standard deviation of e
 
 
 def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpread]:
-    """Return the posterior with each model and the interval to state, for each parameter that all models have.
+    """Return the posterior with each model of the camera's response and the interval to report, for each parameter.
 
     The stated value is the mean of the two models with the most terms. The stated width is the larger width of both
     models and half the distance of both values, added in quadrature.
@@ -60,7 +60,7 @@ def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpr
     full = SensorPosterior.of(recipe, store)
     if not isinstance(full.levels, Levels):
         raise ValueError(
-            f"{recipe.name} has a likelihood of identical pixels: use calibrate.camera for models of the response"
+            f"the likelihood of {recipe.name} assumes identical pixels: use the node calibrate.camera instead"
         )
     terms = [name for name in TERMS if name in full.names]
     _check_levels(full, full.levels, terms)
@@ -72,7 +72,7 @@ def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpr
 
 
 def _check_levels(problem: SensorPosterior, levels: Levels, terms: list[str]) -> None:
-    """Raise `ValueError` if there are too few lit levels to separate the response ``terms`` from a drifting lamp.
+    """Raise `ValueError` if too few lit levels exist to tell the non-linear response ``terms`` from lamp drift.
 
     For 60 simulated cameras and two terms, 90 % intervals contained the truth in 93 % with 4 lit levels, and in
     58 % with 2 lit levels.
@@ -88,7 +88,7 @@ def _check_levels(problem: SensorPosterior, levels: Levels, terms: list[str]) ->
 
 
 def _without(recipe: Recipe, weighing: str, terms: list[str]) -> Recipe:
-    """Return the recipe with ``terms`` of the response fixed at zero in the prior and in the step ``weighing``."""
+    """Return the recipe with the response ``terms`` fixed at zero in the prior and the likelihood step ``weighing``."""
     steps = dict(recipe.steps)
     for name, step in steps.items():
         if step.node.path == "calibrate.camera_prior":
@@ -101,7 +101,7 @@ def _without(recipe: Recipe, weighing: str, terms: list[str]) -> Recipe:
 def _posterior(problem: SensorPosterior, rng: np.random.Generator) -> _Posterior:
     mode = find_mode(problem, initial_theta(problem))
     if not mode.settled:
-        raise ValueError(f"no mode of {', '.join(problem.names)} was found: give narrower priors")
+        raise ValueError(f"no posterior mode of {', '.join(problem.names)} was found: give narrower priors")
     samples, log = draw_samples(problem, mode, rng)
     weight = weights(log)
     centre = weight @ samples

@@ -39,7 +39,7 @@ class Check:
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """The deviance of all levels, and the probability that chance alone gives a deviance at least as large."""
+    """The deviance of all light levels, and the probability that chance alone gives a deviance at least as large."""
 
     deviance: float
     freedom: float  #: degrees of freedom
@@ -70,7 +70,7 @@ class ImportanceSamples:
         return sd
 
     def doubt(self, like: FloatArray) -> FloatArray:
-        """Return the relative standard error (free,) of the standard deviation, with the kurtosis of ``like``."""
+        """Return the relative standard error of each standard deviation, with the kurtosis of the draws ``like``."""
         z = (like - like.mean(0)) / like.std(0)
         error: FloatArray = np.sqrt(((z**4).mean(0) - 1) * (self.weights**2).sum() / 4)
         return error
@@ -110,8 +110,8 @@ def _of_chains(chains: Chains) -> Iterator[Check]:
     taus = chains.steps / chains.tau
     yield Check(
         "chains are long enough",
-        f"{taus:.0f} autocorrelation times",
-        "at least 50, and a stable tau",
+        f"the chains are {taus:.0f} autocorrelation times long",
+        "at least 50 autocorrelation times, with a stable estimate",
         _mark(chains.long),
     )
     coordinates = np.moveaxis(chains.draws, -1, 0)
@@ -119,7 +119,7 @@ def _of_chains(chains: Chains) -> Iterator[Check]:
     yield Check("ensembles agree", f"R-hat {rhat:.4f}", f"at most {_RHAT}", _mark(rhat <= _RHAT))
     bulk, tail = (min(_effective_sample_size(draws, part) for draws in coordinates) for part in ("bulk", "tail"))
     size, enough = f"effective sample size {bulk:.0f}, {tail:.0f} in the tails", min(bulk, tail) >= _INDEPENDENT
-    yield Check("draws are numerous enough", size, f"at least {_INDEPENDENT:.0f} each", _mark(enough))
+    yield Check("draws are numerous enough", size, f"each at least {_INDEPENDENT:.0f} draws", _mark(enough))
     low, high = _ACCEPTED
     well = low <= chains.accepted <= high
     yield Check(
@@ -167,7 +167,7 @@ def _of_data(problem: SensorPosterior, mode: LaplaceFit, identifiability: Identi
 
 
 def goodness_of_fit(likelihood: Likelihood, free: int = 0) -> GoodnessOfFit:
-    """Return the goodness of fit of one sensor whose ``free`` parameters were fitted to the same levels.
+    """Return the goodness of fit of one sensor with ``free`` parameters that were fitted to the same light levels.
 
     Raises: `ValueError` for a likelihood without deviances, for several sensors, and for no degree of freedom.
     """
@@ -177,7 +177,7 @@ def goodness_of_fit(likelihood: Likelihood, free: int = 0) -> GoodnessOfFit:
         raise ValueError("the likelihood has no deviances: set told: true in the step of the likelihood")
     if likelihood.deviance.numel() != len(likelihood.degrees_of_freedom):
         shape = tuple(likelihood.deviance.shape)
-        raise ValueError(f"deviances of shape {shape} belong to several sensors: give one row of parameters")
+        raise ValueError(f"deviances of shape {shape} belong to several sensors: compute the likelihood of one sensor")
     deviance, freedom = float(likelihood.deviance.sum()), float(likelihood.degrees_of_freedom.sum()) - free
     if freedom <= 0:
         raise ValueError(f"{freedom + free:.0f} measured numbers cannot test {free} free parameters: give more levels")

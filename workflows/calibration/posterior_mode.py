@@ -106,7 +106,7 @@ def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit
 
 
 def _climb(problem: SensorPosterior, theta: FloatArray, log: float, step: FloatArray) -> tuple[FloatArray, float, bool]:
-    """Return the best of many points along ``step``, its log posterior, and True if it is higher than at ``theta``.
+    """Return the most probable point along ``step``, its log posterior, and True if this is higher than at ``theta``.
 
     The points change all coordinates, or all except one, which may be at an edge.
     """
@@ -120,7 +120,7 @@ def _climb(problem: SensorPosterior, theta: FloatArray, log: float, step: FloatA
 def _differences(
     function: Callable[[FloatArray], FloatArray], theta: FloatArray, step: FloatArray, sides: FloatArray
 ) -> FloatArray:
-    """Return derivatives (value, free) of ``function`` by differences; ``sides`` (2, free) is 1 for sides to use."""
+    """Return the derivatives of ``function`` by finite differences; ``sides`` selects steps up and steps down."""
     apart = np.diag(step)
     high, low = np.split(function(np.concatenate([theta + apart * sides[0], theta - apart * sides[1]])), 2)
     slopes: FloatArray = (high - low).T / (step * sides.sum(0).clip(1))
@@ -128,7 +128,7 @@ def _differences(
 
 
 def _sides(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> FloatArray:
-    """Return an array (2, free): 1 where a step up or down crosses no edge, such as a full well, and 0 elsewhere."""
+    """Return 1 for each step up or down that meets no edge of the posterior, such as a full well, and 0 for others."""
     apart = np.diag(step)
     log = problem.log_posterior(np.concatenate([theta[None], theta + apart, theta - apart]))
     possible: FloatArray = (log[1:] > log[0] - _EDGE).reshape(2, -1).astype(np.float64)
@@ -136,7 +136,7 @@ def _sides(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> Flo
 
 
 def _slopes(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives of levels and prior by coordinate; the Gram matrix of both is Fisher's information."""
+    """Return derivatives of light levels and prior by coordinate; their Gram matrix is Fisher's information."""
     rows = _differences(lambda p: problem.likelihood(p).scaled.numpy(), theta, step, _sides(problem, theta, step))
     rounded = problem.recipe.steps[problem.step].params["rounding"] == "nearest"
     for name in problem.coordinates.edged.intersection(problem.names) if rounded else ():
@@ -147,20 +147,20 @@ def _slopes(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> tu
 
 
 def _gradient(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> FloatArray:
-    """Return the gradient (free,) of the log posterior."""
+    """Return the gradient of the log posterior with respect to the free parameters."""
     sides = _sides(problem, theta, step)
     gradient: FloatArray = _differences(problem.log_posterior, theta, step, sides)
     return gradient
 
 
 def _free(problem: SensorPosterior, theta: FloatArray, step: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Return the gradient with 0 for components that lead over an edge, beyond which the posterior is zero."""
+    """Return the gradient, with 0 for each component that leads to parameters where the posterior is zero."""
     up, down = _sides(problem, theta, step) == 0
     return np.where((up & (gradient > 0)) | (down & (gradient < 0)), 0.0, gradient)
 
 
 def _covariance(rows: FloatArray, prior: FloatArray) -> FloatArray:
-    """Return the covariance by an SVD of the derivatives; inverting Fisher's information would lose half the digits."""
+    """Return the covariance of the parameters from an SVD of derivatives, which is more precise than an inversion."""
     _, s, v = np.linalg.svd(np.concatenate([rows, prior]), full_matrices=False)
     covariance: FloatArray = (v.T / s**2) @ v
     return covariance

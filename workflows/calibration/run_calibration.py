@@ -98,7 +98,7 @@ def _document(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row of a parameter, without mean and standard deviation if the frames give no estimate."""
+    """Return the results of a parameter, without mean and standard deviation if the frames give no estimate."""
     kept = {name: value for name, value in row.items() if row["kind"] == "estimate" or name not in ("mean", "sd")}
     return {name: None if isinstance(x, float) and not math.isfinite(x) else x for name, x in kept.items()}
 
@@ -116,7 +116,7 @@ def _report(result: CalibrationResult, document: Mapping[str, Any]) -> StudyRepo
 
 
 def _draws(result: CalibrationResult) -> bytes:
-    """Return the bytes of an npz file with draws of each parameter, taken evenly from all chains."""
+    """Return the bytes of an npz file with posterior draws of each parameter, taken evenly from all chains."""
     every = max(1, result.chains.flat.shape[0] // _KEPT)
     out = io.BytesIO()
     draws: dict[str, Any] = {name: x.reshape(-1)[::every] for name, x in result.draws.items()}

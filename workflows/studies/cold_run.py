@@ -19,7 +19,7 @@ from neusee.workflows.store.result_store import Store
 
 @contextmanager
 def cold(store: Store) -> Iterator[Store]:
-    """Yield a temporary store with the code digests of ``store`` and without results; delete the temporary store at exit."""
+    """Yield a temporary store with the code digests of ``store`` and no results, and delete the temporary store."""
     with TemporaryDirectory(prefix="neusee-") as folder:
         if os.path.isfile(store.code_memo):
             shutil.copyfile(store.code_memo, Path(folder) / store.code_memo.name)

@@ -21,7 +21,7 @@ _WORDS = {"b": "b EXPOSURE_NS PHOTONS", "d": "d EXPOSURE_NS [0]", "n": "n BITS W
 
 @dataclass
 class _Level:
-    """The entries of a descriptor for one level."""
+    """The entries of an EMVA 1288 descriptor for one light level."""
 
     line: int
     photons: float
@@ -80,7 +80,9 @@ def _(*, file: Sequence[Path], **rest: object) -> list[str]:
 def _(result: Levels, **params: Any) -> list[Check]:
     dark = int((result.photons == 0).sum())
     return [
-        Check(f"{len(result.mean)} levels, {dark} dark, exposures up to {float(result.exposure.max()):.3g} s", dark > 0)
+        Check(
+            f"{len(result.mean)} levels ({dark} dark), exposures up to {float(result.exposure.max()):.3g} s", dark > 0
+        )
     ]
 
 
@@ -88,11 +90,11 @@ def _reduced(name: str, measurement: _Measurement, level: _Level, scatter: Tempo
     numbers = stack([image for _, image in level.images])
     if measurement.shape and numbers.shape[1:] != measurement.shape:
         raise ValueError(
-            f"{name}:{level.line}: images of {numbers.shape[1:]}, but the descriptor says {measurement.shape} (y, x)"
+            f"{name}:{level.line}: image shape {numbers.shape[1:]}, but descriptor shape {measurement.shape} (y, x)"
         )
     if int(numbers.max()) >= 2**measurement.bits:
         raise ValueError(
-            f"{name}:{level.line}: an image holds {numbers.max()} DN, more than the {measurement.bits} bits of line n"
+            f"{name}:{level.line}: a pixel of {numbers.max()} DN exceeds the {measurement.bits} bits given in line n"
         )
     reduced: Levels = reduce(torch.from_numpy(numbers), photons=level.photons, exposure=level.exposure, scatter=scatter)
     return reduced
@@ -108,16 +110,16 @@ def _parsed(path: Path) -> _Measurement:
             raise ValueError(f"{path.name}:{number}: {why}") from None
     for level in measurement.levels:
         if len(level.images) < 2:
-            raise ValueError(f"{path.name}:{level.line}: {len(level.images)} image(s): a level needs at least two")
+            raise ValueError(f"{path.name}:{level.line}: {len(level.images)} image(s): a light level needs two or more")
     if not measurement.levels:
         raise ValueError(
-            f"{path.name}: no line begins with 'b' or 'd', so there is no level: give an EMVA 1288 descriptor"
+            f"{path.name}: no line begins with 'b' or 'd', so there is no light level: give an EMVA 1288 descriptor"
         )
     return measurement
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the number and the text of each line that is neither empty nor a comment."""
+    """Yield the number and the text of each descriptor line that is neither empty nor a comment."""
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
         if line.strip() and not line.lstrip().startswith("#"):
@@ -128,7 +130,7 @@ def _take(measurement: _Measurement, kind: str, rest: str, folder: Path, line: i
     """Add the content of one line of a descriptor to the measurement."""
     if kind == "i":
         if not measurement.levels:
-            raise ValueError("an image stands before the first level: begin a level with a line 'b' or 'd'")
+            raise ValueError("an image precedes the first light level: begin the level with a line 'b' or 'd'")
         measurement.levels[-1].images.append((line, folder / rest.replace("\\", "/")))
         return
     if kind not in _WORDS:
@@ -145,7 +147,7 @@ def _take(measurement: _Measurement, kind: str, rest: str, folder: Path, line: i
 
 
 def _level(line: int, kind: str, numbers: list[float]) -> _Level:
-    """Return the level that a line describes; raise ValueError for an invalid exposure or number of photons."""
+    """Return the light level of a descriptor line; raise ValueError for an invalid exposure or number of photons."""
     exposure, photons = (*numbers, 0.0)[:2] if kind == "d" else numbers
     if not 0 < exposure < float("inf") or not (0 < photons < float("inf") if kind == "b" else photons == 0):
         raise ValueError

@@ -1,4 +1,4 @@
-"""Statistics of frames of a flat illumination: mean, variance, and a histogram where both are not enough."""
+"""Statistics of frames of a flat illumination: mean, variance, and a histogram if these two do not suffice."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FEW, _SURE, _RATIO = 8, 5.0, 5.0  #: least count at an end; least excess in sig
 
 @node(rtol=1e-12)
 def reduce(frames: Tensor, *, photons: Photons, exposure: Time, scatter: Scatter = "all") -> Levels:
-    """Reduce the frames of one flat illumination to mean and variance, with a histogram where both are not enough.
+    """Reduce the frames of one flat illumination to mean and variance, and a histogram if these do not suffice.
 
     ``scatter`` selects the variance. `all`: the variance over all pixels and frames, for pixels that are alike, as in a
     simulation. `temporal`: the variance of a pixel from frame to frame, for two frames half the mean squared
@@ -49,7 +49,7 @@ def reduce(frames: Tensor, *, photons: Photons, exposure: Time, scatter: Scatter
     if scatter != "all" and len(frames) < 2:
         raise ValueError("one frame has no temporal variance: give two frames or more, or set scatter: all")
     if frames.numel() < 2 or (scatter == "steady" and frames[0].numel() < 2):
-        raise ValueError("one number has no variance: give more pixels or frames")
+        raise ValueError("one pixel value has no variance: give more pixels or frames")
     value, count = histogram(frames)
     total = float(count.sum())
     mean = float((value * count).sum()) / total
@@ -73,7 +73,7 @@ def _(result: Levels, *inputs: Tensor, **params: Any) -> list[Check]:
 
 @node(rtol=0.0)
 def levels(parts: list[Levels]) -> Levels:
-    """Join levels into one measurement, in the given order.
+    """Join the statistics of several light levels into one measurement, in the given order.
 
     Shapes: each (level,) and (cell,) -> the same, concatenated.
     Units:  as in `Levels`.
@@ -82,7 +82,7 @@ def levels(parts: list[Levels]) -> Levels:
     Source: EMVA Standard 1288, release 4.0 Linear, section 6.5 (a measurement is a series of levels).
     """
     if not parts:
-        raise ValueError("there are no levels to join: wire at least one level")
+        raise ValueError("there are no light levels to join: connect at least one step that returns a light level")
     joined = [torch.cat(each) for each in zip(*parts, strict=True)]
     starts = accumulate((len(part.mean) for part in parts), initial=0)
     shifted = [part.cell_level + start for part, start in zip(parts, starts, strict=False)]
@@ -92,11 +92,11 @@ def levels(parts: list[Levels]) -> Levels:
 @levels.check
 def _(result: Levels, *inputs: object) -> list[Check]:
     dark, counted = int((result.photons == 0).sum()), len(set(result.cell_level.tolist()))
-    return [Check(f"{len(result.mean)} levels, {dark} dark, {counted} with a histogram")]
+    return [Check(f"{len(result.mean)} light levels, {dark} dark, {counted} with a histogram")]
 
 
 def histogram(frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the digital numbers that occur, in rising order, and the count of each number: two (cell,) int64."""
+    """Return the digital numbers that occur in frames, in rising order, and the count of each number."""
     counts = torch.zeros(0, dtype=torch.int64, device=frames.device)
     for piece in _pieces(frames.reshape(1, -1)):
         more = torch.bincount(_whole(piece).reshape(-1), minlength=len(counts))
@@ -107,12 +107,12 @@ def histogram(frames: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _pieces(rows: Tensor) -> Iterator[Tensor]:
-    """Split ``rows`` by columns into blocks of about `_PIECE` numbers."""
+    """Split a two-dimensional array by columns into blocks of about `_PIECE` elements."""
     return iter(torch.split(rows, max(1, _PIECE // len(rows)), 1))
 
 
 def _whole(piece: Tensor) -> Tensor:
-    """Return numbers as int64; raise ValueError for a number that no converter can give."""
+    """Return pixel values as int64; raise ValueError for a value that no analogue-to-digital converter can give."""
     whole = piece.to(torch.int64)
     low, high = (int(end) for end in torch.aminmax(whole))
     if low < 0 or high >= _TOP or (piece.is_floating_point() and not bool((whole == piece).all())):
@@ -125,7 +125,7 @@ def _whole(piece: Tensor) -> Tensor:
 
 
 def _within(frames: Tensor, steady: bool) -> float:
-    """Return the sum of squared deviations from the mean of each pixel, and with ``steady`` also of each frame."""
+    """Return the sum of squared deviations from each pixel's mean; ``steady`` also subtracts each frame's mean."""
     parts, sums = [], torch.zeros(len(frames), dtype=torch.float64)
     for piece in _pieces(frames.reshape(len(frames), -1)):
         numbers = piece.double()

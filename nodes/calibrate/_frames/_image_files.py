@@ -52,7 +52,7 @@ def _picture(file: Path) -> NDArray[Any]:
     except UnidentifiedImageError:
         raise ValueError(f"{file} is not a readable picture: save the frame as 16-bit grey PNG") from None
     if len({page.shape for page in pages}) > 1:
-        raise ValueError(f"{file}: the pages differ in size: give frames of one size")
+        raise ValueError(f"{file}: the pages of the file differ in size: give frames of one size")
     return np.stack(pages)
 
 

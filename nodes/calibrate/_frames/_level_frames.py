@@ -1,4 +1,4 @@
-"""A node that reads the frames of one level from image files."""
+"""A node that reads the frames of one light level from image files."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _(result: Tensor, **params: Any) -> list[Check]:
 
 
 def refuse_unreadable(parameter: str, files: Sequence[Path]) -> list[str]:
-    """Raise ParameterError if a file has an unknown suffix; return no warnings."""
+    """Raise ParameterError if a file of frames has an unknown suffix; return an empty list of warnings."""
     try:
         for file in files:
             readable(file)

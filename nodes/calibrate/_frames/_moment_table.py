@@ -1,4 +1,4 @@
-"""A node that reads the moments of frames, measured by another program, from a table."""
+"""A node that reads a table with the means and variances of frames, as measured by another program."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def table(
     drift: str | None = None,
     exposure_unit: Literal["s", "ms", "us", "ns"] = "s",
 ) -> Levels:
-    """Read the moments of pairs of frames from a CSV file with one level per line and with named columns.
+    """Read the means and variances of pairs of frames from a CSV file with named columns and a line per light level.
 
     ``drift`` names the column with the difference of the two means, for a table whose variance excludes that
     difference. Half the square of the difference is then added, because the variance of EMVA 1288 includes that part.

@@ -65,4 +65,4 @@ def expose(
 @expose.check
 def _(result: Tensor, **params: Any) -> list[Check]:
     mean = float(result.sum(-1).sum(dtype=torch.float64)) / result.numel()
-    return [Check(f"mean {mean:.5g} DN, {float(result.min()):g} to {float(result.max()):g}")]
+    return [Check(f"mean {mean:.5g} DN, pixels of {float(result.min()):g} to {float(result.max()):g} DN")]

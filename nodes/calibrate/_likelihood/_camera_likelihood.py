@@ -156,7 +156,7 @@ def _signal(signal: Tensor, top: float, camera: _Camera) -> _Signal:
 
 
 def _used(levels: Levels, share: float) -> tuple[Tensor, float, float]:
-    """Return the indices of the levels to fit, the brightest of their signals, DN, and the shortest dark exposure."""
+    """Return the indices of the light levels to fit, their largest signal in DN, and the shortest dark exposure."""
     dark, whole = levels.photons == 0, ~_piled(levels)
     if not bool((dark & whole).any()):
         raise ValueError("no dark level is free of clipped numbers, so the offset of the camera is unknown: "
@@ -165,12 +165,12 @@ def _used(levels: Levels, share: float) -> tuple[Tensor, float, float]:
     signal = levels.mean - levels.mean[shortest]
     lit = ~dark
     if not bool(lit.any()):
-        raise ValueError("0 lit levels: give at least two of different light")
+        raise ValueError("there are no lit levels: give two or more different light levels")
     full = float(signal[lit][levels.variance[lit].argmax()])
     used = whole & (dark | (signal <= share * full))
     if len(set(levels.photons[used & lit].tolist())) < 2:
         raise ValueError(f"{int((used & lit).sum())} lit level(s) below {share:.0%} of saturation ({full:.4g} DN above "
-                         "the dark level): give at least two of different light there")  # fmt: skip
+                         "the dark level): give two or more different light levels there")  # fmt: skip
     top = float(signal[used].max())
     if top <= 0:
         raise ValueError(f"the brightest level is {top:.4g} DN above the dark level, which must be positive: check "
@@ -183,7 +183,7 @@ def _used(levels: Levels, share: float) -> tuple[Tensor, float, float]:
 
 
 def _piled(levels: Levels) -> Tensor:
-    """Return a mask of the levels whose histogram was kept because numbers pile up at an end of the range."""
+    """Return a mask of the light levels with a histogram because numbers pile up at an end of the range."""
     counted, at_zero = (torch.zeros_like(levels.mean, dtype=torch.bool) for _ in range(2))
     counted[levels.cell_level] = True
     at_zero[levels.cell_level[levels.cell_value == 0]] = True

@@ -35,7 +35,7 @@ def density(
     bits: Bits = 16,
     told: bool = True,
 ) -> Likelihood:
-    """Compute the likelihood of measured levels from the probability distributions of the steps of `sensor`.
+    """Compute the likelihood of measured light levels from the probability distributions of the nodes in `sensor`.
 
     Where numbers count as continuous, mean and variance are sufficient statistics of a level, so that the cost does not
     depend on the number of pixels. Numbers near the well and coarse numbers have the exact probabilities of the

@@ -1,4 +1,4 @@
-"""The distribution of a linear sensor's numbers under flat light, and the likelihood of the measured levels."""
+"""The distribution of a linear sensor's digital numbers under flat light, and the likelihood of light levels."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Sensor(NamedTuple):
 
 
 class Likelihood(NamedTuple):
-    """The likelihood of the levels; the leading dimensions of each tensor are those of the sensor parameters."""
+    """The likelihood of the light levels; the leading dimensions of each tensor are those of the sensor parameters."""
 
     log: Tensor  #: (...)
     deviance: Tensor  #: (..., level) twice the log-likelihood below that of a separate fit of each level
@@ -49,7 +49,7 @@ class _Expected(NamedTuple):
 
 
 def likelihood(levels: Sufficient, sensor: Sensor, rounding: Rounding, bits: int, told: bool) -> Likelihood:
-    """Compute the likelihood of levels from their moments, and from the exact probabilities of their histogram cells.
+    """Compute the likelihood of light levels from means, variances, and exact probabilities of histogram bins.
 
     Without ``told`` only the logarithm is computed, because a sampler needs no other field.
     """
@@ -85,7 +85,7 @@ def _cut_off(levels: Sufficient, signal: _Expected, sensor: Sensor, top: int) ->
 
 
 def _scaled(levels: Sufficient, mean: Tensor, variance: Tensor) -> Tensor:
-    """Return expected mean and log variance of each level, in standard deviations of the measured values."""
+    """Return expected mean and log variance of each light level, in standard deviations of the measured values."""
     known = levels.variance.where(levels.pixels > 0, 1.0)
     return torch.cat(
         [(levels.pixels / known).sqrt() * mean, ((levels.degrees_of_freedom + 1) / 2).sqrt() * variance.log()], -1
@@ -103,12 +103,12 @@ def _has_cells(levels: Sufficient) -> Tensor:
 
 
 def _pixels(levels: Sufficient) -> Tensor:
-    """Return the number of pixels of each level, counted in its moments and in its histogram cells."""
+    """Return the number of pixels of each light level, counted in mean and variance and in histogram bins."""
     return levels.pixels.index_add(0, levels.cell_level, levels.cell_count)
 
 
 def _log_cells(levels: Sufficient, signal: _Expected, sensor: Sensor, rounding: Rounding, top: int) -> Tensor:
-    """Return the logarithm of the probability of each histogram cell: (..., cell)."""
+    """Return the logarithm of the probability of each histogram bin (..., bin)."""
     at = levels.cell_level
     mean, variance = signal.mean.index_select(-1, at), signal.variance.index_select(-1, at)
     continuous = log_cell(levels.cell_value, mean, variance.sqrt(), sensor.well, rounding, top)
@@ -125,7 +125,7 @@ def _log_cells(levels: Sufficient, signal: _Expected, sensor: Sensor, rounding: 
 def _counted_out(
     levels: Sufficient, signal: _Expected, sensor: Sensor, rounding: Rounding, top: int, electrons: Tensor
 ) -> Tensor:
-    """Return log probabilities of cells as a sum over Poisson numbers of electrons, each with the remaining noise."""
+    """Return log probabilities of histogram bins, summed over Poisson-distributed numbers of electrons."""
     at = levels.cell_level
     count = torch.arange(_MOST + 1, dtype=torch.float64).view(-1, *(1 for _ in electrons.shape))
     expected = electrons.clamp_min(1e-300)
@@ -137,7 +137,7 @@ def _counted_out(
 
 
 def _deviance(levels: Sufficient, moments: Tensor, cells: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
-    """Return deviance and degrees of freedom of each level; both are 0 for a partly clipped level."""
+    """Return deviance and degrees of freedom of each light level; both are 0 for a partly clipped level."""
     whole = levels.pixels == 0
     count, total = levels.cell_count, _pixels(levels)[levels.cell_level]
     each = 2.0 * count * ((count / total).log() - cells)

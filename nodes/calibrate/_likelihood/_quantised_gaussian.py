@@ -1,4 +1,4 @@
-"""The exact probability of each number of a converter, for a Gaussian signal limited by a full well.
+"""The exact probability of each digital number of a converter, for a Gaussian signal limited by a full well.
 
 Numbers are not treated as continuous, and no quantization variance is added.
 """
@@ -63,7 +63,7 @@ def _dithered(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, top: int) -
 
 
 def _integral(x: Tensor, mean: Tensor, sd: Tensor, above: Tensor) -> Tensor:
-    """Return the integral of the Gaussian distribution function up to x, minus x - mean where ``above``."""
+    """Return the integral of the Gaussian distribution function up to x, minus (x - mean) if ``above`` is True."""
     z = (x - mean) / sd
     density = torch.exp(-0.5 * z.square()) / math.sqrt(2.0 * math.pi)
     side = torch.where(above, z, -z)

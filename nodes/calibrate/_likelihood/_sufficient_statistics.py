@@ -1,4 +1,4 @@
-"""Sufficient statistics of levels, for a sensor whose pixels are alike."""
+"""Sufficient statistics of the frames of each light level, for a sensor whose pixels are alike."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _COARSE = 0.8  #: DN, standard deviation below which mean and variance are not s
 
 
 class Sufficient(NamedTuple):
-    """The mean and variance of most pixels of each level, and a histogram of the remaining pixels."""
+    """The mean and variance of most pixels of each light level, and a histogram of the remaining pixels."""
 
     photons: Tensor  #: (level,) float64, per pixel and exposure
     exposure: Tensor  #: (level,) float64, s
@@ -31,7 +31,7 @@ class Sufficient(NamedTuple):
 
 @node(rtol=1e-9)
 def sufficient(levels: Levels) -> Sufficient:
-    """Replace the middle of each histogram by a mean and a variance, and keep the counts near both ends.
+    """Replace the middle of each light level's histogram by mean and variance, and keep the counts near both ends.
 
     Between the ends numbers count as continuous, and mean and variance are sufficient; at a full well every single
     number carries information. A level with a standard deviation below 0.8 DN keeps its whole histogram.
@@ -56,7 +56,7 @@ def sufficient(levels: Levels) -> Sufficient:
 def _(result: Sufficient, *inputs: Levels) -> list[Check]:
     counted = len(set(result.cell_level.tolist()))
     return [
-        Check(f"{len(result.mean)} levels, {counted} with a histogram, {len(result.cell_level)} histogram cells in all")
+        Check(f"{len(result.mean)} light levels, {counted} with a histogram, {len(result.cell_level)} histogram bins")
     ]
 
 
@@ -84,7 +84,7 @@ def _(levels: Levels) -> Sufficient:
 
 
 def _inner(value: Tensor, count: Tensor, sd: float) -> tuple[Tensor, Tensor]:
-    """Return a mask of the numbers away from both ends, and their count, mean, variance and degrees of freedom."""
+    """Return a mask of the digital numbers away from both ends of the range, and the statistics of these numbers."""
     inner = (value > value[0] + _EDGE) & (value < value[-1] - _EDGE)
     total = float(count[inner].sum())
     if sd < _COARSE or total < 2:

@@ -66,17 +66,17 @@ class CameraCoordinates(Free):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Return a readable name of each coordinate."""
+        """Return a readable name of each sampler coordinate."""
         return tuple(("" if name in self.linear else "ln ") + name.replace("_", " ") for name in self.names)
 
     def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
-        """Convert parameters to coordinates: (..., free)."""
+        """Convert camera parameters to sampler coordinates (..., free parameter)."""
         return self.scaled({name: torch.as_tensor(parameters[name], dtype=torch.float64) for name in self.names})
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
-        """Convert coordinates (..., free) to the free parameters."""
+        """Convert sampler coordinates (..., free parameter) to camera parameters."""
         return self.unscaled(place)
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Return the log prior density (...) per unit of the coordinates, up to a constant."""
+        """Return the log prior density per unit of the sampler coordinates, up to a constant."""
         return -0.5 * self.whitened(parameters).square().sum(-1)

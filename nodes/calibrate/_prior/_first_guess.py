@@ -1,4 +1,4 @@
-"""First guesses of the parameters of a sensor or camera, from measured levels."""
+"""First guesses of the parameters of a sensor or camera, from measured light levels."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LEAST = 1e-3  #: least dark current or read noise, relative to the believed val
 
 
 def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
-    """Return a least-squares estimate of each parameter of a sensor, or the ``believed`` value without an estimate.
+    """Return a least-squares estimate of each sensor parameter, or the ``believed`` value if there is no estimate.
 
     ``params`` are the fixed parameters of `density`.
 
@@ -47,7 +47,7 @@ def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str
 
 
 def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
-    """Return a least-squares estimate of each parameter of a camera, or the ``believed`` value without an estimate.
+    """Return a least-squares estimate of each camera parameter, or the ``believed`` value if there is no estimate.
 
     ``params`` are the fixed parameters of `camera`.
 

@@ -18,14 +18,14 @@ Pair = tuple[float, float]
 
 
 class Prior(NamedTuple):
-    """Independent normal distributions, one for each parameter of a sensor; NaN stands for a held parameter."""
+    """Independent normal distributions, one for each parameter of a sensor; NaN stands for a fixed parameter."""
 
     centre: Tensor  #: (parameter,) float64, mean of the logarithm, or of a linear parameter itself
     width: Tensor  #: (parameter,) float64, standard deviation of the same quantity
 
 
 def believed(pairs: Mapping[str, Pair | None], linear: frozenset[str]) -> Prior:
-    """Build a prior from a pair of numbers for each free parameter, and None for each held parameter.
+    """Build a prior from a pair of numbers for each free parameter, and None for each fixed parameter.
 
     The pair is median and factor, or mean and standard deviation for a parameter in ``linear``.
     """
@@ -51,7 +51,7 @@ def _normal(name: str, pair: Pair | None, linear: bool) -> Pair:
 
 @dataclass(frozen=True)
 class Free:
-    """Free parameters and their prior; each subclass defines the coordinates."""
+    """Free parameters and their prior; each subclass defines the coordinates for a sampler."""
 
     every: ClassVar[tuple[str, ...]]  #: the names of all parameters, free or held
     linear: ClassVar[frozenset[str]]  #: the parameters that may be 0 or negative
@@ -64,7 +64,7 @@ class Free:
 
     @classmethod
     def of(cls, prior: Prior, nominal: Mapping[str, float]) -> Self:
-        """Build coordinates for the free parameters of a prior; all other parameters keep the ``nominal`` values."""
+        """Build sampler coordinates for the free parameters of a prior; others keep the ``nominal`` values."""
         free = freed(cls.every, prior)
         return cls(free, prior, {name: float(nominal[name]) for name in cls.every if name not in free})
 
@@ -73,20 +73,20 @@ class Free:
         return self.from_whitened(torch.randn(count, len(self.names), generator=rng, dtype=torch.float64))
 
     def whitened(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Convert parameters to distances (..., free) from the prior's centre, in standard deviations of the prior."""
+        """Convert parameters to distances from the prior's centre, in standard deviations of the prior."""
         return (self.scaled(parameters) - self._normals.centre) / self._normals.width
 
     def from_whitened(self, z: Tensor) -> dict[str, Tensor]:
-        """Convert distances (..., free) from the prior's centre, in standard deviations, to parameters."""
+        """Convert distances from the prior's centre, in standard deviations of the prior, to parameters."""
         return self.unscaled(self._normals.centre + self._normals.width * z)
 
     def scaled(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Return the logarithms of the free parameters, or the values of linear parameters: (..., free)."""
+        """Return the logarithm of each free parameter, or the value of a parameter that may be 0 or negative."""
         values = ((name, parameters[name]) for name in self.names)
         return torch.stack([x if name in self.linear else x.log() for name, x in values], -1)
 
     def unscaled(self, values: Tensor) -> dict[str, Tensor]:
-        """Return the free parameters from logarithms (..., free), or from values of linear parameters."""
+        """Return the free parameters from logarithms, or from the values of parameters that may be 0 or negative."""
         pairs = zip(self.names, values.unbind(-1), strict=True)
         return {name: x if name in self.linear else x.exp() for name, x in pairs}
 

@@ -69,18 +69,18 @@ class Coordinates(Free):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Return a readable name of each coordinate."""
+        """Return a readable name of each sampler coordinate."""
         of = {"gain": "ln slope of the photon-transfer curve", "offset": "offset, DN", "spread": "ln spread"}
         return tuple(of.get(name, f"ln {name.replace('_', ' ')} in numbers") for name in self.names)
 
     def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
-        """Convert parameters to coordinates: (..., free)."""
+        """Convert sensor parameters to sampler coordinates (..., free parameter)."""
         full = {name: torch.as_tensor(parameters.get(name, self.held.get(name)), dtype=torch.float64) for name in NAMES}
         slope = full["gain"].log()
         return torch.stack([self._coordinate(name, full, slope) for name in self.names], -1)
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
-        """Convert coordinates (..., free) to the free parameters."""
+        """Convert sampler coordinates (..., free parameter) to sensor parameters."""
         at = dict(zip(self.names, place.unbind(-1), strict=True))
         held = {name: math.log(self.held[name]) for name in ("gain", "spread") if name in self.held}
         logs = {name: torch.tensor(x, dtype=torch.float64) for name, x in held.items()} | at
@@ -96,7 +96,7 @@ class Coordinates(Free):
         return parameters
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Return the log prior density (...) per unit of the coordinates, up to a constant."""
+        """Return the log prior density per unit of the sampler coordinates, up to a constant."""
         total = -0.5 * self.whitened(parameters).square().sum(-1)
         if _LINEAR in self.names and "gain" in self.names:
             total = total - parameters["gain"].log()  # Jacobian from offset in DN to electrons

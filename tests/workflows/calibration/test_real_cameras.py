@@ -139,7 +139,7 @@ def test_too_few_levels_are_refused_with_what_would_do(store, tmp_path):
 
 
 def test_pixels_that_are_all_alike_have_no_models_of_a_response(store):
-    with pytest.raises(ValueError, match="calibrate has a likelihood of identical pixels"):
+    with pytest.raises(ValueError, match="the likelihood of calibrate assumes identical pixels"):
         compare_models(load("calibrate", ["flats.shape=[32, 32]"]), store)
 
 

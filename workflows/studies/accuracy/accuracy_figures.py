@@ -177,7 +177,7 @@ def _draw_exact_level(ax: Any, errors: Iterable[float], exact: float) -> None:
 
 
 def _place_labels(figure: Any, diagrams: Sequence[Diagram]) -> None:
-    """Write the label of each point where it covers no marker and no other label; omit labels without free space."""
+    """Write the label of each point where the label covers no marker or other label; omit labels without free space."""
     from matplotlib.transforms import Bbox
 
     figure.canvas.draw()

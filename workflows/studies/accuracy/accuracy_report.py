@@ -247,7 +247,7 @@ def _dot(p: WorkPrecisionPoint, recipe: Recipe) -> Dot:
 
 
 def _diagram(s: StepTried) -> tuple[str, list[Line], float]:
-    """Return the data of a step's diagram: title, a line for each changed property, and the time of the reference in s."""
+    """Return the data of a step's diagram: title, a line for each changed property, and the reference's time in s."""
     names = dict.fromkeys(f.line for f in s.variants)
     lines = [Line(n, [Dot(f.seconds, f.error, f.label) for f in s.variants if f.line == n], n == USED) for n in names]
     on = f"\non {s.found.cut_inputs}" if s.found.cut_inputs else ""

@@ -137,7 +137,7 @@ def allowed_words(step: Step, parameter: str) -> tuple[str, ...]:
 
 
 def _places(recipe: Recipe, parameter: str, gives: type | None = None, beside: str = "") -> list[_Place]:
-    """Return the recipe paths that set ``parameter``, for steps that return ``gives`` and have a parameter ``beside``."""
+    """Return the recipe paths that set ``parameter``, for steps that return ``gives`` and also have ``beside``."""
     found: dict[str, _Place] = {}
     for name in needed(recipe, recipe.outputs):
         step = recipe.steps[name]

@@ -91,7 +91,7 @@ def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tupl
 
 
 def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: float) -> StepTried:
-    """Measure variants of a step on inputs so small that the reference node takes at most about ``patience`` seconds."""
+    """Measure variants of a step on inputs so small that the reference takes at most about ``patience`` seconds."""
     step = recipe.steps[name]
     if step.node.hooks.reference is None:
         return StepTried(name, step.node.path, share, StepMeasurement(refused="the node has no reference"))
@@ -131,7 +131,7 @@ def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> 
 
 
 def _largest(step: Step, inputs: list[Any], seed: int, patience: float) -> tuple[Cut, Any, float] | None:
-    """Return the largest input size for which the reference node takes about ``patience`` s, the result and the time."""
+    """Return the largest input size for which the reference takes about ``patience`` s, the result and the time."""
     best: tuple[Cut, Any, float] | None = None
     for size in _CUTS:
         if best is not None and best[2] * _GROWTH > patience:
@@ -218,7 +218,7 @@ def _median_time(compute: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def cut_inputs(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
-    """Crop each picture in ``inputs`` to its middle, and keep fewer spectral bands if the node declares the band axis."""
+    """Crop each picture in ``inputs`` to its middle, and keep fewer spectral bands if the node names the band axis."""
     side, bands = size
     parts = []
     for name, value in zip(node.inputs, inputs, strict=True):

@@ -1,4 +1,4 @@
-"""Points of a work-precision diagram: the run time of a cold run and the errors of the outputs."""
+"""Points of a diagram of error against run time: the time of a cold run and the errors of the outputs."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class PointMeasurement:
 
 @dataclass(frozen=True)
 class WorkPrecisionPoint:
-    """A point of a work-precision diagram: a setting of the recipe and its measurement."""
+    """A point of a diagram of error against run time: a setting of the recipe and its measurement."""
 
     trial: Trial
     found: PointMeasurement
@@ -111,7 +111,7 @@ class PointCache:
         return WorkPrecisionPoint(trial, found)
 
     def time_again(self, point: WorkPrecisionPoint, number: int) -> WorkPrecisionPoint:
-        """Add the time of cold run ``number`` to the run times of a point, unless its first run was slow."""
+        """Return a measurement with the time of cold run ``number`` added, or unchanged if the first run was slow."""
         recipe, seconds = point.trial.recipe, point.found.seconds
         if recipe is None or not seconds or seconds[0] >= _QUICK:
             return point
@@ -123,7 +123,7 @@ class PointCache:
         return run_cold(recipe, self.store, self.device).seconds
 
     def key(self, recipe: Recipe) -> str:
-        """Return the store key of a measured setting: a digest of recipe, reference, engine, seeds, device and machine."""
+        """Return the store key of a measurement: a digest of recipe, reference, engine, seeds, device and machine."""
         both = [key_parts(r, self._code, self.device) for r in (recipe, self.reference)]
         return digest("accuracy", both, self.seeds, self.device, engine(), machine())
 
@@ -154,7 +154,7 @@ class PointCache:
         return PointMeasurement(errors, [result.seconds], sum(ran.values()), load, result.proof.worst, ran)
 
     def _warm_up(self, recipe: Recipe) -> None:
-        """Run the recipe once without timing, because the first run of a process also imports libraries and reads code."""
+        """Run the recipe once without timing, because the first run of a process imports libraries and reads code."""
         self.truth(0)
         for step in with_substitutions(recipe, recipe.outputs).steps.values():
             self._code.digest(step.node.fn.__module__)

@@ -56,7 +56,7 @@ class CalibrationStudyResult:
 
     @property
     def failed(self) -> int:
-        """Return how many criteria of the study fail, of two for each parameter and three for the set of simulations."""
+        """Return the number of failed criteria, of two for each parameter and three for the set of simulations."""
         return sum(v.failed for v in self.rank_tests) + bool(self.refused) + bool(self.short) + bool(self.stranded)
 
 

@@ -34,7 +34,7 @@ _ROUNDING = 2e-7  #: rounding error of a sum in float32, relative to its largest
 
 @dataclass(frozen=True)
 class OmissionRow:
-    """The effect of left-out steps: error bound, measured errors relative to the largest element, and saved run time."""
+    """The effect of left-out steps: error bound, errors relative to the largest element, and saved run time."""
 
     name: str
     kind: str
@@ -117,7 +117,7 @@ class OmissionComparison:
         return outputs, self._back(omission) if omission.taken else None
 
     def _holds(self, omission: Omission, bound: float, pair: tuple[Any, Any], result: Result) -> bool:
-        """Return True if the bound holds for the rms error (noise and band sums) or for the largest error (all others)."""
+        """Return True if the bound holds for the rms error (noise and band sums) or the largest error (all others)."""
         if omission.kind == "stands in":  # both computations have a documented error of their own
             steps = [self.full.steps[name] for name in omission.exchange]
             cheaper = [result.recipe.steps[name] for name in omission.exchange.values()]
@@ -158,7 +158,7 @@ def _errors(names: Sequence[str], others: Sequence[str], result: Result, truth: 
 
 
 def _bounds(omission: Omission, result: Result) -> dict[str, float]:
-    """Return the error bound of each compared step: the stated bound, or the proved bound of sums over spectral bands."""
+    """Return the error bound of each compared step: the bound that its node states, or that the engine proves."""
     if omission.kind != "stands in":
         return dict.fromkeys(omission.at, omission.bound)
     return {name: bound for name in omission.at if (bound := result.proof.of(name)) is not None}

@@ -113,7 +113,7 @@ def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omiss
 
 
 def _adding(recipe: Recipe, order: list[str], name: str) -> tuple[str, ...]:
-    """Return the steps that read the result of step ``name``, or no steps if one of them does more than add the result."""
+    """Return the steps that read the result of step ``name`` if all of these steps only add the result, else none."""
     readers = [recipe.steps[n] for n in order if name in recipe.steps[n].sources]
     return tuple(reader.name for reader in readers) if all(_only_adds(reader, name) for reader in readers) else ()
 
@@ -138,7 +138,7 @@ def _facts(wire: Wire, facts_of: FactsOf) -> TensorStats | list[TensorStats | No
 
 
 def _share(largest: float, recipe: Recipe, at: tuple[str, ...], facts_of: FactsOf) -> float:
-    """Return ``largest`` over the largest element of the results of steps ``at``, or infinity for non-tensor results."""
+    """Return ``largest`` over the largest element in the results of steps ``at``, or infinity if not tensors."""
     if largest == 0:
         return 0.0
     if any(recipe.steps[name].node.hints.get("return") is not Tensor for name in at):

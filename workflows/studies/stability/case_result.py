@@ -36,7 +36,7 @@ _HALVES = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
 
 @dataclass(frozen=True)
 class Cell:
-    """The test result of one step in one extreme case: pass, warn or fail, errors of result and gradient, and bounds."""
+    """The test result of one step in one extreme case: pass, warn or fail, and errors of result and gradient."""
 
     mark: Mark
     note: str
@@ -73,7 +73,7 @@ def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell
 
 
 def _changed_inputs(inputs: Sequence[Any], case: Case) -> list[Any] | None:
-    """Return a step's inputs with the picture change of an extreme case, or None if no input has a picture to change."""
+    """Return a step's inputs with the pictures changed for an extreme case, or None if no input is a picture."""
     given = list(inputs)
     if case.alike:
         if len(given) < 2 or not all(isinstance(x, Tensor) and _is_picture(x) for x in given[:2]):
@@ -101,7 +101,7 @@ def _run(step: Step, fn: Any, inputs: Sequence[Any], seed: int, **params: Any) -
 
 
 def _as_used(step: Step, inputs: Sequence[Any], seed: int) -> Any:
-    """Compute a step with its own parameters and return the result; raise `_Refused` if the step raises `ValueError`."""
+    """Compute a step with its own parameters and return its result; raise `_Refused` for a `ValueError`."""
     try:
         return _run(step, step.node.fn, inputs, seed)
     except ValueError as error:
@@ -266,7 +266,7 @@ def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed:
 
 
 def _one_seen(step: Step, given: list[Any], seed: int) -> str:
-    """Return how a step treats NaN or infinity in an input: refused, seen in the result, like a large number, or hidden."""
+    """Return how a step treats NaN or infinity in an input: refused, seen in the result, as a large number, hidden."""
     with torch.no_grad():
         try:
             value = _as_used(step, given, seed)

@@ -34,7 +34,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Case:
-    """An extreme case for the test of a recipe: the changed parameters, results or inputs. Each case is one row of the grid."""
+    """An extreme case of a recipe: changed parameters, results or inputs. Each case is one row of the grid."""
 
     name: str
     what: str  #: the extreme property

@@ -18,7 +18,7 @@ Entry = tuple[str, str, str, Cell]  #: group, case, node, cell
 
 @drawn
 def grid_picture(entries: Sequence[Entry]) -> Any:
-    """Draw the grid of test outcomes and errors: a row for each extreme case and a column for each node, losses last."""
+    """Draw the grid of test outcomes and errors: a row for each extreme case, a column for each node, losses last."""
     cases = list(dict.fromkeys((group, case) for group, case, _, _ in entries))
     nodes = sorted({node for _, _, node, _ in entries}, key=lambda n: (n.startswith("losses."), n))
     panels = max(1, -(-len(nodes) // _ACROSS))

@@ -49,7 +49,7 @@ class GridCell:
 
     @property
     def severity(self) -> tuple[int, float]:
-        """Return a sort key, largest for the worst test result: the outcome, then the largest ratio of error to bound."""
+        """Return a sort key, largest for the worst result: the outcome, then the largest ratio of error to bound."""
         cell = self.cell
         pairs = ((cell.error, cell.bound), (cell.slope, cell.slope_bound))
         shares = [error / bound for error, bound in pairs if error is not None and bound]

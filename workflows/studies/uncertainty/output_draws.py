@@ -74,7 +74,7 @@ class OutputDraws:
         return [numbers for numbers in found if numbers is not None]
 
     def pictures(self, values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
-        """Return the mean and standard deviation of each output picture over the draws, and store each draw's numbers."""
+        """Return mean and standard deviation of each output picture over the draws, and store each draw's numbers."""
         keys = [self.key(row) for row in values]
         whole = digest("uncertainty pictures", keys)
         if (first := self._kept(keys[0])) is not None and not first["pictures"]:
@@ -101,7 +101,7 @@ class OutputDraws:
         return digest("uncertainty draw", engine("studies.uncertainty.output_draws"), outputs, within)
 
     def _keys(self, theta: Mapping[str, Any]) -> dict[str, str]:
-        """Return the store keys of steps at the input values ``theta``; if ``theta`` is empty, of steps without inputs."""
+        """Return the store keys of steps that depend on the inputs ``theta``; if ``theta`` is empty, of other steps."""
         recipe, keys = self.inputs.recipe, dict(self._fixed) if theta else {}
         by_step: dict[str, dict[str, Any]] = {}
         for reader, value in theta.items():
@@ -130,7 +130,7 @@ class OutputDraws:
         return numbers
 
     def _results(self, rows: Sequence[FloatArray]) -> Iterator[dict[str, Any]]:
-        """Yield the outputs for each draw of the inputs, in order; ``self.workers`` threads each compute one draw at a time."""
+        """Yield the outputs for each draw of the inputs, in order; ``self.workers`` threads compute in parallel."""
         if not rows:
             return
         self.ready()

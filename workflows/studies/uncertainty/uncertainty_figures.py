@@ -110,7 +110,7 @@ def _at_one_signal(draws: FloatArray, column: int) -> tuple[FloatArray, FloatArr
 
 @drawn
 def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) -> Any:
-    """Draw a histogram of each output number over all draws, and a line at its value for all inputs at their medians."""
+    """Draw a histogram of each output number over all draws, and a line at the value for median inputs."""
     columns = min(3, len(draws))
     rows = -(-len(draws) // columns)
     figure, axes = canvas(3.6 * columns, 2.5 * rows, rows, columns)

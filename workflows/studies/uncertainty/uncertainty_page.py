@@ -56,7 +56,7 @@ class UncertaintyResult:
 
     @property
     def failed(self) -> int:
-        """Return the number of quantities with NaN or infinity, plus 1 if the standard deviations are not accurate enough."""
+        """Return the number of quantities with NaN or infinity, plus 1 if a standard deviation is too inaccurate."""
         return len(self.strange) + (not self.error <= self.wanted)
 
     @property
@@ -70,7 +70,7 @@ class UncertaintyResult:
 
     @property
     def numbers(self) -> list[str]:
-        """Return the names of scalar quantities that vary between draws, one for each group of proportional quantities."""
+        """Return the names of scalar quantities that vary between draws, one from each group of proportional ones."""
         return list(self.swings)
 
 
@@ -93,7 +93,7 @@ def draw_pictures(result: UncertaintyResult) -> dict[str, bytes]:
 
 
 def _curves(result: UncertaintyResult) -> tuple[dict[str, tuple[FloatArray, dict[str, FloatArray]]], str] | None:
-    """Return the output curves that vary between draws, with their abscissas, by step, and the label of the abscissa."""
+    """Return the curves that vary between draws, with their abscissas, by step, and the label of the abscissa."""
     wavelengths = _wavelengths_nm(result)
     curves: dict[str, tuple[FloatArray, dict[str, FloatArray]]] = {}
     spectral = True

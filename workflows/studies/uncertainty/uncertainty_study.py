@@ -40,7 +40,7 @@ def study(
     workers: int = 0,
     device: str = "cpu",
 ) -> Path:
-    """Sample the inputs, up to ``most`` times, until each output's standard deviation has a relative error of ``error``.
+    """Sample inputs, up to ``most`` times, until all output standard deviations are known to the relative ``error``.
 
     On the CPU, ``workers`` draws are computed at once; 0 means one for each core. Returns the folder with the results.
     """

@@ -91,8 +91,8 @@ def test_every_image_counts_by_its_content(folder):
         ("b 40000.0 120.0", "b -1 120", r"set\.txt:4: cannot read b"),
         ("b 40000.0 120.0", "b nan 120", r"set\.txt:4: cannot read b"),
         ("d 1000000 0", "d 1000000 7", r"set\.txt:12: cannot read d"),
-        ("i images\\b_1.png\n", "", r"set\.txt:4: 1 image\(s\): a level needs at least two"),
-        ("b 40000.0 120.0\n", "", r"set\.txt:4: an image stands before the first level"),
+        ("i images\\b_1.png\n", "", r"set\.txt:4: 1 image\(s\): a light level needs two or more"),
+        ("b 40000.0 120.0\n", "", r"set\.txt:4: an image precedes the first light level"),
         (TEXT, "v 3.0", "no line begins with 'b' or 'd'"),
     ],
 )
@@ -111,8 +111,8 @@ def test_no_descriptor_at_all(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("n 12 6 4", "n 12 4 6", r"set\.txt:4: images of \(4, 6\), but the descriptor says \(6, 4\)"),
-        ("n 12 6 4", "n 10 6 4", r"set\.txt:4: an image holds \d+ DN, more than the 10 bits of line n"),
+        ("n 12 6 4", "n 12 4 6", r"set\.txt:4: image shape \(4, 6\), but descriptor shape \(6, 4\)"),
+        ("n 12 6 4", "n 10 6 4", r"set\.txt:4: a pixel of \d+ DN exceeds the 10 bits given in line n"),
     ],
 )
 def test_images_are_held_to_what_the_descriptor_says(folder, old, new, message):
@@ -123,7 +123,7 @@ def test_images_are_held_to_what_the_descriptor_says(folder, old, new, message):
 
 def test_the_check_wants_a_dark(folder):
     found = descriptor(file=given(folder))
-    assert descriptor.hooks.check(found)[0].text == "3 levels, 2 dark, exposures up to 0.001 s"
+    assert descriptor.hooks.check(found)[0].text == "3 levels (2 dark), exposures up to 0.001 s"
     lit = reduce(np_stack(folder), photons=1.0, exposure=0.1)
     assert not descriptor.hooks.check(lit)[0].ok
 

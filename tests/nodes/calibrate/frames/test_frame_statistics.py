@@ -161,7 +161,7 @@ def test_what_is_no_stack_is_refused(shape):
 def test_what_has_no_variance_is_refused():
     with pytest.raises(ValueError, match="give two frames"):
         one(torch.zeros(1, 4, 4), "temporal")
-    with pytest.raises(ValueError, match="one number has no variance"):
+    with pytest.raises(ValueError, match="one pixel value has no variance"):
         one(torch.zeros(2, 1, 1), "steady")
     with pytest.raises(ValueError, match="no variance"):
         one(torch.zeros(1, 1, 1))
@@ -175,11 +175,11 @@ def test_levels_are_joined_in_their_order():
     assert found.cell_value[found.cell_level == 2].tolist() == [9.0]
     again = levels([levels(parts[:1]), levels(parts[1:])])
     assert all(torch.equal(a, b) for a, b in zip(found, again, strict=True))
-    with pytest.raises(ValueError, match="no levels"):
+    with pytest.raises(ValueError, match="no light levels"):
         levels([])
 
 
 def test_checks_say_what_was_found():
     part = one(torch.full((2, 2, 2), 9.0))
     assert reduce.hooks.check(part)[0].text == "mean 9 DN, variance 0 DN2, histogram of 1 numbers"
-    assert levels.hooks.check(levels([part, part]))[0].text == "2 levels, 0 dark, 2 with a histogram"
+    assert levels.hooks.check(levels([part, part]))[0].text == "2 light levels, 0 dark, 2 with a histogram"

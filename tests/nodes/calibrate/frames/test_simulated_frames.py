@@ -51,4 +51,4 @@ def test_the_same_stream_gives_the_same_frames():
 
 
 def test_the_check_says_the_mean():
-    assert expose.hooks.check(torch.full((1, 2, 2), 7.0))[0].text == "mean 7 DN, 7 to 7"
+    assert expose.hooks.check(torch.full((1, 2, 2), 7.0))[0].text == "mean 7 DN, pixels of 7 to 7 DN"

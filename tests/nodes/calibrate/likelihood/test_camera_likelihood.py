@@ -177,7 +177,7 @@ def test_no_scatter_of_any_kind_is_still_a_number():
     ("photons", "message"),
     [
         ([10.0, 100.0, 1000.0], "no dark level"),
-        ([0.0, 0.0], "0 lit levels"),
+        ([0.0, 0.0], "there are no lit levels"),
         ([0.0, 100.0], r"0 lit level\(s\) below 70% of saturation"),
         ([0.0, 500.0, 500.0, 1000.0], "below 70% of saturation"),
     ],
