@@ -5,7 +5,8 @@ from neusee.nodes.sensor._digitization import crop, digitize, full_well
 from neusee.nodes.sensor._exposure import add_photons, expose, level
 from neusee.nodes.sensor._noise import dark_current, photon_noise, read_noise
 from neusee.nodes.sensor._photon_transfer import photon_transfer
-from neusee.nodes.sensor._saturation import Limits, limits, photons_that_fill, saturation
+from neusee.nodes.sensor._saturation import photons_that_fill, saturation
+from neusee.nodes.sensor._sensor_limits import Limits, limits
 
 __all__ = [
     "Limits",

@@ -1,9 +1,8 @@
-"""Saturation irradiance, largest signal-to-noise ratio and dynamic range of a sensor."""
+"""Saturation irradiance of a sensor, and the photons that fill a pixel."""
 
 import math
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
-import torch
 from pydantic import Field
 from torch import Tensor
 
@@ -14,14 +13,6 @@ from neusee.nodes.values import Bands
 
 Efficiency = Annotated[float, Field(gt=0, le=1)]  #: electrons per photon
 Well = Annotated[Electrons, Field(gt=0)]  #: electrons that fill a pixel
-
-
-class Limits(NamedTuple):
-    """Limits of a sensor: photons that fill a pixel, largest signal-to-noise ratio, and dynamic range."""
-
-    photons: Tensor  #: () float64, photons that fill a pixel
-    snr: Tensor  #: () float64, signal-to-noise ratio at saturation
-    dynamic_range: Tensor  #: () float64, dB
 
 
 def photons_per_joule(centres: Tensor) -> Tensor:
@@ -54,23 +45,3 @@ def saturation(
 def _(result: Tensor, bands: Bands, **params: object) -> list[Check]:
     low, high = float(result.min()), float(result.max())
     return [Check(f"saturation irradiance from {low:.3e} to {high:.3e} W/m2", math.isfinite(low + high) and low > 0)]
-
-
-@node(rtol=1e-12)
-def limits(*, full_well: Well, quantum_efficiency: Efficiency, read_noise: Electrons) -> Limits:
-    """Compute the photons that fill a pixel, the signal-to-noise ratio at saturation, and the dynamic range.
-
-    Shapes: -> three scalars, float64.
-    Units:  photons; signal-to-noise ratio 1; dynamic range in dB, 20 log10(well / read noise).
-    Error:  shot noise alone at the top and read noise alone at the bottom; a read noise under 1 e- counts as 1 e-.
-    Source: EMVA Standard 1288, release 4.0 (SNR_max = sqrt(saturation capacity)).
-    """
-    decibels = 20.0 * math.log10(full_well / max(read_noise, 1.0))
-    values = (photons_that_fill(full_well, quantum_efficiency), math.sqrt(full_well), decibels)
-    return Limits(*(torch.tensor(v, dtype=torch.float64) for v in values))
-
-
-@limits.check
-def _(result: Limits, **params: object) -> list[Check]:
-    text = f"{float(result.photons):.0f} photons, SNR {float(result.snr):.1f}, {float(result.dynamic_range):.1f} dB"
-    return [Check(text, float(result.dynamic_range) > 0)]

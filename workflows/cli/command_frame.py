@@ -12,10 +12,8 @@ from typing import TYPE_CHECKING, NoReturn
 import typer
 
 from neusee.workflows.cli.command_list import BAD
-from neusee.workflows.store.byte_sizes import parse_size
 
 if TYPE_CHECKING:
-    from neusee.workflows.engine.step_job import Executor
     from neusee.workflows.graph.recipe_graph import Recipe
     from neusee.workflows.store.result_store import Store
 
@@ -74,14 +72,6 @@ def failing(*errors: type[Exception], code: int = BAD, before: str = "") -> Iter
         fail(f"{before}{error.args[0] if isinstance(error, LookupError) else error}", code)
 
 
-def check_device(device: str) -> None:
-    """End the command if this machine does not have ``device``, which may be a list with commas."""
-    from neusee.workflows.engine.device_names import check_devices
-
-    with failing(ValueError, before="--device "):
-        check_devices(device)
-
-
 def say(lines: list[str]) -> None:
     """Print lines to stdout."""
     print(*lines, sep="\n", flush=True)
@@ -99,26 +89,3 @@ def the_store() -> Store:
 
     with failing(ValueError, ModuleNotFoundError, before="NEUSEE_CACHE: "):
         return open_store()
-
-
-def memory_limit(text: str) -> int | None:
-    """Return the value of the option ``--memory``, such as ``6 GB``, in bytes, or None for an empty text."""
-    with failing(ValueError, before="--memory: "):
-        return parse_size(text) if text else None
-
-
-@contextmanager
-def executor_of(place: str, store: Store) -> Iterator[Executor | None]:
-    """Yield None for ``local``, or an executor on the cluster ``place``, and close it after the ``with`` block."""
-    if place == "local":
-        yield None
-        return
-    kind, _, count = place.partition(":")
-    if not (kind == "dask" and (not count or count == "here" or count.isdecimal())) and "://" not in place:
-        fail(f"--executor {place}: write local, dask, dask:4, or a scheduler's address such as tcp://host:8786")
-    try:
-        from neusee.workflows.engine.dask_executor import cluster
-    except ModuleNotFoundError as error:
-        fail(f'--executor {place}: {error.name} is not installed: pip install "neusee[distributed]"')
-    with cluster(place, store) as executor:
-        yield executor

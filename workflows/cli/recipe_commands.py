@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import (
+from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, the_store
+from neusee.workflows.cli.command_list import FAILED, MISSED
+from neusee.workflows.cli.command_options import (
+    Debug,
+    Device,
+    Exact,
+    Memory,
+    Out,
+    Words,
     check_device,
     executor_of,
-    fail,
-    failing,
-    load,
     memory_limit,
-    refusing,
-    say,
-    the_store,
 )
-from neusee.workflows.cli.command_list import FAILED, MISSED
-from neusee.workflows.cli.command_options import Debug, Device, Exact, Memory, Out, Words
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe

@@ -8,9 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from neusee.workflows.cli.command_frame import check_device, fail, failing, load, say, the_store
+from neusee.workflows.cli.command_frame import fail, failing, load, say, the_store
 from neusee.workflows.cli.command_list import FAILED
-from neusee.workflows.cli.command_options import Debug, OneDevice, Out, Quiet, Words, option_words, progress_lines
+from neusee.workflows.cli.command_options import (
+    Debug,
+    OneDevice,
+    Out,
+    Quiet,
+    Words,
+    check_device,
+    option_words,
+    progress_lines,
+)
 
 if TYPE_CHECKING:
     from neusee.workflows.api.verbs import Kind

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import check_device, fail, refusing, split, the_store
-from neusee.workflows.cli.command_options import Debug, Device, Out, Words
+from neusee.workflows.cli.command_frame import fail, refusing, split, the_store
+from neusee.workflows.cli.command_options import Debug, Device, Out, Words, check_device
 
 
 def sweep(

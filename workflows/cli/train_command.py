@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import check_device, fail, failing, load, say, the_store
+from neusee.workflows.cli.command_frame import fail, failing, load, say, the_store
 from neusee.workflows.cli.command_list import FAILED
-from neusee.workflows.cli.command_options import Debug, Out, Words, progress_lines
+from neusee.workflows.cli.command_options import Debug, Out, Words, check_device, progress_lines
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from neusee.workflows.store import metadata, orphan_files
+from neusee.workflows.store import garbage_files, metadata
 from neusee.workflows.store.budget_eviction import Candidate, candidates, evict, files, total
 from neusee.workflows.store.journal import Journal
 from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept
@@ -57,7 +57,7 @@ class Maintained(Protocol):
         """
         budget = self.budget if budget is None else budget
         before = total(self.disk)
-        orphans = dict(orphan_files.sweep(self.disk, dry))
+        orphans = dict(garbage_files.sweep(self.disk, dry))
         left = sum(size for path, size, _ in files(self.disk) if path not in orphans)
         gone, refused = self.make_room(left - budget, dry) if budget is not None else ([], [])
         after = left - sum(c.size for c in gone) if dry else total(self.disk)
@@ -73,7 +73,7 @@ class Maintained(Protocol):
             return [], []
         gone, refused = evict(self.disk, candidates(self.disk, self.pinned(), self.read_seconds), excess, dry)
         if gone and not dry:
-            orphan_files.removed(self.disk, orphan_files.bands, dry)
+            garbage_files.removed(self.disk, garbage_files.bands, dry)
             for candidate in gone:
                 self._known.pop(candidate.key, None)
         return gone, refused

@@ -58,7 +58,7 @@ def _weights(z: FloatArray) -> FloatArray:
 
 
 def _value(x: FloatArray, weights: FloatArray, kind: str) -> float:
-    """Return the weighted mean of the draws ``x``, or their 95 % limit if the frames set only a limit on the parameter."""
+    """Return the weighted mean of the draws ``x``, or their 95 % limit if the frames only limit the parameter."""
     if kind not in ("upper", "lower"):
         return float(weights @ x)
     order = np.argsort(x)
