@@ -66,7 +66,8 @@ DYNAMIC = {
 #: Files that may use pi.
 PI = {
     "recipe/blocks/train_lift_block.py": "half a cosine, along which the rate of training falls",
-    "training/mask_design/optimizers.py": "half a cosine, along which a rate falls, and the bound of an angle",
+    "training/mask_design/gradient_descent.py": "half a cosine, along which a rate falls",
+    "training/mask_design/differential_evolution.py": "the bound of an angle",
 }
 MEASURED = {
     "clear_peak",

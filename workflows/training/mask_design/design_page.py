@@ -12,7 +12,7 @@ from neusee.workflows.report.figures import optics
 from neusee.workflows.report.figures.style import canvas, drawn
 from neusee.workflows.report.study_page import Section
 from neusee.workflows.training.mask_design.design_terms import Fabrication, Terms
-from neusee.workflows.training.mask_design.optimizers import LearntMask
+from neusee.workflows.training.mask_design.learnt_mask import LearntMask
 
 _COLUMNS = ("nm", "LSR", "even light", "BSR", "median MTF", "at most", "rms MTF", "at most")
 _NAMES = ("lsr", "energy_floor", "bsr", "median_mtf", "median_mtf_bound", "rms_mtf", "rms_mtf_bound")

@@ -34,7 +34,9 @@ from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.loop.checkpoint import StateFile
 from neusee.workflows.training.loop.resumable_loop import Progress
 from neusee.workflows.training.mask_design.design_terms import Terms
-from neusee.workflows.training.mask_design.optimizers import LearntMask, learn
+from neusee.workflows.training.mask_design.differential_evolution import evolve
+from neusee.workflows.training.mask_design.gradient_descent import descend
+from neusee.workflows.training.mask_design.learnt_mask import LearntMask
 
 __all__ = ["DesignError", "MaskTraining", "Weights", "design", "mask_figures"]
 
@@ -119,7 +121,8 @@ class DesignedMask:
         learning = Terms(_at(recipe, settings), settings, store, device)
         full = Terms(recipe, settings, store, device) if settings.at else learning
         progress(f"fabrication: {full.fabrication}")
-        learnt = learn(learning, kept, progress)
+        optimise = evolve if learning.settings.kind == "five_half_rings" else descend
+        learnt = optimise(learning, kept, progress)
         with torch.no_grad():
             height = learnt.height(full.stop).detach().to("cpu", torch.float32).contiguous()
             figures = mask_figures(full, height.to(full.device))

@@ -13,7 +13,7 @@ from neusee.nodes.doe import half_rings
 from neusee.workflows import load
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.loop.checkpoint import StateFile
-from neusee.workflows.training.mask_design import design_page, optimizers
+from neusee.workflows.training.mask_design import design_page, gradient_descent
 from neusee.workflows.training.mask_design.design_run import DesignError, MaskTraining, design, mask_figures
 from neusee.workflows.training.mask_design.design_terms import Terms
 
@@ -60,7 +60,7 @@ def read(folder):
 def test_every_kind_lowers_its_loss_on_all_bands(kind, recipe, store, tmp_path):
     given = how(kind=kind, iterations=15)
     terms = Terms(recipe, given, store)
-    before = loss_of(terms, optimizers.shape_of(terms, 0)(terms.stop))
+    before = loss_of(terms, gradient_descent.shape_of(terms, 0)(terms.stop))
     folder = design(recipe, given, store, tmp_path, quiet)
     found = read(folder)
     assert found["loss"] < before - 0.1
@@ -220,7 +220,7 @@ def test_what_is_not_in_the_recipe_is_said(values, said, recipe, store, tmp_path
 @pytest.mark.parametrize("kind", ["pixelwise", "five_half_rings"])
 def test_a_loss_that_is_not_finite_stops_with_its_place(kind, recipe, store, tmp_path, monkeypatch):
     monkeypatch.setattr(Terms, "total", lambda self, parts: next(iter(parts.values())) * float("nan"))
-    with pytest.raises(DesignError, match=r"(iteration 0|mask 0).*is NaN or infinite"):
+    with pytest.raises(DesignError, match=r"(iteration 0|mask number 0).*is NaN or infinite"):
         design(recipe, how(kind=kind, iterations=2), store, tmp_path, quiet)
 
 
@@ -234,7 +234,7 @@ def test_settings_that_cannot_be_are_refused(values):
 @pytest.mark.parametrize("schedule", ["cosine", "step"])
 def test_the_rate_falls(schedule):
     given = how(schedule=schedule, iterations=50)
-    rates = [optimizers.rate(given, number) for number in range(50)]
+    rates = [gradient_descent.rate(given, number) for number in range(50)]
     assert rates[0] == given.rate
     assert rates == sorted(rates, reverse=True)
     assert rates[-1] < 0.1 * rates[0]
