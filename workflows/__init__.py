@@ -1,4 +1,4 @@
-"""The plumbing: read a recipe, order its steps, find, place and run them, and say what happened.
+"""The machinery that reads a recipe, runs its steps in order, stores their results and reports on the run.
 
     from neusee.workflows import load
     result = load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}).run()

@@ -53,7 +53,8 @@ def ghosts(
     """
     if spot.ndim != 3 or spot.shape[0] != bands.centres.numel():
         raise ValueError(
-            f"spot is {tuple(spot.shape)}, bands {bands.centres.numel()}: compute both from one `line` step"
+            f"spot is {tuple(spot.shape)}, bands {bands.centres.numel()}: "
+            "the numbers of bands differ, so compute both from one `line` step"
         )
     drawn = _draw(count, spread, radius, rng)
     spot = single(spot)

@@ -41,7 +41,7 @@ def laser_irradiance(
     if psf.intensity.shape[0] != len(bands.centres):
         raise ValueError(
             f"PSF of {psf.intensity.shape[0]} bands and line of {len(bands.centres)} bands: "
-            "compute both from one `line` step"
+            "the numbers of bands differ, so compute both from one `line` step"
         )
     sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency, "pixel_pitch": pixel_pitch}
     saturating: Tensor = saturation(bands, **sensor, exposure=exposure)

@@ -163,7 +163,12 @@ def _of_data(problem: SensorPosterior, mode: LaplaceFit, identifiability: Identi
     count = len(identifiability.directions)
     weak = f"{count} of {len(identifiability.strengths)} directions are not determined"
     text = weak if count else "all parameters are determined"
-    yield Check("the levels determine the parameters", text, "all directions are determined", _mark(not count, "warn"))
+    yield Check(
+        "the levels determine the parameters",
+        text,
+        "all combinations of parameters determined",
+        _mark(not count, "warn"),
+    )
 
 
 def goodness_of_fit(likelihood: Likelihood, free: int = 0) -> GoodnessOfFit:

@@ -141,7 +141,7 @@ class SweepTable(ProgressTable):
         self.running, self.step = point, ""
 
     def watch(self, event: Event) -> None:
-        """Record that a step of the running parameter set begins or ends."""
+        """Record that a step of a sweep begins or ends, for the parameter set that is being computed."""
         self.step = event.step if event.done is None else ""
 
     def finished(self, outcome: PointOutcome) -> None:

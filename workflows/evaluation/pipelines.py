@@ -45,7 +45,7 @@ class Pipeline:
 
     @property
     def name(self) -> str:
-        """Return the pipeline as text, such as ``flat+none``, with file names but no folders."""
+        """Return the name of a pipeline of mask and restorer, such as ``flat+none``; files appear without folders."""
         return f"{self.front}+{self.back}"
 
     @property

@@ -65,7 +65,7 @@ class Code:
         return self._digests[module]
 
     def save(self) -> None:
-        """Save new summaries of source files and new digests of definitions; skip a folder that cannot be written."""
+        """Save the new digests of source files and of their functions; do nothing if the folder cannot be written."""
         if self._new:
             self._new = False
             _write(self._memo, dict(list(self._summaries.items())[-_KEPT:]), self._memo.parent / "tmp")

@@ -8,7 +8,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, needed
 
 
 def unaffected_expectations(recipe: Recipe, written: Recipe) -> Recipe:
-    """Return a changed recipe without the expected numbers that its changes to the recipe ``written`` affect."""
+    """Return a recipe without the expected numbers that are affected by the user's changes to ``written``."""
     same: set[str] = set()
     for name in needed(recipe, recipe.steps):
         if same.issuperset(recipe.steps[name].sources) and _alike(recipe, written, name):

@@ -1,4 +1,4 @@
-"""Global settings of a recipe: its outputs, seed, tolerance and expected numbers."""
+"""Global settings of a recipe: outputs, seed, tolerance, and the numbers that a run is expected to give."""
 
 from __future__ import annotations
 

@@ -155,7 +155,7 @@ def _steps(result: Result) -> dict[str, Any]:
 
 
 def _pictures(values: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Encode the pictures of the camera overview as PNG, or up to four other images if a picture is missing."""
+    """Encode the truth, raw and restored pictures of a run as PNG, or up to four other images if one is missing."""
     from neusee.workflows.report.figures.camera_overview import centre, high
 
     needs = _of_overview()

@@ -76,7 +76,7 @@ class SmallResults:
     def _write(self, raw: bytes, flags: int = 0) -> None:
         """Append a line break and a line to the file, so that an incomplete line of a killed process stays separate."""
         if append(self._path, b"\n" + raw, flags) != len(raw) + 1:
-            raise OSError(f"{self._path}: the disk has no space left for the line of a result")
+            raise OSError(f"{self._path}: the disk has no space left to record a result")
 
     def _read_new_lines(self) -> None:
         """Read the lines added to the file of small results since the last call, or all lines of a replaced file."""

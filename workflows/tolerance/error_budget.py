@@ -29,7 +29,7 @@ class ErrorBudget:
         return twin
 
     def verdict(self, step: Step, params: Mapping[str, Any], facts_of: FactsOf) -> SkipDecision:
-        """Decide whether a step is left out and return the decision; in an exact recipe no step is left out."""
+        """Decide whether a step is left out of the run; with ``--exact`` no step is left out."""
         spent = self.pass_on(step)
         if self._recipe.exact:
             return SkipDecision(float("inf"), False, "the recipe is exact", "")

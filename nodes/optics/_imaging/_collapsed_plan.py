@@ -103,7 +103,7 @@ def _strong(given: Given, brightest: Tensor, within: float) -> tuple[Tensor, Ten
 
 
 def _enough(given: Given, bands: Tensor, lost: Tensor, brightest: Tensor, within: float) -> list[int]:
-    """Return the smallest numbers of basis images that omit at most ``within`` of the brightest pixel."""
+    """Return how many basis images each picture needs for an error of at most ``within`` times the brightest pixel."""
     off = lost + (given.rest[:, bands] * given.passed.total[bands]) @ given.rows[:, bands].abs().T
     fits = [k for k in range(1, len(given.most) + 1) if bool((off[k] <= within * brightest).all())]
     return fits[:_FARTHER]

@@ -131,7 +131,7 @@ def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
 
 
 def _power(field: Field, out: Tensor, add: bool, kept: Tensor | None, method: Method, work: Workspace) -> None:
-    """Write the weighted intensity |U|^2 of one view of the focal plane to ``out``, or add the intensity to ``out``."""
+    """Write the weighted intensity |U|^2 of one window of the focal plane to ``out``, or add it to ``out``."""
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
         if kept is not None:

@@ -131,7 +131,7 @@ class _Inverse:
 
 
 def inner(a: Tensor, b: Tensor, torus: Size) -> Tensor:
-    """Return the inner product of two pictures, given half of their spectra."""
+    """Return the inner product of two pictures, given half of their Fourier transforms."""
     whole = torch.stack([torch.vdot(p.flatten(), q.flatten()) for p, q in zip(a, b, strict=True)]).sum() * 2.0
     for column in (0,) if torus[1] % 2 else (0, -1):
         whole = whole - torch.linalg.vecdot(a[..., column], b[..., column]).sum()

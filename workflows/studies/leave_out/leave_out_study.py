@@ -40,7 +40,7 @@ class LeaveOutResult:
 def study(
     recipe: Recipe, store: Store, runs: Path, command: Sequence[str], progress: Progress, contents: bool = True
 ) -> Path:
-    """Measure the error of leaving out steps of ``recipe`` and, with ``contents``, the run time of simpler scenes."""
+    """Measure the errors of a recipe with steps left out, and with ``contents`` the run times for simpler scenes."""
     study_run = StudyRun("leave-out", recipe, command)
     comparison = OmissionComparison(recipe, store)
     output_errors, rows = comparison.output_errors(), []

@@ -71,7 +71,7 @@ class Shards:
         return own_bands(self.mesh, self.count)
 
     def call(self, step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
-        """Compute a step, for the spectral bands of this process only if the step is divided, and return its result."""
+        """Compute a step and return its result; a divided step computes the spectral bands of this process alone."""
         if step.name in self.steps:
             whole = [name for name in step.node.inputs if step.wires.get(name) not in self.steps]
             inputs = taken(step, inputs, self.own, whole)
