@@ -341,7 +341,7 @@ def test_a_mistake_is_located(change, said):
 
 
 def test_options_of_one_network_are_refused_of_another():
-    with pytest.raises(RecipeError, match="directions, pyramid: only fft_mamba has such options, not unet"):
+    with pytest.raises(RecipeError, match="directions, pyramid: only the network fft_mamba has such options, not unet"):
         load("train_small", ["train.network.kind=unet", "train.network.pyramid=true", "train.network.directions=4"])
 
 
@@ -451,7 +451,7 @@ def test_a_mask_is_designed_where_nothing_else_could_learn(command, tmp_path, ph
 def test_a_mask_is_not_designed_over_one_that_learns(tmp_path, tiny, photographs):
     folder = trained(tiny, tmp_path, [1])
     before = (folder / "mask.safetensors").read_bytes()
-    with pytest.raises(ValueError, match="stage 1 has already begun"):
+    with pytest.raises(ValueError, match="training stage 1 has begun"):
         trained(tiny, tmp_path, [0])
     assert (folder / "mask.safetensors").read_bytes() == before
 

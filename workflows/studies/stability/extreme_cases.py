@@ -50,7 +50,7 @@ class Case:
 #: by node and case: words of the node's docstring about NaN in the inputs, if the result cannot show NaN
 _STATED = {
     ("restore.clipped", "NaN"): "so is what is not a number",
-    ("metrics.saturated", "NaN"): "so does one that is not a number",
+    ("metrics.saturated", "NaN"): "so does a pixel that is NaN",
 }
 
 
