@@ -251,13 +251,13 @@ MUTANTS = (
         "workflows/placement/memory_profile.py",
         "[-1]) + 1",
         "[-1])",
-        within("workflows/placement", "heft_and_cpop.py::test_no_schedule_breaks_a_rule"),
+        within("workflows/placement", "heft_schedule.py::test_no_schedule_breaks_a_rule"),
     ),
     Mutant(
         "workflows/placement/task_priorities.py",
         "held + graph.own[i] + ",
         "held + ",
-        within("workflows/placement", "heft_and_cpop.py::test_no_other_depth_first_order_of_a_tree_holds_less"),
+        within("workflows/placement", "heft_schedule.py::test_no_other_depth_first_order_of_a_tree_holds_less"),
     ),
     Mutant(
         "workflows/studies/accuracy/pareto_line.py",

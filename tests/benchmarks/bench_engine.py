@@ -14,7 +14,9 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from ruamel.yaml import YAML
 
+from neusee import recipes
 from neusee.nodes import node
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.runner import run
@@ -22,6 +24,7 @@ from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys.cache_key import key_of
 from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.recipe.text import yaml_values
 from neusee.workflows.store import serialization
 from neusee.workflows.store.result_store import Store
 
@@ -111,6 +114,25 @@ def keys(folder: Path) -> None:
     row("40 keys, first and later", f"{timed(forty) * 1e3:.1f} and {timed(forty, 5) * 1e3:.1f} ms", "aim 30 ms")
 
 
+def recipe_texts(_: Path) -> None:
+    """Read the twelve largest recipe files, with the place of each value; the library gives plain values."""
+    files = sorted(Path(recipes.__path__[0]).rglob("*.yaml"), key=lambda path: -path.stat().st_size)[:12]
+
+    def ours() -> None:
+        yaml_values._document.cache_clear()
+        for path in files:
+            yaml_values.read(path, path.name)
+
+    def theirs() -> None:
+        for path in files:
+            YAML(typ="safe").load(path)
+
+    pairs = [(timed(ours), timed(theirs)) for _ in range(15)]
+    ratios = sorted(a / b for a, b in pairs)
+    value = f"{ratios[7]:.2f} times ruamel.yaml ({ratios[0]:.2f} to {ratios[-1]:.2f})"
+    row("12 recipe files, with places", value, f"the library alone {min(b for _, b in pairs) * 1e3:.0f} ms")
+
+
 def gigabyte(folder: Path) -> None:
     """Nine results of 111 MB and a number."""
     loads: list[int] = []
@@ -172,5 +194,5 @@ if __name__ == "__main__":
     torch.set_num_threads(2)
     with tempfile.TemporaryDirectory(dir=sys.argv[1] if len(sys.argv) > 1 else None) as place:
         print("| what | measured | beside it |\n|---|---|---|")
-        for part in (memory, overhead, keys, gigabyte, stack, function):
+        for part in (memory, overhead, keys, recipe_texts, gigabyte, stack, function):
             part(Path(place))

@@ -7,7 +7,7 @@ import math
 import random
 from dataclasses import replace
 
-from neusee.workflows.placement.heft_and_cpop import Cluster, Device, Link, Schedule, Task
+from neusee.workflows.placement.heft_schedule import Cluster, Device, Link, Schedule, Task
 
 #: Topcuoglu, Hariri, Wu, IEEE TPDS 13 (2002) 260, figure 2 and table 1: seconds by processor, and by edge
 _COSTS = "14 16 9; 13 19 18; 11 13 19; 13 8 17; 12 13 10; 13 16 9; 7 15 11; 5 11 14; 18 12 20; 21 7 16"

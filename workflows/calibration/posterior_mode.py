@@ -44,13 +44,6 @@ class LaplaceFit:
         return samples
 
 
-def log_density(mode: LaplaceFit, samples: FloatArray) -> FloatArray:
-    """Return the log density (count,) of the normal distribution about a mode, up to a constant."""
-    off = samples - mode.theta
-    log: FloatArray = -0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.pinv(mode.covariance, hermitian=True), off)
-    return log
-
-
 def initial_theta(problem: SensorPosterior) -> FloatArray:
     """Return the start of the search for the mode, a point between a first guess and the middle of the prior.
 

@@ -26,7 +26,7 @@ from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key, device_kind, key_of
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.placement.heft_and_cpop import Schedule, TooLarge
+from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.error_budget import ErrorBudget
 from neusee.workflows.tolerance.skip_decision import SkipDecision

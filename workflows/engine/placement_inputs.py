@@ -12,7 +12,7 @@ from neusee.workflows.engine.memory_use import pool_of
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.step_job import Executor, Lane, StepJob
 from neusee.workflows.keys.cache_key import Key, device_kind
-from neusee.workflows.placement.heft_and_cpop import Cluster, Device, Schedule, Slot, Task, heft
+from neusee.workflows.placement.heft_schedule import Cluster, Device, Schedule, Slot, Task, heft
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in
 

@@ -9,7 +9,7 @@ from neusee.workflows.engine.cost_model import Estimate
 from neusee.workflows.engine.node_call import fits
 from neusee.workflows.engine.placement_inputs import MOST_PARTS
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.placement.heft_and_cpop import Schedule, Task, TooLarge, heft
+from neusee.workflows.placement.heft_schedule import Schedule, Task, TooLarge, heft
 from neusee.workflows.placement.machine_file import Machines
 from neusee.workflows.report.text_table import columns
 from neusee.workflows.store.byte_sizes import format_size

@@ -14,7 +14,7 @@ from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.step_job import Lane, StepJob
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import Key, device_kind
-from neusee.workflows.placement.heft_and_cpop import Schedule, TooLarge
+from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
 from neusee.workflows.report.contents import steps_of, wanted
 from neusee.workflows.report.text_table import columns
 from neusee.workflows.store.byte_sizes import format_size

@@ -90,18 +90,6 @@ def upward(graph: Graph) -> list[float]:
     return ranks
 
 
-def downward(graph: Graph) -> list[float]:
-    """Return the downward rank of each task: the longest time (s) from the graph's start to its start, at mean costs.
-
-    Source: Topcuoglu, Hariri, Wu, IEEE TPDS 13 (2002) 260, eq. 10.
-    """
-    ranks, wait, cost = [0.0] * len(graph.tasks), _mean_transfer(graph), _mean_seconds(graph)
-    for i in graph.by(range(len(graph.tasks))):
-        pairs = zip(graph.sources[i], graph.sizes[i], strict=True)
-        ranks[i] = max((ranks[j] + cost[j] + wait[0] + wait[1] * size for j, size in pairs), default=0.0)
-    return ranks
-
-
 def frugal(graph: Graph) -> list[int]:
     """Return a depth-first order of the tasks that keeps the peak memory low.
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from neusee.workflows.placement.heft_and_cpop import Cluster, Device, Task, heft
+from neusee.workflows.placement.heft_schedule import Cluster, Device, Task, heft
 from neusee.workflows.report.figures import gantt
 from neusee.workflows.report.figures.gantt import timeline
 

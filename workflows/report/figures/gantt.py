@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from neusee.workflows.placement.heft_and_cpop import Schedule
+from neusee.workflows.placement.heft_schedule import Schedule
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn
 
 Row = tuple[str, str, float, float]  #: step, device, start in s since the run began, duration in s

@@ -1,16 +1,12 @@
 import math
 import time
-from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from ruamel.yaml import YAML
 
-import neusee.recipes
 from neusee.workflows.graph.diagnostics import Location, RecipeError
 from neusee.workflows.graph.final_values import flow
-from neusee.workflows.recipe.text import yaml_values
 from neusee.workflows.recipe.text.yaml_values import parse, read
 
 TOP = Location("f.yaml", 1, 1)
@@ -167,25 +163,3 @@ trees = st.recursive(
 @given(trees)
 def test_what_is_written_out_reads_back_the_same(tree):
     assert plain(f"a: {flow(tree)}") == {"a": tree}
-
-
-def test_twelve_files_are_read_as_fast_as_the_library_reads_them():
-    """Each value with its place: no slower by half than plain values, in the same moment on the same machine."""
-    files = sorted(Path(neusee.recipes.__path__[0]).rglob("*.yaml"), key=lambda p: -p.stat().st_size)[:12]
-
-    def ours():
-        yaml_values._document.cache_clear()
-        for path in files:
-            read(path, path.name)
-
-    def theirs():
-        for path in files:
-            YAML(typ="safe").load(path)
-
-    def seconds(work):
-        start = time.process_time()
-        work()
-        return time.process_time() - start
-
-    pairs = [(seconds(ours), seconds(theirs)) for _ in range(7)]
-    assert min(a for a, _ in pairs) < 1.5 * min(b for _, b in pairs)

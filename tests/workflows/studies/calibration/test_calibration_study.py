@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from neusee.nodes.calibrate._likelihood import _linear_sensor
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta, log_density
+from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.calibration import calibration_study, simulated_sensors
@@ -37,6 +37,12 @@ DITHERED = [*SEEN, "reading.rounding=dithered_floor"]
 OPEN = ["~levels.full", "~steps.prior.with.full_well"]  #: nothing is full
 PIXELS = 64
 COUNT = 10_000  #: draws that are weighed
+
+
+def log_density(mode, samples):
+    """Of the normal law about a mode, up to a constant."""
+    off = samples - mode.theta
+    return -0.5 * np.sum(off * np.linalg.solve(mode.covariance, off.T).T, axis=1)
 
 
 def resampled(problem, mode, seed):

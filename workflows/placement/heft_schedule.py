@@ -1,4 +1,4 @@
-"""Scheduling of tasks on devices by the heuristics HEFT and CPOP, with memory as a hard constraint.
+"""Scheduling of tasks on devices by the heuristic HEFT, with memory as a hard constraint.
 
 A schedule is a pure function of tasks, costs and devices, for this machine and for machines described in a file.
 A result leaves a device after its last use. HEFT inserts tasks into idle gaps between placed tasks. A task that
@@ -13,14 +13,14 @@ from __future__ import annotations
 import heapq
 import math
 from bisect import bisect_left
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from neusee.workflows.placement.partial_schedule import PartialSchedule
-from neusee.workflows.placement.task_priorities import Graph, downward, frugal, ranked, upward
+from neusee.workflows.placement.task_priorities import Graph, frugal, ranked, upward
 from neusee.workflows.placement.tasks_and_devices import Cluster, Device, Link, Schedule, Slot, Task, TooLarge
 
-__all__ = ["Cluster", "Device", "Link", "Schedule", "Slot", "Task", "TooLarge", "cpop", "heft"]
+__all__ = ["Cluster", "Device", "Link", "Schedule", "Slot", "Task", "TooLarge", "heft"]
 
 
 def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
@@ -48,29 +48,15 @@ def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
         return schedule
 
 
-def cpop(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
-    """Return the CPOP schedule: the critical path on one device, other tasks on the device with the earliest finish.
-
-    Raises: as `heft`.
-    """
-    graph = Graph(tasks, cluster, keep)
-    through = [up + down for up, down in zip(upward(graph), downward(graph), strict=True)]
-    path = _critical(graph, through)
-    costs = [sum(graph.seconds[i][d] for i in path) for d in range(len(cluster.devices))]
-    fastest = costs.index(min(costs))
-    return _best(graph, [ranked(graph, through)], {i: fastest for i in path if fastest in graph.able[i]})
-
-
-def _best(graph: Graph, orders: Sequence[Sequence[int]], pinned: Mapping[int, int] | None = None) -> Schedule:
+def _best(graph: Graph, orders: Sequence[Sequence[int]]) -> Schedule:
     """Return the schedule of the first task order if the memory suffices, else the shortest schedule that fits."""
-    pinned = pinned or {}
     memory = {device.name: device.memory for device in graph.cluster.devices}
-    schedule = _placed(PartialSchedule(graph, bounded=False), orders[0], pinned).schedule()
+    schedule = _placed(PartialSchedule(graph, bounded=False), orders[0]).schedule()
     if all(peak <= memory[name] for name, peak in schedule.peak.items()):
         return schedule
     best, refused = None, list[TooLarge]()
     for order in (*orders[1:], orders[0]):
-        board = _placed(PartialSchedule(graph), order, pinned, best.makespan if best else math.inf)
+        board = _placed(PartialSchedule(graph), order, best.makespan if best else math.inf)
         if board.refused:
             refused.append(board.too_large())
         elif len(board.placed) == len(order):
@@ -81,13 +67,11 @@ def _best(graph: Graph, orders: Sequence[Sequence[int]], pinned: Mapping[int, in
     return best
 
 
-def _placed(
-    board: PartialSchedule, order: Sequence[int], pinned: Mapping[int, int], below: float = math.inf
-) -> PartialSchedule:
+def _placed(board: PartialSchedule, order: Sequence[int], below: float = math.inf) -> PartialSchedule:
     """Add the tasks to the partial schedule ``board`` in the order ``order``, and return ``board``.
 
-    A task in ``pinned`` runs on the device that ``pinned`` names, if the task fits. A task that does not fit into
-    memory waits until later tasks free memory. The placement stops early if it cannot end before ``below``.
+    A task that does not fit into memory waits until later tasks free memory. The placement stops early if it cannot
+    end before ``below``.
     """
     graph = board.graph
     missing, turn = [len(sources) for sources in graph.sources], {i: n for n, i in enumerate(order)}
@@ -101,7 +85,7 @@ def _placed(
         i = order[n]
         if forced:
             board.force(i)
-        elif not (i in pinned and board.place(i, [pinned[i]])) and not board.place(i, graph.able[i]):
+        elif not board.place(i, graph.able[i]):
             waiting.append(n)
             continue
         if below < math.inf and (forced or board.end[i] >= below):
@@ -114,16 +98,6 @@ def _placed(
             ready, waiting = [*ready, *waiting], []
             heapq.heapify(ready)
     return board
-
-
-def _critical(graph: Graph, through: Sequence[float]) -> list[int]:
-    """Return the tasks on the critical path, from a task without inputs to a task whose result no task reads."""
-    at = max((i for i, sources in enumerate(graph.sources) if not sources), key=through.__getitem__, default=-1)
-    path = []
-    while at >= 0:
-        path.append(at)
-        at = max(graph.readers[at], key=through.__getitem__, default=-1)
-    return path
 
 
 # --- one device -----------------------------------------------------------------------------------------------------
