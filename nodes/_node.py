@@ -11,6 +11,7 @@ generator for a parameter named ``rng``.
     @digitize.skip_bound       # upper bound of the change if the step is skipped
     @digitize.propagate_error  # upper bound of the error that errors of the inputs cause
     @digitize.preflight        # checks the parameters before anything runs
+    @digitize.preview          # the shape of the result, before anything runs
     @digitize.check            # checks that the result is plausible
 
 ``digitize.hooks`` has each attached function under the name of its decorator.
@@ -37,7 +38,8 @@ Fn = TypeVar("Fn", bound=Callable[..., Any])
 class ParameterError(ValueError):
     """The error that the ``preflight`` of a node raises for a wrong parameter, before any step runs.
 
-    Args: the name of the parameter, and one sentence with the value and the fix.
+    Args: the name of the parameter, and one sentence with the value and the fix. The name ``direction.angle`` means the
+    parameter ``angle`` of the step that computes the input ``direction``.
     """
 
     def __init__(self, parameter: str, message: str) -> None:
@@ -78,8 +80,11 @@ class Hooks:
     #: (parameters): True if the result is the same for every band
     band_invariant: Callable[[Mapping[str, Any]], bool] | None = None
     #: (*, parameters): notes for the user, before anything runs; may raise `ParameterError`; an argument with the name
-    #: of an input receives the value of that input if a node with ``before_run`` computes it, else None
+    #: of an input receives what is known of that input before the run, as ``preview`` gives it, else None
     preflight: Callable[..., Sequence[str]] | None = None
+    #: (what is known of each input or None, *, parameters): what is known of the result before the run: a large tensor
+    #: has its shape alone (device ``meta``), a small tensor may have its values; None if nothing is known
+    preview: Callable[..., Any] | None = None
     #: (result, *inputs, **parameters): findings, once after computing
     check: Callable[..., Sequence[Check]] | None = None
 
@@ -175,6 +180,7 @@ class Node:
         return model
 
     reference, preflight, check = _attaches("reference"), _attaches("preflight"), _attaches("check")
+    preview = _attaches("preview")
     skip_bound, skip_scale, zero_bound = _attaches("skip_bound"), _attaches("skip_scale"), _attaches("zero_bound")
     propagate_error, approximation_error = _attaches("propagate_error"), _attaches("approximation_error")
     band_invariant = _attaches("band_invariant")

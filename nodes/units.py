@@ -114,6 +114,8 @@ class IsFile:
 
 
 def _existing(path: Path) -> Path:
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder, not a file: give a file in this folder")
     if not path.is_file():
         raise ValueError(f"no such file: {path}")
     return path

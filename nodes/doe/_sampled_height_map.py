@@ -9,6 +9,7 @@ from torch import Tensor
 
 from neusee.nodes import ParameterError, node
 from neusee.nodes.doe._height_from_phase import height_checks
+from neusee.nodes.input_files import once_per_version, refuse_large_array
 from neusee.nodes.optics._phase_screen import screen
 from neusee.nodes.optics._pupil_grid import grid_of
 from neusee.nodes.units import DataFile, PositiveLength
@@ -37,7 +38,11 @@ def _shape_in(file: Path) -> tuple[int, ...]:
     if file.suffix == ".npy":
         import numpy as np
 
-        return tuple(np.load(file, mmap_mode="r", allow_pickle=False).shape)
+        head = np.load(file, mmap_mode="r", allow_pickle=False)
+        if head.dtype.kind not in "fiu":
+            text = f"{file.name} holds values of type {head.dtype}: save the heights as real numbers, in m"
+            raise ParameterError("file", text)
+        return tuple(head.shape)
     if file.suffix == ".safetensors":
         from safetensors import safe_open
 
@@ -128,9 +133,25 @@ def _fits(file: Path, shape: tuple[int, ...], stop: Stop) -> None:
 def _(*, stop: Stop | None, file: Path | None, **_: Any) -> list[str]:
     if file is not None:
         shape = _header(file)
+        refuse_large_array(file, shape)
         if stop is not None:
             _fits(file, shape, stop)
+        if problem := _wrong_heights(file):
+            raise ParameterError("file", problem)
     return []
+
+
+@once_per_version
+def _wrong_heights(file: Path) -> str:
+    """Return a message for a file whose heights cannot be read or are negative or not finite, else an empty text."""
+    try:
+        height = read_height_map(file, 1.0)
+    except (OSError, ValueError, SyntaxError) as error:
+        return f"{file.name} cannot be read as a height map: {error}"
+    low = float(height.min())
+    if bool(torch.isfinite(height).all()) and low >= 0:
+        return ""
+    return f"{file.name}: lowest height {low:.3g} m, but every height must be finite and at least 0"
 
 
 pixelwise.check(height_checks)

@@ -6,6 +6,7 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.metrics._mask_limits import least_lsr
+from neusee.nodes.shape_preview import without_values
 from neusee.nodes.values import Channels, Psf
 
 _DARK = 1e-30  #: light below which a band counts as dark
@@ -21,6 +22,11 @@ def lsr(psf: Psf) -> Tensor:
     Source: NeuSee, section Sensor Image (LSR).
     """
     return psf.intensity.amax((-2, -1)).double() / psf.clear_peak.to(psf.intensity.device)
+
+
+@lsr.preview
+def _(psf: Psf | None) -> Tensor | None:
+    return None if psf is None else without_values(len(psf.clear_peak), dtype=torch.float64)
 
 
 @lsr.check
@@ -60,6 +66,11 @@ def _shape_and_light(image: Tensor | Channels) -> tuple[tuple[int, ...], Tensor]
     if isinstance(image, Channels):
         return (*image.flux.shape, *image.planes.shape[1:]), image.flux
     return tuple(image.shape), single(image).sum(-1).sum(-1, dtype=torch.float64)
+
+
+@bsr.preview
+def _(image: Tensor | None, plain_image: Tensor | None) -> Tensor | None:
+    return None if image is None else without_values(*image.shape[:-2], dtype=torch.float64)
 
 
 @bsr.check

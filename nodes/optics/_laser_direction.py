@@ -9,6 +9,8 @@ from torch import Generator, Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.units import Angle, Fraction, PositiveLength, Shape
 
+_WIDEST = 1.0  #: rad; an angle counts as its direction cosine, which is below 1
+_SMALL = 0.01  #: relative difference of an angle and its sine, above which a note says the difference
 Rule = Literal["width_over_focal_length", "focal_length_over_width"]
 
 
@@ -30,9 +32,10 @@ def direction(
     The paper prints f / W instead: 6.7 rad for its camera, which no lens images. A draw by f / W is refused.
 
     Shapes: -> (2,), (n_y, n_x) float64.
-    Units:  rad (direction cosines; sine and angle agree to 1e-6 at 2 mrad).
+    Units:  rad (direction cosines; sine and angle agree to 1e-6 at 2 mrad, and to 1 % at 14 degrees).
     Error:  exact.
-    Raises: ParameterError where ``rule`` asks for a draw by f / W.
+    Raises: ParameterError before the run where ``rule`` asks for a draw by f / W, and for an angle of 1 rad or more,
+            which is no direction cosine.
     Source: NeuSee, section Experiment Setup; by definition.
     """
     if angle is not None:
@@ -66,7 +69,7 @@ def _(
     rule: Rule,
 ) -> list[str]:
     if angle is not None:
-        return []
+        return angle_notes(angle)
     if rule == "focal_length_over_width":
         wide = share * focal_length / (shape[1] * pixel_pitch)
         raise ParameterError(
@@ -75,6 +78,29 @@ def _(
             "set `angle`, or set rule: width_over_focal_length",
         )
     return []
+
+
+@direction.preview
+def _(*, angle: tuple[float, float] | None, **params: Any) -> Tensor | None:
+    return None if angle is None else torch.tensor(angle, dtype=torch.float64)
+
+
+def angle_notes(angle: tuple[float, float]) -> list[str]:
+    """Return a note for an angle that differs by more than 1 % from its sine.
+
+    Raises ParameterError for an angle of 1 rad or more, because the model takes an angle as its direction cosine.
+    """
+    size = math.hypot(*angle)
+    degrees = f"{math.degrees(size):.4g} deg"
+    if size >= _WIDEST:
+        raise ParameterError(
+            "angle",
+            f"{degrees} off the axis is {size:.4g} rad, but the model takes an angle in rad as its direction cosine, "
+            "which is below 1: give less than 57.3 deg",
+        )
+    off = 1 - math.sin(size) / size if size else 0.0
+    text = f"{degrees} off the axis: the model takes an angle as its direction cosine, and the two differ by {off:.1%}"
+    return [text] if off > _SMALL else []
 
 
 @direction.check

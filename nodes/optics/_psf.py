@@ -7,12 +7,14 @@ from typing import Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes import Check, node
+from neusee.nodes import Check, ParameterError, node
 from neusee.nodes._half_precision import refuse_half, refuse_not_finite
+from neusee.nodes.optics._laser_direction import angle_notes
 from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
 from neusee.nodes.optics._transform._pupil_field import View
 from neusee.nodes.optics._transform._sample_axis import Axis, centred
 from neusee.nodes.optics._transform._scaled_transform import Method
+from neusee.nodes.shape_preview import without_values
 from neusee.nodes.units import Angle, PositiveLength, Shape
 from neusee.nodes.values import Psf, Pupil
 
@@ -58,8 +60,9 @@ def psf(
     Units: metres -> share of the clear pupil's light per pixel, not normalised to a sum of one.
     Error: single, 2e-6 of the brightest pixel, and 1e-4 of the value in a tail at 1e-8 of the brightest pixel;
         double, 1e-11; integrated, a further 1e-5 of the clear peak.
-    Raises: ValueError where the window reaches beyond half the alias-free field, lambda f / (2 pitch), from the spot;
-        for a closed aperture, for heights or paths that are not finite, and for a pupil in half precision.
+    Raises: ParameterError before the run, or ValueError, where the window reaches beyond half the alias-free field,
+        lambda f / (2 pitch), from the spot; ParameterError for an angle of 1 rad or more; ValueError for a closed
+        aperture, for heights or paths that are not finite, and for a pupil in half precision.
     Source: Goodman, Introduction to Fourier Optics, 3rd edition, eq. 5-14 (field in the focal plane of a lens).
     """
     camera = _Camera(focal_length, pixel_pitch, shape, angle, pixel, sensor).towards(direction)
@@ -69,6 +72,27 @@ def psf(
 @psf.reference
 def _(pupil: Pupil, direction: Tensor | None = None, *, precision: str = "single", **camera: Any) -> Psf:
     return _focus(pupil, _Camera(**camera).towards(direction), torch.float64, "direct")
+
+
+@psf.preflight
+def _(*, pupil: Pupil | None = None, direction: Tensor | None = None, **params: Any) -> list[str]:
+    camera = _Camera(**{name: params[name] for name in _Camera._fields})
+    notes = angle_notes(camera.angle)
+    for parameter, view in (("focal_length", camera), ("direction.angle", camera.towards(direction))):
+        try:
+            if pupil is not None:
+                _refuse_aliases(pupil, view)
+        except ValueError as error:
+            raise ParameterError(parameter, str(error)) from None
+    return notes
+
+
+@psf.preview
+def _(pupil: Pupil | None, *others: Any, shape: tuple[int, int], **params: Any) -> Psf | None:
+    if pupil is None:
+        return None
+    count = len(pupil.wavelengths)
+    return Psf(without_values(count, *shape), without_values(count, dtype=torch.float64))
 
 
 @psf.check

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes import ParameterError
+from neusee.nodes.input_files import not_finite, once_per_version, refuse_large_array
 from neusee.nodes.scene._spectral_exr import exr_header, read_spectral, spectral_channels
 
 Layout = Literal["y x band", "band y x"]
@@ -34,15 +35,42 @@ def cube_and_wavelengths(
 def size_and_type(file: Path, variable: str | None) -> tuple[tuple[int, ...], str]:
     """Read the shape and the data type of a spectral cube from the header of a file."""
     if file.suffix == ".npy":
-        head = np.load(file, mmap_mode="r")
-        size, kind = head.shape, str(head.dtype)
+        size, kind = _numpy_header(file)
     elif file.suffix == ".mat":
         size, kind = _listed(file)[_cube_name(file, variable)]
     else:
         raise ParameterError("file", f"{file.name} is not a .mat, .npy or .exr file: save the cube in such a file")
     if len(size) != 3:
         raise ParameterError("file", f"{file.name} holds an array of shape {size}: save a cube with three axes")
+    if np.dtype(kind).kind not in "uf":
+        fix = "save the cube as float, uint8 or uint16"
+        raise ParameterError("file", f"{file.name} holds values of type {kind}, not real numbers of light: {fix}")
+    refuse_large_array(file, size)
     return size, kind
+
+
+@once_per_version
+def wrong_values(file: Path, variable: str | None) -> str:
+    """Return a message for a cube that cannot be read or has values that are not finite, else an empty text."""
+    try:
+        if file.suffix == ".exr":
+            values: Any = read_spectral(file)[0].numpy()
+        else:
+            values = np.load(file) if file.suffix == ".npy" else _mat(file, _cube_name(file, variable))
+    except Exception as error:  # scipy raises many kinds of errors for damaged bytes
+        return f"{file.name} cannot be read to its end ({error}): copy or save the file again"
+    if np.iscomplexobj(values):
+        return f"{file.name} holds complex values: save the cube as real numbers of light"
+    return not_finite(file, int(np.count_nonzero(~np.isfinite(values))))
+
+
+def _numpy_header(file: Path) -> tuple[tuple[int, ...], str]:
+    """Return the shape and the data type in the header of a .npy file, whose data must be as long as stated."""
+    try:
+        head = np.load(file, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError, SyntaxError) as error:
+        raise ParameterError("file", f"{file.name} cannot be read as .npy ({error}): save the cube again") from None
+    return head.shape, str(head.dtype)
 
 
 def exr_size(file: Path) -> tuple[int, int]:
@@ -52,6 +80,7 @@ def exr_size(file: Path) -> tuple[int, int]:
         raise ParameterError(
             "file", f"{file.name} has the channels {', '.join(names)}: none is spectral, such as T.550,0nm"
         )
+    refuse_large_array(file, (len(names), *size))
     return size
 
 

@@ -10,8 +10,10 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.input_files import not_finite, once_per_version, refuse_large_picture
 from neusee.nodes.scene._crop_to_frame import enlarged, framed
-from neusee.nodes.scene._spectral_exr import exr_header
+from neusee.nodes.scene._spectral_exr import PartHeader, exr_parts, part_headers
+from neusee.nodes.shape_preview import without_values
 from neusee.nodes.units import DataFile, Shape
 
 White = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -25,66 +27,119 @@ def exr(
     shape: Shape | None = None,
     white: White | None = None,
     negatives: Literal["clip", "keep"] = "clip",
+    part: str | None = None,
 ) -> Tensor:
     """Read a scene-linear OpenEXR picture and convert it to linear sRGB.
 
-    The header of the file gives the primaries; Bradford adaptation is used where the white points differ.
+    The channels are R, G and B with the primaries in the header, or CIE X, Y and Z, or Y alone for a grey picture.
+    Bradford adaptation is used where the white points differ; X, Y and Z without `adoptedNeutral` and without
+    `chromaticities` have the white point D65. ``part`` names the part to read if several parts hold a picture.
 
     Shapes: -> (3, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped at the centre).
     Units:  linear sRGB, 1 = `white` in the values of the file (with null the values stay unscaled); no upper limit.
     Error:  half floats resolve 5e-4. Negative light, from noise or colours outside sRGB, is clipped unless kept.
-    Raises: ParameterError before the run unless the channels are R, G and B, or Y alone; ValueError for values
-            that are not finite.
+    Raises: ParameterError before the run for other channels, for a part that does not exist or is not named, for a
+            damaged file, for values that are not finite, and for more than 64 million pixels.
     Source: OpenEXR technical introduction (chromaticities, adoptedNeutral); matrices of colour-science.
     """
-    scene = framed(_linear(file), shape) / (white or 1.0)
+    scene = framed(_linear(file, part), shape) / (white or 1.0)
     return scene.clamp_min(0) if negatives == "clip" else scene
 
 
 @exr.preflight
-def _(*, file: Path, shape: Shape | None = None, **params: Any) -> list[str]:
-    header, names, size = exr_header(file)
-    notes = [f"{file.name}: only luminance; the picture is grey"] if _colour_channels(file, names) == ["Y"] else []
-    if abs(float(header.get("pixelAspectRatio", 1.0)) - 1) > 1e-3:
-        notes += [f"{file.name}: pixels are not square ({header['pixelAspectRatio']:.3f}), but are read as square"]
-    return notes + enlarged(size, shape)
+def _(*, file: Path, shape: Shape | None = None, part: str | None = None, **params: Any) -> list[str]:
+    _, found, channels = _chosen(file, part)
+    refuse_large_picture(file, *found.size)
+    if problem := _damage(file, part):
+        raise ParameterError("file", problem)
+    notes = [f"{file.name}: only luminance; the picture is grey"] if channels == ["Y"] else []
+    ratio = float(found.header.get("pixelAspectRatio", 1.0))
+    if abs(ratio - 1) > 1e-3:
+        notes += [f"{file.name}: pixels are not square ({ratio:.3f}), but are read as square"]
+    return notes + enlarged(found.size, shape)
+
+
+@exr.preview
+def _(*, file: Path, shape: Shape | None = None, part: str | None = None, **params: Any) -> Tensor:
+    return without_values(3, *(shape or _chosen(file, part)[1].size))
 
 
 @exr.check
-def _(result: Tensor, *, file: Path, **params: Any) -> list[Check]:
-    linear = _linear(file)
+def _(result: Tensor, *, file: Path, part: str | None = None, **params: Any) -> list[Check]:
+    linear = _linear(file, part)
     below, least = int((linear < 0).sum()), float(linear.min())
     text = f"peak {float(result.max()):.4g}, mean {float(result.mean()):.3g}"
     return [Check(text + (f"; {below} of {linear.numel()} values were negative, down to {least:.2g}" if below else ""))]
 
 
-def _colour_channels(file: Path, names: list[str]) -> list[str]:
-    """Return the names of the channels to read from an OpenEXR file: R, G and B, or Y alone."""
-    for channels in (["R", "G", "B"], ["Y"]):
-        if set(channels) <= set(names) and not {"RY", "BY"} & set(names):
-            return channels
-    text = (
-        f"{file} has the channels {', '.join(names)}, but R, G and B, or Y alone, are needed: save the picture as RGB"
-    )
-    raise ParameterError("file", text)
+def _chosen(file: Path, part: str | None) -> tuple[int, PartHeader, list[str]]:
+    """Return the number and the header of the part with the picture, and the names of the channels to read."""
+    parts = part_headers(file)
+    names = ", ".join(each.name or "unnamed" for each in parts)
+    if part is not None and part not in [each.name for each in parts]:
+        raise ParameterError("part", f"{file.name} has no part {part!r}: name one of {names}")
+    named = [(i, each) for i, each in enumerate(parts) if part in (None, each.name)]
+    found = [(i, each, channels) for i, each in named if (channels := _colour_channels(each.channels))]
+    if len(found) > 1:
+        several = ", ".join(each.name or "unnamed" for _, each, _ in found)
+        raise ParameterError("file", f"{file.name} has a picture in the parts {several}: set part to one of them")
+    if not found:
+        there = "; ".join(", ".join(each.channels) for _, each in named)
+        fix = "but R, G and B, or X, Y and Z, or Y alone, are needed: save the picture as RGB"
+        raise ParameterError("file", f"{file} has the channels {there}, {fix}")
+    return found[0]
 
 
-def _linear(file: Path) -> Tensor:
+def _colour_channels(names: list[str]) -> list[str]:
+    """Return the channels of a picture: R, G and B, or X, Y and Z, or Y alone; an empty list if there is no picture."""
+    if {"RY", "BY"} & set(names):
+        return []
+    return next((wanted for wanted in (["R", "G", "B"], ["X", "Y", "Z"], ["Y"]) if set(wanted) <= set(names)), [])
+
+
+@once_per_version
+def _damage(file: Path, part: str | None) -> str:
+    """Return a message for a file that cannot be read to its end or has values that are not finite, or nothing."""
+    try:
+        pixels = _pixels(file, part)[2]
+    except (RuntimeError, OSError, ValueError) as error:
+        return f"{file.name} is damaged ({error}): copy or save the file again"
+    return not_finite(file, int((~np.isfinite(pixels)).sum()))
+
+
+def _pixels(file: Path, part: str | None) -> tuple[dict[str, Any], list[str], NDArray[np.float32]]:
+    """Read the header, the names of the channels and the values (channel, y, x) of a picture in an OpenEXR file."""
+    number, _, names = _chosen(file, part)
+    with exr_parts(file) as opened:
+        header, channels = dict(opened.header(number)), opened.channels(number)
+        return header, names, np.stack([np.asarray(channels[name].pixels, dtype=np.float32) for name in names])
+
+
+def _linear(file: Path, part: str | None = None) -> Tensor:
     """Read all pixels of an OpenEXR file as linear sRGB, (3, y, x) float32."""
-    import OpenEXR
-
-    with OpenEXR.File(str(file), separate_channels=True) as opened:
-        header, channels = dict(opened.header()), opened.channels()
-        names = _colour_channels(file, list(channels))
-        pixels = np.stack([np.asarray(channels[name].pixels, dtype=np.float32) for name in names])
-    if bad := int((~np.isfinite(pixels)).sum()):
-        raise ValueError(
-            f"{file.name} holds {bad} values that are not finite: replace these values by finite numbers, such as 0"
-        )
+    header, names, pixels = _pixels(file, part)
+    if problem := not_finite(file, int((~np.isfinite(pixels)).sum())):
+        raise ValueError(problem)
     if names == ["Y"]:
         return torch.from_numpy(pixels).expand(3, -1, -1).clone()
-    matrix = torch.from_numpy(_to_srgb(header)).to(torch.float32)
+    to_srgb = _xyz_to_srgb(header) if names == ["X", "Y", "Z"] else _to_srgb(header)
+    matrix = torch.from_numpy(to_srgb).to(torch.float32)
     return (matrix @ torch.from_numpy(pixels).flatten(1)).reshape(pixels.shape)
+
+
+def _xyz_to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
+    """Return the matrix from CIE X, Y and Z to linear sRGB, with Bradford adaptation of the header's white to D65."""
+    import colour
+
+    srgb = colour.RGB_COLOURSPACES["sRGB"]
+    own = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)[6:]
+    white = np.asarray(header.get("adoptedNeutral", own), dtype=np.float64)
+    if np.allclose(white, srgb.whitepoint, atol=1e-4):
+        plain: NDArray[np.float64] = srgb.matrix_XYZ_to_RGB
+        return plain
+    whites = colour.xy_to_XYZ(white), colour.xy_to_XYZ(srgb.whitepoint)
+    adapted: NDArray[np.float64] = colour.adaptation.matrix_chromatic_adaptation_VonKries(*whites, "Bradford")
+    return np.asarray(srgb.matrix_XYZ_to_RGB @ adapted, dtype=np.float64)
 
 
 def _to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:

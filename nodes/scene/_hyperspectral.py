@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.scene._crop_to_frame import enlarged, framed
-from neusee.nodes.scene._cube_files import Layout, cube_and_wavelengths, exr_size, size_and_type
+from neusee.nodes.scene._cube_files import Layout, cube_and_wavelengths, exr_size, size_and_type, wrong_values
+from neusee.nodes.shape_preview import without_values
 from neusee.nodes.spectra._spectral_tables import Table, require_range
 from neusee.nodes.units import DataFile, Shape, Wavelength
 from neusee.nodes.values import Bands
@@ -35,8 +35,8 @@ def hyperspectral(
     Units:  reflectance, 1 = white.
     Error:  linear interpolation: h^2/8 of the curvature, some 1e-3 for paints at 10 nm; exact on the bands of the
             file. Negative values are clipped.
-    Raises: ParameterError before the run where the file does not fit the parameters; ValueError where `bands` leave
-            the range of the file or values are not finite.
+    Raises: ParameterError before the run where the file does not fit the parameters, is damaged, or has values that are
+            complex or not finite; ValueError where `bands` leave the range of the file or values are not finite.
     Source: layout of spectral OpenEXR: Fichet, Pacanowski, Wilkie, JCGT 10(3), 2021.
     """
     cube, known = cube_and_wavelengths(file, variable, start, stop, layout)
@@ -57,19 +57,35 @@ def _(
     layout: Layout = "y x band",
     shape: Shape | None = None,
 ) -> list[str]:
-    if file.suffix == ".exr":
-        return enlarged(exr_size(file), shape)
+    if file.suffix != ".exr":
+        _refuse_missing_range(file, start, stop)
+    notes = enlarged(_rows_and_columns(file, variable, layout), shape)
+    if problem := wrong_values(file, variable):
+        raise ParameterError("file", problem)
+    return notes
+
+
+@hyperspectral.preview
+def _(
+    bands: Bands | None, *, file: Path, variable: str | None, layout: Layout, shape: Shape | None, **params: Any
+) -> Tensor | None:
+    size = shape or _rows_and_columns(file, variable, layout)
+    return None if bands is None else without_values(len(bands.centres), *size)
+
+
+def _refuse_missing_range(file: Path, start: float | None, stop: float | None) -> None:
     if start is None or stop is None or not start < stop:
         name = "stop" if start is not None else "start"
         text = f"{file.name} has no wavelengths: give start below stop, such as 400 nm and 700 nm"
         raise ParameterError(name, text)
-    size, kind = size_and_type(file, variable)
-    if np.dtype(kind).kind not in "uf":
-        raise ParameterError(
-            "file", f"{file.name} holds values of type {kind}: save the cube as float, uint8 or uint16"
-        )
-    pixels = size[:2] if layout == "y x band" else size[1:]
-    return enlarged((pixels[0], pixels[1]), shape)
+
+
+def _rows_and_columns(file: Path, variable: str | None, layout: Layout) -> tuple[int, int]:
+    """Return the numbers of rows and columns of a cube, from the header of its file."""
+    if file.suffix == ".exr":
+        return exr_size(file)
+    size, _ = size_and_type(file, variable)
+    return (size[0], size[1]) if layout == "y x band" else (size[1], size[2])
 
 
 @hyperspectral.check

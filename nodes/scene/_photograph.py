@@ -7,11 +7,14 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.input_files import once_per_version, refuse_large_picture
 from neusee.nodes.scene._crop_to_frame import enlarged, framed
+from neusee.nodes.shape_preview import without_values
 from neusee.nodes.units import DataFile, Shape
 
 _MODES = ("RGB", "L", "P", "1", "I", "I;16", "I;16B")
 _FIX = "convert the file to 8- or 16-bit sRGB: magick {name} -alpha off -colorspace sRGB -depth 16 {stem}.png"
+_DAMAGED = "{name} is damaged ({error}): copy the file again, or give another picture"
 _ORIENTATION = 0x0112  #: EXIF tag
 _ROTATED = range(5, 9)  #: EXIF orientations that exchange width and height
 
@@ -24,7 +27,8 @@ def photograph(*, file: DataFile, shape: Shape | None = None) -> Tensor:
     Units:  linear sRGB, 1 = the white of the file.
     Error:  half a code value (8 bit: 1.8e-3 near white); the tone curve of the camera is not inverted. Every file is
             read as sRGB: a note names an embedded colour profile, which is ignored.
-    Raises: ParameterError before the run for another format, for another depth, and for transparency.
+    Raises: ParameterError before the run for another format, for another depth, for transparency, for a damaged file,
+            and for more than 64 million pixels.
     Source: IEC 61966-2-1:1999 (sRGB); EXIF 2.3, tag Orientation.
     """
     from kornia.color import rgb_to_linear_rgb
@@ -40,18 +44,64 @@ def _(*, file: Path, shape: Shape | None = None) -> Tensor:
 
 @photograph.preflight
 def _(*, file: Path, shape: Shape | None = None) -> list[str]:
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(file) as image:
-            _refuse(file, image)
-            profile, turned = _profile(image), image.getexif().get(_ORIENTATION, 1)
-            size = image.size if turned in _ROTATED else image.size[::-1]
-    except UnidentifiedImageError:
-        raise ParameterError("file", f"{file} is not a readable picture: give a PNG or JPEG file") from None
+    profile, turned, size = read_header(file)
+    if problem := _damage(file):
+        raise ParameterError("file", problem)
     notes = [f"{file.name}: colour profile {profile!r} is ignored, and the file read as sRGB"] if profile else []
     notes += [f"{file.name}: picture turned upright by EXIF orientation {turned}"] if turned != 1 else []
     return notes + enlarged(size, shape)
+
+
+@photograph.preview
+def _(*, file: Path, shape: Shape | None = None) -> Tensor:
+    return without_values(3, *(shape or read_header(file)[2]))
+
+
+def read_header(file: Path) -> tuple[str, int, tuple[int, int]]:
+    """Return the colour profile, the EXIF orientation, and the numbers of rows and columns of the upright picture."""
+    from PIL import Image, UnidentifiedImageError
+
+    refuse_large_picture(file, *_png_size(file))
+    try:
+        with Image.open(file) as image:
+            refuse_large_picture(file, image.height, image.width)
+            _refuse(file, image)
+            turned = image.getexif().get(_ORIENTATION, 1)
+            return _profile(image), turned, image.size if turned in _ROTATED else image.size[::-1]
+    except UnidentifiedImageError:
+        raise ParameterError("file", f"{file} is not a readable picture: give a PNG or JPEG file") from None
+    except Image.DecompressionBombError:
+        raise ParameterError("file", f"{file.name} states more pixels than can be read: reduce the picture") from None
+    except (OSError, SyntaxError) as error:
+        raise ParameterError("file", _DAMAGED.format(name=file.name, error=error)) from None
+
+
+def _png_size(file: Path) -> tuple[int, int]:
+    """Return the numbers of rows and columns in the first 24 bytes of a PNG file, or (0, 0) for another file."""
+    with file.open("rb") as opened:
+        head = opened.read(24)
+    png = head.startswith(b"\x89PNG") and len(head) == 24
+    return (int.from_bytes(head[20:24]), int.from_bytes(head[16:20])) if png else (0, 0)
+
+
+@once_per_version
+def _damage(file: Path) -> str:
+    """Return a message for a picture that is truncated or damaged, else an empty text.
+
+    The checksums of a PNG are compared. A JPEG is decoded at an eighth of its size, which reads all its data.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(file) as image:
+            if image.format == "PNG":
+                image.verify()
+            else:
+                image.draft("RGB", (1, 1))
+                image.load()
+    except (OSError, SyntaxError, ValueError) as error:
+        return _DAMAGED.format(name=file.name, error=error)
+    return ""
 
 
 @photograph.check

@@ -14,7 +14,7 @@ from torch import Tensor
 from neusee.nodes import ParameterError
 from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.scene._crop_to_frame import covering
-from neusee.nodes.scene._photograph import photograph
+from neusee.nodes.scene._photograph import photograph, read_header
 
 _PICTURES = frozenset({".png", ".jpg", ".jpeg", ".jpe", ".webp", ".tif", ".tiff", ".bmp", ".gif"})
 _ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}  #: first bytes of a format -> end mark of a file of this format
@@ -48,8 +48,7 @@ def _files(root: Path) -> list[Path]:
 def _problem(path: Path) -> str:
     """Return the reason why a file cannot be read as a photograph, or an empty text."""
     try:
-        if photograph.hooks.preflight is not None:
-            photograph.hooks.preflight(file=path, shape=None)
+        read_header(path)
         with path.open("rb") as file:
             end = _ENDS[file.read(2)]
             file.seek(max(0, path.stat().st_size - _TAIL))

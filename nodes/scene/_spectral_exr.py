@@ -5,9 +5,11 @@ layers. Colour-science reads and writes such files only with OpenImageIO, and it
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -23,19 +25,60 @@ _PREFIX = {
 }  # fmt: skip
 
 
-def exr_header(file: Path) -> tuple[dict[str, Any], list[str], tuple[int, int]]:
-    """Read the header, the channel names, and the numbers of rows and columns of an OpenEXR file."""
+@contextmanager
+def exr_parts(file: Path | str) -> Iterator[Any]:
+    """Open an OpenEXR file with its pixels; raise ValueError if a part cannot be read to its end.
+
+    For a truncated file, OpenEXR prints a warning to stdout, which would mix with the output of a command, and leaves
+    the part out.
+    """
+    import OpenEXR
+
+    with OpenEXR.File(str(file), header_only=True) as opened:
+        count = len(opened.parts)
+    with redirect_stdout(StringIO()):
+        opened = OpenEXR.File(str(file), separate_channels=True)
+    with opened:
+        if len(opened.parts) < count:
+            raise ValueError("the pixels end earlier than the header says")
+        yield opened
+
+
+class PartHeader(NamedTuple):
+    """The header of one part of an OpenEXR file."""
+
+    name: str
+    header: dict[str, Any]
+    channels: list[str]
+    size: tuple[int, int]  #: rows and columns
+
+
+def part_headers(file: Path) -> list[PartHeader]:
+    """Read the header of each part of an OpenEXR file."""
     import OpenEXR
 
     try:
         with OpenEXR.File(str(file), header_only=True) as opened:
-            header = dict(opened.header())
+            headers = [dict(part.header) for part in opened.parts]
     except (RuntimeError, OSError, ValueError) as why:
         text = f"{file} cannot be read as OpenEXR ({str(why).strip()}): give an .exr file"
         raise ParameterError("file", text) from None
-    low, high = header["dataWindow"]
+    return [_part(header) for header in headers]
+
+
+def _part(header: dict[str, Any]) -> PartHeader:
+    low, high = ([int(edge) for edge in corner] for corner in header["dataWindow"])
     names = [channel.name for channel in header["channels"]]
-    return header, names, (int(high[1] - low[1]) + 1, int(high[0] - low[0]) + 1)
+    return PartHeader(str(header.get("name", "")), header, names, (high[1] - low[1] + 1, high[0] - low[0] + 1))
+
+
+def exr_header(file: Path) -> tuple[dict[str, Any], list[str], tuple[int, int]]:
+    """Read the header, the channel names, and the numbers of rows and columns of an OpenEXR file with one part."""
+    parts = part_headers(file)
+    if len(parts) > 1:
+        names = ", ".join(part.name for part in parts)
+        raise ParameterError("file", f"{file.name} has {len(parts)} parts ({names}): save one part alone")
+    return parts[0].header, parts[0].channels, parts[0].size
 
 
 def write_spectral(
@@ -75,9 +118,7 @@ def read_spectral(path: Path | str) -> tuple[Tensor, Tensor, dict[str, Any]]:
     reflectance.
     Raises: ValueError, which lists the channels of the file, where no channel is spectral.
     """
-    import OpenEXR
-
-    with OpenEXR.File(str(path), separate_channels=True) as opened:
+    with exr_parts(path) as opened:
         header, channels = dict(opened.header()), opened.channels()
         spectral = spectral_channels(list(channels))
         if not spectral:

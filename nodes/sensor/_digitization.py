@@ -7,9 +7,10 @@ import torch
 from pydantic import Field
 from torch import Generator, Tensor
 
-from neusee.nodes import Check, ErrorBound, TensorStats, node
+from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Well
+from neusee.nodes.shape_preview import same_shape, without_values
 from neusee.nodes.units import Gain, Shape
 
 Rounding = Literal["nearest", "dithered_floor"]
@@ -47,6 +48,9 @@ def _(electrons: TensorStats, *, capacity: float) -> float:
 @full_well.propagate_error
 def _(electrons: ErrorBound, **params: Any) -> float:
     return electrons.rms
+
+
+full_well.preview(same_shape)
 
 
 @full_well.check
@@ -119,6 +123,9 @@ def _(*, gain: float, bits: int = 16, **params: object) -> list[str]:
     return [f"the largest digital number is {top} DN = {top / gain:.0f} e-"]
 
 
+digitize.preview(same_shape)
+
+
 @digitize.check
 def _(result: Tensor, *inputs: Tensor, bits: int = 16, **params: Any) -> list[Check]:
     high, low = (int(torch.count_nonzero(result == end)) / max(1, result.numel()) for end in (2**bits - 1, 0))
@@ -134,15 +141,36 @@ def crop(image: Tensor, *, shape: Shape) -> Tensor:
     Shapes: image (..., y, x) -> (..., *shape).
     Units:  any.
     Error:  exact.
-    Raises: ValueError for a window larger than the image.
+    Raises: ParameterError before the run, or ValueError, for a window larger than the image.
     Source: NeuSee, Eq. (SensorImage).
     """
-    if any(n > m for n, m in zip(shape, image.shape[-2:], strict=True)):
-        raise ValueError(
-            f"window {tuple(shape)} is larger than image {tuple(image.shape[-2:])} in pixels: enlarge the scene"
-        )
+    if problem := _too_small(image, shape):
+        raise ValueError(problem)
     top, left = (m // 2 - n // 2 for n, m in zip(shape, image.shape[-2:], strict=True))
     return image[..., top : top + shape[0], left : left + shape[1]].contiguous()
+
+
+def _too_small(image: Tensor, shape: Shape) -> str:
+    """Return a message if an image is smaller than a window of the given shape, else an empty text."""
+    if all(n <= m for n, m in zip(shape, image.shape[-2:], strict=True)):
+        return ""
+    window, picture = (f"{y} x {x}" for y, x in (shape, image.shape[-2:]))
+    return (
+        f"the sensor window of {window} pixels is larger than the image of {picture}: "
+        f"enlarge the scene (scene.shape) to at least {list(shape)}, or choose a smaller window"
+    )
+
+
+@crop.preflight
+def _(*, shape: tuple[int, int], image: Tensor | None = None) -> list[str]:
+    if image is not None and (problem := _too_small(image, shape)):
+        raise ParameterError("shape", problem)
+    return []
+
+
+@crop.preview
+def _(image: Tensor | None, *, shape: tuple[int, int]) -> Tensor | None:
+    return None if image is None else without_values(*image.shape[:-2], *shape)
 
 
 @crop.propagate_error

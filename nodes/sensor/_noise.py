@@ -12,6 +12,7 @@ from torch import Generator, Tensor
 from neusee.nodes import Check, ErrorBound, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Efficiency, Well
+from neusee.nodes.shape_preview import same_shape
 from neusee.nodes.units import Electrons, Fraction
 
 Distribution = Literal["gaussian", "poisson"]
@@ -61,6 +62,9 @@ def _(*, mean: str = "additive", mean_shift: float = 0.0, **params: object) -> l
     if mean == "literal" and mean_shift < 1:
         return [f"photon noise as the paper prints: the mean is {mean_shift:.0%} of the light"]
     return []
+
+
+photon_noise.preview(same_shape)
 
 
 @photon_noise.check
@@ -144,6 +148,9 @@ def dark_current(electrons: Tensor, *, mean: Electrons, full_well: Well | None =
     return _by_parts(with_dark_current, single(electrons), rng)
 
 
+dark_current.preview(same_shape)
+
+
 @dark_current.skip_bound
 def _(electrons: TensorStats, *, mean: float, full_well: float | None) -> float:
     return _share(mean, math.sqrt(mean), electrons, full_well)
@@ -170,6 +177,9 @@ def read_noise(
         return part + normal(part, rng).mul_(read_noise).add_(offset)
 
     return _by_parts(with_read_noise, single(electrons), rng)
+
+
+read_noise.preview(same_shape)
 
 
 @read_noise.skip_bound

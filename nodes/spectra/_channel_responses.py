@@ -2,13 +2,22 @@
 
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
+from neusee.nodes.shape_preview import without_values
 from neusee.nodes.spectra._spectral_tables import measured_camera, observer
 from neusee.nodes.values import Bands
 
 Camera = Literal["CIE 1931", "Nikon 5100", "Sigma SDMerill"]
+_UNSEEN = 1e-3  #: of the largest sensitivity; a band that every channel sees less counts as unseen
+#: nm, ends of the range in which some channel has more than `_UNSEEN`, with a margin; found without the table
+_SEEN: dict[str, tuple[float, float]] = {
+    "CIE 1931": (375.0, 720.0),
+    "Nikon 5100": (405.0, 690.0),
+    "Sigma SDMerill": (405.0, 675.0),
+}
 
 
 @node(rtol=1e-9)
@@ -24,6 +33,31 @@ def responses(bands: Bands, *, camera: Camera = "CIE 1931") -> Tensor:
     """
     table = observer() if camera == "CIE 1931" else measured_camera(camera)
     return (table.over(bands) / table.values.max()).clamp_min(0).to(bands.centres.device)
+
+
+@responses.preflight
+def _(*, bands: Bands | None = None, camera: Camera = "CIE 1931") -> list[str]:
+    if bands is None:
+        return []
+    centres = bands.centres * 1e9
+    low, high = _SEEN[camera]
+    if low <= float(centres.min()) and float(centres.max()) <= high:
+        return []  # most recipes: colour-science, whose import takes a second, is not needed
+    most = responses(bands, camera=camera).amax(0)
+    unseen = centres[most < _UNSEEN]
+    if not len(unseen):
+        return []
+    which = f"{float(unseen.min()):.5g} nm" + (f" to {float(unseen.max()):.5g} nm" if len(unseen) > 1 else "")
+    largest = float(most[most < _UNSEEN].max())
+    return [
+        f"no channel of {camera} sees {len(unseen)} of {len(centres)} bands, {which}: the largest relative response is "
+        f"{largest:.2g}, below {_UNSEEN:g}, so their light is missing from the picture; choose {low:g} to {high:g} nm"
+    ]
+
+
+@responses.preview
+def _(bands: Bands | None, **params: object) -> Tensor | None:
+    return None if bands is None else without_values(3, len(bands.centres), dtype=torch.float64)
 
 
 @responses.check

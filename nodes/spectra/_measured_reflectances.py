@@ -1,6 +1,5 @@
 """Measured reflectances from colour-science and from the user's files."""
 
-import csv
 import functools
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.input_files import csv_rows
 from neusee.nodes.spectra._linear_lift import inside_charts
 from neusee.nodes.spectra._spectral_tables import Table, gamut_samples, paints, require_range
 from neusee.nodes.units import DataFiles
@@ -116,12 +116,20 @@ def _wrong(wavelengths: Numbers, values: Numbers) -> str:
 
 
 def _csv(file: Path) -> tuple[Numbers, Numbers]:
-    with file.open(newline="", encoding="utf-8-sig") as opened:
-        rows = [row for row in csv.reader(opened) if row]
-    numbers = np.array([[float(cell) for cell in row] for row in rows[1:]], np.float64)
+    rows = [[_number(cell, file, line) for cell in row] for line, row in list(csv_rows(file))[1:]]
+    if len({len(row) for row in rows}) > 1:
+        raise ValueError("the lines have different numbers of cells")
+    numbers = np.array(rows, np.float64)
     if numbers.ndim != 2 or numbers.shape[1] < 2:
         raise ValueError("the file has no columns of numbers below a header")
     return numbers[:, 0].copy(), numbers[:, 1:].T
+
+
+def _number(cell: str, file: Path, line: int) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        raise ValueError(f"{file.name}:{line}: {cell!r} is not a number") from None
 
 
 def _npz(file: Path) -> tuple[Numbers, Numbers]:

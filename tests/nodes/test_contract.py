@@ -73,7 +73,13 @@ def test_the_family_exports_its_node(node):
 @every_node
 def test_hooks_take_what_the_node_takes(node):
     own = set(inspect.signature(node.fn).parameters)
-    for hook in (node.hooks.reference, node.hooks.skip_bound, node.hooks.preflight, node.hooks.check):
+    for hook in (
+        node.hooks.reference,
+        node.hooks.skip_bound,
+        node.hooks.preflight,
+        node.hooks.preview,
+        node.hooks.check,
+    ):
         taken = {} if hook is None else inspect.signature(hook).parameters
         for p in taken.values():
             known = p.name in own or p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL) or p.name == "result"

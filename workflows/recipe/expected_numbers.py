@@ -7,13 +7,16 @@ from dataclasses import replace
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 
 
-def unaffected_expectations(recipe: Recipe, written: Recipe) -> Recipe:
-    """Return a recipe without the expected numbers that are affected by the user's changes to ``written``."""
+def unaffected_expectations(recipe: Recipe, written: Recipe | None) -> Recipe:
+    """Return a recipe without the expected numbers that are affected by the user's changes to ``written``.
+
+    None for ``written`` means that the recipe is not valid without the changes, so that the changes affect everything.
+    """
     same: set[str] = set()
-    for name in needed(recipe, recipe.steps):
-        if same.issuperset(recipe.steps[name].sources) and _alike(recipe, written, name):
+    for name in needed(recipe, recipe.steps) if written else ():
+        if written and same.issuperset(recipe.steps[name].sources) and _alike(recipe, written, name):
             same.add(name)
-    lost = [e for e in recipe.expect if e in written.expect and e.step not in same]
+    lost = [e for e in recipe.expect if (written is None or e in written.expect) and e.step not in same]
     if not lost:
         return recipe
     note = f"not compared, because your changes affect these numbers: {', '.join(e.name for e in lost)}"

@@ -20,6 +20,7 @@ from neusee.workflows.recipe.distributions.nominal_values import Uncertain, sett
 from neusee.workflows.recipe.expected_numbers import unaffected_expectations
 from neusee.workflows.recipe.global_settings import expectations, outputs_of, seed_and_tolerance
 from neusee.workflows.recipe.graph_cache import CachedGraph, cache_graph, cached_graph
+from neusee.workflows.recipe.known_before_run import CheckedStep, check_steps, refuse_indices
 from neusee.workflows.recipe.parameters import Checker
 from neusee.workflows.recipe.step_declarations import Declared, declare, device_of
 from neusee.workflows.recipe.text.composition import Composed, compose, groups_of, packaged
@@ -60,14 +61,24 @@ def load(
     name, beside = os.fspath(name_or_path), Path(folder or ".").absolute()
     changes: tuple[str | Override, ...] = (*overrides, *overrides_of(values, beside))
     recipe = check(compose(name, changes, beside, first))
-    return unaffected_expectations(recipe, _as_written(name, beside)) if recipe.expect and changes else recipe
+    if recipe.expect and changes:
+        recipe = unaffected_expectations(recipe, _as_written(name, beside))
+    if recipe.expect and (problems := list(refuse_indices(recipe))):
+        raise RecipeError(problems)
+    return recipe
 
 
-def _as_written(name: str, folder: Path) -> Recipe:
-    """Return a recipe without the user's overrides, from a cache while its files and nodes are unchanged."""
+def _as_written(name: str, folder: Path) -> Recipe | None:
+    """Return a recipe without the user's overrides, or None if the recipe is not valid without the overrides.
+
+    The result is cached while the files and nodes of the recipe are unchanged.
+    """
     composed = compose(name, (), folder)
     graph = cached_graph(composed.root)
-    return check(composed) if graph is None else _checked(composed, graph)
+    try:
+        return check(composed) if graph is None else _checked(composed, graph)
+    except RecipeError:
+        return None
 
 
 @functools.lru_cache(maxsize=16)
@@ -87,10 +98,13 @@ def check(composed: Composed) -> Recipe:
     graph = cached_graph(root)
     steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, diagnostics)
     wiring, checker = Wiring(root, steps, absent, references, diagnostics), Checker([])
-    bound = {step.name: step for step in _bind(wiring, checker, graph.wires if graph else {})}
-    diagnostics += cycles(bound, {name: step.value.key for name, step in steps.items()})
+    checked: list[CheckedStep] = []
+    bound = {step.name: step for step in _bind(wiring, checker, graph.wires if graph else {}, checked)}
+    loops = list(cycles(bound, {name: step.value.key for name, step in steps.items()}))
+    diagnostics += loops
     seed, tolerance = seed_and_tolerance(root, references, checker.diagnostics)
     outputs = outputs_of(root, wiring)
+    check_steps(checked, checker, None if loops else outputs)
     expect = expectations(root, wiring)
     references.finish()
     if not composed.whole:  # a missing group causes further errors
@@ -102,13 +116,17 @@ def check(composed: Composed) -> Recipe:
     config = Config(_final_values(wiring, bound, checker, uncertain) | dict(_settings(blocks, checker)))
     nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
     notes = (*checker.notes, *(uncertain.notes if uncertain else ()))
-    checked = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
-    return Recipe(*checked, uncertain=uncertain, training=training, lifting=lifting)
+    parts = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
+    return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting)
 
 
-def _bind(wiring: Wiring, checker: Checker, known: Mapping[str, Mapping[str, Wire]]) -> Iterator[Step]:
-    """Yield every copy of every step with its parameters and inputs; ``known`` contains the cached inputs by copy."""
-    checked: list[tuple[Step, Value, Value]] = []
+def _bind(
+    wiring: Wiring, checker: Checker, known: Mapping[str, Mapping[str, Wire]], checked: list[CheckedStep]
+) -> Iterator[Step]:
+    """Yield every copy of every step with its parameters and inputs, and add each valid copy to ``checked``.
+
+    ``known`` contains the cached inputs by copy.
+    """
     for step in wiring.steps.values():
         if not step.items:
             for part in ("from", "with", "device"):
@@ -125,19 +143,8 @@ def _bind(wiring: Wiring, checker: Checker, known: Mapping[str, Mapping[str, Wir
             marks = {str(name): value.mark for name, value in given.items.items()}
             found = Step(name, step.node, params or {}, wires, step.value.key, marks, device)
             if params is not None:
-                checked.append((found, given, step.value))
+                checked.append(CheckedStep(found, given, step.value))
             yield found
-    early = {found.name: _value_before_run(found) for found, *_ in checked if found.node.before_run}
-    for found, given, value in checked:
-        checker.preflight(found, early, given.items, value)
-
-
-def _value_before_run(step: Step) -> Any:
-    """Return the result of a step without inputs before the run, or None if the step's parameters are invalid."""
-    try:
-        return step.node(**step.params)
-    except ValueError:
-        return None
 
 
 def _final_values(

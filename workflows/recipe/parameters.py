@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args
@@ -15,7 +15,7 @@ from pydantic_core import ErrorDetails
 from neusee.nodes import Node, ParameterError
 from neusee.nodes.units import IsFile
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
-from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.graph.recipe_graph import Step, Wire
 from neusee.workflows.recipe.text.references import broken
 from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, kind
@@ -49,21 +49,34 @@ class Checker:
             return None
         return {name: getattr(model, name) for name in node.params.model_fields}
 
-    def preflight(self, bound: Step, early: Mapping[str, Any], values: Mapping[str, Value], step: Value) -> None:
-        """Check a step before a run with its node's own check; ``early`` holds the results that are known by then."""
-        node, inputs = bound.node, {name: early.get(str(bound.wires.get(name))) for name in bound.node.preflight_inputs}
-        if node.hooks.preflight is None:
-            return
+    def preflight(
+        self,
+        bound: Step,
+        inputs: Mapping[str, Any],
+        source: Callable[[Wire], Mapping[Any, Value]],
+        given: Value,
+        step: Value,
+    ) -> Sequence[str] | None:
+        """Check a step with its node's own check, and return its notes, or None for a mistake.
+
+        ``inputs`` has what is known of each input, and ``source`` returns the parameters of the step that feeds one.
+        """
+        if bound.node.hooks.preflight is None:
+            return ()
         try:
-            self.notes.update(dict.fromkeys(node.hooks.preflight(**bound.params, **inputs)))
+            return bound.node.hooks.preflight(
+                **bound.params, **{name: inputs.get(name) for name in bound.node.preflight_inputs}
+            )
         except ParameterError as error:
-            value = values.get(error.parameter)
+            fed, _, name = error.parameter.rpartition(".")
+            value = (source(bound.wires.get(fed)) if fed else given.items).get(name)
             if value is None:
                 self.diagnostics.append(Diagnostic(step.key, f"{step.name}.with.{error.parameter}", str(error)))
             else:
                 self.diagnostics.append(Diagnostic(value.mark, _said(value), str(error)))
         except (ValueError, OSError) as error:
             self.diagnostics.append(Diagnostic(step.key, step.name, str(error)))
+        return None
 
     def _plain(self, node: Node, name: str, value: Value) -> Any:
         """Return a parameter value as plain data, with a file path relative to the folder of its YAML file."""

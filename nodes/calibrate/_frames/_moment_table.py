@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from pathlib import Path
 from typing import Any, Literal
@@ -10,6 +9,7 @@ from typing import Any, Literal
 import torch
 
 from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.input_files import csv_rows, once_per_version
 from neusee.nodes.units import DataFile
 from neusee.nodes.values import Levels
 
@@ -37,7 +37,8 @@ def table(
     Shapes: -> (level,), in the order of the file; no histograms.
     Units:  photons per pixel and exposure; exposure in `exposure_unit`; pixels of one frame; mean DN; variance DN2.
     Error:  exact.
-    Raises: ParameterError before the run for a missing column; ValueError for a cell without a valid number.
+    Raises: ParameterError before the run for a missing column, another separator than a comma, and a cell without a
+            valid number.
     Source: EMVA Standard 1288, release 4.0 Linear, section 6.6 (variance of a pair of frames).
     """
     names = {"photons": photons, "exposure": exposure, "pixels": pixels, "mean": mean, "variance": variance}
@@ -53,12 +54,26 @@ def table(
 
 @table.preflight
 def _(*, file: Path, exposure_unit: str = "s", **names: Any) -> list[str]:
-    with file.open(newline="", encoding="utf-8-sig") as opened:
-        header = next(csv.reader(opened), [])
+    try:
+        _, header = next(csv_rows(file), (0, list[str]()))
+    except ValueError as error:
+        raise ParameterError("file", str(error)) from None
     for parameter, column in names.items():
         if column is not None and column not in header:
             raise ParameterError(parameter, f"{file.name} has no column {column!r}: name one of {', '.join(header)}")
+    if problem := _wrong_cell(file, *sorted((name, column) for name, column in names.items() if column is not None)):
+        raise ParameterError("file", problem)
     return []
+
+
+@once_per_version
+def _wrong_cell(file: Path, *columns: tuple[str, str]) -> str:
+    """Return a message for the first cell of a table that is not a valid number, else an empty text."""
+    try:
+        found = _rows(file, dict(columns))
+    except ValueError as error:
+        return str(error)
+    return "" if found else f"{file.name} has no line below the header: give one line per level"
 
 
 @table.check
@@ -68,12 +83,13 @@ def _(result: Levels, **params: Any) -> list[Check]:
 
 
 def _rows(file: Path, columns: dict[str, str]) -> list[dict[str, float]]:
-    with file.open(newline="", encoding="utf-8-sig") as opened:
-        reader = csv.DictReader(opened)
-        return [
-            {n: _number(row.get(c), n, f"{file.name}:{reader.line_num}: column {c}") for n, c in columns.items()}
-            for row in reader
-        ]
+    rows = csv_rows(file)
+    _, header = next(rows, (0, list[str]()))
+    named = ((line, dict(zip(header, row, strict=False))) for line, row in rows)
+    return [
+        {n: _number(row.get(c), n, f"{file.name}:{line}: column {c}") for n, c in columns.items()}
+        for line, row in named
+    ]
 
 
 def _number(text: str | None, name: str, where: str) -> float:

@@ -1,0 +1,81 @@
+"""Limits of input files, and checks that read the content of a file once, before the run."""
+
+import csv
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from neusee.nodes._node import ParameterError
+
+PIXELS = 64_000_000  #: of a picture, at most; decoding takes some 50 bytes a pixel, so 3 GB
+VALUES = 1_000_000_000  #: numbers in a cube, a height map or a frame, at most; 4 GB as float32
+ROWS = 1_000_000  #: lines of a table, at most
+_SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "vertical bars"}
+
+Result = TypeVar("Result")
+
+
+def refuse_large_picture(file: Path, rows: int, columns: int) -> None:
+    """Raise ParameterError for a picture whose header states more pixels than the limit, before it is decoded."""
+    if rows * columns > PIXELS:
+        text = f"{file.name} has {columns} x {rows} pixels, more than the limit of {PIXELS / 1e6:g} million: "
+        raise ParameterError("file", f"{text}reduce it, such as by magick {file.name} -resize 50% small{file.suffix}")
+
+
+def refuse_large_array(file: Path, shape: Sequence[int]) -> None:
+    """Raise ParameterError for an array whose header states more values than the limit, before it is read."""
+    count = functools.reduce(lambda one, other: one * int(other), shape, 1)
+    if count > VALUES:
+        sizes = " x ".join(map(str, shape))
+        text = f"{file.name} has {sizes} values, more than the limit of {VALUES / 1e6:g} million: give a smaller array"
+        raise ParameterError("file", text)
+
+
+def once_per_version(check: Callable[..., Result]) -> Callable[..., Result]:
+    """Return a function that remembers the results of ``check`` until the file, its first argument, changes.
+
+    The file counts as unchanged while its size, modification time and inode are the same.
+    """
+
+    @functools.lru_cache(maxsize=256)
+    def remembered(version: tuple[int, int, int], *arguments: Any) -> Result:
+        return check(*arguments)
+
+    @functools.wraps(check)
+    def checked(file: Path, *arguments: Any) -> Result:
+        about = file.stat()
+        return remembered((about.st_size, about.st_mtime_ns, about.st_ino), file.absolute(), *arguments)
+
+    return checked
+
+
+def not_finite(file: Path, count: int) -> str:
+    """Return the message for a file with values that are NaN or infinite, or an empty text for a count of 0."""
+    fix = "replace these values by finite numbers, such as 0"
+    return f"{file.name} holds {count} values that are not finite (NaN or infinity): {fix}" if count else ""
+
+
+def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number of the line and the cells of each row of a CSV file that is not empty.
+
+    Raises ValueError for text that is not UTF-8, for another separator than a comma, and for more rows than the limit.
+    """
+    with file.open(newline="", encoding="utf-8-sig") as opened:
+        reader = csv.reader(opened)
+        try:
+            for count, row in enumerate(reader):
+                if count == 0:
+                    _refuse_separator(file, row)
+                if count > ROWS:
+                    raise ValueError(f"{file.name} has more than {ROWS} rows: give a shorter table")
+                if row:
+                    yield reader.line_num, row
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise ValueError(f"{file.name} is not a CSV file in UTF-8 ({error}): save the table as CSV") from None
+
+
+def _refuse_separator(file: Path, header: list[str]) -> None:
+    found = next((name for mark, name in _SEPARATORS.items() if len(header) == 1 and mark in header[0]), None)
+    if found:
+        raise ValueError(f"{file.name} separates its columns by {found}: separate the columns by commas")
