@@ -17,6 +17,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.recipe.text.python_overrides import overrides_of
+from neusee.workflows.report.run_folder import writable_folder
 from neusee.workflows.report.study_folder import Progress, silent
 from neusee.workflows.store.remote_store import open_store
 
@@ -99,7 +100,7 @@ def train(
     Raises: ValueError, or its subclass `DesignError` or `MeshError`, for a recipe that cannot be trained; `NotFinite`
     if a loss is NaN or infinite.
     """
-    recipe, folder, store = _read(recipe, changes), Path(out), store or open_store()
+    recipe, folder, store = _read(recipe, changes), writable_folder(out), store or open_store()
     if recipe.lifting is not None:
         from neusee.workflows.training.lift.lift_run import train_lift
 
@@ -148,7 +149,7 @@ def evaluate(
         small=small,
         reference=reference,
         store=store,
-        runs=Path(out),
+        runs=writable_folder(out),
         command=command,
         progress=progress,
         device=device,
@@ -179,7 +180,7 @@ def calibrate(
 
     recipe, store = _read(recipe, changes), store or open_store()
     options: dict[str, Any] = {"walkers": walkers, "move": move, "draws": draws}
-    return run_calibration.calibrate(recipe, store, Path(out), command, progress, **options)
+    return run_calibration.calibrate(recipe, store, writable_folder(out), command, progress, **options)
 
 
 def study(
@@ -203,7 +204,9 @@ def study(
 
     if kind not in run_study.KINDS:
         raise ValueError(f"there is no study {kind!r}: write one of {', '.join(run_study.KINDS)}")
-    return run_study.study_recipe(kind, _read(recipe, changes), store, Path(out), command, progress, **options)
+    return run_study.study_recipe(
+        kind, _read(recipe, changes), store, writable_folder(out), command, progress, **options
+    )
 
 
 def _read(recipe: Recipe | Named, changes: Changes) -> Recipe:

@@ -33,7 +33,17 @@ Exact = Annotated[bool, typer.Option("--exact", help="Compute every step in full
 Memory = Annotated[
     str, typer.Option("--memory", help="Limit of a device's memory, such as 6 GB, as far as earlier runs tell.")
 ]
-Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the folder of results.")]
+
+
+def _writable(out: Path) -> Path:
+    """End the command before any work if the results could not be written to the folder ``out``."""
+    from neusee.workflows.report.run_folder import writable_folder
+
+    with failing(ValueError, before="--out: "):
+        return writable_folder(out)
+
+
+Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the folder of results.", callback=_writable)]
 
 
 def progress_lines(quiet: bool) -> Callable[[str], None]:

@@ -34,11 +34,11 @@ class Checker:
 
     def read(self, node: Node, given: Value, step: Location) -> dict[str, Any] | None:
         """Return the validated parameters of a step with the defaults of its node, or None if a parameter is wrong."""
+        if broken(given):
+            return None
         if given.data is not None and not isinstance(given.data, dict):
             message = f"must be a mapping of parameters, not {kind(given)}"
             self.diagnostics.append(Diagnostic(given.mark, given.name, message))
-            return None
-        if broken(given):
             return None
         values = {str(name): value for name, value in given.items.items()}
         plain = {name: self._plain(node, name, value) for name, value in values.items()}

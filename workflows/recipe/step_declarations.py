@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 import itertools
+import math
 import pkgutil
 import re
 import sys
@@ -13,11 +14,12 @@ from dataclasses import dataclass
 
 import neusee.nodes
 from neusee.nodes import Node
-from neusee.workflows.graph.diagnostics import Diagnostic, nearest
+from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError, nearest
 from neusee.workflows.recipe.text.references import References, Scope, broken
 from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
+_MOST = 20_000  #: steps of a recipe, at most, with all copies
 _KEYS = ("node", "each", "from", "with", "device")
 _DEVICE = re.compile(r"any|cpu|gpu|mps|cuda(:\d+)?")
 _NAME = re.compile(r"[^\W\d][\w-]*")
@@ -54,22 +56,40 @@ class Declared:
 def declare(
     root: Value, references: References, diagnostics: list[Diagnostic]
 ) -> tuple[dict[str, Declared], dict[str, Value]]:
-    """Return the declared steps of a recipe and the steps that are null; report mistakes in the declarations."""
+    """Return the declared steps of a recipe and the steps that are null; report mistakes in the declarations.
+
+    Raises `RecipeError` for more steps than the limit, before the copies are made.
+    """
     given = root.items.get("steps")
     if given is None or not isinstance(given.data, dict) or not given.data:
         mark = root.mark if given is None else given.mark
         diagnostics.append(Diagnostic(mark, "steps", "a recipe needs steps, or a group with steps (`camera: neusee`)"))
         return {}, {}
     absent = {str(name): value for name, value in given.data.items() if value.data is None}
-    steps = {}
+    steps, total = dict[str, Declared](), 0
     find = functools.cache(find_node)
     for name, value in ((str(name), value) for name, value in given.data.items() if value.data is not None):
         steps[name] = Declared(name, value, None, (), ())
         if _well_formed(name, value, diagnostics):
             node, dims = _node(value, find, references, diagnostics), _dims(value, root, diagnostics)
+            copies = math.prod(len(root.items[dim].items) for dim in dims or ())
+            total += copies
+            if total > _MOST:
+                raise RecipeError([_too_many(value, dims or (), root, copies, total)])
             items = tuple(itertools.product(*(map(str, root.items[dim].items) for dim in dims or ())))
             steps[name] = Declared(name, value, node, dims or (), () if dims is None else items)
     return steps, absent
+
+
+def _too_many(step: Value, dims: tuple[str, ...], root: Value, copies: int, total: int) -> Diagnostic:
+    """Return the diagnostic for the step with which a recipe has more steps than the limit."""
+    if copies <= _MOST:
+        message = f"with this step the recipe has {total} steps, more than the limit of {_MOST}: split the recipe"
+        return Diagnostic(step.key, step.name, message)
+    sizes = " x ".join(f"{len(root.items[dim].items)} {dim}" for dim in dims)
+    each = step.items["each"]
+    message = f"makes {sizes} = {copies} steps, more than the limit of {_MOST}: use fewer items, or a sweep"
+    return Diagnostic(each.mark, each.name, message)
 
 
 def _well_formed(name: str, value: Value, diagnostics: list[Diagnostic]) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import shutil
+import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+_OTHER_FOLDER = "name another folder with --out"
 _ABANDONED = 3600.0  #: s without a change, after which an unfinished folder is removed
 
 
@@ -44,6 +46,23 @@ class RunFolder:
             os.link(source, path)
         except OSError:
             shutil.copyfile(source, path)
+
+
+def writable_folder(out: str | os.PathLike[str]) -> Path:
+    """Return the folder in which a command makes its folder of results; raise ValueError if nothing can be written.
+
+    A folder that does not exist yet is not made: the nearest existing folder above it must be writable.
+    """
+    root = Path(out)
+    existing = next(path for path in (root, *root.absolute().parents) if path.exists() or path.is_symlink())
+    if not existing.is_dir():
+        raise ValueError(f"{existing} is not a folder, so that no results can be written to {root}: {_OTHER_FOLDER}")
+    try:
+        os.rmdir(tempfile.mkdtemp(prefix=".neusee.", dir=existing))
+    except OSError as error:
+        text = f"the folder {existing} cannot be written ({error.strerror}), so that {root} cannot hold results"
+        raise ValueError(f"{text}: {_OTHER_FOLDER}") from None
+    return root
 
 
 @contextmanager

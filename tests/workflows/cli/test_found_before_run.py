@@ -327,3 +327,125 @@ def test_one_part_of_a_file_with_several_is_chosen_by_name(neusee, tmp_path):
     code, _, err = neusee(*words, "steps.scene.with.part=middle")
     assert code == 2
     assert "a.exr has no part 'middle': name one of left, right" in err
+
+
+# --- limits -----------------------------------------------------------------------------------------------------------
+
+LIMITED = """\
+# A limit.
+a: {A}
+seven: {S}
+steps:
+  stop: {node: optics.stop, with: {samples: "${seven.samples}", pitch: 10 um, diameter: 70 um}}
+  more: {node: optics.stop, with: "${a.a0}"}
+outputs: [stop]
+"""
+
+
+def chain(link):
+    """Twelve levels, each with nine references to the next: 9^12 values at the top."""
+    levels = [f"  a{n}: {link.replace('#', str(n + 1))}" for n in range(12)]
+    return LIMITED.replace("{A}", "\n" + "\n".join(levels) + "\n  a12: x").replace("{S}", "{samples: 7}")
+
+
+def many(count):
+    rows = "".join(f"  s{n}: {{node: doe.flat, from: stop}}\n" for n in range(count))
+    return LIMITED.partition("  more")[0].replace("{A}", "{}").replace("{S}", "{samples: 7}") + rows + "outputs: [stop]"
+
+
+def product(one, other):
+    lists = "".join(
+        f"{name}:\n" + "".join(f"  {name}{n}: {{}}\n" for n in range(count))
+        for name, count in (("p", one), ("q", other))
+    )
+    step = "  s: {node: doe.flat, each: [p, q], from: stop}\n"
+    head = LIMITED.partition("  more")[0].replace("a: {A}\n", "").replace("{S}", "{samples: 7}")
+    return head + step + "outputs: [stop]\n" + lists
+
+
+LIMITS = {
+    "text": (chain('"' + "${a.a#}" * 9 + '"'), "a.a6   references expand this text to more than 100000 characters"),
+    "list": (
+        chain("[" + ", ".join(['"${a.a#}"'] * 9) + "]"),
+        "references expand this value to more than 100000 values",
+    ),
+    "mapping": (
+        chain("{" + ", ".join(f'k{i}: "${{a.a#}}"' for i in range(9)) + "}"),
+        "references expand this value to more than 100000 values",
+    ),
+    "each": (product(3000, 3000), "steps.s.each   makes 3000 p x 3000 q = 9000000 steps, more than the limit of 20000"),
+    "each, by two": (product(20, 1001), "makes 20 p x 1001 q = 20020 steps, more than the limit of 20000"),
+    "file": (many(100) + "#" * 4_000_000, "more than the limit of 4000000: split the recipe into groups"),
+}
+
+
+@pytest.mark.parametrize(("recipe", "said"), LIMITS.values(), ids=LIMITS)
+def test_a_recipe_that_grows_beyond_a_limit_is_refused_with_the_limit(neusee, tmp_path, recipe, said):
+    (tmp_path / "mine.yaml").write_text(recipe)
+    code, out, err = neusee("validate", "mine.yaml")
+    assert (code, out) == (2, "")
+    assert said in err
+    assert "\n1 problem," in err
+
+
+def test_the_limit_of_steps_counts_the_steps_and_their_copies(neusee, tmp_path, monkeypatch):
+    from neusee.workflows.recipe import step_declarations
+
+    monkeypatch.setattr(step_declarations, "_MOST", 30)
+    (tmp_path / "mine.yaml").write_text(many(29))
+    assert neusee("validate", "mine.yaml")[0] == 0
+    (tmp_path / "mine.yaml").write_text(many(30))
+    code, _, err = neusee("validate", "mine.yaml")
+    assert code == 2
+    assert "steps.s29   with this step the recipe has 31 steps, more than the limit of 30" in err
+
+
+# --- the folder of results --------------------------------------------------------------------------------------------
+
+COMMANDS = (
+    ("run", "first_light"), ("sweep", "first_light", "sensor.c2=0,1"), ("train", "train_small"),
+    ("evaluate", "first_light"), ("calibrate", "camera"), ("study", "stability", "first_light"),
+    ("study", "uncertainty", "first_light"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_a_folder_that_cannot_hold_results_is_refused_before_any_work(neusee, tmp_path, words):
+    (tmp_path / "taken").write_text("a file")
+    for out in ("taken", "taken/runs"):
+        code, said, err = neusee(*words, "--out", out)
+        assert (code, said) == (2, "")
+        assert err == (
+            f"--out: {'taken' if out == 'taken' else tmp_path / 'taken'} is not a folder, so that no results can be "
+            f"written to {out}: name another folder with --out\n"
+        )
+    assert not (tmp_path / "cache").exists()
+
+
+def test_a_folder_that_the_system_does_not_let_us_write_is_refused(neusee, tmp_path, monkeypatch):
+    """As `os.mkdir` says it for a read-only file system; the rights of a folder do not bind the root of a machine."""
+    import errno
+    import tempfile
+
+    def refuse(**options):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(tempfile, "mkdtemp", refuse)
+    code, said, err = neusee("run", "first_light")
+    assert (code, said) == (2, "")
+    assert err.startswith(f"--out: the folder {tmp_path} cannot be written (Read-only file system)")
+
+
+def test_a_python_call_refuses_such_a_folder_too(tmp_path):
+    import neusee
+
+    (tmp_path / "taken").write_text("a file")
+    with pytest.raises(ValueError, match="is not a folder"):
+        neusee.study("first_light", kind="stability", out=tmp_path / "taken")
+
+
+def test_the_check_of_the_folder_leaves_nothing(neusee, tmp_path):
+    from neusee.workflows.report.run_folder import writable_folder
+
+    assert writable_folder(tmp_path / "runs" / "mine") == tmp_path / "runs" / "mine"
+    assert list(tmp_path.iterdir()) == []

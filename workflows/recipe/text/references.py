@@ -17,6 +17,8 @@ from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
 
 _REFERENCE = re.compile(r"\$\{([^${}]*)\}")
 _DEEPEST = 50  #: longest chain of references
+_MOST_VALUES = 100_000  #: values to which references may expand one value
+_MOST_CHARACTERS = 100_000  #: characters to which references may expand one text
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +54,8 @@ class References:
         self.open: list[Where] = []  #: values that are being resolved
         self.lacking: list[tuple[Where, Diagnostic]] = []  #: targets that do not exist
         self.spare: set[Where] = set()  #: unused values of packaged options
+        self.followed = 0  #: references followed since the last value of a step was begun
+        self.weights: dict[int, tuple[int, Any]] = {}  #: number of values in each list or mapping, by identity
 
     def resolve(self, value: Value, scope: Scope) -> Value:
         """Return a recipe value with its references resolved; report a failed reference and return `BROKEN` for it."""
@@ -73,9 +77,13 @@ class References:
                 return replace(value, data=BROKEN)
             if match[0] == text:
                 return target
+            if target.data is BROKEN:
+                return target
             if isinstance(target.data, dict | list):
                 return self._fail(value, f"${{{match[1]}}} is a list or a mapping: it cannot be part of a string")
             text = text[: match.start()] + _pasted(target.data) + text[match.end() :]
+            if len(text) > _MOST_CHARACTERS:
+                return self._fail(value, f"references expand this text to more than {_MOST_CHARACTERS} characters")
         if "${" in text:
             return self._fail(value, "the reference is incomplete: write a reference as ${block.name}")
         return replace(value, data=text)
@@ -106,12 +114,29 @@ class References:
         if len(self.open) > _DEEPEST:
             self._fail(origin, f"the value begins a chain of more than {_DEEPEST} references")
             return None
+        self.followed = self.followed + 1 if self.open else 0
+        if self.followed > _MOST_VALUES:
+            self._fail(origin, f"references expand this value to more than {_MOST_VALUES} values")
+            return None
         self.open.append(target.path)
         value = self.resolve(target, scope if target.path[0] == "steps" else Scope({}, dotted(target.path)))
         self.open.pop()
+        if self._weight(value) > _MOST_VALUES:
+            value = self._fail(target, f"references expand this value to more than {_MOST_VALUES} values")
+        elif any(child.data is BROKEN for child in value.items.values()):
+            value = replace(value, data=BROKEN)
         if target.path[0] != "steps":
             self.known[target.path] = value
         return value
+
+    def _weight(self, value: Value) -> int:
+        """Return the number of values in a resolved value, in which references may repeat the same list many times."""
+        if not isinstance(value.data, dict | list):
+            return 1
+        if id(value.data) not in self.weights:
+            weight = 1 + sum(map(self._weight, value.items.values()))
+            self.weights[id(value.data)] = weight, value.data  # kept alive, so that its identity stays its own
+        return self.weights[id(value.data)][0]
 
     def _missing(self, start: Value, parts: list[str], origin: Value, scope: Scope) -> None:
         """Report a reference to a missing value: at the item if other items have the value, else at the reference."""
@@ -129,7 +154,9 @@ class References:
         self.lacking.append((path, Diagnostic(origin.mark, origin.name, f"${{{name}}}{hint}")))
 
     def _fail(self, origin: Value, message: str) -> Value:
-        self.diagnostics.append(Diagnostic(origin.mark, origin.name, message))
+        problem = Diagnostic(origin.mark, origin.name, message)
+        if problem not in self.diagnostics[-1:]:
+            self.diagnostics.append(problem)
         return replace(origin, data=BROKEN)
 
     def touch(self, value: Value, dims: Sequence[str]) -> None:

@@ -22,6 +22,7 @@ _TAG = "tag:yaml.org,2002:"
 _INT = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
 _MOST = 1_000_000  #: largest number of values in one file
+_LARGEST = 4_000_000  #: bytes of one file; 20 000 steps take about half of them
 _MOST_ALIASED = 100_000  #: largest number of values from aliases in one file
 
 
@@ -106,6 +107,10 @@ def read(path: Path, shown: str) -> Document:
     Raises one `RecipeError` with all mistakes of the file.
     """
     try:
+        size = path.stat().st_size
+        if size > _LARGEST:
+            message = f"the file has {size} bytes, more than the limit of {_LARGEST}: split the recipe into groups"
+            raise RecipeError([Diagnostic(Location(shown), "", message)])
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         before = error.object[: error.start].decode("utf-8", "replace")
