@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import itertools
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -28,10 +30,19 @@ def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int
     words = list(words or [])
     named = bool(words) and not _is_change(words[0])
     name = words.pop(0) if named else DEFAULT
-    for word in words:
+    for number, word in enumerate(words):
         if not _is_change(word):
-            fail(f"{word}: not a change of a value: write key=value, +key=value or ~key")
+            fail(f"{word}: not a change of a value: {_fix(words, number)}")
     return name, words, 1 + named + before
+
+
+def _fix(words: list[str], number: int) -> str:
+    """Return how to write the word at ``number``, which is not a change and often the rest of a value with a space."""
+    if number == 0:
+        return "write key=value, +key=value or ~key"
+    rest = itertools.takewhile(lambda word: not _is_change(word), words[number:])
+    whole = " ".join([words[number - 1], *rest])
+    return f"quote a value that has a space: {shlex.quote(whole)}"
 
 
 def _is_change(word: str) -> bool:

@@ -94,7 +94,7 @@ def check(composed: Composed) -> Recipe:
     composed, lifting = read_lift_training(composed)
     composed, uncertain = settle(composed)
     diagnostics = list(composed.diagnostics)
-    root, references = composed.root, References(composed.root, diagnostics)
+    root, references = composed.root, References(composed.root, diagnostics, dict(composed.replaced))
     graph = cached_graph(root)
     steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, diagnostics)
     wiring, checker = Wiring(root, steps, absent, references, diagnostics), Checker([])
@@ -115,7 +115,7 @@ def check(composed: Composed) -> Recipe:
         cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
     config = Config(_final_values(wiring, bound, checker, uncertain) | dict(_settings(blocks, checker)))
     nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
-    notes = (*checker.notes, *(uncertain.notes if uncertain else ()))
+    notes = (*checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
     parts = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
     return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting)
 

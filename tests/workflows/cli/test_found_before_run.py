@@ -449,3 +449,41 @@ def test_the_check_of_the_folder_leaves_nothing(neusee, tmp_path):
 
     assert writable_folder(tmp_path / "runs" / "mine") == tmp_path / "runs" / "mine"
     assert list(tmp_path.iterdir()) == []
+
+
+# --- words of the command line, and values of one's own recipe --------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("sensor.read_noise=20", "e-"), "e-: not a change of a value: quote a value that has a space: "
+         "'sensor.read_noise=20 e-'\n"),
+        (("seed=1", "lasers.green.angle=[0", "deg,", "1", "deg]", "seed=2"), "'lasers.green.angle=[0 deg, 1 deg]'\n"),
+    ],
+)  # fmt: skip
+def test_a_value_with_a_space_needs_quotes(neusee, words, said):
+    for command in ("run", "validate", "sweep", "evaluate"):
+        code, out, err = neusee(command, "first_light", *words)
+        assert (code, out) == (2, "")
+        assert err.endswith(said)
+
+
+def test_a_file_of_ones_own_recipe_is_no_mistake_with_a_scene_that_has_no_file(neusee, tmp_path):
+    picture(tmp_path, ".png")
+    groups = (
+        "camera: neusee, scene: china, illuminant: daylight, lift: lmmse, laser: green, optics: small, sensor: small"
+    )
+    groups += ", doe: five_half_rings, flare: clean, restore: wiener, reading: coherent"
+    defaults = "".join(f"  - {group}\n" for group in groups.split(", "))
+    (tmp_path / "mine.yaml").write_text(f"# Mine.\ndefaults:\n{defaults}scene: {{file: a.png}}\noutputs: [raw]\n")
+    assert "not used" not in neusee("validate", "mine.yaml")[1]
+    code, out, _ = neusee("validate", "mine.yaml", "scene=siemens")
+    assert code == 0
+    assert "note     scene.file (mine.yaml:14:15) is not used with scene=siemens\n" in out
+    code, out, _ = neusee("config", "mine.yaml", "scene=siemens")
+    assert code == 0
+    assert "a.png" not in out
+    code, _, err = neusee("validate", "mine.yaml", "scene=siemens", "scene.file=a.png")
+    assert code == 2
+    assert "argument 3   scene.file   unknown: no step refers to this value" in err

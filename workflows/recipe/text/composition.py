@@ -11,7 +11,7 @@ from pathlib import Path
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, nearest
 from neusee.workflows.recipe.text.overrides import Override, apply, read_override
-from neusee.workflows.recipe.text.yaml_values import Value, kind, read
+from neusee.workflows.recipe.text.yaml_values import Value, Where, kind, read
 
 _NAME = re.compile(r"[\w-]+")
 
@@ -25,6 +25,8 @@ class Composed:
     root: Value
     diagnostics: tuple[Diagnostic, ...]
     whole: bool = True  #: whether every named group could be read
+    #: paths of the values in options that arguments replaced, each with the argument, such as ``scene=siemens``
+    replaced: tuple[tuple[Where, str], ...] = ()
 
     def without(self, key: str) -> Composed:
         """Return the recipe without the block ``key``."""
@@ -83,7 +85,8 @@ def compose(recipe: str | Path, arguments: Sequence[str | Override], folder: Pat
     root = _merged((*(option for option in options if option is not None), document.root))
     for override in rest:
         root = apply(root, override, diagnostics, [choice.group for choice in choices])
-    return Composed(path.stem, document.title, root, tuple(diagnostics), None not in options)
+    replaced = tuple(_replaced(document.root, choices, path.parent, folder))
+    return Composed(path.stem, document.title, root, tuple(diagnostics), None not in options, replaced)
 
 
 def shown(path: Path, folder: Path) -> str:
@@ -149,6 +152,18 @@ def _choose(
         else:
             choices[group] = Choice(group, None if data is None else str(data), o.mark, o.text)
     return list(choices.values()), rest
+
+
+def _replaced(root: Value, choices: Iterable[Choice], beside: Path, folder: Path) -> Iterator[tuple[Where, str]]:
+    """Yield the path of each value in an option that the recipe names and an argument replaces or removes."""
+    chosen = {choice.group: choice for choice in choices}
+    for written in _defaults(root, []):
+        now = chosen.get(written.group)
+        if written.option is None or (now and now.option == written.option):
+            continue
+        option = _option(written, beside, folder, [])
+        shown = now.shown if now else f"~{written.group}"
+        yield from ((leaf.path, shown) for leaf in (option.leaves() if option else ()))
 
 
 def _group_fault(o: Override, choices: Mapping[str, Choice]) -> str:

@@ -47,8 +47,10 @@ class Scope:
 class References:
     """Resolver of the references in a recipe, with a record of the values that the steps use."""
 
-    def __init__(self, root: Value, diagnostics: list[Diagnostic]) -> None:
+    def __init__(self, root: Value, diagnostics: list[Diagnostic], replaced: Mapping[Where, str] | None = None) -> None:
         self.root, self.diagnostics = root, diagnostics
+        self.replaced = replaced or {}  #: the argument that replaced an option, by the path of a value of the option
+        self.notes: list[str] = []  #: on values of the user's recipe that the arguments make unused
         self.used: set[Where] = set()
         self.known: dict[Where, Value] = {}  #: resolved values
         self.open: list[Where] = []  #: values that are being resolved
@@ -183,6 +185,10 @@ class References:
             meant = self._meant(leaf) or ()
             if _is_packaged(leaf) and meant not in targets:
                 self.spare.add(leaf.path)
+                continue
+            if leaf.path in self.replaced and meant not in targets and leaf.mark.line and leaf.key.line:
+                self.spare.add(leaf.path)
+                self.notes.append(f"{leaf.name} ({leaf.mark}) is not used with {self.replaced[leaf.path]}")
                 continue
             misspelt.add(meant)
             if now := instead(leaf.name):
