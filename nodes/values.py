@@ -77,7 +77,6 @@ class Channels(NamedTuple):
 
     planes: Tensor  #: (row, y, x)
     rows: Tensor  #: (row, band) float64
-    flux: Tensor  #: (band,) float64, sum of image[b] over all pixels
     bound: Tensor  #: () float64, upper bound of the root mean square error over max |plane|, for the worst row
     kept: Tensor = torch.zeros(5, dtype=torch.int64)  #: counts of planes, kernels, bands, PSF rows and PSF columns
     largest: Tensor = torch.tensor(torch.inf, dtype=torch.float64)  #: upper bound of the relative error of max |plane|

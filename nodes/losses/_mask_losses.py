@@ -8,6 +8,7 @@ from torch import Tensor
 
 from neusee.nodes import node
 from neusee.nodes._half_precision import single
+from neusee.nodes.metrics import bsr
 from neusee.nodes.values import Psf
 
 _DARK = 1e-30  #: light, or ratio, below which a band counts as dark
@@ -50,15 +51,19 @@ def _(psf: Psf, *, power: float = 8.0, log: bool = False) -> Tensor:
 
 
 @node()
-def background_loss(image: Tensor, plain_image: Tensor) -> Tensor:
-    """Sum over the bands the ratio of the scene light without the mask to the scene light with the mask.
+def background_loss(psf: Psf, radiance: Tensor | None = None) -> Tensor:
+    """Sum over the bands the inverse of the background suppression ratio, which `metrics.bsr` computes.
 
-    Shapes: image and plain_image (..., band, y, x) -> ().
-    Units:  none; equal to the number of bands where no light is lost.
+    Light that the mask scatters out of the field or out of the window of the PSF makes the loss larger, whatever the
+    border of the image is. Without a scene, the loss is that of a point on the axis.
+
+    Shapes: psf.intensity (band, any, any), radiance (..., band, y, x) -> ().
+    Units:  none; the number of bands where no light is lost, and more where light is lost.
     Error:  compares energy in the field and ignores sharpness. A band without light counts as 1.
+    Raises: ValueError where scene and PSF have different bands.
     Source: NeuSee, section Two-Stage Training (L_DOE), as a ratio of energies.
     """
-    kept, plain = (x.sum((-2, -1), dtype=torch.float64) for x in (image, plain_image))
-    dark = (plain <= _DARK) | (kept <= _DARK)  # false for NaN, so that NaN reaches the result
-    ratios: Tensor = torch.where(dark, 1.0, plain / kept.where(~dark, 1.0))
-    return ratios.sum().to(single(image).dtype)
+    share = bsr(psf, radiance)
+    dark = share <= _DARK  # false for NaN, so that NaN reaches the result
+    ratios: Tensor = torch.where(dark, 1.0, 1.0 / share.where(~dark, 1.0))
+    return ratios.sum().to(single(psf.intensity).dtype)

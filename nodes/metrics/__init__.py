@@ -5,7 +5,7 @@ from neusee.nodes.metrics._peak_irradiance import Peak, peak_irradiance
 from neusee.nodes.metrics._picture_quality import Quality, quality
 from neusee.nodes.metrics._psf_contrast import Mtf, encircled, encircled_curve, mtf, over_clear_peak
 from neusee.nodes.metrics._saturated_pixels import Saturated, saturated
-from neusee.nodes.metrics._suppression_ratios import bsr, lsr
+from neusee.nodes.metrics._suppression_ratios import bsr, light_outside, lsr
 
 __all__ = [
     "Limits",
@@ -17,6 +17,7 @@ __all__ = [
     "encircled",
     "encircled_curve",
     "least_lsr",
+    "light_outside",
     "limits",
     "lsr",
     "most_contrast",

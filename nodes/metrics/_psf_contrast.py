@@ -76,7 +76,8 @@ def encircled(psf: Psf, *, pixel_pitch: PositiveLength, radius: PositiveLength) 
     Source: Goodman, Introduction to Fourier Optics, 4th ed.; Born and Wolf, Principles of Optics, 7th ed., ch. 8.
     """
     sizes = psf.intensity.shape[-2:]
-    y, x = ((torch.arange(n, device=psf.intensity.device) - n // 2) * pixel_pitch for n in sizes)
+    steps = (torch.arange(n, dtype=torch.float64, device=psf.intensity.device) - n // 2 for n in sizes)
+    y, x = (step * pixel_pitch for step in steps)
     inside = torch.hypot(y[:, None], x[None, :]) <= radius
     return (psf.intensity * inside).sum(-1).sum(-1, dtype=torch.float64)
 

@@ -17,16 +17,26 @@ def phase_steps(pupil: Pupil) -> tuple[float, float]:
     """
     worst = int((pupil.index / pupil.wavelengths).argmax())
     every = max(1, len(pupil.height) // _ROWS)
-    turns, lit = [], []
-    for first in (0, 1):
-        height, path, aperture = (x[first::every] for x in (pupil.height, pupil.path, pupil.aperture))
-        turns.append((pupil.index[worst] * height + path) / pupil.wavelengths[worst])
-        lit.append(aperture > 0)
-    pairs = min(map(len, turns))
-    down = (turns[1][:pairs] - turns[0][:pairs])[lit[1][:pairs] & lit[0][:pairs]]
-    along = turns[0].diff(dim=1)[lit[0][:, 1:] & lit[0][:, :-1]]
-    steps = torch.cat([down, along]).abs()
+    here, below = ([x[k::every] for x in (pupil.height, pupil.path, pupil.aperture > 0)] for k in (0, 1))
+    pairs = len(below[0])
+    steps = torch.cat(
+        [
+            _steps(pupil, worst, [x[:pairs] for x in here], below),
+            _steps(pupil, worst, [x[:, :-1] for x in here], [x[:, 1:] for x in here]),
+        ]
+    )
     return (float(steps.median()), float((steps > 0.5).double().mean())) if steps.numel() else (0.0, 0.0)
+
+
+def _steps(pupil: Pupil, band: int, one: list[Tensor], other: list[Tensor]) -> Tensor:
+    """Return the absolute phase difference in turns, between neighbours that are both inside the stop.
+
+    Differences are taken before the phase: in float32, a phase of thousands of turns has no digits left for its steps.
+    """
+    inside = one[2] & other[2]
+    height, path = ((b - a)[inside] for a, b in zip(one[:2], other[:2], strict=True))
+    steps: Tensor = (float(pupil.index[band]) * height + path).abs() / float(pupil.wavelengths[band])
+    return steps
 
 
 def mask_turns(pupil: Pupil, band: int, step: int = 1) -> Tensor:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -10,6 +10,7 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes._half_precision import refuse_half, refuse_not_finite
 from neusee.nodes.optics._laser_direction import angle_notes
+from neusee.nodes.optics._psf_definition import Geometry, by_definition
 from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
 from neusee.nodes.optics._transform._pupil_field import View
 from neusee.nodes.optics._transform._sample_axis import Axis, centred
@@ -19,15 +20,8 @@ from neusee.nodes.units import Angle, PositiveLength, Shape
 from neusee.nodes.values import Psf, Pupil
 
 
-class _Camera(NamedTuple):
-    """The geometry of lens, sensor and source, in metres, radians and pixels."""
-
-    focal_length: float
-    pixel_pitch: float
-    shape: tuple[int, int]
-    angle: tuple[float, float] = (0.0, 0.0)
-    pixel: str = "point"
-    sensor: str = "point"
+class _Camera(Geometry):
+    """The geometry of lens, sensor and source, to which the direction of a laser is added."""
 
     def towards(self, direction: Tensor | None) -> "_Camera":
         """Return the camera with ``direction`` added to the angle of the source."""
@@ -71,7 +65,10 @@ def psf(
 
 @psf.reference
 def _(pupil: Pupil, direction: Tensor | None = None, *, precision: str = "single", **camera: Any) -> Psf:
-    return _focus(pupil, _Camera(**camera).towards(direction), torch.float64, "direct")
+    given = _Camera(**camera).towards(direction)
+    _agree(pupil)
+    _refuse_aliases(pupil, given)
+    return by_definition(pupil, given)
 
 
 @psf.preflight

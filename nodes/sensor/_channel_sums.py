@@ -31,8 +31,7 @@ def channel_sums(image: Tensor, rows: Tensor) -> Channels:
     bands are the contribution of these bands to the whole.
     """
     exact = torch.zeros((), dtype=torch.float64)
-    light = single(image).sum(-1).sum(-1, dtype=torch.float64)
-    return Channels(weighted(image, rows), rows.detach().double(), light, exact, largest=exact)
+    return Channels(weighted(image, rows), rows.detach().double(), exact, largest=exact)
 
 
 def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:

@@ -51,6 +51,13 @@ CASES = {
         ((pupil(301, 4, height=0.0),), {"shape": (33, 47)}),  # few turns of phase: another path
         ((pupil(1080, 4, height=2e-5),), {"shape": (1000, 999)}),
     ],
+    "metrics.bsr": [
+        ((as_psf(5, 9, 9), rand(5, 17, 33)), {}),
+        ((as_psf(4, 64, 64), rand(2, 4, 21, 20)), {}),
+        ((as_psf(7, 31, 30, dtype=torch.float64), rand(7, 100, 75)), {}),
+        ((as_psf(31, 128, 128), rand(31, 128, 128)), {}),
+        ((as_psf(31, 65, 64),), {}),
+    ],
     "optics.image": [
         ((rand(5, 17, 33), as_psf(5, 9, 9)), {}),
         ((rand(5, 17, 33), as_psf(5, 9, 10)), {"border": "reflect"}),

@@ -113,9 +113,12 @@ def test_half_precision_is_computed_in_single(half):
     psf = psf_of(torch.rand(2, 16, 16, generator=torch.Generator().manual_seed(1)).to(half))
     wide = Psf(psf.intensity.float(), psf.clear_peak)
     one, two = (torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(s)).to(half) for s in (1, 2))
-    for loss in (losses.charbonnier, losses.fft_l1, losses.background_loss):
+    for loss in (losses.charbonnier, losses.fft_l1):
         assert loss(one, two).dtype == torch.float32
         assert float(loss(one, two)) == pytest.approx(float(loss(one.float(), two.float())), rel=1e-6)
+    found = losses.background_loss(psf, one[:2])
+    assert found.dtype == torch.float32
+    assert float(found) == pytest.approx(float(losses.background_loss(wide, one[:2].float())), rel=1e-6)
     assert float(losses.suppression_loss(psf)) == pytest.approx(float(losses.suppression_loss(wide)), rel=1e-6)
     torch.testing.assert_close(metrics.mtf(psf).rms, metrics.mtf(wide).rms)
 
@@ -137,8 +140,8 @@ def test_a_ratio_of_what_is_no_number_is_none():
     picture = torch.rand(2, 5, 5, generator=torch.Generator().manual_seed(1))
     broken = picture.clone()
     broken[0, 2, 2] = math.nan
-    for pair in ((broken, picture), (picture, broken)):
-        assert math.isnan(float(losses.background_loss(*pair)))
+    for kernel, scene in ((broken, picture), (picture, broken), (broken, None)):
+        assert math.isnan(float(losses.background_loss(psf_of(kernel), scene)))
     assert math.isnan(float(losses.suppression_loss(psf_of(broken))))
     assert math.isnan(float(losses.gradient_penalty(broken)))
 
@@ -177,7 +180,7 @@ def test_the_light_of_what_is_no_number_is_not_left_out():
     for rule in ("channel_sum", "per_band"):
         with pytest.raises(ValueError, match="plain_image holds values that are not finite"):
             sensor.level(image, bands, responses, strength=0.7, rule=rule, **SENSOR)
-    assert math.isnan(float(metrics.bsr(image, image)[0]))
+    assert math.isnan(float(metrics.bsr(psf_of(torch.rand(2, 3, 3)), image)[0]))
     raw = torch.zeros(3, 5, 5)
     raw[0, 2, 2] = math.nan
     well = {"full_well": 25500.0, "gain": 1 / 0.37}

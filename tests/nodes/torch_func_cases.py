@@ -51,7 +51,7 @@ PUPIL = Pupil(DISC, DISC, HEIGHT, 0 * HEIGHT, INDEX, BANDS.centres, torch.tensor
 DIRT = Dirt(rand(16, 16, dtype=torch.float32), HEIGHT)
 LOW_RANK = LowRankCube(rand(2, 12, 12), rand(4, 2), torch.zeros(3, 4, dtype=torch.float64))
 ROWS = spectra.rows(BANDS, RESPONSES)
-CHANNELS = Channels(rand(3, 12, 12), rand(3, 4), rand(4), torch.tensor(0.0, dtype=torch.float64))
+CHANNELS = Channels(rand(3, 12, 12), rand(3, 4), torch.tensor(0.0, dtype=torch.float64))
 LEVEL = 1e3 * rand(4)
 DIRECTION = torch.tensor([1e-4, -2e-4], dtype=torch.float64)
 
@@ -129,7 +129,7 @@ CASES = {
     "doe.zernike": Case("coefficients.4", (STOP,), {"coefficients": {4: number(0.3), 6: number(0.1)}}),
     "flare.dirt": Case("grease", (STOP,), {"grease": number(1e-7), "dust": 3.0}),
     "flare.ghosts": Case("0", (rand(3, 12, 12), LINE, DIRECTION), {**LENS, "count": 3, "radius": 3e-5}),
-    "losses.background_loss": Case("0", (SCENE, PLAIN)),
+    "losses.background_loss": Case("0.intensity", (PSF, SCENE)),
     "losses.charbonnier": Case("0", (PICTURE, OTHER)),
     "losses.contrast": Case("0.intensity", (WIDE,)),
     "losses.fft_l1": Case("0", (PICTURE, OTHER)),
@@ -137,8 +137,9 @@ CASES = {
     "losses.suppression_loss": Case("0.intensity", (PSF,)),
     "losses.mrae": Case("0", (SCENE, PLAIN)),
     "losses.wiener": Case("0.intensity", (WIDE, LIGHT, RESPONSES, BANDS)),
-    "metrics.bsr": Case("0", (SCENE, PLAIN)),
+    "metrics.bsr": Case("0.intensity", (PSF, SCENE)),
     "metrics.encircled": Case("0.intensity", (PSF,), {"pixel_pitch": 2.9e-6, "radius": 8e-6}),
+    "metrics.light_outside": Case("0.intensity", (PSF, PUPIL)),
     "metrics.limits": Case("0.clear_peak", (PSF,)),
     "metrics.lsr": Case("0.intensity", (PSF,)),
     "metrics.mtf": Case("0.intensity", (WIDE,)),

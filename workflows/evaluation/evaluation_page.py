@@ -141,7 +141,7 @@ def _between(x: Interval, digits: str) -> str:
 def _suppression(result: EvaluationResult, picture: bytes) -> Section:
     own = next(p.front for p in result.pipelines if p.name == result.reference)
     text = f"""LSR: the brightest pixel of a laser with the mask, divided by the brightest pixel without the mask; BSR:
-        light of the scene in the field, divided by the light with the plain lens, mean over scenes. Energy floor: the
+        share of the scene's light that stays in the field, at most 1, mean over scenes. Energy floor: the
         LSR of light that is spread evenly over the window of the PSF. Stronger: the mean LSR of {own} divided by the
         mean LSR of the mask. The file suppression.csv has LSR and BSR by wavelength."""
     base = float(result.masks[own].lsr.mean())

@@ -39,7 +39,8 @@ FIGURES = tuple(Figure(**figure) for figure in _TABLES["figure"])
 
 def _row(arm: str) -> dict[str, str]:
     """Return the step whose result each column of the result table shows, for the ``plain`` lens or the ``mask``."""
-    steps = {"peak/I_sat": "peak", "LSR": "lsr", "BSR": "bsr", "quality": "developed_quality", "saturated": "saturated"}
+    steps = {"peak/I_sat": "peak", "LSR": "lsr", "BSR": "bsr", "outside": "outside", "quality": "developed_quality",
+             "saturated": "saturated"}  # fmt: skip
     return {column: f"{step}[{arm}]" for column, step in steps.items()}
 
 

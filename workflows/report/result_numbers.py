@@ -18,10 +18,12 @@ _COLUMNS: Mapping[str, tuple[str, str, Callable[[Tensor, int], Any], str]] = {
     "peak/I_sat": ("peak/I_sat", "", lambda x, band: x.max(), "{:.4g}"),
     "LSR": ("LSR", "", lambda x, band: x.flatten()[min(band, x.numel() - 1)], "{:.3g}"),
     "BSR": ("BSR", "", lambda x, band: x.double().mean(), "{:.3f}"),
+    "outside": ("outside", "", lambda x, band: x.double().mean(), "{:.2%}"),
     "PSNR (dB)": ("quality", "psnr", lambda x, band: x, "{:.2f}"),
     "SSIM": ("quality", "ssim", lambda x, band: x, "{:.3f}"),
     "saturated px": ("saturated", "", lambda x, band: x.double().sum(), "{:,.0f}"),
 }
+_OUTSIDE = "BSR: share of the scene's light that stays in the field; outside: light of a point outside the PSF window."
 _DESIGN_WAVELENGTH = 550e-9  #: m, for the LSR in the result table of a recipe without a laser
 _MOST = 4096  #: elements, at most, of a result whose numbers become rows
 
@@ -47,7 +49,8 @@ def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, An
         known = {column: value(step) for column, step in cells.items() if step in keys}
         texts = [_cell(known.get(x), field, number, form, band) for x, field, number, form in _COLUMNS.values()]
         rows.append({"name": name, "cells": texts})
-    legend = [f"LSR at {where}; BSR is the mean over the bands."] if any(r["cells"][1] for r in rows) else []
+    legend = [f"LSR at {where}; BSR and outside are means over the bands.", _OUTSIDE]
+    legend = legend if any(r["cells"][1] for r in rows) else []
     rows = rows if any(any(row["cells"]) for row in rows) else []
     return {"columns": list(_COLUMNS), "rows": rows, "legend": legend}
 

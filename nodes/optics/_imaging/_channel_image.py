@@ -10,8 +10,7 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes.optics._imaging._band_image import Border, image, reach
 from neusee.nodes.optics._imaging._collapsed_plan import Given, choose, with_windows
-from neusee.nodes.optics._imaging._convolve_plan import bordered, convolved, guessed, majorant, rounding
-from neusee.nodes.optics._imaging._light_in_field import flux
+from neusee.nodes.optics._imaging._convolve_plan import convolved, guessed, majorant, rounding
 from neusee.nodes.optics._imaging._psf_energy import passed
 from neusee.nodes.values import Channels, LowRankCube, Psf
 
@@ -38,13 +37,13 @@ def image_channels(
     the error of the low-rank cube is allowed, and the error of the brightest pixel is bounded as well.
 
     Shapes: radiance k planes (y, x), psf.intensity (band, any, any), rows (row, band) -> planes (row, y, x).
-    Units:  those of the radiance times those of the rows; flux those of the radiance.
+    Units:  those of the radiance times those of the rows.
     Error:  `bound`, as a share of the brightest pixel of each row. Proved upper bounds: the residual of the cube,
             by the sum of each PSF (Young's inequality, as for the root mean square; where the border reflects, three
             times that of the scene); of the brightest pixel, the image of the largest residual of each pixel;
             tails, by Young's inequality; kernels, by the sum of their residuals. Estimated, not proved: round-off of
-            the transforms, from the powers of planes and kernels, never less than was measured. Flux: 1e-6, and the
-            residual of the cube. Planes and PSF receive gradients; basis and rows are constants.
+            the transforms, from the powers of planes and kernels, never less than was measured.
+            Planes and PSF receive gradients; basis and rows are constants.
     Raises: ValueError where scene, PSF and rows have different bands, or the scene is a batch.
     Source: linearity of incoherent imaging, Goodman, Introduction to Fourier Optics, 4th ed., ch. 7.
     """
@@ -55,12 +54,10 @@ def image_channels(
     given = _given(radiance, planes, intensity, scaled, border)
     result, bound, kept = _formed(planes, intensity, given, 0.0 if largest else within)
     top = _top(result, radiance, intensity, given) if largest else math.inf
-    wide = bordered(planes, given, (intensity.shape[1], intensity.shape[2]))
-    light = flux(wide, intensity, radiance.basis.detach(), given.size)
     brightest = torch.tensor(top, dtype=torch.float64)
     scale = unit.to(result)[:, None, None]
     result = result * scale if result.requires_grad else result.mul_(scale)
-    return Channels(result, rows.detach().double(), light, bound, kept, brightest)
+    return Channels(result, rows.detach().double(), bound, kept, brightest)
 
 
 @image_channels.reference
@@ -69,7 +66,7 @@ def _(radiance: LowRankCube, psf: Psf, rows: Tensor, *, border: Border = "zero",
     cube = torch.tensordot(radiance.basis.double(), radiance.planes.double(), 1)
     bands = image.hooks.reference(cube, psf, border=border)
     zero = torch.zeros((), dtype=torch.float64)
-    return Channels(torch.tensordot(rows.double(), bands, 1), rows.double(), bands.sum((-2, -1)), zero)
+    return Channels(torch.tensordot(rows.double(), bands, 1), rows.double(), zero)
 
 
 @image_channels.approximation_error
@@ -81,8 +78,8 @@ def _(result: Channels) -> tuple[float, float]:
 def _(result: Channels, *inputs: Any, within: float = 0.0, **params: Any) -> list[Check]:
     planes, kernels, bands, y, x = result.kept.tolist()
     text = (
-        f"{planes} planes and {kernels} kernels of {y} x {x} for {len(result.flux)} bands, "
-        f"{len(result.flux) - bands} left out, within {float(result.bound):.2g}"
+        f"{planes} planes and {kernels} kernels of {y} x {x} for {result.rows.shape[1]} bands, "
+        f"{result.rows.shape[1] - bands} left out, within {float(result.bound):.2g}"
     )
     return [Check(text, within == 0 or float(result.bound) <= within)]
 

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neusee.nodes.metrics import bsr, lsr, peak_irradiance, saturated
+from neusee.nodes.metrics import lsr, peak_irradiance, saturated
 from neusee.nodes.optics import laser_irradiance
 from neusee.nodes.sensor import digitize, expose, full_well, level, saturation
 from neusee.nodes.spectra import rows
@@ -33,16 +33,6 @@ def test_lsr_check_names_the_floor():
     assert lines[0].ok
     assert lines[1].text == "light spread evenly over the field would give a laser suppression ratio of 0.1"
     assert not lsr.hooks.check(torch.tensor([1.2]), psf)[0].ok
-
-
-def test_bsr_is_a_ratio_of_energies():
-    plain = torch.rand(3, 4, 4)
-    plain[2] = 0.0
-    found = bsr(plain * torch.tensor([0.5, 0.9, 1.0])[:, None, None], plain)
-    torch.testing.assert_close(found, torch.tensor([0.5, 0.9, 1.0], dtype=torch.float64), rtol=1e-6, atol=0.0)
-    assert bsr.hooks.check(found)[0].ok
-    with pytest.raises(ValueError, match="differ"):
-        bsr(plain, plain[..., :3])
 
 
 @pytest.mark.parametrize("rounding", ["nearest", "dithered_floor"])
@@ -102,25 +92,17 @@ def test_a_level_of_zero_is_dark():
 
 def channels(light, weights):
     """Sums over the bands of an image, as `optics.image_channels` gives them."""
-    return Channels(torch.tensordot(weights.to(light), light, 1), weights, light.sum((1, 2)).double(), torch.zeros(()))
+    return Channels(torch.tensordot(weights.to(light), light, 1), weights, torch.zeros(()))
 
 
-def test_peak_and_bsr_of_channels_are_those_of_all_bands():
+def test_the_peak_of_channels_is_that_of_all_bands():
     visible, seen = bands(450e-9, 520e-9, 600e-9), torch.tensor([[0.1, 0.9, 0.2]], dtype=torch.float64)
-    scene, kept = torch.rand(3, 6, 7, dtype=torch.float64), torch.rand(3, 6, 7, dtype=torch.float64)
-    both = [channels(x, rows(visible, seen)) for x in (scene, kept)]
+    scene = torch.rand(3, 6, 7, dtype=torch.float64)
+    summed = channels(scene, rows(visible, seen))
     factor = level(scene, visible, seen, strength=0.7, **SENSOR)
     laser = torch.rand(3, 6, 7, dtype=torch.float64)
-    found = [peak_irradiance(x, visible, factor, [laser], [visible], **SENSOR) for x in (scene, both[0])]
+    found = [peak_irradiance(x, visible, factor, [laser], [visible], **SENSOR) for x in (scene, summed)]
     torch.testing.assert_close(*found, rtol=1e-12, atol=0)
-    torch.testing.assert_close(bsr(both[1], both[0]), bsr(kept, scene), rtol=1e-12, atol=0)
-    torch.testing.assert_close(bsr(kept, both[0]), bsr(kept, scene), rtol=1e-12, atol=0)
-    with pytest.raises(ValueError, match="differ in shape"):
-        bsr(both[0], scene[:, :3])
     with pytest.raises(ValueError, match="from every combination of these weights"):
         peak_irradiance(channels(scene, rows(visible, seen)[:1]), visible, factor, **SENSOR)
-    assert (peak_irradiance.accepts_channel_sums, peak_irradiance.needs_band_invariant, bsr.accepts_channel_sums) == (
-        ("image",),
-        ("level",),
-        ("image", "plain_image"),
-    )
+    assert (peak_irradiance.accepts_channel_sums, peak_irradiance.needs_band_invariant) == (("image",), ("level",))

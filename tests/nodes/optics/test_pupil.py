@@ -283,3 +283,15 @@ def test_a_height_of_one_wave_turns_the_phase_once_and_at_twice_the_wavelength_n
     assert turns.shape == (50, 50)
     assert_close(turns, torch.ones(50, 50, dtype=torch.float64), rtol=1e-6, atol=0)
     assert float(optics.mask_turns(pupil(height, wavelengths=(450, 900)), 1).mean()) == pytest.approx(0.485, abs=0.01)
+
+
+def test_phase_steps_on_a_thick_plate_are_exact():
+    """10 mm are 8600 turns, of which float32 holds the steps to 5e-4 turn alone."""
+    grid = stop(64, pitch=30e-6)
+    height = doe.half_rings(grid, waves=(3.0,)) + 10e-3
+    median, share = phase_steps(p := optics.pupil(height, doe.material(bands(532)), bands(532), grid))
+    turns = p.index * height.double() / p.wavelengths
+    lit = p.aperture > 0
+    steps = torch.cat([(turns.diff(dim=d)[lit.narrow(d, 1, 63) & lit.narrow(d, 0, 63)]).abs() for d in (0, 1)])
+    assert median == pytest.approx(float(steps.median()), rel=1e-6)
+    assert share == float((steps > 0.5).double().mean())

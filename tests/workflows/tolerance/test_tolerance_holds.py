@@ -40,8 +40,7 @@ def holds(recipe, result, full):
     assert result.proof.worst <= recipe.tolerance
     for arm in ("plain", "mask"):
         assert error_of(result[f"raw[{arm}]"], full[f"raw[{arm}]"]) <= recipe.tolerance
-        if recipe.steps["image[plain]"].params["border"] == "zero":
-            assert float(result[f"bsr[{arm}]"].max()) <= 1.0 + 1e-2
+        assert float(result[f"bsr[{arm}]"].max()) <= 1.0 + 1e-6
 
 
 @pytest.mark.parametrize("seed", [13, 20])

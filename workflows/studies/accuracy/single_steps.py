@@ -191,7 +191,7 @@ def _compared_value(value: Any) -> Any:
     """Return the tensors of a step's result to compare, for example all bands of a low-rank spectral cube."""
     if isinstance(value, LowRankCube):
         return torch.einsum("bk,kyx->byx", value.basis.to(value.planes), value.planes)
-    return (value.planes, value.flux) if isinstance(value, Channels) else value
+    return value.planes if isinstance(value, Channels) else value
 
 
 def _call(step: Step, function: Any, inputs: list[Any], seed: int, **other: Any) -> Any:

@@ -92,6 +92,11 @@ def _noise(depth: float) -> Callable[[Tensor], Tensor]:
     return change
 
 
+def _plate(height: Tensor) -> Tensor:
+    """Return a random height map of 100 um on a plate of 10 mm, 8600 turns of phase at 532 nm."""
+    return _noise(100e-6)(height) + 10e-3
+
+
 def _steps(height: Tensor) -> Tensor:
     """Return a checkerboard height map with aliased steps of 0.9 waves at 550 nm in fused silica."""
     v, u = (torch.arange(n) for n in height.shape)
@@ -159,6 +164,8 @@ CASES: tuple[Case, ...] = (
     Case("301 bands", "1 nm a band", "spectrum", size=Size(20, 24, 301)),
     Case("height 0", "a flat mask", "height", values=_heights(torch.zeros_like)),
     Case("height 100 um", "a random height map, 80 waves deep", "height", values=_heights(_noise(100e-6))),
+    Case("plate", "a random height map, 80 waves deep, on a plate of 10 mm; the reference is the sum by definition",
+         "height", values=_heights(_plate)),
     Case("steps past pi", "0.9 wave from sample to sample", "height", values=_heights(_steps)),
     Case("wrapped", "100 um wrapped at 550 nm", "height", {"doe.fabricate.wrap_at": 550e-9},
          _heights(_noise(100e-6))),

@@ -191,8 +191,8 @@ def _key(recipe: Recipe, settings: MaskTraining, store: Store | None) -> str:
 def mask_figures(terms: Terms, height: Tensor) -> dict[str, Any]:
     """Return laser suppression, background suppression and contrast of a mask, by spectral band and as means."""
     with torch.no_grad():
-        psf, plain = terms.psf(height), terms.plain()
-        lsr, bsr = metrics.lsr(psf), metrics.bsr(psf.intensity, plain.intensity)
+        psf = terms.psf(height)
+        lsr, bsr = metrics.lsr(psf), metrics.bsr(psf)
         mtf, limits = metrics.mtf(psf), metrics.limits(psf)
     each = {
         "wavelength": terms.bands.centres, "lsr": lsr, "bsr": bsr, "median_mtf": mtf.median, "rms_mtf": mtf.rms,

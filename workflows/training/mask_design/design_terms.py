@@ -105,13 +105,13 @@ class Terms:
 
     def parts(self, height: Tensor, chosen: Sequence[int] | None = None) -> dict[str, Tensor]:
         """Return the terms of the mask loss that have a weight above 0, by name, each as a mean over spectral bands."""
-        psf, plain, settings = self.psf(height, chosen), self.plain(chosen), self.settings
+        psf, settings = self.psf(height, chosen), self.settings
         weights = settings.weights
         sums = {}
         if weights.lsr:
             sums["lsr"] = self._suppression(psf)
         if weights.bsr:
-            sums["bsr"] = losses.background_loss(psf.intensity, plain.intensity)
+            sums["bsr"] = losses.background_loss(psf)
         if weights.contrast:
             sums["contrast"] = losses.contrast(psf, floor=settings.floor, up_to=settings.up_to)
         terms = {name: term / len(psf.intensity) for name, term in sums.items()}

@@ -92,22 +92,20 @@ class Shards:
         """Return the tensors of a step's result that this process sends to the process that completes the picture."""
         if name not in self.rows:
             return band_tensors(value)
-        part = channel_sums(value, self.rows[name][:, self.own])
-        return [part.planes, part.flux]
+        return [channel_sums(value, self.rows[name][:, self.own]).planes]
 
     def ports(self, name: str, sent: Sequence[Tensor]) -> list[Port]:
         """Return an exchange object for each tensor of ``sent``, which exchanges spectral bands or sums over bands."""
         if name in self.rows:
-            return [Sum(self.mesh), Swapped(self.mesh, -1, self.count)]
+            return [Sum(self.mesh)]
         return [Swapped(self.mesh, self.axis(name), self.count) for _ in sent]
 
     def received(self, name: str, like: Any, found: Sequence[Tensor]) -> Any:
         """Assemble the result of a step with all spectral bands from the tensors that other processes sent."""
         if name not in self.rows:
             return with_band_tensors(like, found)
-        planes, flux = found
         exact = self.rows[name].new_zeros(())
-        return Channels(planes, self.rows[name], flux, exact, largest=exact)
+        return Channels(found[0], self.rows[name], exact, largest=exact)
 
 
 def _sampled(recipe: Recipe, name: str) -> set[str]:
