@@ -89,10 +89,18 @@ def sample(
         long = steps >= (_TAUS + _BURN) * tau and (change < _CHANGE or steps >= (_SURELY + _BURN) * tau)
         chains = _gathered(runs, tau, steps, long)
         size = chains.flat.shape[0] / tau
-        progress(f"{steps} steps of {ENSEMBLES} x {walkers} walkers: tau {tau:.1f}, effective sample size {size:.0f}")
-        if (long and size >= wanted) or steps >= _LONGEST:
+        ends = (long and size >= wanted) or steps >= _LONGEST
+        needed = steps if ends else max(int(_GROWTH * steps), _steps_needed(steps, tau, size, wanted))
+        where = f"{steps} of about {needed} steps of {ENSEMBLES} x {walkers} walkers"
+        progress(f"{where}: tau {tau:.1f}, effective sample size {size:.0f}")
+        if ends:
             return chains
         tau_before, steps = tau, int(_GROWTH * steps)
+
+
+def _steps_needed(steps: int, tau: float, size: float, wanted: int) -> int:
+    """Return how many steps the chains need in all, if autocorrelation time and rate of draws stay as they are."""
+    return min(int(max((_TAUS + _BURN) * tau, steps * wanted / max(size, 1.0))), _LONGEST)
 
 
 def _longest_time(runs: Sequence[Walk], steps: int | None = None) -> float:

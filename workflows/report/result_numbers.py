@@ -40,7 +40,7 @@ def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
 
 
 def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, Any]:
-    """Return the result table for plain lens, mask and restored picture, with the rows and columns that have numbers."""
+    """Return the table for plain lens, mask and restored picture, with the rows and columns that have numbers."""
     band, where = _band(recipe, keys, value)
     rows = []
     for name, cells in TABLE.items():

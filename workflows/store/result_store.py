@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from neusee.workflows.store import metadata, payload
 from neusee.workflows.store.bandwidth import Speeds
@@ -45,6 +45,8 @@ class Store(Maintained):
 
     A failure of the folder gives a missing result, never a wrong result.
     """
+
+    failures: ClassVar[list[str]] = []  #: the warnings of all stores of this process, for the reports of studies
 
     def __init__(
         self, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
@@ -187,6 +189,7 @@ class Store(Maintained):
         """Warn that the folder cannot be written, once for each store; `failure` keeps the text for reports."""
         if not self.failure:
             self.failure = f"the cache {self.root} cannot be written ({error}): {_CONSEQUENCE}"
+            self.failures.append(self.failure)
             warnings.warn(self.failure, stacklevel=5)
 
     def _write(self, key: str, value: Any, about: Metadata) -> bool:
