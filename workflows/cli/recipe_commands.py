@@ -67,7 +67,7 @@ def run(
     predicted = {} if silent else _predicted(recipe, store, device)
     table = console.RunTable(cheaper, contents.steps_of(cheaper), console.mode_for(silent), predicted)
     with (
-        resumable(lambda: kept_in(store, f"{table.finished} steps are finished, and their results are")),
+        resumable(lambda: kept_in(store, f"{table.finished} steps are finished, and results that take time are")),
         executor_of(executor, store) as cluster,
         table,
     ):

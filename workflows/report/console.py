@@ -167,7 +167,7 @@ class RunTable(ProgressTable):
     @property
     def finished(self) -> int:
         """Return the number of steps that the run has computed or loaded so far."""
-        return sum(len(family.needed) for family in self.families.values())
+        return sum(d.state in ("run", "cached") for family in self.families.values() for d in family.done)
 
     def caption(self) -> str:
         """Return the time that is left, or how many steps were neither computed nor loaded in the end."""
