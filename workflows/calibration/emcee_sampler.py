@@ -7,9 +7,11 @@ continues from the last round and gives the same draws, to the last bit, as a ru
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import emcee
@@ -80,19 +82,27 @@ def sample(
     moves = move(how)
     runs = [start_ensemble(problem, mode, file, index, seed, walkers, moves) for index in range(ENSEMBLES)]
     before, steps = _round(min(run.iteration for run in runs))
-    tau_before = _longest_time(runs, before) if before else np.inf
+    tau_before, kept = _longest_time(runs, before) if before else np.inf, True
     while True:
         walk_until(runs, steps, problem.log_posterior)
-        _keep(file, [run.backend for run in runs], progress)
+        kept = _keep(file, [run.backend for run in runs], progress if kept else silent)
         tau = _longest_time(runs)
         change = abs(tau - tau_before) / tau
         long = steps >= (_TAUS + _BURN) * tau and (change < _CHANGE or steps >= (_SURELY + _BURN) * tau)
         chains = _gathered(runs, tau, steps, long)
         size = chains.flat.shape[0] / tau
-        progress(f"{steps} steps of {ENSEMBLES} x {walkers} walkers: tau {tau:.1f}, effective sample size {size:.0f}")
-        if (long and size >= wanted) or steps >= _LONGEST:
+        ends = (long and size >= wanted) or steps >= _LONGEST
+        needed = steps if ends else max(int(_GROWTH * steps), _steps_needed(steps, tau, size, wanted))
+        where = f"{steps} of about {needed} steps of {ENSEMBLES} x {walkers} walkers"
+        progress(f"{where}: tau {tau:.1f}, effective sample size {size:.0f}")
+        if ends:
             return chains
         tau_before, steps = tau, int(_GROWTH * steps)
+
+
+def _steps_needed(steps: int, tau: float, size: float, wanted: int) -> int:
+    """Return how many steps the chains need in all, if autocorrelation time and rate of draws stay as they are."""
+    return min(int(max((_TAUS + _BURN) * tau, steps * wanted / max(size, 1.0))), _LONGEST)
 
 
 def _longest_time(runs: Sequence[Walk], steps: int | None = None) -> float:
@@ -161,9 +171,9 @@ def _gathered(runs: Sequence[Walk], tau: float, steps: int, long: bool) -> Chain
 
 def _read(file: Path, index: int) -> Any:
     """Read the draws of an ensemble into a backend in memory; return None if the file cannot be read."""
-    if not file.is_file():
-        return None
     try:
+        if not file.is_file():
+            return None
         kept = emcee.backends.HDFBackend(str(file), name=f"ensemble{index}", read_only=True)
         memory = emcee.backends.Backend()
         memory.reset(*kept.shape)
@@ -175,32 +185,44 @@ def _read(file: Path, index: int) -> Any:
     return memory
 
 
-def _keep(file: Path, backends: Sequence[Any], progress: Progress) -> None:
-    """Write the draws to a file; if this fails, for example on a full disk, report the error and continue."""
+def _keep(file: Path, backends: Sequence[Any], progress: Progress) -> bool:
+    """Write the draws to a file; if this fails, for example on a full disk, report the error and return False."""
     try:
         _write(file, backends)
     except (OSError, RuntimeError) as error:  # h5py raises both
         progress(f"the draws are not on disk, so an interruption would lose them: {error}")
+        return False
+    return True
 
 
 def _write(file: Path, backends: Sequence[Any]) -> None:
-    """Write the draws of all ensembles to one file with an atomic rename."""
+    """Write the draws of all ensembles to one file with an atomic rename.
+
+    HDF5 writes to a temporary folder first, because after an error of the disk it can no longer close its file.
+    """
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_suffix(f".{os.getpid()}.part")
     try:
-        for index, memory in enumerate(backends):
-            kept = emcee.backends.HDFBackend(str(part), name=f"ensemble{index}")
-            kept.reset(*memory.shape)
-            kept.grow(memory.iteration, None)
-            with kept.open("a") as opened:
-                group = opened[kept.name]
-                group["chain"][...], group["log_prob"][...] = memory.chain, memory.log_prob
-                group["accepted"][...] = memory.accepted
-                group.attrs["iteration"] = memory.iteration
-                for i, value in enumerate(memory.random_state):
-                    group.attrs[f"random_state_{i}"] = value
+        with TemporaryDirectory(prefix="neusee-") as folder:
+            whole = Path(folder) / "draws.h5"
+            _write_draws(whole, backends)
+            shutil.copyfile(whole, part)
         with open(part, "rb") as written:
             os.fsync(written.fileno())
         os.replace(part, file)
     finally:
         part.unlink(missing_ok=True)
+
+
+def _write_draws(path: Path, backends: Sequence[Any]) -> None:
+    for index, memory in enumerate(backends):
+        kept = emcee.backends.HDFBackend(str(path), name=f"ensemble{index}")
+        kept.reset(*memory.shape)
+        kept.grow(memory.iteration, None)
+        with kept.open("a") as opened:
+            group = opened[kept.name]
+            group["chain"][...], group["log_prob"][...] = memory.chain, memory.log_prob
+            group["accepted"][...] = memory.accepted
+            group.attrs["iteration"] = memory.iteration
+            for i, value in enumerate(memory.random_state):
+                group.attrs[f"random_state_{i}"] = value

@@ -5,10 +5,11 @@ from __future__ import annotations
 import gc
 import os
 import sys
+import warnings
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.cli.command_list import BAD, COLUMNS, DONE, FAILED, INTERRUPTED, help_page
+from neusee.workflows.cli.command_list import BAD, COLUMNS, DONE, FAILED, INTERRUPTED, TYPED, help_page
 
 if TYPE_CHECKING:
     import typer
@@ -27,6 +28,7 @@ def __getattr__(name: str) -> Any:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit; print an error as one line, or with ``--debug`` as a traceback."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    TYPED[:] = arguments
     gc.disable()  # a search for garbage among imported modules takes a tenth of the start-up time
     try:
         sys.exit(_run(arguments))
@@ -34,7 +36,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.stderr.close()
         sys.exit(DONE)
     except KeyboardInterrupt:
-        print("stopped; finished results are kept, and the next run continues from there", file=sys.stderr)
+        print("stopped; finished results are kept, and the same command goes on from there", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except Exception as error:
         if "--debug" in arguments:
@@ -47,9 +49,12 @@ def _run(arguments: list[str]) -> int:
     if arguments in (["--help"], ["-h"]) and not completes and get_terminal_size().columns >= COLUMNS:
         print(help_page())
         return DONE
+    from neusee.workflows.cli.interruption import print_warning
     from neusee.workflows.cli.typer_program import run_program
 
-    return run_program(arguments, completes)
+    with warnings.catch_warnings():
+        warnings.showwarning = print_warning
+        return run_program(arguments, completes)
 
 
 def _explained(error: Exception) -> int:

@@ -10,7 +10,8 @@ import typer
 
 from neusee.workflows.cli.command_frame import fail, failing, load, say, the_store
 from neusee.workflows.cli.command_list import FAILED, MISSED
-from neusee.workflows.cli.command_options import Debug, Out, Quiet, Words, option_words, progress_lines
+from neusee.workflows.cli.command_options import AsJson, Debug, Out, Quiet, Words, option_words, progress_lines
+from neusee.workflows.cli.interruption import kept_in, require_writable, resumable, say_folder
 
 
 def calibrate(
@@ -21,6 +22,7 @@ def calibrate(
     ] = "de",
     draws: Annotated[int, typer.Option("--draws", min=100, help="Least number of independent draws.")] = 1000,
     quiet: Quiet = False,
+    as_json: AsJson = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
@@ -31,6 +33,8 @@ def calibrate(
     continue. Needs: pip install -e ".[calibrate]".
     """
     recipe, command = load(words, "calibrate")
+    require_writable(out)
+    store = the_store()
     from neusee.workflows.api import verbs
     from neusee.workflows.calibration.run_calibration import CalibrationRefused
     from neusee.workflows.graph.run_error import RunError
@@ -38,16 +42,17 @@ def calibrate(
     options: dict[str, Any] = {"walkers": walkers, "move": move, "draws": draws}
     command += option_words(options)
     with (
+        resumable(lambda: kept_in(store, "the draws up to the last line above are")),
         failing(RunError, ValueError, ImportError, code=FAILED),
         failing(CalibrationRefused, code=FAILED, before="refused, nothing was drawn: "),
     ):
         folder = verbs.calibrate(
-            recipe, store=the_store(), out=out, command=command, progress=progress_lines(quiet), **options
+            recipe, store=store, out=out, command=command, progress=progress_lines(quiet or as_json), **options
         )
     document = json.loads((folder / "posterior.json").read_text())
-    if not quiet:
+    if not quiet and not as_json:
         say(_lines(document["parameters"]))
-    say([str(folder / "report.html")])
+    say_folder(folder, as_json)
     if count := document["failed"]:
         wrong = "; ".join(f"{c['name']}: {c['found']}" for c in document["checks"] if c["mark"] == "fail")
         fail(f"not fit for use: {count} checks fail ({wrong}); see {folder / 'report.html'}", MISSED)

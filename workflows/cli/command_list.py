@@ -7,6 +7,8 @@ from textwrap import fill
 
 DONE, FAILED, BAD, MISSED, INTERRUPTED = 0, 1, 2, 3, 130  #: exit codes
 
+TYPED: list[str] = []  #: the arguments of the command that runs, as the user typed them
+
 SUMMARY = (
     "Simulate what a laser does to a camera: its light, its glass and its sensor, as recipes. "
     "Start with `neusee run`. Each command explains itself: `neusee run --help`."

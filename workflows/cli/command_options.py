@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from neusee.workflows.cli.command_frame import fail, failing
+from neusee.workflows.report.text_table import lasts
 from neusee.workflows.store.byte_sizes import parse_size
 
 if TYPE_CHECKING:
@@ -29,6 +31,7 @@ Debug = Annotated[bool, typer.Option("--debug", help="Show where in the code an 
 Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu.")]
 OneDevice = Annotated[str, typer.Option("--device", help="Where to compute: cpu or cuda.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print only the path of the page.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object, and nothing else.")]
 Exact = Annotated[bool, typer.Option("--exact", help="Compute every step in full; omit nothing.")]
 Memory = Annotated[
     str, typer.Option("--memory", help="Limit of a device's memory, such as 6 GB, as far as earlier runs tell.")
@@ -46,14 +49,49 @@ def _writable(out: Path) -> Path:
 Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the folder of results.", callback=_writable)]
 
 
+_COUNT = re.compile(r"(?P<what>(?:stage \d, )?\D{0,20})(?P<done>\d+)(?: draws)?(?: of |/)(?:about )?(?P<all>\d+)\b")
+
+
+class ProgressLines:
+    """A printer of lines of progress, which adds the time that is left to a line with a count, such as ``3 of 20``."""
+
+    def __init__(self, quiet: bool, clock: Callable[[], float] = time.monotonic) -> None:
+        self._quiet, self._clock, self._before = quiet, clock, clock()
+        self._began: dict[str, tuple[float, int]] = {}  #: by kind of line: time and count from which the rate is taken
+        self._last: dict[str, int] = {}
+
+    def __call__(self, line: str) -> None:
+        if not self._quiet:
+            print(f"{line}{self._left(line)}", flush=True)
+
+    def _left(self, line: str) -> str:
+        now, before = self._clock(), self._before
+        self._before = now
+        if not (count := _COUNT.match(line)):
+            return ""
+        what, done, whole = count["what"], int(count["done"]), int(count["all"])
+        if what not in self._began or done <= self._last[what]:  # a stopped study may begin with any count
+            self._began[what] = (before, 0) if done == 1 else (now, done)
+        self._last[what] = done
+        began, first = self._began[what]
+        if done == first:
+            return ""
+        seconds = (now - began) / (done - first) * (whole - done)
+        return f"; about {lasts(seconds)} left" if seconds >= 1 else ""
+
+
 def progress_lines(quiet: bool) -> Callable[[str], None]:
     """Return a function that prints a line of progress, or that prints nothing if ``quiet`` is True."""
-    return (lambda line: None) if quiet else partial(print, flush=True)
+    return ProgressLines(quiet)
 
 
 def option_words(options: Mapping[str, Any]) -> list[str]:
-    """Return ``--name value``, or ``--name`` for True, for each option; omit options that are False, 0 or empty."""
-    return [f"--{name}" if value is True else f"--{name} {value}" for name, value in options.items() if value]
+    """Return the words ``--name`` and ``value`` of each option; omit options that are False, 0 or empty.
+
+    The value True has no word.
+    """
+    given = {name: value for name, value in options.items() if value}
+    return [word for name, value in given.items() for word in (f"--{name}", str(value))[: 1 if value is True else 2]]
 
 
 def check_device(device: str) -> None:
@@ -80,6 +118,8 @@ def executor_of(place: str, store: Store) -> Iterator[Executor | None]:
     if not (kind == "dask" and (not count or count == "here" or count.isdecimal())) and "://" not in place:
         fail(f"--executor {place}: write local, dask, dask:4, or a scheduler's address such as tcp://host:8786")
     try:
+        import distributed  # noqa: F401
+
         from neusee.workflows.engine.dask_executor import cluster
     except ModuleNotFoundError as error:
         fail(f'--executor {place}: {error.name} is not installed: pip install "neusee[distributed]"')

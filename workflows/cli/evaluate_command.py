@@ -7,9 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, say, split, the_store
+from neusee.workflows.cli.command_frame import fail, failing, split, the_store
 from neusee.workflows.cli.command_list import FAILED
 from neusee.workflows.cli.command_options import (
+    AsJson,
     Debug,
     OneDevice,
     Out,
@@ -19,6 +20,7 @@ from neusee.workflows.cli.command_options import (
     option_words,
     progress_lines,
 )
+from neusee.workflows.cli.interruption import kept_in, require_writable, resumable, say_folder
 
 
 def evaluate(
@@ -36,6 +38,7 @@ def evaluate(
         str, typer.Option("--reference", help="Pipeline that the others are compared with; by default the first.")
     ] = "",
     device: OneDevice = "cpu",
+    as_json: AsJson = False,
     quiet: Quiet = False,
     debug: Debug = False,
     out: Out = Path("runs"),
@@ -49,7 +52,15 @@ def evaluate(
     """
     name, changes, _ = split(words)
     check_device(device)
-    options = {"data": data, "scenes": scenes, "strengths": strengths, "small": small, "reference": reference}
+    require_writable(out)
+    options = {
+        "pipelines": pipelines,
+        "data": data,
+        "scenes": scenes,
+        "strengths": strengths,
+        "small": small,
+        "reference": reference,
+    }
     folder = _evaluate(
         name,
         changes=changes,
@@ -61,19 +72,21 @@ def evaluate(
         reference=reference.replace(" ", ""),
         device=device,
         out=out,
-        progress=progress_lines(quiet),
-        command=["neusee", "evaluate", name, *changes, f'--pipelines "{pipelines}"', *option_words(options)],
+        progress=progress_lines(quiet or as_json),
+        command=["neusee", "evaluate", name, *changes, *option_words(options)],
     )
-    say([str(folder / "report.html")])
+    say_folder(folder, as_json)
 
 
 def _evaluate(name: str, **options: Any) -> Path:
+    store = the_store()
     from neusee.workflows.api import verbs
     from neusee.workflows.evaluation.pipelines import EvaluationRefused
     from neusee.workflows.graph.run_error import RunError
 
-    with failing(EvaluationRefused), failing(RunError, code=FAILED):
-        return verbs.evaluate(name, store=the_store(), **options)
+    kept = resumable(lambda: kept_in(store, "the points that are finished are"))
+    with kept, failing(EvaluationRefused), failing(RunError, code=FAILED):
+        return verbs.evaluate(name, store=store, **options)
 
 
 def _numbers(text: str) -> list[float]:

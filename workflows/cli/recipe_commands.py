@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import json
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +12,7 @@ import typer
 from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, the_store
 from neusee.workflows.cli.command_list import FAILED, MISSED
 from neusee.workflows.cli.command_options import (
+    AsJson,
     Debug,
     Device,
     Exact,
@@ -21,6 +23,7 @@ from neusee.workflows.cli.command_options import (
     executor_of,
     memory_limit,
 )
+from neusee.workflows.cli.interruption import kept_in, print_warning, require_writable, resumable, say_json
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -33,7 +36,7 @@ Where = Annotated[
 
 def run(
     words: Words = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of the table.")] = False,
+    as_json: AsJson = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the report.")] = False,
     debug: Debug = False,
     device: Device = "cpu",
@@ -53,24 +56,59 @@ def run(
     from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
     check_device(device)
+    require_writable(out)
     limit, silent = memory_limit(memory), as_json or quiet
     if not silent:
-        say(console.opening(recipe, " ".join(command[1:])))
+        say(console.opening(recipe, shlex.join(command[1:])))
     store = the_store()
     if limit is not None:
         _refuse_too_large(recipe, store, device, limit)
     cheaper = with_substitutions(recipe, contents.wanted(recipe))
-    table = console.RunTable(cheaper, contents.steps_of(cheaper), console.mode_for(silent))
-    with executor_of(executor, store) as cluster, table:
+    predicted = {} if silent else _predicted(recipe, store, device)
+    table = console.RunTable(cheaper, contents.steps_of(cheaper), console.mode_for(silent), predicted)
+    with (
+        resumable(lambda: kept_in(store, f"{table.finished} steps are finished, and results that take time are")),
+        executor_of(executor, store) as cluster,
+        table,
+    ):
         done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit)
     if as_json:
-        say([json.dumps({"report": str(done.page), **done.document}, ensure_ascii=False)])
+        say_json({"report": str(done.page), **done.document})
     elif quiet:
         say([str(done.page)])
     else:
-        say(console.closing(done.document, str(done.page), console.next_commands(recipe)))
+        hints = console.next_commands(recipe, command[2 : -1 if exact else None], _loads)
+        say(console.closing(done.document, str(done.page), hints))
+    for line in done.document["warnings"] if silent else ():
+        print_warning(line)
     if done.document["missed"]:
         raise typer.Exit(MISSED)
+
+
+def _predicted(recipe: Recipe, store: Store, device: str) -> dict[str, float]:
+    """Print how long a run will take, as far as earlier runs tell; return the predicted seconds of each step."""
+    from neusee.workflows.engine.local_executor import lanes_of
+    from neusee.workflows.explain.run_forecast import planned
+    from neusee.workflows.report.console import forecast_line
+
+    plan = planned(recipe, store, lanes_of(device.split(",")))
+    slots = plan.schedule.slots if plan.schedule else ()
+    unknown = sum(not estimate.known for estimate in plan.expected.values())
+    if line := forecast_line(plan.schedule.makespan if plan.schedule else 0.0, len(plan.expected), unknown):
+        say([line])
+    return {slot.task: slot.end - slot.start for slot in slots if plan.expected[slot.task].known}
+
+
+def _loads(words: Sequence[str]) -> bool:
+    """Return True if a recipe with its changes has no mistake."""
+    from neusee.workflows.graph.diagnostics import RecipeError
+    from neusee.workflows.recipe.loading import load as read
+
+    try:
+        read(words[0], list(words[1:]))
+    except RecipeError:
+        return False
+    return True
 
 
 def _refuse_too_large(recipe: Recipe, store: Store, device: str, memory: int) -> None:
@@ -82,19 +120,23 @@ def _refuse_too_large(recipe: Recipe, store: Store, device: str, memory: int) ->
         fail(f"--memory: {refused}")
 
 
-def validate(words: Words = None, debug: Debug = False) -> None:
+def validate(words: Words = None, as_json: AsJson = False, debug: Debug = False) -> None:
     """Check a recipe without running it.
 
     All mistakes are listed at once, each with its file, line and column and the nearest known name.
     """
     recipe, command = load(words, "run")
-    from neusee.workflows.report.console import opening
+    from neusee.workflows.report.console import contents_of, opening
 
-    say(opening(recipe, " ".join(command[1:])))
+    if as_json:
+        say_json({"valid": True, "command": shlex.join(command), **contents_of(recipe)})
+    else:
+        say(opening(recipe, shlex.join(command[1:])))
 
 
 def plan(
     words: Words = None,
+    as_json: AsJson = False,
     debug: Debug = False,
     device: Device = "cpu",
     memory: Memory = "",
@@ -109,16 +151,19 @@ def plan(
     a step that never ran shows a question mark. With --devices the run is simulated on machines that you do not
     have: makespan, utilisation and critical path.
     """
-    recipe, _ = load(words, exact=exact)
+    recipe, command = load(words, "plan", exact=exact)
     from neusee.workflows.explain import run_forecast
 
     check_device(device)
     if devices:
         with refusing():
-            say(run_forecast.simulated_lines(recipe, the_store(), devices))
-        return
-    lines, refused = run_forecast.plan_lines(recipe, the_store(), device, memory_limit(memory))
-    say(lines)
+            lines, refused = run_forecast.simulated_lines(recipe, the_store(), devices), False
+    else:
+        lines, refused = run_forecast.plan_lines(recipe, the_store(), device, memory_limit(memory))
+    if as_json:
+        say_json({"command": shlex.join(command), "refused": refused, "lines": lines})
+    else:
+        say(lines)
     if refused:
         raise typer.Exit(FAILED)
 

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, load, say, the_store
+from neusee.workflows.cli.command_frame import fail, failing, load, the_store
 from neusee.workflows.cli.command_list import FAILED
 from neusee.workflows.cli.command_options import (
+    AsJson,
     Debug,
     OneDevice,
     Out,
@@ -20,6 +21,7 @@ from neusee.workflows.cli.command_options import (
     option_words,
     progress_lines,
 )
+from neusee.workflows.cli.interruption import kept_in, require_writable, resumable, say_folder
 
 if TYPE_CHECKING:
     from neusee.workflows.api.verbs import Kind
@@ -51,6 +53,7 @@ def accuracy(
     seeds: Annotated[int, typer.Option("--seeds", min=1, help="Number of noise draws for the error bars.")] = 3,
     quick: Annotated[bool, typer.Option("--quick", help="Use fewer points.")] = False,
     quiet: Quiet = False,
+    as_json: AsJson = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
@@ -58,27 +61,39 @@ def accuracy(
 
     The tolerances and the settings of accuracy are varied; the page names the cheapest setting for each error.
     """
-    _run("accuracy", words, quiet, out, seeds=seeds, quick=quick)
+    _run("accuracy", words, quiet, as_json, out, seeds=seeds, quick=quick)
 
 
 @study.command()
-def stability(words: Words = None, quiet: Quiet = False, debug: Debug = False, out: Out = Path("runs")) -> None:
+def stability(
+    words: Words = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    out: Out = Path("runs"),
+) -> None:
     """Compare the steps of a recipe with float64 in stiff and extreme cases.
 
     Values and gradients are compared: each case passes, warns or fails with its number. The exit code is 1 if
     a case fails.
     """
-    _run("stability", words, quiet, out)
+    _run("stability", words, quiet, as_json, out)
 
 
 @study.command("leave-out")
-def leave_out(words: Words = None, quiet: Quiet = False, debug: Debug = False, out: Out = Path("runs")) -> None:
+def leave_out(
+    words: Words = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    out: Out = Path("runs"),
+) -> None:
     """Measure the effect and the saved time of each omitted step.
 
     Each omitted step is computed in full as well. The page has the stated bound, the measured change and the
     seconds saved, and what simpler scenes cost. The exit code is 1 if a change exceeds its bound.
     """
-    _run("leave-out", words, quiet, out)
+    _run("leave-out", words, quiet, as_json, out)
 
 
 @study.command()
@@ -89,6 +104,7 @@ def calibration(
     ] = 200,
     move: Annotated[Move, typer.Option("--move", help="Move of the walkers.")] = Move.DE,
     quiet: Quiet = False,
+    as_json: AsJson = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
@@ -98,7 +114,7 @@ def calibration(
     posterior (simulation-based calibration, SBC). The page also shows the effect of doubling the width of each prior.
     The exit code is 1 if ranks or coverage are wrong.
     """
-    _run("calibration", words, quiet, out, simulations=simulations, move=move.value)
+    _run("calibration", words, quiet, as_json, out, simulations=simulations, move=move.value)
 
 
 @study.command()
@@ -117,6 +133,7 @@ def uncertainty(
     ] = 0,
     device: OneDevice = "cpu",
     quiet: Quiet = False,
+    as_json: AsJson = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:
@@ -128,21 +145,22 @@ def uncertainty(
     """
     check_device(device)
     how = {"error": error, "most": most, "points": points.value, "workers": workers, "device": device}
-    _run("uncertainty", words, quiet, out, **how)
+    _run("uncertainty", words, quiet, as_json, out, **how)
 
 
-def _run(kind: Kind, words: list[str] | None, quiet: bool, out: Path, **options: Any) -> None:
+def _run(kind: Kind, words: list[str] | None, quiet: bool, as_json: bool, out: Path, **options: Any) -> None:
     recipe, command = load(words, "study", kind)
+    require_writable(out)
+    store = the_store()
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
     from neusee.workflows.studies.run_study import count_failures
 
     command += option_words(options)
-    progress = progress_lines(quiet)
-    with failing(RunError, ValueError, ImportError, code=FAILED):
-        folder = verbs.study(
-            recipe, kind=kind, store=the_store(), out=out, command=command, progress=progress, **options
-        )
-    say([str(folder / "report.html")])
+    progress = progress_lines(quiet or as_json)
+    kept = resumable(lambda: kept_in(store, "the parts that are finished are"))
+    with kept, failing(RunError, ValueError, ImportError, code=FAILED):
+        folder = verbs.study(recipe, kind=kind, store=store, out=out, command=command, progress=progress, **options)
+    say_folder(folder, as_json)
     if count := count_failures(folder):
         fail(f"{count} do not hold: see {folder / 'report.html'}", FAILED)

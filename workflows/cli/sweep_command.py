@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from neusee.workflows.cli.command_frame import fail, refusing, split, the_store
-from neusee.workflows.cli.command_options import Debug, Device, Out, Words, check_device
+from neusee.workflows.cli.command_options import AsJson, Debug, Device, Out, Words, check_device
+from neusee.workflows.cli.interruption import kept_in, require_writable, resumable
 
 
 def sweep(
@@ -20,6 +21,7 @@ def sweep(
         str, typer.Option("--on-error", help="After a failed point: stop, or continue with the next.")
     ] = "stop",
     netcdf: Annotated[bool, typer.Option("--netcdf", help="Write sweep.nc too (needs neusee[xarray]).")] = False,
+    as_json: AsJson = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the table.")] = False,
     debug: Debug = False,
     device: Device = "cpu",
@@ -34,9 +36,11 @@ def sweep(
     if on_error not in ("stop", "continue"):
         fail(f"--on-error {on_error}: write stop or continue")
     check_device(device)
+    require_writable(out)
+    store = the_store()
     from neusee.workflows.cli.sweep_screen import run_sweep
 
-    with refusing():
+    with refusing(), resumable(lambda: kept_in(store, "the points that are finished are")):
         code = run_sweep(
             name,
             words,
@@ -46,8 +50,9 @@ def sweep(
             netcdf=netcdf,
             device=device,
             out=out,
-            store=the_store(),
+            store=store,
             quiet=quiet,
+            as_json=as_json,
         )
     if code:
         raise typer.Exit(code)

@@ -8,17 +8,19 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.cli.command_list import DONE, FAILED, INTERRUPTED
+from neusee.workflows.cli.interruption import say_json
 from neusee.workflows.report.console import Mode, ProgressTable, mode_for
+from neusee.workflows.report.text_table import lasts
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import read_words
 from neusee.workflows.sweeps.sweep_files import require_xarray
 from neusee.workflows.sweeps.sweep_points import OnError, PointOutcome, outcomes
 from neusee.workflows.sweeps.sweep_run import Sweep, Sweeping, SweepState, counted, write_sweep
-from neusee.workflows.sweeps.sweep_table import AxisColumn, cell_text, headline, lasts, point_cells
+from neusee.workflows.sweeps.sweep_table import AxisColumn, cell_text, headline, point_cells
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.step_record import Event
@@ -40,10 +42,12 @@ def run_sweep(
     out: Path = Path("runs"),
     store: Store | None = None,
     quiet: bool = False,
+    as_json: bool = False,
 ) -> int:
     """Run, show and write a sweep to ``out/sweeps/<date>_<recipe>_<key>/``; return the exit code of the command.
 
-    ``words`` are the changes and axes; the first of them is argument ``first`` of the command line.
+    With ``as_json`` the result is printed as one JSON object, and nothing else. ``words`` are the changes and axes;
+    the first of them is argument ``first`` of the command line.
     Raises: RecipeError with every mistake of every point, before anything runs.
     """
     if netcdf:
@@ -51,19 +55,36 @@ def run_sweep(
     began, place = time.perf_counter(), Path().absolute()
     work = Sweeping(recipe, read_words(words, place, first), place, store or open_store(), zip, device)
     again = _command(recipe, words, zip, on_error, netcdf, device, out)
-    if not quiet:
+    silent = quiet or as_json
+    if not silent:
         print(*_opening(work), sep="\n", flush=True)
-    done, state, error = _run_points(work, on_error, quiet)
+    done, state, error = _run_points(work, on_error, silent)
     if error is not None and not (on_error == "stop" and done and done[-1].state == "failed"):
         raise error
     result = work.sweep(done, state)
     path = write_sweep(work, result, again, out, netcdf, time.perf_counter() - began)
-    if quiet:
+    if silent:
         print(*_failures(result), sep="\n", end="\n" if result.failed else "", file=sys.stderr)
-        print(path / "sweep.csv", flush=True)
+        if as_json:
+            say_json(_document(result, path, again))
+        else:
+            print(path / "sweep.csv", flush=True)
     else:
-        print(*_closing(result, path, again, time.perf_counter() - began), sep="\n", flush=True)
+        print(*_closing(result, path, again, time.perf_counter() - began, work.store.failure), sep="\n", flush=True)
     return INTERRUPTED if state == "interrupted" else FAILED if result.failed else DONE
+
+
+def _document(result: Sweep, path: Path, again: Sequence[str]) -> dict[str, Any]:
+    """Return the result of a sweep for ``--json``: its table, its state, and every number of every point."""
+    return {
+        "table": str(path / "sweep.csv"),
+        "command": shlex.join(again),
+        "recipe": result.recipe,
+        "state": result.state,
+        "points": result.points,
+        "failed": [{"point": o.point.number, "step": o.step, "message": o.message} for o in result.failed],
+        "rows": result.rows,
+    }
 
 
 def _opening(work: Sweeping) -> Iterator[str]:
@@ -106,14 +127,17 @@ def _command(
     return ["neusee", "sweep", recipe, *words, *options]
 
 
-def _closing(result: Sweep, path: Path, again: Sequence[str], seconds: float) -> Iterator[str]:
+def _closing(result: Sweep, path: Path, again: Sequence[str], seconds: float, failure: str) -> Iterator[str]:
     """Yield the lines that appear on the screen after the end of a sweep."""
     yield ""
     yield f"{counted(result)}  ({lasts(seconds)})"
     yield from (f"  {line}" for line in _failures(result))
     yield f"table    {path / 'sweep.csv'}"
+    if failure:
+        yield f"warning  {failure}"
     if result.state != "complete":
-        yield f"partial: what is done is kept; to go on: {shlex.join(again)}"
+        kept = "nothing is kept in the cache" if failure else "what is done is kept"
+        yield f"partial: {kept}; to go on: {shlex.join(again)}"
 
 
 def _failures(result: Sweep) -> Iterator[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shlex
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from enum import StrEnum
@@ -12,7 +14,8 @@ import typer
 
 from neusee.workflows.cli.command_frame import fail, failing, load, say, the_store
 from neusee.workflows.cli.command_list import FAILED
-from neusee.workflows.cli.command_options import Debug, Out, Words, check_device, progress_lines
+from neusee.workflows.cli.command_options import AsJson, Debug, Out, ProgressLines, Words, check_device, progress_lines
+from neusee.workflows.cli.interruption import kept_training, require_writable, resumable, say_json
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -29,6 +32,7 @@ class Stages(StrEnum):
 
 _STAGES = "1: mask and network; 2: network alone; both: 1, then 2; mask: mask alone, without images."
 _MESH = "DATAxBAND processes of torchrun: 4x2, four groups that share the bands by two; else all share the data."
+_LINES = 10  #: lines of progress for a stage, outside a terminal
 _NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.MASK: (0,)}  #: the `stages` that `verbs.train` takes
 
 
@@ -37,6 +41,7 @@ def train(
     stage: Annotated[Stages, typer.Option("--stage", help=_STAGES)] = Stages.BOTH,
     device: Annotated[str, typer.Option("--device", help="Where to train: cpu or cuda.")] = "cpu",
     mesh: Annotated[str, typer.Option("--mesh", help=_MESH)] = "",
+    as_json: AsJson = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the folder.")] = False,
     debug: Debug = False,
     out: Out = Path("runs"),
@@ -52,50 +57,62 @@ def train(
     --mesh 4x2.
     """
     recipe, command = load(words or ["train_small"], "train")
+    require_writable(out)
     if recipe.lifting is not None:
         if stage is not Stages.BOTH or mesh:
             fail(f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage and --mesh out")
         check_device(device)
-        return _lift(recipe, command, out, device, quiet)
+        return _lift(recipe, command, out, device, quiet, as_json)
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
     from neusee.workflows.training.parallel.process_mesh import MeshError, device_here, joined, processes
 
     device, (rank, world) = device_here(device), processes()
     check_device(device)
-    quiet, who = quiet or rank > 0, f"process {rank}: " if world > 1 else ""
+    silent, who = quiet or as_json or rank > 0, f"process {rank}: " if world > 1 else ""
     stages = _NUMBERS.get(stage, recipe.training.learnt if recipe.training else ())
     command += ["--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
     lengths = {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
     with (
+        resumable(lambda: kept_training(out, recipe.name)),
         failing(RunError, ValueError, ArithmeticError, code=FAILED, before=who),
         failing(MeshError, before=who),
         joined(mesh, device) as processes_here,
-        _loss_bar(quiet, lengths) as watch,
+        _loss_bar(silent, lengths) as watch,
     ):
-        folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(quiet),
+        folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(silent),
                              command=command, stages=stages, watch=watch, mesh=processes_here)  # fmt: skip
-    if not quiet:
-        say(_next(folder, stage))
     if rank == 0:
-        say([str(folder)])
+        _say_results(folder, as_json, [] if silent else _next(folder, stage))
 
 
-def _lift(recipe: Recipe, command: list[str], out: Path, device: str, quiet: bool) -> None:
+def _say_results(folder: Path, as_json: bool, lines: list[str]) -> None:
+    """Print ``lines`` and the folder of a training, or the document of the training as JSON."""
+    if not as_json:
+        return say([*lines, str(folder)])
+    files = (folder / name for name in ("mask.json", "training.json"))
+    found = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in files if path.is_file()}
+    say_json({"folder": str(folder), **found})
+
+
+def _lift(recipe: Recipe, command: list[str], out: Path, device: str, quiet: bool, as_json: bool) -> None:
     """Train the network of a recipe that reconstructs spectra from RGB."""
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
 
     assert recipe.lifting is not None
-    lengths = {0: recipe.lifting.iterations}
-    with failing(RunError, ValueError, ArithmeticError, code=FAILED), _loss_bar(quiet, lengths) as watch:
-        folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(quiet),
+    lengths, silent = {0: recipe.lifting.iterations}, quiet or as_json
+    with (
+        resumable(lambda: kept_training(out, recipe.name)),
+        failing(RunError, ValueError, ArithmeticError, code=FAILED),
+        _loss_bar(silent, lengths) as watch,
+    ):
+        folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(silent),
                              command=command, watch=watch)  # fmt: skip
-    if not quiet:
-        weights = folder / "mst_plus_plus.safetensors"
-        say([f"weights: {weights}", f"curves:  {folder / 'curves.png'}", f"judged:  {folder / 'training.json'}",
-             f"next:    neusee run first_light lift=mst_plus_plus lift.weights={weights}"])  # fmt: skip
-    say([str(folder)])
+    weights = folder / "mst_plus_plus.safetensors"
+    again = shlex.join(["neusee", "run", "first_light", "lift=mst_plus_plus", f"lift.weights={weights}"])
+    lines = [f"weights: {weights}", f"curves:  {folder / 'curves.png'}", f"judged:  {folder / 'training.json'}"]
+    _say_results(folder, as_json, [] if silent else [*lines, f"next:    {again}"])
 
 
 def _next(folder: Path, stage: Stages) -> list[str]:
@@ -108,7 +125,10 @@ def _next(folder: Path, stage: Stages) -> list[str]:
 
 @contextmanager
 def _loss_bar(quiet: bool, lengths: Mapping[int, int]) -> Iterator[Callable[[int, int, Mapping[str, float]], None]]:
-    """Show a progress bar on a terminal; yield a function that shows the losses of an iteration."""
+    """Show a progress bar on a terminal, and a line for each tenth of a stage elsewhere; yield a function for both.
+
+    The function shows the losses of an iteration.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -116,12 +136,15 @@ def _loss_bar(quiet: bool, lengths: Mapping[int, int]) -> Iterator[Callable[[int
     console = Console(stderr=True)
     hidden = quiet or not console.is_terminal
     bar = Progress(*columns, TextColumn("{task.fields[losses]}"), console=console, disable=hidden)
+    lines = ProgressLines(quiet)
     tasks = {s: bar.add_task(f"stage {s}" if s else "lift", total=n, losses="") for s, n in lengths.items()}
 
     def watch(stage: int, done: int, losses: Mapping[str, float]) -> None:
         names = [name for name in ("LSR", "L1", "critics", "MRAE", "RMSE") if name in losses]
         text = " ".join(f"{name} {losses[name]:.3g}" for name in names)
         bar.update(tasks[stage], completed=done, losses=text)
+        if bar.disable and not quiet and done % max(1, lengths[stage] // _LINES) == 0:
+            lines(f"{f'stage {stage}, ' if stage else ''}iteration {done} of {lengths[stage]}: {text}")
 
     with bar:
         yield watch

@@ -6,16 +6,18 @@ step had to load share one line.
 
 from __future__ import annotations
 
+import re
+import shlex
 import sys
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from neusee.workflows.graph.step_record import Event, StepRecord
-from neusee.workflows.report.run_page import shape_of, unit_of
-from neusee.workflows.report.text_table import by_family, columns, indented
+from neusee.workflows.report.run_page import shape_of, unchecked_line, unit_of
+from neusee.workflows.report.text_table import by_family, columns, indented, lasts
 from neusee.workflows.report.tolerance_spent import said_of_economies
 
 if TYPE_CHECKING:
@@ -133,8 +135,12 @@ class RunTable(ProgressTable):
 
     header, numbers = HEADER, ("seconds",)
 
-    def __init__(self, recipe: Recipe, names: Iterable[str], mode: Mode) -> None:
+    def __init__(
+        self, recipe: Recipe, names: Iterable[str], mode: Mode, predicted: Mapping[str, float] | None = None
+    ) -> None:
+        """Make the table of the steps ``names``; ``predicted`` has the seconds of steps as earlier runs took."""
         super().__init__(mode)
+        self._left = dict(predicted or {})
         self.families = families(recipe, names)
         self.widths = (max((len(f.cells()[0]) for f in self.families.values()), default=0), *_WIDTHS)
 
@@ -145,6 +151,8 @@ class RunTable(ProgressTable):
 
     def watch(self, event: Event) -> None:
         """Update the table of steps with the start or the end of a step."""
+        if event.done is not None:
+            self._left.pop(event.step, None)
         family = note(self.families, event)
         if event.done is not None and family.needed and len(family.done) == len(family.members):
             self.show_row(family.cells())
@@ -156,8 +164,15 @@ class RunTable(ProgressTable):
                 cells = family.cells()
                 yield cells, "failed" if "LOOK" in cells[5] else cells[2]
 
+    @property
+    def finished(self) -> int:
+        """Return the number of steps that the run has computed or loaded so far."""
+        return sum(d.state in ("run", "cached") for family in self.families.values() for d in family.done)
+
     def caption(self) -> str:
-        """Return a sentence with the number of steps that were neither computed nor loaded."""
+        """Return the time that is left, or how many steps were neither computed nor loaded in the end."""
+        if (left := sum(self._left.values())) >= 1:
+            return f"about {lasts(left)} left, as earlier runs took"
         count = sum(d.state == "not needed" for f in self.families.values() for d in f.done)
         return f"{count} steps were not needed: the results that need them are in the cache" if count else ""
 
@@ -186,13 +201,28 @@ def note(families: dict[str, Family], event: Event) -> Family:
     return family
 
 
+def contents_of(recipe: Recipe) -> dict[str, Any]:
+    """Return the title of a recipe, its numbers of steps, nodes and parameters, its outputs and its notes."""
+    nodes = {step.node.path for step in recipe.steps.values()}
+    values = sum(len(step.params) for step in recipe.steps.values())
+    sizes = {"steps": len(recipe.steps), "nodes": len(nodes), "parameters": values}
+    return {"recipe": recipe.name, "title": recipe.title, **sizes, "outputs": recipe.outputs, "notes": recipe.notes}
+
+
 def opening(recipe: Recipe, command: str) -> list[str]:
     """Return the lines to print before a run: recipe title, numbers of checked steps and parameters, and notes."""
-    values = sum(len(step.params) for step in recipe.steps.values())
-    nodes = len({step.node.path for step in recipe.steps.values()})
-    checked = f"checked  {len(recipe.steps)} steps of {nodes} nodes, {values} parameters: all right"
+    found = contents_of(recipe)
+    sizes = f"{found['steps']} steps of {found['nodes']} nodes, {found['parameters']} parameters"
     notes = [f"note     {line}" for line in recipe.notes]
-    return [f"neusee {command}: {recipe.title or recipe.name}", checked, *notes]
+    return [f"neusee {command}: {recipe.title or recipe.name}", f"checked  {sizes}: all right", *notes]
+
+
+def forecast_line(seconds: float, steps: int, unknown: int) -> str:
+    """Return the time that ``steps`` steps will take, of which ``unknown`` never ran; empty for less than a second."""
+    if seconds < 1 or unknown == steps:
+        return ""
+    rest = f"; {unknown} of {steps} steps never ran before" if unknown else ""
+    return f"time     about {lasts(seconds)}, as earlier runs took{rest}"
 
 
 def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str]:
@@ -208,6 +238,8 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str
         for e in doc["expected"]
         if not e["ok"]
     ]
+    lines += [f"  {unchecked_line(e)}" for e in doc["unchecked"]]
+    lines += [f"warning  {line}" for line in doc["warnings"]]
     return [*lines, f"report   {path}", "", "next", *[f"  {line}" for line in again]]
 
 
@@ -221,15 +253,29 @@ def left_out_line(doc: Mapping[str, Any]) -> str:
     return f"left out {each}; tolerance {doc['tolerance']:g}"
 
 
-def next_commands(recipe: Recipe) -> list[str]:
-    """Return three example commands for a recipe, each with a comment."""
-    name, noise = recipe.name, "sensor.read_noise"
-    commands = [
-        (f'neusee run {name} {noise}="20 e-"', "only what follows is run", noise in recipe.config.settings),
-        (f"neusee run {name} doe=vortex", "another mask", "height" in recipe.steps),
-        (f"neusee plan {name}", "what would run, and for how long", True),
-        ("neusee nodes optics.psf", "what a step computes, and its source", True),
-        ("neusee recipes", "what else there is", True),
+def next_commands(recipe: Recipe, words: Sequence[str], works: Callable[[Sequence[str]], bool]) -> list[str]:
+    """Return three commands to try after a run, each with a comment, quoted for a shell.
+
+    ``words`` are the name and the changes of the recipe, as the user wrote them. ``works`` tells whether a recipe with
+    its changes can be loaded.
+    """
+    noise = "sensor.read_noise"
+    changed = {
+        "only what follows is run": _with(words, f"{noise}=20 e-") if noise in recipe.config.settings else [],
+        "another mask": _with(words, "doe=vortex") if "height" in recipe.steps else [],
+    }
+    tried = {what: again for what, again in changed.items() if again and works(again)}
+    shown = [[shlex.join(["neusee", "run", *again]), f"# {what}"] for what, again in tried.items()]
+    shown += [
+        [shlex.join(["neusee", "plan", *words]), "# what would run, and for how long"],
+        ["neusee nodes optics.psf", "# what a step computes, and its source"],
+        ["neusee recipes", "# what else there is"],
     ]
-    shown = [[command, f"# {comment}"] for command, comment, works in commands if works]
     return columns(shown[:3], gap="   ")
+
+
+def _with(words: Sequence[str], change: str) -> list[str]:
+    """Return the words of a recipe with one more change, in place of changes of the same value or of a part of it."""
+    path = change.partition("=")[0]
+    same = re.compile(rf"[~+]?{re.escape(path)}([.=]|$)")
+    return [*(word for word in words if not same.match(word)), change]

@@ -1,5 +1,7 @@
 """Contents of the report of a run: figures, result table and data files, and the steps whose results they show.
 
+The report shows what the outputs of the recipe need; no step runs for the report alone.
+
 Only this file and ``contents.toml`` name the steps of the camera graph. A text names the source of one argument of a
 drawing function:
 
@@ -18,7 +20,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 
-from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.recipe_graph import Expectation, Recipe, needed
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 
@@ -50,8 +52,6 @@ TABLE: Mapping[str, Mapping[str, str]] = {
     "with mask": _row("mask"),
     "restored": {"quality": "restored_quality"},
 }
-#: Steps that only a figure reads. A run computes each of these steps if the recipe has the step.
-SHOWN = ("transfer",)
 
 BANDS = "bands"
 LINES = "line[*]"
@@ -63,10 +63,17 @@ FILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
 
 
 def wanted(recipe: Recipe) -> tuple[str, ...]:
-    """Return the steps that a run must give: outputs of the recipe, sources of expected numbers and of the report."""
-    promised = [e.step for e in recipe.expect]
-    shown = [s for s in (*(s for row in TABLE.values() for s in row.values()), *SHOWN) if s in recipe.steps]
-    return tuple(dict.fromkeys([*recipe.outputs, *promised, *shown]))
+    """Return the steps that a run must give: the outputs, and the steps of the expected numbers that it compares."""
+    return tuple(dict.fromkeys([*recipe.outputs, *(e.step for e in compared(recipe)[0])]))
+
+
+def compared(recipe: Recipe) -> tuple[list[Expectation], list[Expectation]]:
+    """Return the expected numbers that a run compares, and the others, whose steps no output of the recipe needs."""
+    asked = set(needed(recipe.unsubstituted or recipe, recipe.outputs))
+    found: tuple[list[Expectation], list[Expectation]] = ([], [])
+    for number in recipe.expect:
+        found[number.step not in asked].append(number)
+    return found
 
 
 def steps_of(recipe: Recipe) -> list[str]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neusee.nodes.spectra import mean_wavelength
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.report.contents import BANDS, LINES, TABLE
+from neusee.workflows.report.contents import BANDS, LINES, TABLE, compared
 from neusee.workflows.report.figures.style import nearest
 
 Value = Callable[[str], Any]  #: a function from the name of a step to the value of the step
@@ -29,9 +29,9 @@ _MOST = 4096  #: elements, at most, of a result whose numbers become rows
 
 
 def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
-    """Compare every number that a recipe expects with the number from the run, and return one row for each."""
+    """Compare the numbers that a recipe expects with the numbers from the run, and return one row for each."""
     rows = []
-    for e in recipe.expect:
+    for e in compared(recipe)[0]:
         found: Any = value(e.step)
         for part in e.at:
             found = getattr(found, part) if isinstance(part, str) and not isinstance(found, dict) else found[part]
@@ -42,7 +42,7 @@ def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
 
 
 def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, Any]:
-    """Return the result table, with rows for plain lens, mask and restored picture if any cell has a number."""
+    """Return the table for plain lens, mask and restored picture, with the rows and columns that have numbers."""
     band, where = _band(recipe, keys, value)
     rows = []
     for name, cells in TABLE.items():
@@ -51,8 +51,10 @@ def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, An
         rows.append({"name": name, "cells": texts})
     legend = [f"LSR at {where}; BSR and outside are means over the bands.", _OUTSIDE]
     legend = legend if any(r["cells"][1] for r in rows) else []
-    rows = rows if any(any(row["cells"]) for row in rows) else []
-    return {"columns": list(_COLUMNS), "rows": rows, "legend": legend}
+    rows = [row for row in rows if any(row["cells"])]
+    shown = [i for i in range(len(_COLUMNS)) if any(row["cells"][i] for row in rows)]
+    rows = [{**row, "cells": [row["cells"][i] for i in shown]} for row in rows]
+    return {"columns": [list(_COLUMNS)[i] for i in shown], "rows": rows, "legend": legend}
 
 
 def _cell(found: Any, field: str, number: Callable[[Tensor, int], Any], form: str, band: int) -> str:

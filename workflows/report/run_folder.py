@@ -18,6 +18,10 @@ _OTHER_FOLDER = "name another folder with --out"
 _ABANDONED = 3600.0  #: s without a change, after which an unfinished folder is removed
 
 
+class NotWritten(OSError):
+    """Error for a folder of results that could not be written; no part of the folder is left."""
+
+
 @dataclass
 class RunFolder:
     """The folder of a run, which has a temporary path until all files are written, and then its final path."""
@@ -67,7 +71,20 @@ def writable_folder(out: str | os.PathLike[str]) -> Path:
 
 @contextmanager
 def new_run(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
-    """Create a run folder with a temporary name; rename it after the ``with`` block, or remove it after an error."""
+    """Create a run folder with a temporary name; rename it after the ``with`` block, or remove it after an error.
+
+    Raises `NotWritten` for an error of a file.
+    """
+    try:
+        with _folder(root, recipe, key) as run:
+            yield run
+    except OSError as error:
+        text = f"the folder of results in {root} cannot be written ({error}), and no part of it is left"
+        raise NotWritten(text) from error
+
+
+@contextmanager
+def _folder(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
     root.mkdir(parents=True, exist_ok=True)
     _sweep(root)
     name = f"{date.today().isoformat()}_{recipe}_{key[:8]}"

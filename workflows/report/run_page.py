@@ -28,7 +28,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.step_record import StepRecord
 from neusee.workflows.recipe.distributions.nominal_values import told
 from neusee.workflows.recipe.paper_readings import in_force
-from neusee.workflows.report.contents import FIGURES
+from neusee.workflows.report.contents import FIGURES, compared
 from neusee.workflows.report.result_numbers import expected, metrics, table
 from neusee.workflows.report.run_timing import said_of, timing
 from neusee.workflows.report.study_page import filled
@@ -47,7 +47,8 @@ def document(
 ) -> dict[str, Any]:
     """Return the report of a run, apart from its pictures, as a document of JSON values."""
     recipe, done = result.recipe, list(result.done.values())
-    found = expected(recipe, result.value)
+    found, warned = expected(recipe, result.value), list(dict.fromkeys(warnings))
+    unchecked = [{"name": e.name, "step": e.step} for e in compared(recipe)[1]]
     steps = [_step(d, result) for d in done]
     failed = [f"{s['step']}: {c['text']}" for s in steps for c in s["checks"] if not c["ok"]]
     time = timing(steps, _planned(result))
@@ -62,13 +63,15 @@ def document(
         "tolerance": recipe.tolerance,
         "seed": recipe.seed,
         "counts": state_counts(done),
-        "verdict": verdict(found, failed),
+        "verdict": verdict(found, failed, len(unchecked)),
         "missed": [e["name"] for e in found if not e["ok"]],
         "failed": failed,
         "expected": found,
+        "unchecked": unchecked,
         "table": table(recipe, result.keys, result.value),
         "metrics": metrics(recipe, result.keys, result.value),
-        "notes": [*_sampling(recipe), *recipe.notes, *dict.fromkeys(warnings)],
+        "notes": [*_sampling(recipe), *recipe.notes, *map(unchecked_line, unchecked), *warned],
+        "warnings": warned,
         "posterior": told(recipe.uncertain.standings) if recipe.uncertain else [],
         "readings": _readings(recipe),
         "left_out": [{"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"],
@@ -101,11 +104,15 @@ def rebuild(folder: Path) -> Path:
     return target
 
 
-def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str]) -> str:
-    """Return a sentence that counts the expected numbers that the run reproduced, and the checks that failed."""
+def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked: int = 0) -> str:
+    """Return a sentence that counts the expected numbers that the run reproduced, and the checks that failed.
+
+    ``unchecked`` is the number of expected numbers whose steps no output needs, so that the run has not compared them.
+    """
     met = sum(e["ok"] for e in found)
     some = f"{met} of {len(found)} expected numbers within tolerance"
-    numbers = some if found else "No expected numbers in this recipe"
+    numbers = some if found or unchecked else "No expected numbers in this recipe"
+    numbers += f", {unchecked} more not checked" if unchecked else ""
     checks = "every check held" if not failed else f"{len(failed)} check{'s' * (len(failed) > 1)} to look at"
     return f"{numbers}; {checks}."
 
@@ -175,6 +182,11 @@ def _sampling(recipe: Recipe) -> list[str]:
     """Return a note on the sampling of the PSF, because every LSR depends on the sampling."""
     kinds = {step.params.get("sensor") for step in recipe.steps.values() if step.node.path == "optics.psf"}
     return [_SAMPLING] if "point" in kinds else ["The PSF is integrated over each pixel."] if kinds else []
+
+
+def unchecked_line(number: Mapping[str, str]) -> str:
+    """Return a sentence that names an expected number that the run has not compared, and the step that was missing."""
+    return f"not checked: {number['name']}, because no output of this run needs the step {number['step']}"
 
 
 def _readings(recipe: Recipe) -> list[dict[str, str]]:

@@ -9,6 +9,7 @@ folder = run.write(runs, key, document, report)
 from __future__ import annotations
 
 import json
+import shlex
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,6 +20,7 @@ from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_page import Section, page
+from neusee.workflows.store.result_store import Store
 
 Progress = Callable[[str], None]  #: receives a line after each part of a study
 CsvTable = tuple[Sequence[str], Iterable[Sequence[Any]]]  #: the names of the columns, and the rows
@@ -54,6 +56,7 @@ class StudyReport:
             content(folder.path / name) if callable(content) else folder.write(name, content)
         folder.write("provenance.json", as_json(document))
         shown = {name: document[name] for name in self.shown}
+        shown |= {"warnings": "; ".join(document["warnings"])} if document.get("warnings") else {}
         folder.write("report.html", page(self.title, self.lead, self.sections, shown, self.banner))
 
 
@@ -62,17 +65,18 @@ class StudyRun:
 
     def __init__(self, kind: str, recipe: Recipe, command: Sequence[str]) -> None:
         self.kind, self.recipe, self.command = kind, recipe, command
-        self._began = time.perf_counter()
+        self._began, self._failures = time.perf_counter(), len(Store.failures)
 
     def document(self, content: Mapping[str, Any]) -> dict[str, Any]:
         """Return the provenance of a study as a document: command, date, run time, ``content``, versions and recipe."""
         return {
             "study": self.kind,
             "recipe": self.recipe.name,
-            "command": " ".join(self.command),
+            "command": shlex.join(self.command),
             "date": timestamp(),
             "seconds": time.perf_counter() - self._began,
             **content,
+            "warnings": Store.failures[self._failures :],
             "versions": versions(),
             "config": self.recipe.config.to_yaml(),
         }

@@ -29,3 +29,11 @@ def by_family(names: Iterable[str]) -> dict[str, list[str]]:
     for name in names:
         groups.setdefault(name.partition("[")[0], []).append(name)
     return groups
+
+
+def lasts(seconds: float) -> str:
+    """Return a duration in words, such as ``3 h 05 min``, ``2 min 10 s`` or ``4 s``."""
+    whole = round(seconds)
+    if whole >= 3600:
+        return f"{whole // 3600} h {whole % 3600 // 60:02} min"
+    return f"{whole // 60} min {whole % 60:02} s" if whole >= 60 else f"{whole} s"

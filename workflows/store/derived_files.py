@@ -29,7 +29,7 @@ class DerivedFiles:
     def find(self, key: str, suffix: str) -> Path | None:
         """Return the path of the derived file ``key``, or None if the file is missing or has a wrong checksum."""
         path = self._path(key, suffix)
-        with suppress(KeyError):
+        with suppress(KeyError, OSError):
             if path.is_file() and self.store.has(key) and bytes(self.store.get(key).tolist()) == _checksum(path):
                 return path
         return None
@@ -38,7 +38,8 @@ class DerivedFiles:
         """Write a read-only file by atomic rename and store its checksum; return the path of the file."""
         try:
             path = self._written(key, suffix, content)
-        except PermissionError:
+        except OSError as error:
+            self.store.report_failure(error)
             self._spare = TemporaryDirectory(prefix="neusee-")
             self.folder = Path(self._spare.name)
             path = self._written(key, suffix, content)

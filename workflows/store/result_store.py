@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from neusee.workflows.store import metadata, payload
 from neusee.workflows.store.bandwidth import Speeds
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from neusee.workflows.store.band_files import Blobs
 
 
+_CONSEQUENCE = "the run goes on, but results are not stored, so that the next run computes them again"
 _USED = 3600.0  #: smallest time in s between two records of the use of a value
 
 
@@ -44,6 +45,8 @@ class Store(Maintained):
 
     A failure of the folder gives a missing result, never a wrong result.
     """
+
+    failures: ClassVar[list[str]] = []  #: the warnings of all stores of this process, for the reports of studies
 
     def __init__(
         self, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
@@ -67,7 +70,7 @@ class Store(Maintained):
         self._known: dict[str, Metadata] = {}
         self._lost: set[str] = set()  # damaged results that the user may have no permission to move
         self._used: set[str] = set()
-        self._warned = False
+        self.failure = ""  #: the warning after the first write that failed
 
     def __reduce__(self) -> tuple[Any, ...]:  # another process receives the path and opens the store
         return partial(type(self), self.root, verify=self.verify, budget=self.budget), ()
@@ -179,10 +182,15 @@ class Store(Maintained):
                 self.disk.forget()
                 return write(key, *arguments)
         except OSError as error:
-            if not self._warned:
-                warnings.warn(f"{self.root} cannot be written ({error}): results are not stored", stacklevel=4)
-            self._warned = True
+            self.report_failure(error)
             return False
+
+    def report_failure(self, error: Exception) -> None:
+        """Warn that the folder cannot be written, once for each store; `failure` keeps the text for reports."""
+        if not self.failure:
+            self.failure = f"the cache {self.root} cannot be written ({error}): {_CONSEQUENCE}"
+            self.failures.append(self.failure)
+            warnings.warn(self.failure, stacklevel=5)
 
     def _write(self, key: str, value: Any, about: Metadata) -> bool:
         from neusee.workflows.store.serialization import blobs_in

@@ -116,11 +116,3 @@ def _range_of(values: Sequence[float]) -> str:
 def cell_text(cell: Any) -> str:
     """Return a table cell as text; a float has at most six significant digits."""
     return f"{cell:.6g}" if isinstance(cell, float) else str(cell)
-
-
-def lasts(seconds: float) -> str:
-    """Return a duration in words, such as ``3 h 05 min``, ``2 min 10 s`` or ``4 s``."""
-    whole = round(seconds)
-    if whole >= 3600:
-        return f"{whole // 3600} h {whole % 3600 // 60:02} min"
-    return f"{whole // 60} min {whole % 60:02} s" if whole >= 60 else f"{whole} s"

@@ -86,7 +86,8 @@ def _measure(
         values = {name: np.array([n[name] for n in numbers]) for name in ends[0]}
         scattered = {name: scatter(x, sequences) for name, x in values.items()}
         worst, error = worst_known(scattered)
-        progress(f"{used} draws: every standard deviation to {error:.1%} ({worst})")
+        needed = used if error <= wanted else min(len(at.values), int(used * (error / wanted) ** 2))
+        progress(f"{used} draws of about {needed}: every standard deviation to {error:.1%} ({worst})")
         if error <= wanted:
             break
     middle, swings = ends[0], _swings(inputs, ends, values, scattered)

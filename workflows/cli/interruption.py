@@ -1,0 +1,101 @@
+"""What a command prints if it is stopped, or if its results cannot be written: what is kept, and how to go on."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neusee.workflows.cli.command_frame import fail, say
+from neusee.workflows.cli.command_list import BAD, FAILED, INTERRUPTED, TYPED
+
+if TYPE_CHECKING:
+    from neusee.workflows.store.result_store import Store
+
+
+def typed_command() -> str:
+    """Return the command that runs, as the user typed it, quoted for a shell."""
+    return shlex.join(["neusee", *TYPED])
+
+
+@contextmanager
+def resumable(kept: Callable[[], str]) -> Iterator[None]:
+    """If the ``with`` block is stopped by Ctrl-C or by an error of a file, say what is ``kept`` and how to go on.
+
+    The exit code is 130 after Ctrl-C, and 1 after an error of a file.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        fail(f"stopped: {kept()}; to go on: {typed_command()}", INTERRUPTED)
+    except OSError as error:
+        if isinstance(error, BrokenPipeError) or "--debug" in TYPED:
+            raise
+        fail(f"{error}\nfailed: {kept()}; to go on: {typed_command()}", FAILED)
+
+
+def kept_in(store: Store, what: str) -> str:
+    """Return a clause that says that ``what`` is kept in the cache, or why the cache keeps nothing."""
+    if store.failure:
+        return f"nothing is kept, because the cache {store.root} cannot be written"
+    return f"{what} kept in the cache {store.root}"
+
+
+def kept_training(out: Path, recipe: str) -> str:
+    """Return a clause that says up to which iteration the newest checkpoint keeps a training of ``recipe``."""
+    from neusee.workflows.training.loop.checkpoint import StateFile
+
+    states = [*out.glob(f"{recipe}_*/state.pt"), *out.glob(f"{recipe}_*/mask.state")]
+    if not states:
+        return "no checkpoint is written yet, so nothing is kept"
+    newest = max(states, key=lambda path: path.stat().st_mtime)
+    state = StateFile(newest).read(strict=False)
+    stage = f" of stage {state['stage']}" if state.get("stage") else ""
+    upto = f" up to iteration {state['iteration']}{stage}" if "iteration" in state else ""
+    return f"the training{upto} is kept in {newest.parent}"
+
+
+def require_writable(out: Path) -> None:
+    """End the command, before anything runs, if the folder ``out`` of the results cannot be made or written."""
+    from tempfile import TemporaryFile
+
+    above = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.exists())
+    try:
+        if not above.is_dir():
+            raise NotADirectoryError(f"{above} is a file")
+        TemporaryFile(dir=above).close()
+    except OSError as error:
+        fail(f"--out {out}: results cannot be written there ({error}): write --out FOLDER", BAD)
+
+
+def say_json(document: dict[str, Any]) -> None:
+    """Print the result of a command as one JSON object on one line of stdout; a number that is not finite is null."""
+    say([json.dumps(_finite(document), ensure_ascii=False, default=str, allow_nan=False)])
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def say_folder(folder: Path, as_json: bool, *more: str) -> None:
+    """Print the path of the page in a folder of results, or the page's document and the files ``more`` as JSON."""
+    page = str(folder / "report.html")
+    if not as_json:
+        return say([page])
+    files = ("provenance.json", *more)
+    found = [json.loads((folder / name).read_text(encoding="utf-8")) for name in files]
+    say_json({"report": page, **{name: value for document in found for name, value in document.items()}})
+
+
+def print_warning(message: Warning | str, *where: object, **more: object) -> None:
+    """Print a warning as one line on stderr, in place of Python's form, which shows a line of source code."""
+    print(f"warning: {message}", file=sys.stderr, flush=True)
