@@ -101,6 +101,12 @@ MUTANTS = (
         within("nodes/sensor", "digitization.py::test_dithered_floor_agrees_with_its_reference"),
     ),
     Mutant(
+        "nodes/sensor/_digitization.py",
+        "electrons.double() * gain",
+        "(electrons * gain).double()",
+        within("nodes/sensor", "digitization.py::test_no_number_is_further_from_the_exact_product_than_half"),
+    ),
+    Mutant(
         "nodes/sensor/_photon_transfer.py",
         "else 1.0 / 6.0",
         "else 1.0 / 12.0",

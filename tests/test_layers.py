@@ -195,9 +195,9 @@ def exits(files):
 
 
 def terminal(files):
-    """Words to a terminal outside cli and the console of report."""
+    """Words to a terminal outside cli, and the console and the live table of report."""
     for file, tree in files.items():
-        if home(file) == "cli" or file == "report/console.py":
+        if home(file) == "cli" or file in ("report/console.py", "report/live_table.py"):
             continue
         names = [e for e in imports(tree) if outer(e.full) == "rich" or e.full in ("sys.stdout", "sys.stderr")]
         yield from (f"{file}:{e.line}: {e.full}" for e in names)

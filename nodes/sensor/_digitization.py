@@ -1,6 +1,7 @@
 """Conversion of electrons to digital numbers: full well, analogue-to-digital converter, and sensor window."""
 
 import math
+from fractions import Fraction
 from typing import Annotated, Any, Literal
 
 import torch
@@ -72,21 +73,34 @@ def digitize(
     Shapes: electrons (..., y, x) -> (..., y, x), whole numbers in the dtype of the input (float32 for half precision).
     Units:  electrons e-; gain K of EMVA 1288, DN/e-, which a recipe may also write as e-/DN; result DN in
             [0, 2**bits - 1].
-    Error:  `nearest` is exact (half to even), with variance 1/12 DN2. `dithered_floor`, floor(x + U(-1/2, 1/2)) as
-            printed, is 1/2 DN too low with up to 1/6 DN2 more variance. Integral nonlinearity is left out. The
-            gradient is that of the numbers before rounding, and 0 where the converter clips.
+    Error:  `nearest` rounds the float64 product of electrons and gain half to even: every number is exact unless the
+            product is within 1e-11 DN of the middle of two numbers. Variance 1/12 DN2. `dithered_floor`,
+            floor(x + U(-1/2, 1/2)) as printed, is 1/2 DN too low with up to 1/6 DN2 more variance. Integral
+            nonlinearity is left out. The gradient is that of the numbers before rounding, and 0 where the converter
+            clips.
     Raises: ValueError for `dithered_floor` without rng.
     Source: NeuSee, Eq. (SensorImage); EMVA Standard 1288, release 4.0 (quantization variance 1/12 DN2).
     """
-    line = single(electrons) * gain
-    ideal = line.clamp(0, 2**bits - 1)
-    if rounding == "nearest":  # the sum is exact; without a gradient, the rounded number is enough
-        return ideal + (ideal.round() - ideal).detach() if ideal.requires_grad else ideal.round_()
-    if rng is None:
+    if rounding == "dithered_floor" and rng is None:
         raise ValueError("rounding dithered_floor needs random numbers: give rng=torch.Generator()")
+    electrons = single(electrons)
+    whole = _whole_numbers(electrons.detach(), gain, 2**bits - 1, rng if rounding == "dithered_floor" else None)
+    if not electrons.requires_grad:
+        return whole
+    ideal = (electrons * gain).clamp(0, 2**bits - 1)
+    return ideal + (whole - ideal).detach()  # the sum is exact: the difference is a multiple of the last bit of `ideal`
+
+
+def _whole_numbers(electrons: Tensor, gain: float, top: int, rng: Generator | None) -> Tensor:
+    """Return the digital numbers from 0 to ``top``, rounded half to even, or with a dither from ``rng``.
+
+    The product is float64: in float32, one number in a thousand would be off by one.
+    """
+    line = electrons.double() * gain
+    if rng is None:
+        return line.clamp_(0, top).round_().to(electrons.dtype)
     dither = torch.rand(line.shape, generator=rng, device=rng.device, dtype=torch.float32).to(line) - 0.5
-    whole = (line + dither).floor().clamp(0, 2**bits - 1)
-    return ideal + (whole - ideal).detach()
+    return line.add_(dither).floor_().clamp_(0, top).to(electrons.dtype)
 
 
 @digitize.reference
@@ -99,12 +113,12 @@ def _(
     rng: Generator | None = None,
 ) -> Tensor:
     top, electrons = 2**bits - 1, single(electrons)
-    line = (electrons * gain).flatten().tolist()
+    line = [float(Fraction(x) * Fraction(gain)) for x in electrons.flatten().tolist()]
     if rounding == "nearest":
         whole = [round(min(max(x, 0.0), float(top))) for x in line]
     else:
         dither = torch.rand(electrons.shape, generator=rng, dtype=torch.float32).flatten().tolist()
-        whole = [min(max(math.floor(x + d - 0.5), 0), top) for x, d in zip(line, dither, strict=True)]
+        whole = [min(max(math.floor(x + (d - 0.5)), 0), top) for x, d in zip(line, dither, strict=True)]
     return torch.tensor(whole, dtype=electrons.dtype).reshape(electrons.shape)
 
 

@@ -92,9 +92,9 @@ class ProgressTable(ABC):
 
     def __enter__(self) -> Self:
         if self.mode == "live":
-            from rich.live import Live
+            from neusee.workflows.report.live_table import LiveTable
 
-            self._live = Live(self, refresh_per_second=8, vertical_overflow="visible")
+            self._live = LiveTable(self)
             self._live.start()
         self.show_row(self.header)
         return self
