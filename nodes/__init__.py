@@ -3,6 +3,6 @@
 No node depends on a recipe, a cache, a device or a graph.
 """
 
-from neusee.nodes._node import Check, ErrorBound, Node, ParameterError, TensorStats, node
+from neusee.nodes._node import Check, ErrorBound, Node, ParameterError, TensorStats, node, registered_nodes
 
-__all__ = ["Check", "ErrorBound", "Node", "ParameterError", "TensorStats", "node"]
+__all__ = ["Check", "ErrorBound", "Node", "ParameterError", "TensorStats", "node", "registered_nodes"]

@@ -33,6 +33,7 @@ from neusee.nodes._error_bound import ErrorBound, TensorStats
 
 Device = Literal["any", "cpu", "gpu"]
 Fn = TypeVar("Fn", bound=Callable[..., Any])
+_registered: dict[tuple[str, str], Node] = {}  #: every node of this process, the newest of each module and name
 
 
 class ParameterError(ValueError):
@@ -138,6 +139,7 @@ class Node:
         self.before_run = before_run
         if before_run and (self.inputs or self.random):
             raise ValueError(f"{self.path}: before_run needs a node without inputs and without rng: omit before_run")
+        _registered[fn.__module__, fn.__name__] = self
 
     def __call__(self, *inputs: Any, **params: Any) -> Any:
         """Call the function of the node directly, with gradients, without parameter validation and without cache."""
@@ -192,6 +194,11 @@ class Node:
         return tuple(name for name in inspect.signature(hook).parameters if name in self.inputs) if hook else ()
 
 
+def registered_nodes() -> tuple[Node, ...]:
+    """Return every node that this process has defined or imported, the newest of each module and name."""
+    return tuple(_registered.values())
+
+
 def _imported(module: str, name: str) -> Node:
     imported: Node = getattr(importlib.import_module(module), name)
     return imported
@@ -235,4 +242,14 @@ def node(
     )
 
 
-__all__ = ["Check", "Device", "ErrorBound", "Hooks", "Node", "ParameterError", "TensorStats", "node"]
+__all__ = [
+    "Check",
+    "Device",
+    "ErrorBound",
+    "Hooks",
+    "Node",
+    "ParameterError",
+    "TensorStats",
+    "node",
+    "registered_nodes",
+]

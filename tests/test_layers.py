@@ -59,7 +59,6 @@ DYNAMIC = {
     "recipe/step_declarations.py": "a recipe names the family of a node",
     "cli/typer_program.py": "a command line names the command, whose module alone is imported",
     "cli/catalogue.py": "a family of nodes is listed with its own words",
-    "store/serialization.py": "a stored result names the class of its values",
     "training/tensorboard_log.py": "TensorBoard is optional, and has no types",
 }
 

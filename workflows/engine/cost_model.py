@@ -34,7 +34,7 @@ class Costs:
         self._steps: dict[str, list[Row]] = {}
         self._nodes: dict[str, list[Row]] = {}
         for row in rows:
-            if row.get("node") and row.get("step"):
+            if row.get("node") and row.get("step") and _is_measured(row):
                 self._steps.setdefault(f"{row['step']} {row['node']}", []).append(row)
                 self._nodes.setdefault(row["node"], []).append(row)
         self._ratio = {"cpu": 1.0, **self._measured_ratios()}
@@ -42,6 +42,7 @@ class Costs:
     def of(self, step: Step, kinds: Sequence[str], exact: Row | None = None) -> Estimate:
         """Predict the cost of ``step`` on each kind of device; ``exact`` holds measured costs of the same result."""
         own = self._steps.get(f"{step.name} {step.node.path}", [])
+        exact = exact if exact and _is_measured(exact) else None
         rows = [exact] if exact else own[-_NEWEST:] or self._nodes.get(step.node.path, [])[-_NEWEST:]
         if not rows:
             return Estimate({kind: GUESS / self._faster(kind) for kind in kinds}, 0.0, 0.0, False)
@@ -73,6 +74,10 @@ class Costs:
                 if cpu > 0 and median(seconds) > 0:
                     found.setdefault(kind, []).append(cpu / median(seconds))
         return {kind: median(ratios) for kind, ratios in found.items()}
+
+
+def _is_measured(row: Row) -> bool:
+    return row.get("seconds") is not None and row.get("bytes") is not None
 
 
 def _kind(row: Row) -> str:

@@ -13,7 +13,8 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import Any, get_args, get_origin
 
 import torch
 
@@ -22,6 +23,8 @@ from neusee.workflows.engine.step_job import InputMissing, Lane, Outcome, StepJo
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.keys.seal import Unsigned, check_signature, secrets, signature
+from neusee.workflows.recipe.step_declarations import all_nodes
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in
@@ -61,6 +64,7 @@ class Dask:
             self.where,
             self.threads,
             _SHARE * min((lane.memory for lane in self._lanes.values()), default=0.0),
+            signature("worker", b""),
             key=f"neusee-{work[0].key}-{work[-1].key}-{self._tries[work[0].key]}",
             workers=[work[0].lane] if work[0].lane in self._lanes else None,
             allow_other_workers=True,
@@ -127,10 +131,11 @@ class _Here:
         self.values: OrderedDict[Key, Any] = OrderedDict()
         self.room, self.held = room, 0
 
-    def fetch(self, key: Key) -> Any:
+    def fetch(self, key: Key, kinds: Mapping[Key, Any]) -> Any:
+        """Return the value of a key; ``kinds`` are the annotated types of the inputs of a step, by their keys."""
         if key not in self.values:
             try:
-                self.keep(key, self.store.get(key))
+                self.keep(key, self.store.get(key, kinds.get(key, Any)))
             except KeyError:
                 raise InputMissing(key) from None
         self.values.move_to_end(key)
@@ -155,8 +160,14 @@ def lane_here(dask_worker: Any) -> tuple[str, float]:
     return "cpu", _PLANNED * min(there_is("cpu"), allowed or float("inf"))
 
 
-def work_here(chain: tuple[StepJob, ...], where: str, threads: int, room: float) -> list[Outcome]:
-    """Compute a chain of jobs on a worker; return outcomes without values, and cache up to ``room`` bytes of values."""
+def work_here(chain: tuple[StepJob, ...], where: str, threads: int, room: float, signed: str = "") -> list[Outcome]:
+    """Compute a chain of jobs on a worker; return outcomes without values, and cache up to ``room`` bytes of values.
+
+    ``signed`` is a signature by the secret of the caller, which this worker needs too.
+    """
+    if not _same_secret(signed):
+        text = "NEUSEE_CACHE_SECRET of a worker is not that of this process: set the same secret there"
+        return [Outcome(chain[0], error=RunError(chain[0].step, [], OSError(text)))]
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
     here = _here.get(where) or _here.setdefault(where, _Here(where, room))
@@ -171,15 +182,40 @@ def work_here(chain: tuple[StepJob, ...], where: str, threads: int, room: float)
     return [_light(outcome) for outcome in outcomes]
 
 
+def _same_secret(signed: str) -> bool:
+    try:
+        check_signature(signed, "worker", b"")
+    except Unsigned:
+        return False
+    return bool(secrets()) == bool(signed)
+
+
 def _one_here(work: StepJob, here: _Here) -> Outcome:
     own = here.code.digest(work.step.node.fn.__module__)
     if own != work.origin["code"]:
         text = f"the code of {work.step.node.path} differs on a worker: install the same version there"
         return Outcome(work, error=RunError(work.step, [], OSError(text)))
-    outcome = carry_out(work, here.fetch, here.store)
+    outcome = carry_out(work, partial(here.fetch, kinds=kinds_of(work)), here.store)
     if outcome.value is not None:
         here.keep(work.key, outcome.value)
     return outcome
+
+
+def kinds_of(work: StepJob) -> dict[Key, Any]:
+    """Return the annotated type of each input of a job, by the key of the input.
+
+    Where a type is not annotated, the value may be a named tuple of any node, so all families of nodes are imported.
+    """
+    node, kinds = work.step.node, dict[Key, Any]()
+    for name, read in zip(node.inputs, work.reads, strict=True):
+        kind = node.hints.get(name, Any)
+        if isinstance(read, tuple):
+            lists = [each for each in (kind, *get_args(kind)) if get_origin(each) is list]
+            kind = get_args(lists[0])[0] if lists else Any
+        if kind is Any:
+            list(all_nodes())
+        kinds |= dict.fromkeys(read if isinstance(read, tuple) else [read] if read else [], kind)
+    return kinds
 
 
 def _light(outcome: Outcome) -> Outcome:

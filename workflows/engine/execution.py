@@ -154,7 +154,7 @@ class Execution:
 
         def compute(key: Key) -> float:
             about = self.receipts.get(key) or self.store.about(key)
-            return float(about["seconds"]) if about else _UNKNOWN
+            return float(about.get("seconds") or 0.0) if about else _UNKNOWN
 
         def load(key: Key) -> float:
             return 0.0 if key in self.values else self._reading(key) if self.known(key) else float("inf")
@@ -167,7 +167,7 @@ class Execution:
     def _reading(self, key: Key) -> float:
         """Return the predicted time (s) for reading a stored value, or infinity if the value is not stored."""
         about = self.store.about(key)
-        return self.store.read_seconds(about["bytes"]) if about else float("inf")
+        return self.store.read_seconds(about.get("bytes") or 0) if about else float("inf")
 
     def _execute(
         self, plan: list[Key], again: frozenset[Key], targets: list[Key], keep: bool, uses: Counter[Key]
@@ -253,7 +253,7 @@ class Execution:
         if key not in self.values:
             began = time.perf_counter()
             try:
-                self.values[key] = self.store.get(key)
+                self.values[key] = self.store.get(key, self.makers[key].node.hints.get("return", Any))
             except KeyError:
                 raise InputMissing(key) from None
             if self.makers[key].name not in self.done:
@@ -265,10 +265,12 @@ class Execution:
         if about is None:
             raise InputMissing(key)
         name = self.makers[key].name
-        why = why or f"computed {about['date']} in {about['seconds']:.3g} s"
-        checks = tuple(Check(text, ok) for text, ok in about["checks"])
+        why = why or f"computed {about.get('date')} in {about.get('seconds') or 0.0:.3g} s"
+        checks = tuple(Check(text, ok) for text, ok in about.get("checks") or ())
         facts, bound, error = facts_in(about), self._bound(name), error_in(about)
-        return StepRecord(name, "cached", why, seconds, key, facts, checks, "cpu", about["bytes"], bound, error=error)
+        return StepRecord(
+            name, "cached", why, seconds, key, facts, checks, "cpu", about.get("bytes") or 0, bound, error=error
+        )
 
     def _facts_of(self, name: str) -> TensorStats | None:
         """Return the statistics of the result of a step; compute the result if no statistics are known."""

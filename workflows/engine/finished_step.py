@@ -21,7 +21,10 @@ def error_in(about: Mapping[str, Any] | None) -> tuple[float, float] | None:
 def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
     """Return the statistics in the metadata of a stored result, or None if the metadata contain none."""
     found = (about or {}).get("facts")
-    return TensorStats(**{**found, "shape": tuple(found["shape"])}) if found else None
+    try:
+        return TensorStats(**{**found, "shape": tuple(found["shape"])}) if found else None
+    except (TypeError, LookupError):  # no statistics that this program writes
+        return None
 
 
 def ran(outcome: Outcome, why: str, bound: float | None, began: float, predicted: float | None) -> StepRecord:

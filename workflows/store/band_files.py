@@ -1,13 +1,15 @@
 """Band files: files with one spectral band each, shared by all stored results that contain the band.
 
-A band file (a blob) holds the bytes of a slice and a trailer with type, shape, checksum and the trailer's length. The
-bytes begin at the start of the file, so that slices of whole memory pages are mapped side by side into one address
-range, which gives a contiguous tensor without a copy. The maps are private: a write to the tensor changes no file.
+A band file (a blob) holds the bytes of a slice and a trailer with type, shape, format version, name, signature,
+checksum and the trailer's length. The bytes begin at the start of the file, so that slices of whole memory pages are
+mapped side by side into one address range, which gives a contiguous tensor without a copy. The maps are private: a
+write to the tensor changes no file.
 """
 
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import json
 import mmap
 import os
@@ -26,13 +28,17 @@ import torch
 import xxhash
 from torch import Tensor
 
+from neusee.workflows.keys.seal import FORMAT, NotRead, OtherFormat, check_signature, secrets, signature
+from neusee.workflows.store.layout_check import is_band, is_checksum, is_shape
 from neusee.workflows.store.shared_folder import Disk
 
 _SMALL = 4096  #: bytes up to which a blob is not synced to disk: a torn blob fails its checksum
 _WRITERS = 8
 _FIXED = 0x10  #: MAP_FIXED of Linux and macOS
 _LIBC = ctypes.CDLL(None, use_errno=True) if sys.platform in ("linux", "darwin") else None
-_UNREADABLE = (FileNotFoundError, ValueError, LookupError, TypeError, AttributeError)
+_UNREADABLE = (FileNotFoundError, ValueError, LookupError, TypeError, AttributeError, RuntimeError)
+_TAIL = 1024  #: bytes at the end of a band file that contain its trailer
+_DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in vars(torch).values() if isinstance(dtype, torch.dtype)}
 
 if _LIBC is not None:
     _LIBC.mmap.restype = ctypes.c_void_p
@@ -53,11 +59,13 @@ class Stacked:
 
 
 class Blob(NamedTuple):
-    """Type, shape and checksum of a spectral band, as stored at the end of its band file."""
+    """Type, shape, checksum and signature of a spectral band, as stored at the end of its band file."""
 
     dtype: torch.dtype
     shape: tuple[int, ...]
     xxh3: str
+    name: str = ""
+    sign: str = ""
 
     @property
     def nbytes(self) -> int:
@@ -84,7 +92,7 @@ class Blobs:
         """Return the type, shape and checksum of a stored band; raise `Damaged` if its file is missing or damaged."""
         try:
             with open(self.path(name), "rb") as file:
-                return _trailer(file.fileno())[0]
+                return _trailer(file.fileno(), name)[0]
         except (OSError, *_UNREADABLE) as error:
             raise self._damaged(name, error) from None
 
@@ -93,7 +101,8 @@ class Blobs:
         if self.has(name):
             with suppress(Damaged):
                 return self.about(name).xxh3
-        data, kind = bytes_of(x), _kind(x.dtype, tuple(x.shape))
+        data, kind = bytes_of(x), _kind(x.dtype, tuple(x.shape), name)
+        kind = _signed(kind, signature(name, _sha256(data, kind)) if secrets() else "")
         xxh3 = _checksum(data, kind)
         with self._disk.temporary(name) as (part, file):
             for piece in (data, kind, xxh3.encode(), len(kind).to_bytes(4, "little")):
@@ -133,10 +142,15 @@ class Blobs:
         checksum of every byte; ``xxh3`` lists the expected checksums. Raises `Damaged` for a missing or damaged file,
         which then counts as missing.
         """
-        expected = [Blob(dtype, tuple(shape[1:]), xxh3[i] if xxh3 else "") for i in range(len(names))]
+        if bad := [name for name in names if not is_band(name)]:
+            raise Damaged(f"{bad[0]!r} is not the name of a band")
+        expected = [Blob(dtype, tuple(shape[1:]), xxh3[i] if xxh3 else "", name) for i, name in enumerate(names)]
         size = expected[0].nbytes if expected else 0
         if not size:
             return torch.empty(*shape, dtype=dtype)
+        if (first := self.about(names[0]))[:2] != expected[0][:2]:  # before memory is reserved
+            error = ValueError(f"it holds {first.dtype} {first.shape}, not {dtype} {expected[0].shape}")
+            raise self._damaged(names[0], error)
         if _LIBC is not None and size % mmap.PAGESIZE == 0:
             with suppress(OSError):  # a file system or a limit that allows no maps
                 space = _reserve(len(names) * size)
@@ -168,10 +182,8 @@ class Blobs:
     def _damaged(self, name: str, error: Exception) -> Damaged:
         """Move a damaged band file to the folder ``bad/`` of the store for inspection; return the error to raise."""
         self._lost.add(name)
-        if not isinstance(error, OSError):
-            with suppress(OSError):
-                self._disk.make_folder(f"{self._disk.folder}/bad")
-                os.replace(self.path(name), f"{self._disk.folder}/bad/{name}")
+        if not isinstance(error, OSError | NotRead) and is_band(name):
+            self._disk.put_aside(self.path(name))
         return Damaged(f"the band {name} is damaged or missing: {error}")
 
 
@@ -185,14 +197,17 @@ def bytes_of(x: Tensor) -> memoryview:
 
 def dtype_of(name: str) -> torch.dtype:
     """Return the torch dtype with a name such as ``float32``; raise `ValueError` for an unknown name."""
-    dtype = getattr(torch, name, None)
-    if not isinstance(dtype, torch.dtype):
+    if name not in _DTYPES:
         raise ValueError(f"{name!r} is not a dtype of torch")
-    return dtype
+    return _DTYPES[name]
 
 
-def _kind(dtype: torch.dtype, shape: tuple[int, ...]) -> bytes:
-    return json.dumps([str(dtype).removeprefix("torch."), list(shape)]).encode()
+def _kind(dtype: torch.dtype, shape: tuple[int, ...], name: str) -> bytes:
+    return json.dumps([str(dtype).removeprefix("torch."), list(shape), FORMAT, name]).encode()
+
+
+def _signed(kind: bytes, sign: str) -> bytes:
+    return kind[:-1] + f', "{sign}"]'.encode()
 
 
 def _checksum(data: memoryview, kind: bytes) -> str:
@@ -201,19 +216,32 @@ def _checksum(data: memoryview, kind: bytes) -> str:
     return digest.hexdigest()
 
 
-def _trailer(file: int) -> tuple[Blob, bytes]:
-    """Return type, shape and checksum from the end of a band file, and the JSON of type and shape as bytes.
+def _sha256(data: memoryview, kind: bytes) -> bytes:
+    digest = hashlib.sha256(data)
+    digest.update(kind)
+    return digest.digest()
 
-    Raises `ValueError` if the size of the file is wrong.
+
+def _trailer(file: int, name: str) -> tuple[Blob, bytes]:
+    """Return what the end of the band file ``name`` says, and the part of it that the checksum covers.
+
+    Raises `OtherFormat` for a file of another version, and `ValueError` for a wrong size or name.
     """
     size = os.fstat(file).st_size
-    tail = os.pread(file, 512, max(0, size - 512))
+    tail = os.pread(file, _TAIL, max(0, size - _TAIL))
     length = int.from_bytes(tail[-4:], "little")
     body = tail[-36 - length : -4]
     if len(body) != length + 32:
         raise ValueError("the trailer of the band file is missing or cut short")
-    dtype, shape = json.loads(body[:length])
-    blob = Blob(dtype_of(dtype), tuple(int(n) for n in shape), body[length:].decode())
+    said = json.loads(body[:length])
+    if not isinstance(said, list) or len(said) < 2:
+        raise ValueError("the trailer of the band file is not what was written")
+    if said[2:3] != [FORMAT] or len(said) != 5:
+        raise OtherFormat(f"its format is version {said[2] if len(said) > 2 else 1!r}, not version {FORMAT}")
+    (dtype, shape, _, own, sign), xxh3 = said, body[length:].decode(errors="replace")
+    if own != name or not isinstance(sign, str) or not is_shape(shape) or not is_checksum(xxh3):
+        raise ValueError(f"the band file belongs to the band {own!r}, or its trailer is not what was written")
+    blob = Blob(dtype_of(str(dtype)), tuple(shape), xxh3, name, sign)
     if size != blob.nbytes + length + 36:
         raise ValueError(f"the band file has {size} bytes instead of {blob.nbytes + length + 36} bytes")
     return blob, body[:length]
@@ -221,7 +249,7 @@ def _trailer(file: int) -> tuple[Blob, bytes]:
 
 def _load(file: BufferedReader, expected: Blob, into: memoryview, address: int | None, verify: bool) -> None:
     """Load a band file into memory; raise `ValueError` if the file holds another band or damaged bytes."""
-    blob, kind = _trailer(file.fileno())
+    blob, kind = _trailer(file.fileno(), expected.name)
     if blob[:2] != expected[:2]:
         raise ValueError(f"the band file holds {blob.dtype} {blob.shape}, not {expected.dtype} {expected.shape}")
     if expected.xxh3 and blob.xxh3 != expected.xxh3:
@@ -232,6 +260,9 @@ def _load(file: BufferedReader, expected: Blob, into: memoryview, address: int |
         raise ValueError("the band file was truncated while it was read")
     if verify and _checksum(into, kind) != blob.xxh3:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
+    if secrets():
+        plain = _kind(blob.dtype, blob.shape, blob.name)
+        check_signature(blob.sign, blob.name, _sha256(into, plain))
 
 
 def _reserve(size: int) -> Any:

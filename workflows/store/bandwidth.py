@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import suppress
 from typing import Literal
 
-from neusee.workflows.store.shared_folder import Disk
+from neusee.workflows.keys.seal import seal_record, unseal_record
+from neusee.workflows.store.shared_folder import Disk, read_file
 
 Direction = Literal["read", "write"]
 _FILE = "speeds.json"
@@ -39,7 +39,7 @@ class Speeds:
         if not written / _NEWS < self._now[way] < written * _NEWS:
             self._written = dict(self._now)
             with suppress(OSError):
-                self._disk.replace(_FILE, json.dumps(self._now).encode())
+                self._disk.replace(_FILE, seal_record({str(way): speed for way, speed in self._now.items()}))
 
     def _speed(self, way: Direction) -> float:
         if not self._now:
@@ -49,8 +49,7 @@ class Speeds:
 
     def _stored(self) -> dict[Direction, float]:
         try:
-            with open(f"{self._disk.folder}/{_FILE}", "rb") as file:
-                speeds = json.load(file)
+            speeds = unseal_record(read_file(f"{self._disk.folder}/{_FILE}"))
             return {way: float(speeds[way]) for way in _USUAL if 1e3 < speeds[way] < 1e13}
         except (OSError, ValueError, LookupError, TypeError):
             return {}

@@ -14,9 +14,10 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
+from neusee.workflows.keys.seal import NotRead
 from neusee.workflows.store import metadata
 from neusee.workflows.store.metadata import UNREADABLE, Metadata
-from neusee.workflows.store.shared_folder import Disk
+from neusee.workflows.store.shared_folder import Disk, below
 
 LOW = 0.9  #: fraction of the budget that remains after an eviction
 _HALF = 7 * 86400.0  #: s in which the weight of an unused value halves
@@ -97,18 +98,29 @@ def total(disk: Disk) -> int:
 def candidates(disk: Disk, pinned: Collection[str], read_seconds: Callable[[float], float]) -> Iterator[Candidate]:
     """Yield every stored value that may be evicted, with the number of bytes that its eviction frees.
 
-    The bytes of a band are divided among the values that use the band.
+    The bytes of a band are divided among the values that use the band. A result that this program does not read saves
+    no time.
     """
     stats = {os.path.basename(path): (size, changed) for path, size, changed in files(disk)}
-    kept = {key: about for key, about in metadata.each(disk) if metadata.is_kept(about)}
-    bands = {key: set(metadata.bands(about)) for key, about in kept.items()}
-    shared = Counter(name for names in bands.values() for name in names)
-    for key, about in kept.items():
+    shared = Counter[str]()
+    kept = list[tuple[str, int, float, tuple[str, ...]]]()  # key, bytes, s that the value saves, bands
+    for key in metadata.names(disk):
+        stored = stats.get(f"{key}.safetensors", _NONE)[0]
+        with suppress(*UNREADABLE):
+            try:
+                about = metadata.read(disk, key)
+            except NotRead:
+                kept.append((key, stored + stats.get(f"{key}.json", _NONE)[0], 0.0, ()))
+                continue
+            if metadata.is_kept(about):
+                size = stored + sum(len(tensor[-1]) for tensor in about.get("tensors") or ())
+                size += stats.get(about.get("file") or "", _NONE)[0]
+                saved = float(about.get("seconds") or 0.0) - read_seconds(float(about.get("bytes") or 0))
+                kept.append((key, size, saved, tuple(set(metadata.bands(about)))))
+                shared.update(kept[-1][-1])
+    for key, size, saved, bands in kept:
         if key not in pinned and f"{key}.json" in stats:
-            size = sum(len(tensor[-1]) for tensor in about.get("tensors", ()))
-            size += sum(stats.get(name, _NONE)[0] for name in (f"{key}.safetensors", about.get("file", "")))
-            size += int(sum(stats.get(name, _NONE)[0] / shared[name] for name in bands[key]))
-            saved = float(about.get("seconds") or 0.0) - read_seconds(float(about.get("bytes") or 0))
+            size += int(sum(stats.get(name, _NONE)[0] / shared[name] for name in bands))
             yield Candidate(key, size, saved, stats[f"{key}.json"][1])
 
 
@@ -116,9 +128,14 @@ def drop(disk: Disk, key: str) -> bool:
     """Delete a stored value but keep its metadata; return False if the value cannot be deleted."""
     try:
         with disk.lock():
-            about = metadata.read(disk, key)
+            try:
+                about = metadata.read(disk, key)
+            except NotRead:
+                about = {"payload": True}
+                disk.unlink(disk.path(key, "json"))
             if metadata.is_kept(about):
-                _write_receipt(disk, key, about)
+                if "key" in about:
+                    _write_receipt(disk, key, about)
                 _delete_files(disk, key, about)
     except FileNotFoundError:
         pass  # another process was first
@@ -134,7 +151,7 @@ def _write_receipt(disk: Disk, key: str, about: Metadata) -> None:
     except OSError as error:
         if error.errno not in _FULL:
             raise
-        os.unlink(disk.path(key, "json"))
+        disk.unlink(disk.path(key, "json"))
 
 
 def _delete_files(disk: Disk, key: str, about: Metadata) -> None:
@@ -143,7 +160,7 @@ def _delete_files(disk: Disk, key: str, about: Metadata) -> None:
         paths.append(f"{disk.folder}/files/{key[:2]}/{os.path.basename(name)}")
     for path in paths:
         with suppress(FileNotFoundError):
-            os.unlink(path)
+            disk.unlink(path)
 
 
 def files(disk: Disk) -> Iterator[tuple[str, int, float]]:
@@ -153,19 +170,3 @@ def files(disk: Disk) -> Iterator[tuple[str, int, float]]:
             with suppress(OSError):
                 stat = entry.stat(follow_symlinks=False)
                 yield entry.path, stat.st_size, stat.st_mtime
-
-
-def below(base: str) -> Iterator[os.DirEntry[str]]:
-    """Yield the files in those subfolders of ``base`` whose names have two letters."""
-    for folder in entries(base):
-        if len(folder.name) == 2 and folder.is_dir(follow_symlinks=False):
-            yield from entries(folder.path)
-
-
-def entries(folder: str) -> list[os.DirEntry[str]]:
-    """Return the files and folders in a folder, or an empty list if the folder cannot be read."""
-    try:
-        with os.scandir(folder) as listing:
-            return list(listing)
-    except OSError:
-        return []

@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
-import xxhash
+from torch import Tensor
 
 from neusee.workflows.store.result_store import Store
 
@@ -30,7 +30,7 @@ class DerivedFiles:
         """Return the path of the derived file ``key``, or None if the file is missing or has a wrong checksum."""
         path = self._path(key, suffix)
         with suppress(KeyError, OSError):
-            if path.is_file() and self.store.has(key) and bytes(self.store.get(key).tolist()) == _checksum(path):
+            if path.is_file() and self.store.has(key) and torch.equal(self.store.get(key, Tensor), _digest(path)):
                 return path
         return None
 
@@ -50,7 +50,7 @@ class DerivedFiles:
             "file": path.name,
             "file_bytes": len(content),
         }
-        self.store.put(key, torch.tensor(list(_checksum(path)), dtype=torch.uint8), about)
+        self.store.put(key, _digest(path), about)
         return path
 
     def _path(self, key: str, suffix: str) -> Path:
@@ -69,6 +69,7 @@ class DerivedFiles:
         return path
 
 
-def _checksum(path: Path) -> bytes:
+def _digest(path: Path) -> Tensor:
+    """Return the SHA-256 of a file as bytes, which the signature of the store covers."""
     with path.open("rb") as file:
-        return hashlib.file_digest(file, xxhash.xxh3_128).digest()
+        return torch.tensor(list(hashlib.file_digest(file, "sha256").digest()), dtype=torch.uint8)

@@ -6,17 +6,23 @@ whose owner cannot be determined is kept for an hour.
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
+from neusee.workflows.keys.seal import NotRead, checked_body
 from neusee.workflows.store import metadata
-from neusee.workflows.store.budget_eviction import below, entries
+from neusee.workflows.store.layout_check import are_bands
 from neusee.workflows.store.metadata import UNREADABLE
-from neusee.workflows.store.shared_folder import OLD, Disk
+from neusee.workflows.store.shared_folder import OLD, Disk, below, entries, read_file
 
 Find = Callable[[Disk], Iterator[os.DirEntry[str]]]
+_HAS_PAYLOAD, _HAS_BANDS = (
+    b'"payload":{',
+    b'"bands":{',
+)  #: no text in JSON contains a quotation mark without a backslash
 _WEEK = 7 * 86400.0  #: s for which a damaged entry is kept for inspection
 
 
@@ -25,7 +31,7 @@ def sweep(disk: Disk, dry: bool = False) -> list[tuple[str, int]]:
     if not os.path.isdir(disk.folder):
         return []
     gone = disk.sweep(dry, _WEEK) if os.path.isdir(f"{disk.folder}/tmp") else []
-    for find in (_payloads, bands, _files, _damaged):
+    for find in (_not_read, _payloads, bands, _files, _damaged):
         gone += removed(disk, find, dry)
     return gone
 
@@ -41,9 +47,27 @@ def removed(disk: Disk, find: Find, dry: bool) -> list[tuple[str, int]]:
             for entry in find(disk):
                 with suppress(OSError):
                     size = entry.stat(follow_symlinks=False).st_size
-                    os.unlink(entry.path)
+                    disk.unlink(entry.path)
                     gone.append((entry.path, size))
     return gone
+
+
+def _not_read(disk: Disk) -> Iterator[os.DirEntry[str]]:
+    """Yield old metadata of another format version, or without the signature that is asked for."""
+    for entry in below(disk.folder):
+        key, _, suffix = entry.name.partition(".")
+        if suffix == "json":
+            with suppress(*UNREADABLE):
+                if _age(entry) > _WEEK and _is_not_read(disk, key):
+                    yield entry
+
+
+def _is_not_read(disk: Disk, key: str) -> bool:
+    try:
+        metadata.read(disk, key)
+    except NotRead:
+        return True
+    return False
 
 
 def _payloads(disk: Disk) -> Iterator[os.DirEntry[str]]:
@@ -53,7 +77,7 @@ def _payloads(disk: Disk) -> Iterator[os.DirEntry[str]]:
         if suffix == "safetensors":
             with suppress(*UNREADABLE):
                 try:
-                    orphan = not metadata.read(disk, key).get("payload")
+                    orphan = _HAS_PAYLOAD not in _raw(disk, key) and not metadata.read(disk, key).get("payload")
                 except FileNotFoundError:
                     orphan = True
                 if orphan:
@@ -61,16 +85,30 @@ def _payloads(disk: Disk) -> Iterator[os.DirEntry[str]]:
 
 
 def bands(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Yield the band files that no stored value uses, or nothing if metadata of another user cannot be read."""
+    """Yield the band files that no stored value uses, or nothing if metadata of another user cannot be read.
+
+    The bands of results of another format version count as used.
+    """
     files, needed = list(below(f"{disk.folder}/bands")), set[str]()
     for key in metadata.names(disk) if files else ():
         try:
-            needed.update(metadata.bands(metadata.read(disk, key)))
+            raw = _raw(disk, key)
+            if _HAS_BANDS in raw:
+                about = json.loads(checked_body(raw)[0] + b"}")
+                needed.update(about["bands"]["names"] if are_bands(about["bands"]["names"]) else ())
         except PermissionError:
             return
         except UNREADABLE:
             continue
     yield from (entry for entry in files if entry.name not in needed)
+
+
+def _raw(disk: Disk, key: str) -> bytes:
+    """Return the metadata of a result as they are stored, without a check.
+
+    Whether a field is in them decides about most files, and takes a third of the time of a check.
+    """
+    return read_file(disk.path(key, "json"))
 
 
 def _files(disk: Disk) -> Iterator[os.DirEntry[str]]:

@@ -1,13 +1,13 @@
 """Journal of a store: one line for every finished result, so that a query reads one file instead of all results.
 
-No result depends on the journal. Each line is one write, and a torn line is skipped. A journal that is missing or
+No result depends on the journal. Each line is one write and has its own seal; a line that is torn, damaged or out of
+range is skipped. A journal that is missing or
 damaged is rebuilt from the metadata of the results.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import re
 import threading
@@ -15,15 +15,16 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from typing import Any
 
+from neusee.workflows.keys.seal import FORMAT, seal_record, unseal_record
 from neusee.workflows.store import metadata
+from neusee.workflows.store.metadata_fields import FIELDS, is_text
 from neusee.workflows.store.shared_folder import Disk, append
 
 Row = dict[str, Any]
 _FIELDS = ("step", "recipe", "seconds", "bytes", "device", "peak", "date")
-_TEXT, _NUMBER = str | None, int | float | None
-_KINDS = {"key": str, "step": _TEXT, "node": _TEXT, "seconds": _NUMBER, "bytes": _NUMBER, "kept": bool}
-_HEAD = re.compile(rb'\{"journal":"[0-9a-f]{16}"\}')
-_encode = json.JSONEncoder(separators=(",", ":")).encode
+_CHECKED = [(name, FIELDS[name]) for name in (*_FIELDS, "kept")]
+_NAMES = {"key", "node", "kept", *_FIELDS}
+_HEAD = re.compile(rb'\{"journal":"[0-9a-f]{16}","format":%d\}' % FORMAT)
 _SPARE = 20_000  #: superseded lines from which the file is rewritten
 
 
@@ -46,7 +47,7 @@ class Journal:
         """Append the line of a result to the journal; ignore a failure, because no result depends on the journal."""
         with suppress(OSError):
             try:
-                append(self._path, b"\n" + _encode(row_of(key, about)).encode())
+                append(self._path, b"\n" + seal_record(row_of(key, about)))
             except FileNotFoundError:
                 with self._guard:
                     self._rebuild()
@@ -93,7 +94,7 @@ class Journal:
     def _read_new_lines(self) -> None:
         """Read the lines added to the journal file since the last call; rebuild a missing or damaged file."""
         try:
-            with open(self._path, "rb") as file:
+            with open(self._path, "rb", opener=_opened) as file:
                 head = file.readline(100).strip()
                 if head != self._head or os.fstat(file.fileno()).st_size < self._offset:
                     self._forget()
@@ -121,8 +122,8 @@ class Journal:
         """Replace the journal file by the lines ``rows``; a line that another process adds meanwhile may be lost."""
         self._forget()
         self._rows = rows
-        self._head = f'{{"journal":"{os.urandom(8).hex()}"}}'.encode()
-        raw = b"".join([self._head, *(b"\n" + _encode(row).encode() for row in rows)])
+        self._head = f'{{"journal":"{os.urandom(8).hex()}","format":{FORMAT}}}'.encode()
+        raw = b"".join([self._head, *(b"\n" + seal_record(row) for row in rows)])
         self._offset = len(raw)
         try:
             if rows:
@@ -132,19 +133,23 @@ class Journal:
 
 
 def _parsed(raw: bytes) -> Iterator[Row]:
-    """Yield the valid lines of the journal text ``raw``, decoded from JSON; skip damaged lines."""
-    lines = [line for line in raw.split(b"\n") if line]
-    try:
-        rows = json.loads(b"[" + b",".join(lines) + b"]")
-    except ValueError:
-        rows = [_row(line) for line in lines]
-    for row in rows:
-        if isinstance(row, dict) and all(isinstance(row.get(name, ...), kind) for name, kind in _KINDS.items()):
-            yield row
+    """Yield the undamaged lines of the journal text ``raw`` as dicts; skip any other line."""
+    for line in raw.split(b"\n"):
+        if line:
+            with suppress(ValueError):
+                row = unseal_record(line)
+                if _is_row(row):
+                    yield row
 
 
-def _row(line: bytes) -> Any:
-    try:
-        return json.loads(line)
-    except ValueError:
-        return None
+def _is_row(row: Row) -> bool:
+    if not row.keys() >= _NAMES:
+        return False
+    key, node = row["key"], row["node"]
+    known = isinstance(key, str) and key.isalnum() and (node is None or is_text(node)) and row["kept"] is not None
+    return known and all(row[name] is None or is_right(row[name]) for name, is_right in _CHECKED)
+
+
+def _opened(path: str, flags: int) -> int:
+    """Open the journal without waiting for a pipe in its place, and without following a symbolic link."""
+    return os.open(path, flags | os.O_NONBLOCK | os.O_NOFOLLOW)

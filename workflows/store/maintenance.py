@@ -8,8 +8,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from neusee.workflows.keys.seal import NotRead
 from neusee.workflows.store import garbage_files, metadata
-from neusee.workflows.store.budget_eviction import Candidate, candidates, evict, files, total
+from neusee.workflows.store.budget_eviction import Candidate, candidates, evict, total
 from neusee.workflows.store.journal import Journal
 from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept
 from neusee.workflows.store.shared_folder import Disk
@@ -47,7 +48,8 @@ class Maintained(Protocol):
     _known: dict[str, Metadata]
 
     def read_seconds(self, size: float) -> float: ...
-    def load(self, about: Metadata, verify: str) -> Any: ...
+    def load(self, about: Metadata, verify: str, kind: Any = Any) -> Any: ...
+    def leave(self, error: NotRead) -> None: ...
     def put_aside(self, key: str, error: Exception) -> None: ...
 
     def gc(self, budget: int | None = None, dry: bool = False) -> Swept:
@@ -58,13 +60,14 @@ class Maintained(Protocol):
         budget = self.budget if budget is None else budget
         before = total(self.disk)
         orphans = dict(garbage_files.sweep(self.disk, dry))
-        left = sum(size for path, size, _ in files(self.disk) if path not in orphans)
+        uncounted = (f"{self.disk.folder}/tmp/", f"{self.disk.folder}/bad/")  # files outside the budget
+        outside = sum(size for path, size in orphans.items() if path.startswith(uncounted))
+        left = before - (sum(orphans.values()) - outside)
         gone, refused = self.make_room(left - budget, dry) if budget is not None else ([], [])
-        after = left - sum(c.size for c in gone) if dry else total(self.disk)
+        after = left - sum(c.size for c in gone) if dry or not gone else total(self.disk)
         if not dry:
             self.journal.compact()
-        uncounted = (f"{self.disk.folder}/tmp/", f"{self.disk.folder}/bad/")  # files outside the budget
-        freed = max(before - after, 0) + sum(size for path, size in orphans.items() if path.startswith(uncounted))
+        freed = max(before - after, 0) + outside
         return Swept(tuple(c.key for c in gone), tuple(c.key for c in refused), freed, len(orphans), after)
 
     def make_room(self, excess: float, dry: bool = False) -> tuple[list[Candidate], list[Candidate]]:
@@ -81,7 +84,7 @@ class Maintained(Protocol):
     def check(self) -> Iterator[Checked]:
         """Yield the outcome of a check of every stored result; move damaged results to the folder ``bad/``.
 
-        The check reads every value and compares every checksum.
+        The check reads every value and compares every checksum. It needs no type of a value, so it imports no node.
 
         The mode ``verify`` of the store has no effect on this check.
         """
@@ -90,7 +93,10 @@ class Maintained(Protocol):
             try:
                 about = metadata.read(self.disk, key)
                 if is_kept(about):
-                    self.load(about, "always")
+                    self.load(about, "always", None)
+            except NotRead as error:
+                self.leave(error)
+                continue
             except UNREADABLE as error:
                 if not metadata.has_value(self.disk, key):
                     continue  # another process evicted the value meanwhile
@@ -102,12 +108,12 @@ class Maintained(Protocol):
         """Protect the stored value of ``key`` from eviction. Raises `OSError` if the folder cannot be written."""
         self.disk.prepare()
         self.disk.make_folder(f"{self.disk.folder}/pins")
-        open(f"{self.disk.folder}/pins/{key}", "wb").close()
+        os.close(os.open(f"{self.disk.folder}/pins/{key}", os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW, 0o666))
 
     def unpin(self, key: str) -> None:
         """Allow the eviction of the value of ``key`` again."""
         with suppress(FileNotFoundError):
-            os.unlink(f"{self.disk.folder}/pins/{key}")
+            self.disk.unlink(f"{self.disk.folder}/pins/{key}")
 
     def pinned(self) -> set[str]:
         """Return the keys of the values that are protected from eviction."""

@@ -24,9 +24,12 @@ def compute_once(
     which get the date and the seconds that ``compute`` took. small: whether to store the value with `Store.put_small`.
     """
     with suppress(KeyError):
-        kept = store.get(key)
+        kept = store.get(key, dict if is_dataclass(kind) else kind)
         make: Callable[..., T] = kind
-        return make(**kept) if is_dataclass(kind) else make(kept)
+        try:
+            return make(**kept) if is_dataclass(kind) else make(kept)
+        except (TypeError, ValueError) as error:  # a value with other fields
+            store.put_aside(key, error)
     began = time.perf_counter()
     value = compute()
     spent: Metadata = {"seconds": time.perf_counter() - began, "date": datetime.now(UTC).isoformat(timespec="seconds")}

@@ -2,59 +2,41 @@
 
 from __future__ import annotations
 
-import json
 import os
+import re
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any, TypeGuard
 
-import xxhash
-
-from neusee.workflows.store.shared_folder import Disk
+from neusee.workflows.keys.seal import NotRead, seal_record, unseal_record
+from neusee.workflows.store.metadata_fields import checked_fields
+from neusee.workflows.store.shared_folder import Disk, entries, read_file
 
 Metadata = dict[str, Any]
 INLINE = 4096  #: bytes of tensors up to which a result is stored inside its JSON
-UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, ImportError)
+UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, ArithmeticError, MemoryError)
+_TOP = re.compile("[0-9a-f]{2}")
 _OF_THE_VALUE = ("layout", "payload", "tensors", "bands")
-_SEAL = ',"seal":"'
-_SEAL_SIZE = len(_SEAL) + 32 + 2
-_encode = json.JSONEncoder(separators=(",", ":")).encode
-
-
-def seal(about: Metadata) -> bytes:
-    """Return the metadata of a result as JSON whose last field is the checksum of all bytes before that field."""
-    body = _encode(about)[:-1].encode()
-    return body + f'{_SEAL}{xxhash.xxh3_128_hexdigest(body)}"}}'.encode()
-
-
-def unseal(raw: bytes) -> Metadata:
-    """Return the metadata that `seal` wrote; raise `ValueError` if the checksum does not match."""
-    body = raw[:-_SEAL_SIZE]
-    if raw[-_SEAL_SIZE:] != f'{_SEAL}{xxhash.xxh3_128_hexdigest(body)}"}}'.encode():
-        raise ValueError("checksum mismatch: the metadata have changed since they were written")
-    about: Metadata = json.loads(body + b"}")
-    return about
 
 
 def read(disk: Disk, key: str) -> Metadata:
-    """Return the metadata of ``key``; raise one of the errors in `UNREADABLE` if the file is missing or damaged."""
-    with open(disk.path(key, "json"), "rb") as file:
-        return unseal_of(key, file.read())
+    """Return the metadata of ``key``; raise one of the errors in `UNREADABLE` if the file is missing or damaged.
+
+    Raises `NotRead` for the metadata of another format version, or without the signature that is asked for.
+    """
+    return unseal_of(key, read_file(disk.path(key, "json")))
 
 
 def unseal_of(key: str, raw: bytes) -> Metadata:
-    """Return the metadata that `seal` wrote for ``key``; raise `ValueError` for the metadata of another key."""
-    about = unseal(raw)
-    if about["key"] != key:
-        raise ValueError(f"the metadata of {key} belong to the key {about['key']}")
-    return about
+    """Return the metadata that `seal_record` wrote for ``key``; raise `ValueError` for the metadata of another key."""
+    return checked_fields(unseal_record(raw), key)
 
 
 def write(disk: Disk, key: str, about: Metadata, over: bool) -> bool:
     """Write the metadata of ``key``; if ``over`` is False, keep an existing file and return False."""
     path = disk.path(key, "json")
     with disk.temporary(key) as (part, file):
-        file.write(seal(about))
+        file.write(seal_record(about))
         file.flush()  # without a sync to disk, because torn metadata fail their checksum
         linked = disk.link(part, path)
         if over and not linked:
@@ -90,6 +72,8 @@ def find(disk: Disk, key: str) -> Metadata | None:
     for _ in range(2):
         try:
             return _read_whole(disk, key)
+        except NotRead:
+            raise
         except UNREADABLE as error:
             if not os.path.exists(disk.path(key, "json")):
                 return None
@@ -98,9 +82,11 @@ def find(disk: Disk, key: str) -> Metadata | None:
 
 
 def has_value(disk: Disk, key: str) -> bool:
-    """Return True if the store has a value for ``key``, or metadata of ``key`` that cannot be read."""
+    """Return True if the store has a value for ``key``, or metadata of ``key`` that are damaged."""
     try:
         return is_kept(read(disk, key))
+    except NotRead:
+        return False
     except UNREADABLE:
         return os.path.exists(disk.path(key, "json"))
 
@@ -121,9 +107,15 @@ def receipt(about: Metadata) -> Metadata:
 
 
 def names(disk: Disk) -> Iterator[str]:
-    """Yield the cache key of every result of a store in ascending order."""
-    for path in sorted(disk.root.glob("[0-9a-f][0-9a-f]/*.json")):
-        yield path.stem
+    """Yield the cache key of every result of a store in ascending order; follow no symbolic link."""
+    for folder in _folders(disk):
+        found = (entry.name.rpartition(".") for entry in entries(folder.path))
+        yield from sorted(key for key, _, suffix in found if suffix == "json" and key[:2] == folder.name)
+
+
+def _folders(disk: Disk) -> list[os.DirEntry[str]]:
+    found = [entry for entry in entries(disk.folder) if _TOP.fullmatch(entry.name)]
+    return sorted((entry for entry in found if entry.is_dir(follow_symlinks=False)), key=lambda entry: entry.name)
 
 
 def each(disk: Disk) -> Iterator[tuple[str, Metadata]]:

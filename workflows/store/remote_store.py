@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -24,13 +23,12 @@ from typing import Any
 import xxhash
 
 from neusee.workflows.keys.cache_key import Key, digest
+from neusee.workflows.keys.seal import NotRead, seal_record, secrets
 from neusee.workflows.store.environment import Verify
-from neusee.workflows.store.metadata import Metadata, is_kept, receipt, seal, unseal, unseal_of
+from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept, read, receipt, unseal_of
 from neusee.workflows.store.payload import newest, stamp_of
 from neusee.workflows.store.remote_files import RemoteFiles
 from neusee.workflows.store.result_store import Store
-
-_NAME = re.compile("[0-9a-f]{32}")
 
 
 def open_store(where: str | Path | None = None) -> Store:
@@ -60,6 +58,7 @@ class RemoteStore(Store):
         self.url, self._remote = url, RemoteFiles(url)
         self._seen: dict[Key, Metadata] = {}  # metadata read from the URL
         self._broken: set[Key] = set()  # keys whose copy at the URL cannot be used
+        self._failed: set[Key] = set()  # keys whose local copy was damaged
         super().__init__(root or local_layer(url), verify=verify, budget=budget)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -70,11 +69,18 @@ class RemoteStore(Store):
         here = super().about(key)
         return here if is_kept(here) else self._remote_metadata(key) or here
 
-    def get(self, key: Key) -> Any:
+    def get(self, key: Key, kind: Any = Any) -> Any:
         """Return the value of ``key``; raise `KeyError` if neither the local folder nor the URL has the value."""
         if not self._is_local(key):
             self._fetch_value(key)
-        return super().get(key)
+        return super().get(key, kind)
+
+    def put_aside(self, key: Key, error: Exception) -> None:
+        """Move the local files of a damaged result to ``bad/``; the second time, do not use its copy at the URL."""
+        super().put_aside(key, error)
+        if key in self._failed:
+            self._give_up(key)
+        self._failed.add(key)
 
     def put(self, key: Key, value: Any, about: Metadata) -> bool:
         """Store a value locally and at the URL; return False if the value cannot be stored locally."""
@@ -87,7 +93,7 @@ class RemoteStore(Store):
         """Store the metadata of a result without its value, locally and at the URL."""
         stored = super().put_receipt(key, about)
         if stored and not self._remote.exists(_receipt_name(key)) and not self._remote.exists(f"{key}.json"):
-            self._remote.write(_receipt_name(key), seal(receipt({"key": key, **about})))
+            self._remote.write(_receipt_name(key), seal_record(receipt({"key": key, **about})))
         return stored
 
     def entries(self) -> Iterator[tuple[Key, Metadata]]:
@@ -126,7 +132,10 @@ class RemoteStore(Store):
         if raw is not None:
             try:
                 self._seen[key] = unseal_of(key, raw)
-            except (ValueError, LookupError, TypeError) as error:
+            except NotRead as error:
+                self._give_up(key)
+                self.leave(error)
+            except UNREADABLE as error:
                 self._distrust(key, error)
 
     def _fetch_value(self, key: Key) -> None:
@@ -135,15 +144,17 @@ class RemoteStore(Store):
         try:
             if is_kept(about) and not self._value_fetched(key, about):
                 self._give_up(key)
-        except ValueError as error:
-            self._distrust(key, error)
         except OSError as error:
             self._give_up(key)
             self._remote.warn(f"{self.root} cannot keep copies of {self.url} ({error}): set NEUSEE_CACHE_LOCAL")
+        except UNREADABLE as error:
+            self._distrust(key, error)
 
     def _value_fetched(self, key: Key, about: Metadata) -> bool:
         """Copy a value from the URL into the local folder after a check of every byte; return False if a copy fails."""
-        payload, bands = about["payload"], _bands(about["layout"])
+        from neusee.workflows.store.serialization import blobs_in
+
+        payload, bands = about["payload"], blobs_in(about["layout"])
         missing = {name: xxh3 for name, xxh3 in bands.items() if not self.blobs.has(name)}
         with ExitStack() as files:
             part, *parts = (self._part(files, name) for name in (key, *missing))
@@ -195,7 +206,9 @@ class RemoteStore(Store):
         with open(part, "rb") as file:
             xxh3, size = hashlib.file_digest(file, xxhash.xxh3_128).hexdigest(), file.tell()
             os.fsync(file.fileno())
-        if (size, xxh3) != (payload["size"], payload["xxh3"]):
+            file.seek(0)
+            signed = not secrets() or hashlib.file_digest(file, "sha256").hexdigest() == payload.get("sha256")
+        if (size, xxh3) != (payload["size"], payload["xxh3"]) or not signed:
             raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
         return True
 
@@ -205,10 +218,9 @@ class RemoteStore(Store):
         if not over and self._remote.exists(name):
             return
         try:
-            raw = Path(self.disk.path(key, "json")).read_bytes()
-            about = unseal(raw)
+            about = read(self.disk, key)
             files = self._files(key, about)
-        except (OSError, ValueError, LookupError):
+        except UNREADABLE:
             return
         with ThreadPoolExecutor(16) as pool:
             sent = pool.map(
@@ -216,15 +228,17 @@ class RemoteStore(Store):
             )
             if not all(sent):
                 return
-        if self._remote.write(name, raw, over):
+        if self._remote.write(name, seal_record(about), over):
             self._broken.discard(key)
 
     def _files(self, key: Key, about: Metadata) -> dict[str, str]:
         """Return the local paths of the payload and band files of a value, by the name of each file at the URL."""
+        from neusee.workflows.store.serialization import blobs_in
+
         paths = {}
         if payload := about["payload"]:
             paths[_payload_name(key, payload["xxh3"])] = self.disk.path(key, "safetensors")
-        for name, xxh3 in _bands(about["layout"]).items():
+        for name, xxh3 in blobs_in(about["layout"]).items():
             paths[_band_name(name, xxh3)] = self.blobs.path(name)
         return paths
 
@@ -247,16 +261,3 @@ def _payload_name(key: Key, xxh3: str) -> str:
 
 def _band_name(name: str, xxh3: str) -> str:
     return f"{name}-{xxh3}.band"
-
-
-def _bands(layout: Any) -> dict[str, str]:
-    """Return the checksum of every band file of a value, by the name of the band.
-
-    Raises `ValueError` for a name that may be a path.
-    """
-    from neusee.workflows.store.serialization import blobs_in
-
-    checksums = blobs_in(layout)
-    if bad := [name for name in checksums if not _NAME.fullmatch(name)]:
-        raise ValueError(f"{bad[0]!r} is not the name of a band file, which has 32 hexadecimal digits")
-    return checksums

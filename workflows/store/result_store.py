@@ -19,6 +19,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from neusee.workflows.keys.seal import NotRead, Unsigned
 from neusee.workflows.store import metadata, payload
 from neusee.workflows.store.bandwidth import Speeds
 from neusee.workflows.store.budget_eviction import LOW, CacheBudget
@@ -71,6 +72,7 @@ class Store(Maintained):
         self._lost: set[str] = set()  # damaged results that the user may have no permission to move
         self._used: set[str] = set()
         self.failure = ""  #: the warning after the first write that failed
+        self._told = False
 
     def __reduce__(self) -> tuple[Any, ...]:  # another process receives the path and opens the store
         return partial(type(self), self.root, verify=self.verify, budget=self.budget), ()
@@ -97,21 +99,26 @@ class Store(Maintained):
         if not is_kept(about):
             try:
                 about = metadata.find(self.disk, key) or about
+            except NotRead as error:
+                self.leave(error)
             except UNREADABLE as error:
                 self._put_aside(key, error)
         if about is not None:
             self._known[key] = about
         return about
 
-    def get(self, key: str) -> Any:
-        """Return the value of ``key``; raise `KeyError` if no undamaged value is stored."""
+    def get(self, key: str, kind: Any = Any) -> Any:
+        """Return the value of ``key``; raise `KeyError` if no undamaged value is stored.
+
+        ``kind`` is the annotated type of the value; a value that does not fit counts as damaged.
+        """
         about = self.about(key)
         while is_kept(about):
             try:
-                value = self.load(about, self.verify)
+                value = self.load(about, self.verify, kind)
             except UNREADABLE as error:
                 before, about = about, self._again(key)
-                if about == before:
+                if about == before or self.brief.find(key) == before:
                     self._put_aside(key, error)
                     break
             else:
@@ -157,10 +164,15 @@ class Store(Maintained):
             return metadata.read(self.disk, key)
         return None
 
-    def load(self, about: Metadata, verify: str) -> Any:
-        """Return the value that the metadata ``about`` describe; raise an error in `UNREADABLE` if it is damaged."""
+    def load(self, about: Metadata, verify: str, kind: Any = Any) -> Any:
+        """Return the value that the metadata ``about`` describe; raise an error in `UNREADABLE` if it is damaged.
+
+        For the ``kind`` None the named tuples in the value are plain tuples, so that no type need be known.
+        """
         began = time.perf_counter()
-        value, size = payload.load(self.disk, about, verify, self.blobs)
+        value, size = payload.load(self.disk, about, verify, self.blobs, kind is not None)
+        if kind is not None and kind is not Any:
+            payload.check_kind(value, kind)
         self._speeds.learn("read", size, time.perf_counter() - began)
         return value
 
@@ -193,14 +205,11 @@ class Store(Maintained):
             warnings.warn(self.failure, stacklevel=5)
 
     def _write(self, key: str, value: Any, about: Metadata) -> bool:
-        from neusee.workflows.store.serialization import blobs_in
-
         began = time.perf_counter()
-        entry, tensors = payload.described(key, value, about, self.blobs)
+        entry, tensors, bands = payload.described(key, value, about, self.blobs)
         if self._room and entry["bytes"] > LOW * self._room.budget:
             self._write_receipt(key, entry)
             return False
-        bands = blobs_in(entry["layout"])
         if tensors or bands:
             self._write_parts(key, entry, tensors, value if bands else None)
             self._speeds.learn("write", sum(t.nbytes for t in tensors), time.perf_counter() - began)
@@ -212,29 +221,25 @@ class Store(Maintained):
         return True
 
     def _write_small(self, key: str, value: Any, about: Metadata) -> bool:
-        entry, tensors = payload.described(key, value, about)
+        entry, tensors, _ = payload.described(key, value, about)
         if tensors:
             entry = metadata.receipt(entry)
         self.brief.append(entry)
+        self._lost.discard(key)
         self._known[key] = entry
         self.journal.append(key, entry)
         return is_kept(entry)
 
     def _write_parts(self, key: str, entry: Metadata, tensors: list[Tensor], banded: Any) -> None:
         """Write the large files of a value, then the metadata that name the files; keep a value stored earlier."""
-        from neusee.workflows.store import serialization
-
         with self.disk.temporary(key) as (part, file):
             if tensors:
-                xxh3 = serialization.write(file, tensors)
-                file.flush()
-                os.fsync(file.fileno())
-                entry["payload"] = {"size": file.tell(), "xxh3": xxh3}
+                entry["payload"] = payload.written(file, tensors)
             with self.disk.lock():
                 if key not in self._lost and metadata.has_value(self.disk, key):
                     return
                 if banded is not None:  # a sweep may have removed bands that no value names yet
-                    names = list(serialization.blobs_in(serialization.pack(banded, self.blobs)[0]))
+                    names = list(payload.described(key, banded, {}, self.blobs)[2])
                     entry["bands"] = {"names": names, "newest": payload.newest(self.blobs, names)}
                 if tensors:
                     path = self.disk.path(key, "safetensors")
@@ -269,8 +274,18 @@ class Store(Maintained):
         self._lost.add(key)
         unreadable = isinstance(error, OSError) and not isinstance(error, FileNotFoundError)
         for suffix in () if unreadable else ("json", "safetensors"):
-            with suppress(OSError):
-                self.disk.make_folder(f"{self.disk.folder}/bad")
-                os.replace(self.disk.path(key, suffix), f"{self.disk.folder}/bad/{key}.{suffix}")
-        if not os.path.lexists(self.disk.path(key, "json")):
-            self._lost.discard(key)
+            self.disk.put_aside(self.disk.path(key, suffix))
+        small = self.brief.find(key)
+        with suppress(OSError):
+            if is_kept(small):
+                self.brief.append(metadata.receipt(small))
+            if not os.path.lexists(self.disk.path(key, "json")):
+                self._lost.discard(key)
+
+    def leave(self, error: NotRead) -> None:
+        """Issue one warning for all results that are left alone, because they are of another format or unsigned."""
+        if not self._told:
+            what = "without a signature by NEUSEE_CACHE_SECRET" if isinstance(error, Unsigned) else "of another version"
+            text = f"results {what} in {self.root} are not read, and count as missing"
+            warnings.warn(f"{text}: `neusee cache gc` removes those that nobody used for a week", stacklevel=4)
+        self._told = True

@@ -8,11 +8,11 @@ code path for a stored value and a computed value. The layout of a `Stacked` ten
 from __future__ import annotations
 
 import base64
-import importlib
+import hashlib
 import json
 import math
 import mmap
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import IO, Any
 
 import torch
@@ -20,6 +20,8 @@ import xxhash
 from torch import Tensor
 
 from neusee.workflows.store.band_files import Blobs, Stacked, bytes_of, dtype_of
+from neusee.workflows.store.layout_check import checked_layout, is_count, is_shape
+from neusee.workflows.store.stored_types import is_registered, made, stored_type, type_name
 
 _ALIGN = 64
 _FILLER = "_"  #: first letter of the names of padding entries, which fill up to the next multiple of `_ALIGN`
@@ -118,7 +120,8 @@ def _layout(item: Any, listed: _Listed, blobs: Blobs | None) -> dict[str, Any]:
     if isinstance(item, bytes):
         return {"bytes": listed.add(torch.frombuffer(bytearray(item), dtype=torch.uint8) if item else torch.empty(0))}
     if isinstance(item, tuple):
-        return {"class": _class_path(item), "items": [_layout(i, listed, blobs) for i in item]}
+        items = [_layout(i, listed, blobs) for i in item]
+        return {"tuple": items} if type(item) is tuple else {"class": _class_name(item), "items": items}
     if isinstance(item, list):
         return {"list": [_layout(i, listed, blobs) for i in item]}
     if isinstance(item, dict) and all(isinstance(k, str) for k in item):
@@ -131,56 +134,57 @@ def _layout(item: Any, listed: _Listed, blobs: Blobs | None) -> dict[str, Any]:
 def _stack_layout(item: Stacked, blobs: Blobs) -> dict[str, Any]:
     written = blobs.write_all(item.names, item.tensor.unbind())
     kind = str(item.tensor.dtype).removeprefix("torch.")
-    return {"stacked": {"names": item.names, "xxh3": written, "dtype": kind, "shape": list(item.tensor.shape)}}
+    return {"stacked": {"names": list(item.names), "xxh3": written, "dtype": kind, "shape": list(item.tensor.shape)}}
 
 
-def unpack(layout: Any, tensors: list[Tensor], blobs: Blobs | None = None, verify: bool = True) -> Any:
-    """Return the value that `pack` turned into ``layout`` and ``tensors``; raise `ValueError` if a band is damaged."""
-    ((kind, body),) = ((k, v) for k, v in layout.items() if k != "items")
-    if kind == "tensor":
-        return tensors[body]
+def unpack(
+    layout: Any, tensors: list[Tensor], blobs: Blobs | None = None, verify: bool = True, typed: bool = True
+) -> Any:
+    """Return the value that `pack` turned into ``layout`` and ``tensors``; ``typed=False`` gives plain tuples.
+
+    Raises `UnknownType` for a named tuple that is not in the registry of `stored_types`, and `ValueError` for a layout
+    that `pack` did not write or a damaged band.
+    """
+    checked_layout(layout)
+    return _unpacked(layout, tensors, blobs, verify, typed)
+
+
+def _unpacked(layout: dict[str, Any], tensors: list[Tensor], blobs: Blobs | None, verify: bool, typed: bool) -> Any:
+    if "class" in layout or "tuple" in layout:
+        items = [_unpacked(i, tensors, blobs, verify, typed) for i in layout["items" if "class" in layout else "tuple"]]
+        return made(stored_type(layout["class"]), items) if typed and "class" in layout else tuple(items)
+    ((kind, body),) = layout.items()
+    if kind in ("tensor", "bytes"):
+        if body >= len(tensors):
+            raise ValueError(f"the value needs tensor {body}, but only {len(tensors)} are stored")
+        return tensors[body] if kind == "tensor" else _bytes(tensors[body])
     if kind == "stacked":
         if blobs is None:
             raise ValueError("the value has band files: give the folder of the band files as ``blobs``")
         return blobs.read(body["names"], body["shape"], dtype_of(body["dtype"]), verify, body["xxh3"])
-    if kind == "bytes":
-        return tensors[body].numpy().tobytes()
-    if kind == "class":
-        items = (unpack(i, tensors, blobs, verify) for i in layout["items"])
-        return _class(body)(*items) if body else tuple(items)
     if kind == "list":
-        return [unpack(i, tensors, blobs, verify) for i in body]
-    return {k: unpack(v, tensors, blobs, verify) for k, v in body.items()} if kind == "dict" else body
+        return [_unpacked(i, tensors, blobs, verify, typed) for i in body]
+    return {k: _unpacked(v, tensors, blobs, verify, typed) for k, v in body.items()} if kind == "dict" else body
+
+
+def _bytes(x: Tensor) -> bytes:
+    if x.dtype != torch.uint8 and x.numel():
+        raise ValueError(f"bytes cannot be stored as a tensor of {x.dtype}")
+    return x.numpy().tobytes()
 
 
 def blobs_in(layout: Any) -> dict[str, str]:
     """Return the checksum (xxh3) of every band file that the layout of a value names, by the name of the band."""
-    checksums: dict[str, str] = {}
-    todo = [layout]
-    while todo:
-        item = todo.pop()
-        if "stacked" in item:
-            checksums |= zip(item["stacked"]["names"], item["stacked"]["xxh3"], strict=True)
-        todo += item.get("items", item.get("list", item.get("dict", {}).values()))
-    return checksums
+    return checked_layout(layout)
 
 
-def _class_path(item: tuple[Any, ...]) -> str:
-    """Return the module and the name of the class of a named tuple, or an empty string for a plain tuple."""
+def _class_name(item: tuple[Any, ...]) -> str:
+    """Return the name of the class of a named tuple in the registry; raise `TypeError` for any other class."""
     kind = type(item)
-    if kind is tuple:
-        return ""
-    if not kind.__module__.startswith("neusee.nodes.") or not hasattr(item, "_fields"):
-        raise TypeError(f"{kind.__module__}.{kind.__qualname__} cannot be stored: use a NamedTuple of neusee.nodes")
-    return f"{kind.__module__}:{kind.__qualname__}"
-
-
-def _class(path: str) -> Callable[..., Any]:
-    module, _, name = path.partition(":")
-    if not module.startswith("neusee.nodes."):
-        raise ValueError(f"the stored class {path} is not a class of neusee.nodes")
-    named_tuple: Callable[..., Any] = getattr(importlib.import_module(module), name)
-    return named_tuple
+    if not is_registered(kind):
+        known = "annotate the node's result with it" if hasattr(item, "_fields") else "use a NamedTuple"
+        raise TypeError(f"{kind.__module__}.{kind.__qualname__} cannot be stored: {known}")
+    return type_name(kind)
 
 
 def to_text(x: Tensor) -> list[Any]:
@@ -190,11 +194,28 @@ def to_text(x: Tensor) -> list[Any]:
 
 def from_text(kind: str, shape: list[int], is_complex: bool, text: str) -> Tensor:
     """Return the tensor that `to_text` turned into four JSON values."""
-    return _tensor(bytearray(base64.b64decode(text)), 0, kind, shape, is_complex)
+    data = bytearray(base64.b64decode(text, validate=True))
+    x = _tensor(data, 0, kind, shape, is_complex)
+    if x.nbytes != len(data):
+        raise ValueError(f"a tensor of {x.nbytes} bytes is stored as {len(data)} bytes")
+    return x
 
 
-def write(file: IO[bytes], tensors: list[Tensor]) -> str:
-    """Write tensors to a safetensors file; return the checksum (xxh3) of all bytes."""
+def write(file: IO[bytes], tensors: list[Tensor], also: Any = None) -> str:
+    """Write tensors to a safetensors file; return the checksum (xxh3) of all bytes.
+
+    ``also`` is a hash object of `hashlib` that receives the same bytes.
+    """
+    digest = xxhash.xxh3_128()
+    for part in _parts(tensors):
+        file.write(part)
+        for each in (digest, also) if also is not None else (digest,):
+            each.update(part)
+    return digest.hexdigest()
+
+
+def _parts(tensors: list[Tensor]) -> Iterator[bytes | memoryview]:
+    """Yield the bytes of a safetensors file: the length of the header, the header, and the padded tensors."""
     header: dict[str, Any] = {"__metadata__": {}}
     end = 0
     for i, x in enumerate(tensors):
@@ -207,30 +228,41 @@ def write(file: IO[bytes], tensors: list[Tensor]) -> str:
             end += pad
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-(8 + len(text)) % _ALIGN)
-    digest = xxhash.xxh3_128()
-    for block in (len(text).to_bytes(8, "little"), text):
-        file.write(block)
-        digest.update(block)
+    yield len(text).to_bytes(8, "little")
+    yield text
     for x in tensors:
-        for part in (bytes_of(x), bytes(-x.nbytes % _ALIGN)):
-            file.write(part)
-            digest.update(part)
-    return digest.hexdigest()
+        yield bytes_of(x)
+        yield bytes(-x.nbytes % _ALIGN)
 
 
-def read(path: str, expected: str | None) -> list[Tensor]:
-    """Map the tensors in a safetensors file into memory; compare the file with the checksum ``expected`` if given."""
+def read(path: str, expected: str | None, sha256: str | None = None) -> list[Tensor]:
+    """Map the tensors in a safetensors file into memory.
+
+    Compare the file with the checksum ``expected`` and the digest ``sha256`` if given. Raises `ValueError` for a file
+    that differs, or that `write` did not write.
+    """
     with open(path, "rb") as file:
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
     if expected is not None and xxhash.xxh3_128_hexdigest(data) != expected:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
-    size = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + size])
-    tensors = []
-    for i, name in sorted((int(n), n) for n in header if n.isdigit()):
-        entry, is_complex = header[name], header["__metadata__"][str(i)] == "complex"
-        tensors.append(_tensor(data, 8 + size + entry["data_offsets"][0], entry["dtype"], entry["shape"], is_complex))
-    return tensors
+    if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
+        raise ValueError("the stored bytes are not those that were signed")
+    start = 8 + int.from_bytes(data[:8], "little")
+    header = json.loads(data[8:start]) if start <= len(data) else None
+    if not isinstance(header, dict) or not isinstance(kinds := header.get("__metadata__"), dict):
+        raise ValueError("the header of the file of tensors is missing or cut short")
+    numbers = sorted(int(name) for name in header if name.isdecimal())
+    return [_entry(data, start, header.get(str(i)), kinds.get(str(i))) for i in numbers]
+
+
+def _entry(data: Any, start: int, entry: Any, kind: Any) -> Tensor:
+    offsets = entry.get("data_offsets") if isinstance(entry, dict) else None
+    if not is_shape(offsets) or len(offsets) != 2 or kind not in ("real", "complex"):
+        raise ValueError("the header of the file of tensors is not what was written")
+    x = _tensor(data, start + offsets[0], entry.get("dtype"), entry.get("shape"), kind == "complex")
+    if offsets[1] - offsets[0] != x.nbytes:
+        raise ValueError(f"a tensor of {x.nbytes} bytes is stored as {offsets[1] - offsets[0]} bytes")
+    return x
 
 
 def _kind(x: Tensor) -> tuple[str, list[int], bool]:
@@ -240,8 +272,15 @@ def _kind(x: Tensor) -> tuple[str, list[int], bool]:
     return _DTYPES[real], [*x.shape, 2] if x.is_complex() else list(x.shape), x.is_complex()
 
 
-def _tensor(data: Any, offset: int, kind: str, shape: list[int], is_complex: bool) -> Tensor:
-    dtype, count = _NAMES[kind], math.prod(shape)
+def _tensor(data: Any, offset: int, kind: Any, shape: Any, is_complex: bool) -> Tensor:
+    """Return the tensor at an offset of ``data``; raise `ValueError` if type, shape or size cannot be right."""
+    dtype = _NAMES.get(kind) if isinstance(kind, str) else None
+    if dtype is None or not is_shape(shape) or not is_count(count := math.prod(shape)):
+        raise ValueError(f"a stored tensor has the type {str(kind)[:20]} and the shape {str(shape)[:60]}")
+    if is_complex and (shape[-1:] != [2] or not dtype.is_floating_point or dtype.itemsize < 2):
+        raise ValueError(f"a complex tensor is stored as {kind} of the shape {shape}")
+    if offset + count * dtype.itemsize > len(data):
+        raise ValueError(f"a stored tensor of {count} elements is longer than its file")
     flat = torch.frombuffer(data, dtype=dtype, count=count, offset=offset) if count else torch.empty(0, dtype=dtype)
     x = flat.reshape(shape)
     return torch.view_as_complex(x) if is_complex else x

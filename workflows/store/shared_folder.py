@@ -12,6 +12,7 @@ import fcntl
 import itertools
 import math
 import os
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -20,6 +21,7 @@ from typing import IO
 
 from neusee.workflows.store.process_owner import me, owner_of
 
+MOST_READ = 64 << 20  #: bytes of metadata that are read at once
 OLD = 3600.0  #: s after which a temporary file of another machine counts as abandoned
 _PATIENCE = 10.0  #: s to wait for the lock; its owner may be stopped, and a run without the lock may only repeat work
 _LINKLESS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  #: errors of a file system without hard links
@@ -127,8 +129,10 @@ class Disk:
 
     def _lock_file(self) -> int:
         path = f"{self.folder}/tmp/.lock"
+        if os.path.islink(path):
+            os.unlink(path)
         try:
-            return os.open(path, os.O_RDWR | os.O_TRUNC)
+            return os.open(path, os.O_RDWR | os.O_TRUNC | os.O_NOFOLLOW)
         except FileNotFoundError:
             file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
             self.share(path)
@@ -142,22 +146,98 @@ class Disk:
         Leases and badges of other machines stay for ``patience`` seconds, because clocks may jump.
         """
         gone = []
-        for entry in os.scandir(f"{self.folder}/tmp"):
+        for entry in entries(f"{self.folder}/tmp"):
             with suppress(OSError):
                 if entry.name != ".lock" and _abandoned(entry, patience):
                     gone.append((entry.path, entry.stat(follow_symlinks=False).st_size))
                     if not dry:
-                        os.unlink(entry.path)
+                        self.unlink(entry.path)
         return gone
+
+    def unlink(self, path: str) -> None:
+        """Delete a file below the root folder; raise `OSError` if a folder on the way there is a symbolic link."""
+        with self._opened_folder(path) as (folder, name):
+            os.unlink(name, dir_fd=folder)
+
+    def put_aside(self, path: str) -> None:
+        """Move a damaged file to the folder ``bad/`` for inspection, if this user may; follow no symbolic link."""
+        with suppress(OSError):
+            self.make_folder(f"{self.folder}/bad")
+            with self._opened_folder(path) as (folder, name), self._opened_folder(f"{self.folder}/bad/_") as (to, _):
+                os.replace(name, name, src_dir_fd=folder, dst_dir_fd=to)
+
+    @contextmanager
+    def _opened_folder(self, path: str) -> Iterator[tuple[int, str]]:
+        """Yield the opened folder of a file below the root, and the name of the file.
+
+        Each folder is opened in the one above it, so that no symbolic link leads out of the root, however late it is
+        put there. Raises `OSError` for a symbolic link.
+        """
+        *folders, name = path.removeprefix(f"{self.folder}/").split("/")
+        if {"", ".", ".."} & {*folders, name}:
+            raise OSError(errno.EPERM, f"{path} is not below {self.folder}")
+        opened = [os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)]
+        try:
+            for each in folders:
+                opened.append(os.open(each, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=opened[-1]))
+            yield opened[-1], name
+        finally:
+            for file in opened:
+                os.close(file)
 
 
 def append(path: str, raw: bytes, flags: int = 0) -> int:
-    """Append bytes to a file in one write; return the number of written bytes. ``flags`` are flags of `os.open`."""
-    file = os.open(path, os.O_WRONLY | os.O_APPEND | flags, 0o666)
+    """Append bytes to a file in one write; return the number of written bytes. ``flags`` are flags of `os.open`.
+
+    A symbolic link is deleted, and counts as a missing file.
+    """
+    try:
+        file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | flags, 0o666)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        os.unlink(path)
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path) from None
     try:
         return os.write(file, raw)
     finally:
         os.close(file)
+
+
+def read_file(path: str, most: int = MOST_READ) -> bytes:
+    """Return the bytes of a file; raise `ValueError` for what is no file or has more than ``most`` bytes.
+
+    A pipe or a device in place of the file never makes the caller wait.
+    """
+    file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        about = os.fstat(file)
+        if not stat.S_ISREG(about.st_mode) or about.st_size > most:
+            raise ValueError(f"{path} is not a file of at most {most} bytes")
+        raw = os.read(file, about.st_size)
+        while len(raw) != about.st_size and (more := os.read(file, most + 1 - len(raw))) and len(raw) <= most:
+            raw += more
+        return raw
+    finally:
+        os.close(file)
+
+
+def entries(folder: str) -> list[os.DirEntry[str]]:
+    """Return the files and folders in a folder, or an empty list for a symbolic link or an unreadable folder."""
+    try:
+        if os.path.islink(folder):
+            return []
+        with os.scandir(folder) as listing:
+            return list(listing)
+    except OSError:
+        return []
+
+
+def below(base: str) -> Iterator[os.DirEntry[str]]:
+    """Yield the files in those subfolders of ``base`` whose names have two letters; follow no symbolic link."""
+    for folder in sorted(entries(base), key=lambda entry: entry.name):
+        if len(folder.name) == 2 and folder.is_dir(follow_symlinks=False):
+            yield from entries(folder.path)
 
 
 def _locked(file: int) -> bool:
@@ -174,7 +254,7 @@ def _abandoned(entry: os.DirEntry[str], patience: float) -> bool:
     """Return True if the owner of a temporary file is dead, or if the owner is unknown and the file is old."""
     words = entry.name.split(".")
     shows_owner = words[-1] == "lease" or words[0] == "badge"
-    if words[-1] == "lease":
+    if words[-1] == "lease" and entry.is_file(follow_symlinks=False):
         with open(entry.path, "rb") as file:
             words = file.readline(200).decode(errors="replace").split()
     owner = next(filter(None, map(owner_of, words)), None)

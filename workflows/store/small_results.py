@@ -11,7 +11,9 @@ import os
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
+from stat import S_ISREG
 
+from neusee.workflows.keys.seal import seal_record
 from neusee.workflows.store import metadata
 from neusee.workflows.store.metadata import UNREADABLE, Metadata
 from neusee.workflows.store.shared_folder import Disk, append
@@ -43,7 +45,7 @@ class SmallResults:
 
         Raises `OSError` if the line cannot be written.
         """
-        raw = metadata.seal(about)
+        raw = seal_record(about)
         try:
             self._write(raw)
         except FileNotFoundError:
@@ -86,6 +88,8 @@ class SmallResults:
             return
         if (stat.st_ino, stat.st_size) == (self._file, self._offset):
             return
+        if not S_ISREG(stat.st_mode):
+            return
         with self._guard, suppress(OSError), open(self._path, "rb") as file:
             if stat.st_ino != self._file or stat.st_size < self._offset:
                 self._lines, self._offset = {}, 0
@@ -95,8 +99,9 @@ class SmallResults:
             for line in raw[:whole].split(b"\n"):
                 if line.startswith(_HEAD):
                     key = line[_KEY].decode(errors="replace")
-                    self._lines.pop(key, None)  # keep the newest line last
-                    self._lines[key] = line
+                    if key.isalnum():  # it may be a part of a path
+                        self._lines.pop(key, None)  # keep the newest line last
+                        self._lines[key] = line
             self._file, self._offset = os.fstat(file.fileno()).st_ino, self._offset + max(0, whole)
         if self._offset > MOST:
             self.compact()

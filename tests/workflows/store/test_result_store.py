@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file
 
 from neusee.nodes.values import Bands, Pupil
+from neusee.workflows.keys.seal import seal_record, unseal_record
 from neusee.workflows.store import band_files, metadata, serialization
 from neusee.workflows.store import payload as payload_module
 from neusee.workflows.store.metadata import INLINE
@@ -443,9 +444,9 @@ def test_a_result_that_takes_its_name_while_one_looks_is_not_damaged(tmp_path, m
 
 def test_entries_from_before_there_were_receipts_are_values(tmp_path):
     keep(tmp_path, BIG)
-    about = metadata.unseal(sidecar(tmp_path).read_bytes())
+    about = unseal_record(sidecar(tmp_path).read_bytes())
     del about["kept"], about["payload"]["stamp"]
-    sidecar(tmp_path).write_bytes(metadata.seal(about))
+    sidecar(tmp_path).write_bytes(seal_record(about))
     assert Store(tmp_path).has(KEY)
     for verify in ("always", "sampled", "never"):
         same(Store(tmp_path, verify=verify).get(KEY), BIG)
@@ -479,10 +480,10 @@ def quietly_flipped(root):
     """A bit that changes without the file being touched, as a disk may do it; the file's stamp is put back."""
     stamp, path = payload(root).stat(), payload(root)
     flip(path, 0.9)
-    about = metadata.unseal(sidecar(root).read_bytes())
+    about = unseal_record(sidecar(root).read_bytes())
     os.utime(path, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
     about["payload"]["stamp"] = payload_module.stamp_of(str(path))
-    sidecar(root).write_bytes(metadata.seal(about))
+    sidecar(root).write_bytes(seal_record(about))
 
 
 def test_sampled_finds_what_was_written_to_at_once(tmp_path, monkeypatch):
