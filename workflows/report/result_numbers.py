@@ -23,7 +23,11 @@ _COLUMNS: Mapping[str, tuple[str, str, Callable[[Tensor, int], Any], str]] = {
     "SSIM": ("quality", "ssim", lambda x, band: x, "{:.3f}"),
     "saturated px": ("saturated", "", lambda x, band: x.double().sum(), "{:,.0f}"),
 }
-_OUTSIDE = "BSR: share of the scene's light that stays in the field; outside: light of a point outside the PSF window."
+_LEGEND = {
+    "LSR": "LSR at {band}",
+    "BSR": "BSR, the mean over the bands: the share of the scene's light that stays in the field",
+    "outside": "outside, the mean over the bands: the share of a point's light that falls outside the window of the PSF",
+}
 _DESIGN_WAVELENGTH = 550e-9  #: m, for the LSR in the result table of a recipe without a laser
 _MOST = 4096  #: elements, at most, of a result whose numbers become rows
 
@@ -49,12 +53,12 @@ def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, An
         known = {column: value(step) for column, step in cells.items() if step in keys}
         texts = [_cell(known.get(x), field, number, form, band) for x, field, number, form in _COLUMNS.values()]
         rows.append({"name": name, "cells": texts})
-    legend = [f"LSR at {where}; BSR and outside are means over the bands.", _OUTSIDE]
-    legend = legend if any(r["cells"][1] for r in rows) else []
     rows = [row for row in rows if any(row["cells"])]
     shown = [i for i in range(len(_COLUMNS)) if any(row["cells"][i] for row in rows)]
     rows = [{**row, "cells": [row["cells"][i] for i in shown]} for row in rows]
-    return {"columns": [list(_COLUMNS)[i] for i in shown], "rows": rows, "legend": legend}
+    columns = [list(_COLUMNS)[i] for i in shown]
+    legend = [text.format(band=where) for column, text in _LEGEND.items() if column in columns]
+    return {"columns": columns, "rows": rows, "legend": legend}
 
 
 def _cell(found: Any, field: str, number: Callable[[Tensor, int], Any], form: str, band: int) -> str:
