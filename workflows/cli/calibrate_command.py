@@ -11,7 +11,7 @@ import typer
 from neusee.workflows.cli.command_frame import fail, failing, load, say, the_store
 from neusee.workflows.cli.command_list import FAILED, MISSED
 from neusee.workflows.cli.command_options import AsJson, Debug, Out, Quiet, Words, option_words, progress_lines
-from neusee.workflows.cli.interruption import kept_in, require_writable, resumable, say_folder
+from neusee.workflows.cli.interruption import kept_in, resumable, say_folder
 
 
 def calibrate(
@@ -33,7 +33,6 @@ def calibrate(
     continue. Needs: pip install -e ".[calibrate]".
     """
     recipe, command = load(words, "calibrate")
-    require_writable(out)
     store = the_store()
     from neusee.workflows.api import verbs
     from neusee.workflows.calibration.run_calibration import CalibrationRefused

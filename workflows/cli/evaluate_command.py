@@ -20,7 +20,7 @@ from neusee.workflows.cli.command_options import (
     option_words,
     progress_lines,
 )
-from neusee.workflows.cli.interruption import kept_in, require_writable, resumable, say_folder
+from neusee.workflows.cli.interruption import kept_in, resumable, say_folder
 
 
 def evaluate(
@@ -52,7 +52,6 @@ def evaluate(
     """
     name, changes, _ = split(words)
     check_device(device)
-    require_writable(out)
     options = {
         "pipelines": pipelines,
         "data": data,

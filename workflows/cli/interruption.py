@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.cli.command_frame import fail, say
-from neusee.workflows.cli.command_list import BAD, FAILED, INTERRUPTED, TYPED
+from neusee.workflows.cli.command_list import FAILED, INTERRUPTED, TYPED
 
 if TYPE_CHECKING:
     from neusee.workflows.store.result_store import Store
@@ -58,19 +58,6 @@ def kept_training(out: Path, recipe: str) -> str:
     stage = f" of stage {state['stage']}" if state.get("stage") else ""
     upto = f" up to iteration {state['iteration']}{stage}" if "iteration" in state else ""
     return f"the training{upto} is kept in {newest.parent}"
-
-
-def require_writable(out: Path) -> None:
-    """End the command, before anything runs, if the folder ``out`` of the results cannot be made or written."""
-    from tempfile import TemporaryFile
-
-    above = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.exists())
-    try:
-        if not above.is_dir():
-            raise NotADirectoryError(f"{above} is a file")
-        TemporaryFile(dir=above).close()
-    except OSError as error:
-        fail(f"--out {out}: results cannot be written there ({error}): write --out FOLDER", BAD)
 
 
 def say_json(document: dict[str, Any]) -> None:

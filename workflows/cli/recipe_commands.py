@@ -23,7 +23,7 @@ from neusee.workflows.cli.command_options import (
     executor_of,
     memory_limit,
 )
-from neusee.workflows.cli.interruption import kept_in, print_warning, require_writable, resumable, say_json
+from neusee.workflows.cli.interruption import kept_in, print_warning, resumable, say_json
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -56,7 +56,6 @@ def run(
     from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
     check_device(device)
-    require_writable(out)
     limit, silent = memory_limit(memory), as_json or quiet
     if not silent:
         say(console.opening(recipe, shlex.join(command[1:])))

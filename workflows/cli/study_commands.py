@@ -21,7 +21,7 @@ from neusee.workflows.cli.command_options import (
     option_words,
     progress_lines,
 )
-from neusee.workflows.cli.interruption import kept_in, require_writable, resumable, say_folder
+from neusee.workflows.cli.interruption import kept_in, resumable, say_folder
 
 if TYPE_CHECKING:
     from neusee.workflows.api.verbs import Kind
@@ -150,7 +150,6 @@ def uncertainty(
 
 def _run(kind: Kind, words: list[str] | None, quiet: bool, as_json: bool, out: Path, **options: Any) -> None:
     recipe, command = load(words, "study", kind)
-    require_writable(out)
     store = the_store()
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError

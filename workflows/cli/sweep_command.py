@@ -9,7 +9,7 @@ import typer
 
 from neusee.workflows.cli.command_frame import fail, refusing, split, the_store
 from neusee.workflows.cli.command_options import AsJson, Debug, Device, Out, Words, check_device
-from neusee.workflows.cli.interruption import kept_in, require_writable, resumable
+from neusee.workflows.cli.interruption import kept_in, resumable
 
 
 def sweep(
@@ -36,7 +36,6 @@ def sweep(
     if on_error not in ("stop", "continue"):
         fail(f"--on-error {on_error}: write stop or continue")
     check_device(device)
-    require_writable(out)
     store = the_store()
     from neusee.workflows.cli.sweep_screen import run_sweep
 

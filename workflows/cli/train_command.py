@@ -15,7 +15,7 @@ import typer
 from neusee.workflows.cli.command_frame import fail, failing, load, say, the_store
 from neusee.workflows.cli.command_list import FAILED
 from neusee.workflows.cli.command_options import AsJson, Debug, Out, ProgressLines, Words, check_device, progress_lines
-from neusee.workflows.cli.interruption import kept_training, require_writable, resumable, say_json
+from neusee.workflows.cli.interruption import kept_training, resumable, say_json
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -57,7 +57,6 @@ def train(
     --mesh 4x2.
     """
     recipe, command = load(words or ["train_small"], "train")
-    require_writable(out)
     if recipe.lifting is not None:
         if stage is not Stages.BOTH or mesh:
             fail(f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage and --mesh out")

@@ -26,7 +26,7 @@ _COLUMNS: Mapping[str, tuple[str, str, Callable[[Tensor, int], Any], str]] = {
 _LEGEND = {
     "LSR": "LSR at {band}",
     "BSR": "BSR, the mean over the bands: the share of the scene's light that stays in the field",
-    "outside": "outside, the mean over the bands: the share of a point's light that falls outside the window of the PSF",
+    "outside": "outside, the mean over the bands: the share of a point's light that falls outside the PSF window",
 }
 _DESIGN_WAVELENGTH = 550e-9  #: m, for the LSR in the result table of a recipe without a laser
 _MOST = 4096  #: elements, at most, of a result whose numbers become rows
