@@ -508,3 +508,19 @@ def test_a_file_of_ones_own_recipe_is_no_mistake_with_a_scene_that_has_no_file(n
     code, _, err = neusee("validate", "mine.yaml", "scene=siemens", "scene.file=a.png")
     assert code == 2
     assert "argument 3   scene.file   unknown: no step refers to this value" in err
+
+
+def test_the_guide_states_each_limit_as_the_program_has_it():
+    from neusee.nodes import input_files
+    from neusee.nodes.spectra import _bands
+    from neusee.workflows.recipe import step_declarations
+    from neusee.workflows.recipe.text import references, yaml_values
+    from neusee.workflows.recipe.text.composition import packaged
+
+    text = (packaged() / "guide" / "recipes.md").read_text(encoding="utf-8")
+    stated = [int(number.replace(" ", "")) for number in re.findall(r"^\|[^|]+\| ([\d ]+) \|$", text, re.MULTILINE)]
+    assert references._MOST_VALUES == references._MOST_CHARACTERS
+    assert stated == [
+        step_declarations._MOST, yaml_values._LARGEST, references._MOST_VALUES, yaml_values._MOST_ALIASED,
+        _bands._MOST, input_files.PIXELS, input_files.VALUES, input_files.ROWS,
+    ]  # fmt: skip
