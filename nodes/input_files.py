@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from neusee.nodes._node import ParameterError
+from neusee.nodes import ParameterError
 
-PIXELS = 64_000_000  #: of a picture, at most; decoding takes some 50 bytes a pixel, so 3 GB
+PIXELS = 64_000_000  #: of a picture, at most; a picture of this size takes 4 GB of memory to decode and scale
 VALUES = 1_000_000_000  #: numbers in a cube, a height map or a frame, at most; 4 GB as float32
 ROWS = 1_000_000  #: lines of a table, at most
 _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "vertical bars"}

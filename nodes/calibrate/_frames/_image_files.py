@@ -57,11 +57,16 @@ def _picture(file: Path) -> NDArray[Any]:
 
 
 def _page(file: Path, page: Any) -> NDArray[Any]:
+    refuse_page(file, page)
+    return np.array(page)
+
+
+def refuse_page(file: Path, page: Any) -> None:
+    """Raise ValueError for a page of a picture file that does not hold raw grey numbers."""
     depth = file.read_bytes()[24:25] if page.format == "PNG" else b"\x08"
     if page.mode not in _GREY or page.format not in ("PNG", "TIFF") or depth not in (b"\x08", b"\x10"):
         raise ValueError(f"{file} is {page.format} with pixels of kind {page.mode}, not raw grey of 8 or 16 bits: save "
                          "one channel as PNG or TIFF, without colour and without lossy compression")  # fmt: skip
-    return np.array(page)
 
 
 def _exr(file: Path) -> NDArray[Any]:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.calibrate._frames._damaged_frames import frame_problem
 from neusee.nodes.calibrate._frames._image_files import read, readable
 from neusee.nodes.units import DataFiles
 
@@ -22,8 +23,8 @@ def frames(*, files: DataFiles) -> Tensor:
     Shapes: -> (frame, y, x) int32, the frames of all files in order.
     Units:  DN.
     Error:  exact.
-    Raises: ParameterError before the run for an unknown kind of file; ValueError for colour, for numbers that are not
-            whole, and for frames that differ in size.
+    Raises: ParameterError before the run for an unknown kind of file, for a damaged file and for colour; ValueError for
+            numbers that are not whole, and for frames that differ in size.
     Source: EMVA Standard 1288, release 4.0 Linear, section 6.5 (raw frames, without corrections).
     """
     return torch.from_numpy(stack(files))
@@ -41,10 +42,14 @@ def _(result: Tensor, **params: Any) -> list[Check]:
 
 
 def refuse_unreadable(parameter: str, files: Sequence[Path]) -> list[str]:
-    """Raise ParameterError if a file of frames has an unknown suffix; return an empty list of warnings."""
+    """Raise ParameterError for a file of frames that is damaged or of an unknown suffix; return no warnings."""
     try:
         for file in files:
             readable(file)
+            if problem := frame_problem(file):
+                raise ParameterError(parameter, problem)
+    except ParameterError:
+        raise
     except ValueError as error:
         raise ParameterError(parameter, str(error)) from None
     return []

@@ -71,6 +71,47 @@ def test_xyz_primaries_are_xyz(tmp_path):
     np.testing.assert_allclose(result, expected, rtol=2e-3)
 
 
+#: of CIE X, Y, Z, without a matrix of colour-science: IEC 61966-2-1, clause 5.2
+XYZ_TO_SRGB = [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
+
+
+def test_channels_x_y_and_z_are_cie_xyz(tmp_path):
+    xyz = np.array([0.3, 0.4, 0.2])
+    path = saved(tmp_path, dict(zip("XYZ", (np.full((2, 3), v, np.float32) for v in xyz), strict=True)))
+    assert exr.hooks.preflight(file=path) == []
+    result = exr(file=path, negatives="keep")[:, 1, 2].numpy()
+    np.testing.assert_allclose(result, XYZ_TO_SRGB @ xyz, atol=3e-4)
+
+
+@pytest.mark.parametrize(
+    ("header", "white"),
+    [
+        ({"adoptedNeutral": np.array([0.3457, 0.3585], np.float32)}, (0.3457, 0.3585)),
+        ({"chromaticities": (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)}, (1 / 3, 1 / 3)),
+        ({}, (0.3127, 0.3290)),
+    ],
+)
+def test_the_white_of_xyz_in_the_header_becomes_the_white_of_srgb(tmp_path, header, white):
+    x, y = white
+    xyz = (x / y, 1.0, (1 - x - y) / y)
+    path = saved(tmp_path, dict(zip("XYZ", (np.full((2, 3), v, np.float32) for v in xyz), strict=True)), **header)
+    np.testing.assert_allclose(exr(file=path, negatives="keep").numpy(), 1.0, atol=1e-3)
+
+
+def test_the_part_with_the_picture_is_found_or_chosen_by_name(tmp_path):
+    about = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    depth = OpenEXR.Part({**about, "name": "depth"}, {"Z": np.ones((2, 3), np.float32)})
+    left, right = (OpenEXR.Part({**about, "name": n}, planes(v, v, v)) for n, v in (("left", 0.25), ("right", 0.5)))
+    OpenEXR.File([depth, right]).write(str(tmp_path / "a.exr"))
+    assert float(exr(file=tmp_path / "a.exr").max()) == 0.5
+    OpenEXR.File([depth, left, right]).write(str(tmp_path / "b.exr"))
+    assert float(exr(file=tmp_path / "b.exr", part="left").max()) == 0.25
+    with pytest.raises(ParameterError, match="in the parts left, right: set part"):
+        exr.hooks.preflight(file=tmp_path / "b.exr")
+    with pytest.raises(ParameterError, match="the channels Z, but"):
+        exr.hooks.preflight(file=tmp_path / "b.exr", part="depth")
+
+
 def test_luminance_alone_is_grey_and_said(tmp_path):
     path = saved(tmp_path, {"Y": np.array([[0.5, 2.0]], np.float32)})
     assert "luminance" in exr.hooks.preflight(file=path)[0]

@@ -1,5 +1,7 @@
 """What `neusee validate` and the start of `neusee run` refuse or note, by the command line, before any step runs."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -263,6 +265,12 @@ steps:
   spectra: {node: spectra.reflectances, from: bands, with: {sets: [], files: "${file.file}"}}
 outputs: [spectra]
 """
+FRAMES = """\
+# Frames.
+file: {file: a.png}
+steps: {frames: {node: calibrate.frames, with: {files: "${file.file}"}}}
+outputs: [frames]
+"""
 HEAD = "photons,exposure_s,pixels,mean,variance\n"
 
 
@@ -287,7 +295,20 @@ def text(content):
     return lambda path: path.write_bytes(content.encode())
 
 
+def grey(path, count=None, values=None):
+    """Write a picture of random grey levels, or the first ``count`` bytes of this picture."""
+    from PIL import Image
+
+    levels = np.random.default_rng(3).integers(0, 65535, (40, 40), np.uint16) if values is None else values
+    Image.fromarray(levels).save(path)
+    path.write_bytes(path.read_bytes()[:count])
+
+
 FILES = {
+    "truncated PNG frame": (FRAMES, lambda path: grey(path, 900), "a.png is damaged"),
+    "truncated TIFF frame": (FRAMES.replace("png", "tif"), lambda path: grey(path, 2000), "a.tif is damaged"),
+    "colour frame": (FRAMES, lambda path: grey(path, values=np.zeros((4, 4, 3), np.uint8)), "not raw grey"),
+    "complex frame": (FRAMES.replace("png", "npy"), npy(1, np.complex64), "values of type complex64"),
     "NaN in a cube": (CUBE, npy(np.nan), "a.npy holds 1 values that are not finite"),
     "complex cube": (CUBE, npy(1, np.complex64), "values of type complex64"),
     "large cube": (CUBE, large_npy, "a.npy cannot be read as .npy"),
@@ -306,7 +327,7 @@ FILES = {
 @pytest.mark.parametrize(("recipe", "make", "said"), FILES.values(), ids=FILES)
 def test_the_content_of_every_other_file_is_checked(neusee, tmp_path, recipe, make, said):
     (tmp_path / "mine.yaml").write_text(recipe)
-    make(tmp_path / ("a.npy" if "a.npy" in recipe else "a.csv"))
+    make(tmp_path / re.search(r"file: (a\.\w+)", recipe)[1])
     code, out, err = neusee("run", "mine.yaml")
     assert (code, out) == (2, "")
     assert err.startswith("mine.yaml:2:14   file.file = a.")
@@ -487,3 +508,19 @@ def test_a_file_of_ones_own_recipe_is_no_mistake_with_a_scene_that_has_no_file(n
     code, _, err = neusee("validate", "mine.yaml", "scene=siemens", "scene.file=a.png")
     assert code == 2
     assert "argument 3   scene.file   unknown: no step refers to this value" in err
+
+
+def test_the_guide_states_each_limit_as_the_program_has_it():
+    from neusee.nodes import input_files
+    from neusee.nodes.spectra import _bands
+    from neusee.workflows.recipe import step_declarations
+    from neusee.workflows.recipe.text import references, yaml_values
+    from neusee.workflows.recipe.text.composition import packaged
+
+    text = (packaged() / "guide" / "recipes.md").read_text(encoding="utf-8")
+    stated = [int(number.replace(" ", "")) for number in re.findall(r"^\|[^|]+\| ([\d ]+) \|$", text, re.MULTILINE)]
+    assert references._MOST_VALUES == references._MOST_CHARACTERS
+    assert stated == [
+        step_declarations._MOST, yaml_values._LARGEST, references._MOST_VALUES, yaml_values._MOST_ALIASED,
+        _bands._MOST, input_files.PIXELS, input_files.VALUES, input_files.ROWS,
+    ]  # fmt: skip

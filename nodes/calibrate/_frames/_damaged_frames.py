@@ -1,0 +1,73 @@
+"""The check of a file of raw frames before the run, without decoding its pixels."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neusee.nodes import ParameterError
+from neusee.nodes.calibrate._frames._image_files import refuse_page
+from neusee.nodes.input_files import VALUES, once_per_version
+
+_STRIP_STARTS, _STRIP_LENGTHS = 273, 279  #: TIFF tags
+
+
+@once_per_version
+def frame_problem(file: Path) -> str:
+    """Return a message for a file that is damaged or holds no raw frames, as far as headers show it, else nothing."""
+    check = _CHECKS.get(file.suffix.lower())
+    try:
+        return check(file) if check else ""
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
+        return str(error) if isinstance(error, ValueError) else f"{file} is damaged ({error}): copy the file again"
+
+
+def _picture(file: Path) -> str:
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(file) as image:
+            refuse_page(file, image)
+            ends = zip(*(_numbers(image, tag) for tag in (_STRIP_STARTS, _STRIP_LENGTHS)), strict=False)
+            if image.format == "PNG":
+                image.verify()
+            elif (last := max(map(sum, ends), default=0)) > file.stat().st_size:
+                return f"{file} is damaged (its pixels end at byte {last}, after its end): copy the file again"
+    except UnidentifiedImageError:
+        return f"{file} is not a readable picture: save the frame as 16-bit grey PNG"
+    except Image.DecompressionBombError:
+        return f"{file} states more pixels than can be read: give frames of one sensor"
+    return ""
+
+
+def _numbers(image: Any, tag: int) -> tuple[int, ...]:
+    return tuple(getattr(image, "tag_v2", {}).get(tag, ()))
+
+
+def _numpy(file: Path) -> str:
+    head = np.load(file, mmap_mode="r", allow_pickle=False)
+    if head.dtype.kind not in "uif":
+        return f"{file} holds values of type {head.dtype}: save raw frames as whole numbers"
+    if head.size > VALUES:
+        return f"{file} has {head.size} values, more than the limit of {VALUES}: divide the frames among several files"
+    return ""
+
+
+def _exr(file: Path) -> str:
+    from neusee.nodes.scene._spectral_exr import exr_header
+
+    try:
+        _, names, _ = exr_header(file)
+    except ParameterError as error:
+        return str(error)
+    return f"{file} has the channels {', '.join(names)}: save one channel alone" if len(names) != 1 else ""
+
+
+_CHECKS: dict[str, Callable[[Path], str]] = {
+    ".png": _picture,
+    ".tif": _picture,
+    ".tiff": _picture,
+    ".npy": _numpy,
+    ".exr": _exr,
+}
