@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from neusee.workflows.graph.step_record import Event, StepRecord
-from neusee.workflows.report.run_page import shape_of, unchecked_line, unit_of
+from neusee.workflows.report.run_page import shape_of, unchecked_lines, unit_of
 from neusee.workflows.report.text_table import by_family, columns, indented, lasts
 from neusee.workflows.report.tolerance_spent import said_of_economies
 
@@ -238,7 +238,7 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str
         for e in doc["expected"]
         if not e["ok"]
     ]
-    lines += [f"  {unchecked_line(e)}" for e in doc["unchecked"]]
+    lines += [f"  {line}" for line in unchecked_lines(doc["unchecked"])]
     lines += [f"warning  {line}" for line in doc["warnings"]]
     return [*lines, f"report   {path}", "", "next", *[f"  {line}" for line in again]]
 

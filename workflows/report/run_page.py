@@ -70,7 +70,7 @@ def document(
         "unchecked": unchecked,
         "table": table(recipe, result.keys, result.value),
         "metrics": metrics(recipe, result.keys, result.value),
-        "notes": [*_sampling(recipe), *recipe.notes, *map(unchecked_line, unchecked), *warned],
+        "notes": [*_sampling(recipe), *recipe.notes, *unchecked_lines(unchecked), *warned],
         "warnings": warned,
         "posterior": told(recipe.uncertain.standings) if recipe.uncertain else [],
         "readings": _readings(recipe),
@@ -111,8 +111,9 @@ def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked
     """
     met = sum(e["ok"] for e in found)
     some = f"{met} of {len(found)} expected numbers within tolerance"
-    numbers = some if found or unchecked else "No expected numbers in this recipe"
-    numbers += f", {unchecked} more not checked" if unchecked else ""
+    some += f", {unchecked} more not checked" if unchecked else ""
+    none = f"None of {unchecked} expected numbers checked" if unchecked else "No expected numbers in this recipe"
+    numbers = some if found else none
     checks = "every check held" if not failed else f"{len(failed)} check{'s' * (len(failed) > 1)} to look at"
     return f"{numbers}; {checks}."
 
@@ -184,9 +185,10 @@ def _sampling(recipe: Recipe) -> list[str]:
     return [_SAMPLING] if "point" in kinds else ["The PSF is integrated over each pixel."] if kinds else []
 
 
-def unchecked_line(number: Mapping[str, str]) -> str:
-    """Return a sentence that names an expected number that the run has not compared, and the step that was missing."""
-    return f"not checked: {number['name']}, because no output of this run needs the step {number['step']}"
+def unchecked_lines(numbers: Sequence[Mapping[str, str]]) -> list[str]:
+    """Return a line that names the expected numbers that a run has not compared, or no line if there are none."""
+    names = ", ".join(number["name"] for number in numbers)
+    return [f"not checked, because no output of this run needs their steps: {names}"] if numbers else []
 
 
 def _readings(recipe: Recipe) -> list[dict[str, str]]:

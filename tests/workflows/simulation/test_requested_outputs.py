@@ -47,7 +47,7 @@ def test_an_expected_number_that_no_output_needs_is_said_to_be_unchecked(report)
     assert [number["name"] for number in doc["expected"]] == ["a corner"]
     assert doc["unchecked"] == [{"name": "the quality", "step": "restored_quality"}]
     assert "1 of 1 expected numbers within tolerance, 1 more not checked" in doc["verdict"]
-    said = "not checked: the quality, because no output of this run needs the step restored_quality"
+    said = "not checked, because no output of this run needs their steps: the quality"
     assert said in doc["notes"]
     assert f"  {said}" in closing(doc, "report.html", [])
 
@@ -56,7 +56,7 @@ def test_the_outputs_of_the_command_line_decide(report):
     doc = report("outputs=[scene]")
     assert [step["step"] for step in doc["steps"]] == ["scene"]
     assert (doc["expected"], len(doc["unchecked"])) == ([], 2)
-    assert doc["verdict"].startswith("0 of 0 expected numbers")
+    assert doc["verdict"].startswith("None of 2 expected numbers checked; ")
 
 
 def test_the_table_has_the_rows_and_columns_that_there_are(report):
