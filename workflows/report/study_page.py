@@ -8,8 +8,10 @@ from __future__ import annotations
 import base64
 import json
 import numbers
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from html import escape
 from pathlib import Path
 from typing import Any, Literal
 
@@ -48,7 +50,14 @@ def filled(template: str, **values: Any) -> str:
     from jinja2 import Environment, StrictUndefined
 
     text = (Path(__file__).parent / "templates" / template).read_text(encoding="utf-8")
-    return Environment(autoescape=True, undefined=StrictUndefined).from_string(text).render(**values)
+    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    environment.filters["code"] = _with_code
+    return environment.from_string(text).render(**values)
+
+
+def _with_code(text: str) -> str:
+    """Return text as HTML, with each part between backticks as code."""
+    return re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))
 
 
 def said(value: Any) -> str:
