@@ -82,7 +82,8 @@ def _section(anchor: str, section: Section) -> dict[str, Any]:
         "columns": section.columns,
         "numeric": numeric,
         "rows": [
-            [_cell(v, section.marks.get((r, c))) for c, v in enumerate(row)] for r, row in enumerate(section.rows)
+            [_cell(v, section.marks.get((r, c)), c in numeric) for c, v in enumerate(row)]
+            for r, row in enumerate(section.rows)
         ],
     }
 
@@ -97,8 +98,9 @@ def _refuse_stray_marks(section: Section) -> None:
             )
 
 
-def _cell(value: Any, mark: Mark | None) -> dict[str, str]:
-    return {"text": said(value), "kind": " ".join(filter(None, ("n" if _is_number(value) else "", mark)))}
+def _cell(value: Any, mark: Mark | None, numeric: bool) -> dict[str, str]:
+    right = "n" if numeric or _is_number(value) else ""
+    return {"text": said(value), "kind": " ".join(filter(None, (right, mark)))}
 
 
 def _is_number(value: Any) -> bool:
