@@ -82,7 +82,7 @@ def traces(draws: FloatArray, labels: Sequence[str]) -> Any:
             steps = np.arange(len(middle)) * every
             ax.fill_between(steps, low, high, color=colour, alpha=0.12, linewidth=0)
             ax.plot(steps, middle, color=colour, linewidth=0.8)
-        ax.set_ylabel(label, fontsize=9, rotation=0, ha="right", va="center")
+        ax.set_ylabel(label, fontsize=9, rotation=0, ha="right", va="center", labelpad=8)
         ax.ticklabel_format(axis="y", useOffset=False)
     axes[-1, 0].set_xlabel("step after the discarded steps")
     return figure

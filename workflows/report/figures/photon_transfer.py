@@ -36,7 +36,7 @@ def transfer(*, measured: Tensor) -> Any:
     least = min([floor, *variance[seen].sqrt().tolist()]) / 3
     if bool(clipped.any()):
         heights = variance[clipped].sqrt().clamp_min(1.3 * least)
-        ax.loglog(signal[clipped].numpy(), heights.numpy(), "v", label="clipped: less noise than shown", **_OPEN)
+        ax.loglog(signal[clipped].numpy(), heights.numpy(), "v", label="clipped: noise at most as drawn", **_OPEN)
     ax.set_ylim(least, 3 * float(predicted.max().sqrt()))
     title = "photon-transfer curve of this sensor"
     ax.set(title=title, xlabel="mean above dark (DN)", ylabel="standard deviation (DN)")
