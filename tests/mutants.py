@@ -96,14 +96,14 @@ MUTANTS = (
     # Physics.
     Mutant(
         "nodes/sensor/_digitization.py",
-        ".to(line) - 0.5",
-        ".to(line)",
+        "dtype=torch.float32) - 0.5",
+        "dtype=torch.float32)",
         within("nodes/sensor", "digitization.py::test_dithered_floor_agrees_with_its_reference"),
     ),
     Mutant(
         "nodes/sensor/_digitization.py",
-        "electrons.double() * gain",
-        "(electrons * gain).double()",
+        "flat[part].double() * gain",
+        "(flat[part] * gain).double()",
         within("nodes/sensor", "digitization.py::test_no_number_is_further_from_the_exact_product_than_half"),
     ),
     Mutant(

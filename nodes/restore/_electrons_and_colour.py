@@ -18,7 +18,8 @@ def electrons(raw: Tensor, *, gain: Gain, offset: Electrons, offset_subtracted: 
 
     Shapes: raw (..., y, x) -> (..., y, x).
     Units:  raw DN; gain K, DN/e-; offset e-; result e-, negative where read noise was negative.
-    Error:  the rounding of the converter, 0.29 DN rms; clipped pixels stay clipped.
+    Error:  the rounding of the converter, 0.29 DN rms; clipped pixels stay clipped. The quotient itself is float32,
+            within 1.2e-7 of raw / gain.
     Source: NeuSee, Eq. (SensorImage), inverted.
     """
     return single(raw) / gain - (offset if offset_subtracted else 0.0)

@@ -15,6 +15,7 @@ from neusee.nodes.shape_preview import same_shape, without_values
 from neusee.nodes.units import Gain, Shape
 
 Rounding = Literal["nearest", "dithered_floor"]
+_BLOCK = 2**18  #: pixels that are converted at a time, so that their float64 numbers stay in the cache of the processor
 Bits = Annotated[int, Field(ge=1, le=16)]
 
 
@@ -96,11 +97,17 @@ def _whole_numbers(electrons: Tensor, gain: float, top: int, rng: Generator | No
 
     The product is float64: in float32, one number in a thousand would be off by one.
     """
-    line = electrons.double() * gain
-    if rng is None:
-        return line.clamp_(0, top).round_().to(electrons.dtype)
-    dither = torch.rand(line.shape, generator=rng, device=rng.device, dtype=torch.float32).to(line) - 0.5
-    return line.add_(dither).floor_().clamp_(0, top).to(electrons.dtype)
+    result = torch.empty_like(electrons, memory_format=torch.contiguous_format)
+    flat, whole, dither = electrons.reshape(-1), result.view(-1), None
+    if rng is not None:
+        dither = torch.rand(electrons.shape, generator=rng, device=rng.device, dtype=torch.float32) - 0.5
+        dither = dither.to(electrons.device).reshape(-1)
+    for at in range(0, flat.numel(), _BLOCK):
+        part = slice(at, at + _BLOCK)
+        line = flat[part].double() * gain
+        line = line.round_() if dither is None else line.add_(dither[part]).floor_()
+        whole[part] = line.clamp_(0, top)
+    return result
 
 
 @digitize.reference

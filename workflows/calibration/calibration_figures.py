@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 _BAND = (5.0, 50.0, 95.0)  #: percentiles
 _POINTS = 1500  #: most points of a chain in the picture
 _LEAST = 0.1  #: DN², the variance at which a level without scatter is drawn
+_CLIPPED = {"marker": "v", "color": VERMILION, "markerfacecolor": "none",
+            "label": "clipped or coarse: numbers counted one by one; variance at most as drawn"}  # fmt: skip
 
 
 @drawn
@@ -33,11 +35,12 @@ def transfer(measured: FloatArray, predicted: FloatArray, whole: NDArray[np.bool
     mean, (low, middle, high) = predicted[0].mean(0)[order], np.percentile(predicted[1], _BAND, axis=0)[:, order]
     above.fill_between(mean, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %")
     above.plot(mean, middle, color=BLUE, linewidth=1.2, label="predicted, median")
-    clipped = {"color": VERMILION, "markerfacecolor": "none", "label": "clipped or coarse: numbers counted one by one"}
-    for at, style in ((whole, {"color": BLACK, "label": "measured"}), (~whole, clipped)):
+    lowest = max(_LEAST, 0.5 * float(min([*measured[1, whole], *middle], default=_LEAST)))
+    for at, style in ((whole, {"marker": "o", "color": BLACK, "label": "measured"}), (~whole, _CLIPPED)):
         if at.any():
-            above.plot(measured[0, at], measured[1, at].clip(_LEAST), "o", markersize=5, **style)
+            above.plot(measured[0, at], measured[1, at].clip(lowest), linestyle="", markersize=5, **style)
     above.set(xscale="log", yscale="log", ylabel="temporal variance (DN²)", title="Photon-transfer curve")
+    above.set_ylim(bottom=lowest / 2)  # a clipped level does not stretch the axis
     above.legend(loc="upper left")
     distance = (measured[1, whole] - predicted[1].mean(0)[whole]) / predicted[1].std(0)[whole]
     below.axhspan(-2, 2, color=BLUE, alpha=0.12, linewidth=0)
@@ -79,6 +82,7 @@ def traces(draws: FloatArray, labels: Sequence[str]) -> Any:
             steps = np.arange(len(middle)) * every
             ax.fill_between(steps, low, high, color=colour, alpha=0.12, linewidth=0)
             ax.plot(steps, middle, color=colour, linewidth=0.8)
-        ax.set_ylabel(label, fontsize=9, rotation=0, ha="right", va="center")
+        ax.set_ylabel(label, fontsize=9, rotation=0, ha="right", va="center", labelpad=8)
+        ax.ticklabel_format(axis="y", useOffset=False)
     axes[-1, 0].set_xlabel("step after the discarded steps")
     return figure

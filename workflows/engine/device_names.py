@@ -6,12 +6,22 @@ import torch
 
 
 def check_devices(text: str) -> None:
-    """Raise ValueError for a list of devices that names a device twice, or a device that this machine does not have."""
-    names = text.split(",")
-    if len(set(names)) < len(names):
-        raise ValueError(f"{text}: names a device twice; name each device once")
-    for name in names:
+    """Raise ValueError for a list of devices with the same device twice, or with one that cannot compute a recipe here.
+
+    ``cpu:0,cpu:1`` are two lanes of one CPU, and so two devices.
+    """
+    found = dict[tuple[str, int], str]()
+    for name in text.split(","):
         try:
-            torch.empty(0, device=name)
+            place = torch.empty(0, device=name).device
         except (RuntimeError, AssertionError) as error:
             raise ValueError(f"{name}: {str(error).partition(chr(10))[0]}") from error
+        if place.type == "meta":
+            raise ValueError(f"{name}: a tensor there has a shape and no values: write cpu or cuda")
+        lane = place.type, torch.device(name).index or place.index or 0
+        if lane in found:
+            again = name if name == found[lane] else f"{found[lane]} and {name} are one device"
+            raise ValueError(
+                f"{text}: names a device twice ({again}): name each device once; cpu:0,cpu:1 are two lanes"
+            )
+        found[lane] = name

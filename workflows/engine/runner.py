@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from neusee.workflows.engine.device_names import check_devices
 from neusee.workflows.engine.execution import Execution
 from neusee.workflows.engine.node_call import to_device
 from neusee.workflows.engine.step_job import Executor
@@ -89,9 +90,10 @@ def run(
     Args: outputs: if None, the outputs of the recipe. device: one or several devices, such as
     ``cuda:0,cuda:1,cpu``, the preferred device first. executor: computes the steps in place of this process.
     memory: bytes of each device that the run may use; if None, nine tenths of its memory.
-    Raises `RunError`, which names the step.
+    Raises `RunError`, which names the step, and ValueError for a device that this machine does not have.
     """
     began = time.perf_counter()
+    check_devices(device)
     wanted = recipe.outputs if outputs is None else tuple(outputs)
     for name in wanted:
         if name not in recipe.steps:

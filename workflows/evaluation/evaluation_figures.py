@@ -129,7 +129,9 @@ def plane(masks: Mapping[str, MaskOptics]) -> Any:
     unsuppressed = float(next(iter(masks.values())).unsuppressed.mean())
     bound = most_contrast(unsuppressed, torch.from_numpy(x)).numpy()
     ax.fill_between(x, bound, 1.5, color=_GREY, alpha=0.15, linewidth=0)
-    ax.plot(x, bound, color=_GREY, linewidth=1.2, label="rms contrast: no mask is above (Parseval)")
+    ax.plot(
+        x, bound, color=_GREY, linewidth=1.2, label="rms contrast: no mask that keeps its light is above (Parseval)"
+    )
     ax.axvspan(x[0], floor, color=BLUE, alpha=0.12, linewidth=0, label="LSR: no mask that keeps its light is here")
     looks = _looks(list(masks))
     for name, mask in masks.items():

@@ -97,7 +97,7 @@ def _crossed(result: EvaluationResult) -> Section:
 
 def _with_interval(x: Interval, metric: str) -> str:
     digits = _DIGITS.get(metric.partition(" ")[0], ".3g")
-    half = "" if math.isnan(x.half) else f"\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{x.half:{digits}}"
+    half = "" if math.isnan(x.half) else f" ±\N{NO-BREAK SPACE}{x.half:{digits}}"
     return f"{x.mean:{digits}}{half}"
 
 
@@ -107,12 +107,19 @@ def _numbers(result: EvaluationResult) -> Section:
         picture. Damaged: fraction of the points whose brightest pixel exceeds the damage threshold of the sensor.
         PSNR is a mean of decibels."""
     metrics = [metric for metric in METRICS if metric != "peak"]
-    columns = ("pipeline", *(re.sub("l1|psnr|ssim", lambda match: match[0].upper(), metric) for metric in metrics))
+    columns = ("pipeline", *(_column(metric) for metric in metrics))
     listed = [
         (p.name, *(_with_interval(mean(result.tables[p.name].scenes(metric)), metric) for metric in metrics))
         for p in result.pipelines
     ]
     return Section("All numbers", text, columns, listed)
+
+
+def _column(metric: str) -> str:
+    """Return the heading of a column with a metric, with its unit."""
+    units = {"psnr": " (dB)", "saturated": " (pixels)"}
+    name = re.sub("l1|psnr|ssim", lambda match: match[0].upper(), metric)
+    return name + units.get(metric.partition(" ")[0], "")
 
 
 def _compared(result: EvaluationResult) -> Section:

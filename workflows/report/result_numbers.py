@@ -48,24 +48,64 @@ def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
 def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, Any]:
     """Return the table for plain lens, mask and restored picture, with the rows and columns that have numbers."""
     band, where = _band(recipe, keys, value)
-    rows = []
+    numbers: dict[str, dict[str, float]] = {}
     for name, cells in TABLE.items():
         known = {column: value(step) for column, step in cells.items() if step in keys}
-        texts = [_cell(known.get(x), field, number, form, band) for x, field, number, form in _COLUMNS.values()]
-        rows.append({"name": name, "cells": texts})
-    rows = [row for row in rows if any(row["cells"])]
-    shown = [i for i in range(len(_COLUMNS)) if any(row["cells"][i] for row in rows)]
-    rows = [{**row, "cells": [row["cells"][i] for i in shown]} for row in rows]
-    columns = [list(_COLUMNS)[i] for i in shown]
+        numbers[name] = {
+            column: float(number(found, band))
+            for column, (x, field, number, _) in _COLUMNS.items()
+            if (found := _field(known.get(x), field)) is not None
+        }
+    columns = [column for column in _COLUMNS if any(column in cells for cells in numbers.values())]
+    rows = [{"name": name, "cells": [_text(cells, c) for c in columns]} for name, cells in numbers.items() if cells]
     legend = [text.format(band=where) for column, text in _LEGEND.items() if column in columns]
-    return {"columns": columns, "rows": rows, "legend": legend}
+    return {"columns": columns, "rows": rows, "legend": legend, "balance": balance(numbers)}
 
 
-def _cell(found: Any, field: str, number: Callable[[Tensor, int], Any], form: str, band: int) -> str:
-    """Return one number of a result as formatted text, or an empty string if the result lacks the field ``field``."""
+def _field(found: Any, field: str) -> Tensor | None:
+    """Return the field ``field`` of a result, or its first field for an empty name, or None if the field is missing."""
     fields = {} if found is None else dict(_fields(found))
-    tensor = fields.get(field) if field else next(iter(fields.values()), None)
-    return "" if tensor is None else form.format(float(number(tensor, band)))
+    return fields.get(field) if field else next(iter(fields.values()), None)
+
+
+def _text(cells: Mapping[str, float], column: str) -> str:
+    """Return a number of the result table as text, or an empty text if the table has no number there."""
+    return _COLUMNS[column][3].format(cells[column]) if column in cells else ""
+
+
+def balance(numbers: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Return what the mask gains and what the mask costs in a run as sentences, from the rows of the result table."""
+    plain, mask, restored = (numbers.get(name, {}) for name in ("plain lens", "with mask", "restored"))
+    gain = _gain(plain, mask)
+    return [*gain, *_price(plain, mask, restored)] if gain else []
+
+
+def _gain(plain: Mapping[str, float], mask: Mapping[str, float]) -> list[str]:
+    """Return a sentence with the ratio of the irradiance of the brightest pixel without and with the mask."""
+    peak = "peak/I_sat"
+    if not (plain.get(peak, 0.0) > 0 and mask.get(peak, 0.0) > 0):
+        return []
+    less = plain[peak] / mask[peak]
+    ends = f"{_text(mask, peak)} in place of {_text(plain, peak)} times the saturation irradiance"
+    if 0.99 < less < 1.01:
+        return [f"The mask does not change the light of the brightest pixel ({ends})."]
+    if less < 1:
+        return [f"The mask does not protect the sensor here: the brightest pixel receives {1 / less:.3g} times more "
+                f"light than behind the plain lens ({ends})."]  # fmt: skip
+    return [f"What the mask is for: the brightest pixel receives {less:.3g} times less light than behind the plain "
+            f"lens ({ends}), which protects the sensor from damage by a strong laser."]  # fmt: skip
+
+
+def _price(plain: Mapping[str, float], mask: Mapping[str, float], restored: Mapping[str, float]) -> list[str]:
+    """Return a sentence with the picture quality and the saturated pixels without and with the mask."""
+    quality, lost, parts = "PSNR (dB)", "saturated px", list[str]()
+    if quality in plain and quality in mask:
+        after = f" ({_text(restored, quality)} dB after restoration)" if quality in restored else ""
+        parts.append(f"a PSNR of {_text(mask, quality)} dB{after} in place of {_text(plain, quality)} dB")
+    if lost in plain and lost in mask:
+        parts.append(f"{_text(mask, lost)} saturated pixels in place of {_text(plain, lost)}")
+    worse = mask.get(quality, 0.0) < plain.get(quality, 0.0)
+    return [f"{'The price' if worse else 'The picture'} with the mask: {', and '.join(parts)}."] if parts else []
 
 
 def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, str]:

@@ -8,8 +8,10 @@ from __future__ import annotations
 import base64
 import json
 import numbers
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from html import escape
 from pathlib import Path
 from typing import Any, Literal
 
@@ -48,7 +50,14 @@ def filled(template: str, **values: Any) -> str:
     from jinja2 import Environment, StrictUndefined
 
     text = (Path(__file__).parent / "templates" / template).read_text(encoding="utf-8")
-    return Environment(autoescape=True, undefined=StrictUndefined).from_string(text).render(**values)
+    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    environment.filters["code"] = _with_code
+    return environment.from_string(text).render(**values)
+
+
+def _with_code(text: str) -> str:
+    """Return text as HTML, with each part between backticks as code."""
+    return re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))
 
 
 def said(value: Any) -> str:
@@ -73,7 +82,8 @@ def _section(anchor: str, section: Section) -> dict[str, Any]:
         "columns": section.columns,
         "numeric": numeric,
         "rows": [
-            [_cell(v, section.marks.get((r, c))) for c, v in enumerate(row)] for r, row in enumerate(section.rows)
+            [_cell(v, section.marks.get((r, c)), c in numeric) for c, v in enumerate(row)]
+            for r, row in enumerate(section.rows)
         ],
     }
 
@@ -88,8 +98,9 @@ def _refuse_stray_marks(section: Section) -> None:
             )
 
 
-def _cell(value: Any, mark: Mark | None) -> dict[str, str]:
-    return {"text": said(value), "kind": " ".join(filter(None, ("n" if _is_number(value) else "", mark)))}
+def _cell(value: Any, mark: Mark | None, numeric: bool) -> dict[str, str]:
+    right = "n" if numeric or _is_number(value) else ""
+    return {"text": said(value), "kind": " ".join(filter(None, (right, mark)))}
 
 
 def _is_number(value: Any) -> bool:

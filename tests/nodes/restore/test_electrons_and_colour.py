@@ -1,5 +1,7 @@
 """From digital numbers back to electrons, clipped values marked, channels to colour."""
 
+from fractions import Fraction
+
 import pytest
 import torch
 
@@ -41,3 +43,9 @@ def test_colour_is_a_matrix_at_every_pixel():
     assert torch.autograd.gradcheck(lambda c: colour(c, matrix), (torch.rand(3, 2, 2).double().requires_grad_(),))
     with pytest.raises(ValueError, match="do not fit"):
         colour(torch.rand(4, 2, 2), matrix)
+
+
+def test_electrons_are_within_the_stated_error_of_exact_fractions():
+    raw, gain = torch.arange(65536, dtype=torch.float32), 1 / 0.37
+    found = electrons(raw, gain=gain, offset=0.0).tolist()
+    assert max(abs(Fraction(x) - n / Fraction(gain)) / (n / Fraction(gain)) for n, x in enumerate(found) if n) <= 1.2e-7

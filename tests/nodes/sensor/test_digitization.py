@@ -60,6 +60,15 @@ def test_the_numbers_are_the_same_with_a_gradient():
     assert torch.equal(learnt, digitize(electrons, gain=1 / 0.37))
 
 
+@pytest.mark.parametrize("rounding", ["nearest", "dithered_floor"])
+def test_blocks_of_pixels_leave_no_trace(rounding, monkeypatch):
+    electrons = torch.rand(3, 7, 11, generator=torch.Generator().manual_seed(5)).transpose(0, 2) * 26000
+    whole = digitize(electrons, gain=1 / 0.37, rounding=rounding, rng=seeded())
+    monkeypatch.setattr("neusee.nodes.sensor._digitization._BLOCK", 10)
+    assert torch.equal(digitize(electrons, gain=1 / 0.37, rounding=rounding, rng=seeded()), whole)
+    assert whole.shape == (11, 7, 3)
+
+
 def test_dithered_floor_agrees_with_its_reference():
     electrons = torch.rand(500, dtype=torch.float64) * 100
     how = {"gain": 1 / 0.37, "rounding": "dithered_floor", "bits": 8}

@@ -307,6 +307,9 @@ def test_an_evaluation_writes_its_folder_and_goes_on_where_it_was_stopped(tmp_pa
     page = (folder / "report.html").read_text()
     assert page.count("<img") == 4
     assert "broken.jpg" in page
+    assert "<th>PSNR (dB)</th>" in page
+    assert " ±\N{NO-BREAK SPACE}" in page  # a number may stand above its interval, so that the wide table fits
+    assert "\N{NO-BREAK SPACE}±" not in page
     with (folder / "table.csv").open() as file:
         first, second = csv.DictReader(file)
     own = np.array([float(r["l1"]) for r in rows if r["pipeline"] == "five_half_rings+none"])

@@ -209,6 +209,42 @@ def test_axes_say_their_unit(drawings):
         assert any(unit in label for label in labels), f"{name}: {labels}"
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_no_axes_are_empty(drawings, name):
+    draw, arguments = drawings[name]
+    for ax in draw.__wrapped__(**arguments).axes:
+        curves = [line for line in ax.lines if len(line.get_xdata()) > 2 or line.get_linestyle() == "None"]
+        assert curves or ax.images or ax.patches or ax.collections or ax.texts, ax.get_title()
+
+
+def test_a_lamp_darkens_neither_the_scene_nor_the_points_of_the_spectra():
+    lamp = scene()
+    lamp[:, 3, 3] = 1e3
+    ax = scene_spectra.canvas(4, 4)[1][0, 0]
+    scene_spectra._scene(ax, lamp, points := scene_spectra._points(lamp))
+    assert points == scene_spectra._points(scene())
+    assert float(ax.images[0].get_array()[:, 20:].max()) > 0.9
+
+
+def test_without_bsr_there_is_one_panel(light):
+    arguments = dict(lsr=light.lsr, bands=bands(), psf=light.mask)
+    assert len(optics.suppression.__wrapped__(**arguments).axes) == 1
+    assert len(optics.suppression.__wrapped__(**arguments, bsr=torch.full((B,), 0.9)).axes) == 2
+
+
+@pytest.mark.parametrize("left", [1e-9, 1e-3, 0.2])
+def test_one_clipped_level_does_not_squeeze_the_photon_transfer_curve(left):
+    whole = transfer_curve()[:-1]
+    top = torch.tensor([[7e4, left * (800 + 2.7 * 7e4), 800 + 2.7 * 7e4]], dtype=torch.float64)
+    ax = photon_transfer.transfer.__wrapped__(measured=torch.cat([whole, top])).axes[0]
+    alone = photon_transfer.transfer.__wrapped__(measured=whole).axes[0]
+    assert ax.get_ylim()[0] == alone.get_ylim()[0]
+    (clipped,) = (line for line in ax.lines if line.get_label().startswith("clipped"))
+    assert clipped.get_xdata().tolist() == [7e4]
+    assert ax.get_ylim()[0] < clipped.get_ydata()[0] < ax.get_ylim()[1]
+    assert not any(line.get_label().startswith("clipped") for line in alone.lines)
+
+
 def test_laser_added_as_shifted_psf_is_sound_where_a_joint_convolution_is_not(light):
     errors = numerics.laser_trial(linear_image, light.plain)
     assert float(errors[0, -1]) < 1e-4

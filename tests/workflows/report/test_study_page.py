@@ -39,7 +39,7 @@ def made(**how):
 
 def test_cells_hold_numbers_to_three_digits_and_marks_as_classes():
     found = Cells(made(marks={(0, 1): "fail", (1, 0): "pass"})).cells
-    assert found[:4] == [("dark", ""), ("0.000123", "n fail"), ("<one>", "pass"), ("–", "")]
+    assert found[:4] == [("dark", ""), ("0.000123", "n fail"), ("<one>", "pass"), ("–", "n")]
     assert ("[1, 2]", "key") in found
 
 
@@ -86,3 +86,19 @@ def test_every_ink_is_read_on_its_ground_in_light_and_in_dark():
 @pytest.mark.parametrize(("value", "text"), [(3, "3"), (True, "yes"), (2.0, "2"), (1e-9, "1e-09"), ("a", "a")])
 def test_what_a_cell_says(value, text):
     assert said(value) == text
+
+
+def test_words_between_backticks_are_code_and_a_sign_stays_beside_its_word():
+    text = page("t", "of `a` and `<b>`", [Section("s", "", ("c",), [("yes",)], marks={(0, 0): "pass"})], {})
+    assert "<p>of <code>a</code> and <code>&lt;b&gt;</code></p>" in text
+    assert 'td.pass::before { content: "✓\\a0"; }' in text
+
+
+def test_every_table_scrolls_within_its_box():
+    text = page("t", "", [Section("s", "", ("c",), [("yes",)])], {"a": 1})
+    assert text.count("<table") == text.count('<div class="scroll"><table') == 2
+
+
+def test_a_dash_stands_below_the_numbers_of_its_column():
+    text = page("t", "", [Section("s", "", ("a", "b"), [(1.0, "x"), (None, None)])], {})
+    assert '<tr><td class="n">–</td><td>–</td></tr>' in text

@@ -48,6 +48,7 @@ def _map(
 def psf(*, plain: Psf, mask: Psf, bands: Bands, pixel_pitch: float) -> Any:
     """Draw the logarithm of the PSF at three wavelengths, and the encircled energy, for plain lens and mask."""
     figure, axes = canvas(13.0, 6.6, 2, 4)
+    figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
     shown: Any = None
     for row, (arm, each) in enumerate({"plain lens": plain, "with mask": mask}.items()):
         for column, wavelength in enumerate(_WAVELENGTHS):
@@ -87,19 +88,24 @@ def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
 
 @drawn
 def suppression(*, lsr: Tensor, bands: Bands, psf: Psf, bsr: Tensor | None = None) -> Any:
-    """Draw laser and background suppression ratio (LSR, BSR) over wavelength, with the lower bound of the LSR."""
-    figure, axes = canvas(11.0, 4.2, 1, 2)
-    nm, left, right = nanometres(bands.centres), axes[0, 0], axes[0, 1]
-    left.axhline(1.0, color="black", linewidth=0.8, linestyle=":", label="plain lens")
+    """Draw the laser suppression ratio (LSR) over wavelength with its lower bound, and beside it the BSR if given."""
+    figure, axes = canvas(11.0 if bsr is not None else 6.4, 4.2, 1, 2 if bsr is not None else 1)
+    nm, left = nanometres(bands.centres), axes[0, 0]
+    _unsuppressed(left)
     left.semilogy(nm, lsr.cpu().numpy(), "o-", color=VERMILION, markersize=3.5, label="with mask")
     left.semilogy(nm, metrics.least_lsr(psf).cpu().numpy(), "--", color=BLUE, label="energy floor")
     left.set(title="laser suppression ratio (peak / clear peak)", ylabel="LSR")
-    right.axhline(1.0, color="black", linewidth=0.8, linestyle=":", label="plain lens")
     if bsr is not None:
+        right = axes[0, 1]
+        _unsuppressed(right)
         right.plot(nm, bsr.cpu().numpy(), "s-", color=GREEN, markersize=3.5, label="with mask")
-    right.set_ylim(0.0, max(1.1, 1.1 if bsr is None else 1.1 * float(bsr.max())))
-    right.set(title="background kept in the field (BSR)", ylabel="BSR")
-    for ax in (left, right):
+        right.set_ylim(0.0, max(1.1, 1.1 * float(bsr.max())))
+        right.set(title="background kept in the field (BSR)", ylabel="BSR")
+    for ax in axes[0]:
         ax.set_xlabel("wavelength (nm)")
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=3)
     return figure
+
+
+def _unsuppressed(ax: Any) -> None:
+    ax.axhline(1.0, color="black", linewidth=0.8, linestyle=":", label="plain lens")

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from neusee.nodes.spectra import mean_wavelength
 from neusee.nodes.values import Bands
+from neusee.workflows.report.figures.camera_overview import high
 from neusee.workflows.report.figures.style import BLUE, GREEN, VERMILION, canvas, drawn, encoded, nanometres, picture
 
 _POINTS = ("A", "B", "C")
@@ -43,14 +44,14 @@ def spectra(
 def _points(scene: Tensor) -> list[tuple[int, int]]:
     """Return (y, x) of the reddest, the greenest and the bluest pixel of the scene that is neither dark nor clipped."""
     inner = torch.nn.functional.avg_pool2d(scene[None].float(), 5, 1, 2)[0] if min(scene.shape[-2:]) >= 5 else scene
-    lit = inner.amax(0)
-    usable = (lit > 0.2 * lit.max()) & (lit < 0.9 * lit.max())
+    lit, white = inner.amax(0), high(scene)
+    usable = (lit > 0.2 * white) & (lit < 0.9 * white)
     share = inner / inner.sum(0).clamp_min(1e-9)
     return [divmod(int(channel.where(usable, -1.0).argmax()), scene.shape[-1]) for channel in share]
 
 
 def _scene(ax: Any, scene: Tensor, points: list[tuple[int, int]]) -> None:
-    picture(ax, encoded(scene / scene.max().clamp_min(1e-9)), "three points of the scene")
+    picture(ax, encoded(scene / high(scene)), "three points of the scene")
     box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "black", "linewidth": 0.8}
     for name, (y, x) in zip(_POINTS, points, strict=True):
         for colour, width in (("white", 2.5), ("black", 1.0)):

@@ -97,7 +97,7 @@ def _lead(recipe: Recipe, result: LeaveOutResult) -> str:
 
 def _outputs(recipe: Recipe, result: LeaveOutResult) -> Section:
     rows = [(p.output, p.bound, p.rms, p.largest, recipe.tolerance, _HELD[p.holds]) for p in result.output_errors]
-    text = """Each output of the recipe with the chosen omissions, compared with the full computation (--exact). The
+    text = """Each output of the recipe with the chosen omissions, compared with the full computation (`--exact`). The
         error is the root mean square of the difference over the largest element; the tolerance limits this error. The
         proved bound follows from the bounds of the omissions, if all nodes can propagate them."""
     columns = ("output", "proved bound", "error", "largest difference", "tolerance", "holds")
@@ -115,7 +115,7 @@ def _omissions(result: LeaveOutResult) -> Section:
         Outputs: the error of the worst output with this omission alone. Put back: the change of the worst output when
         the recipe with the chosen omissions computes this step in full. Saved: the run time of the omitted steps, in s.
         Omissions that the tolerance does not allow are tested too."""
-    columns = ("step", "how", "chosen", "bound", "error", "largest", "outputs", "put back", "saved s", "holds")
+    columns = ("step", "how", "chosen", "bound", "error", "largest", "outputs", "put back", "saved (s)", "holds")
     cells = [(_cells(row), row) for row in result.rows]
     rows = [(name, _HOW[kind], *rest, _HELD[row.holds]) for (name, kind, *rest), row in cells]
     return Section("Each omission", text, columns, rows, marks=_marks(result.rows, len(columns) - 1))

@@ -16,6 +16,7 @@ _GREY = "#777777"
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE)
 _WIDE = 30.0  #: ratio of the largest to the least value of curves above which their axis is logarithmic
 _BINS = 24
+_APART = 0.1  #: inches around each diagram, so that a title does not touch the numbers above it
 _SLIGHT = 1e-6  #: share of a curve's largest element; no ratio to a smaller median is drawn
 _ALONG = 200  #: signals of a photon-transfer curve
 
@@ -26,7 +27,8 @@ def tornado(swings: Mapping[str, Sequence[tuple[str, float, float]]], middles: M
     columns = min(2, len(swings))
     rows = -(-len(swings) // columns)
     most = max(map(len, swings.values()))
-    figure, axes = canvas(6.6 * columns, (0.34 * most + 1.2) * rows, rows, columns)
+    figure, axes = canvas(6.6 * columns, (0.34 * most + 1.3) * rows, rows, columns)
+    figure.get_layout_engine().set(h_pad=_APART)
     for ax, (name, bars) in zip(axes.flat, swings.items(), strict=False):
         _bars(ax, sorted(bars, key=lambda bar: abs(bar[2] - bar[1])), middles[name])
         ax.set_title(name)
@@ -113,10 +115,11 @@ def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) ->
     """Draw a histogram of each output number over all draws, and a line at the value for median inputs."""
     columns = min(3, len(draws))
     rows = -(-len(draws) // columns)
-    figure, axes = canvas(3.6 * columns, 2.5 * rows, rows, columns)
+    figure, axes = canvas(3.6 * columns, 2.6 * rows + 0.3, rows, columns)
+    figure.get_layout_engine().set(h_pad=_APART)
     for ax, (name, values) in zip(axes.flat, draws.items(), strict=False):
         ax.hist(values, _BINS, color=BLUE, alpha=0.8)
-        ax.axvline(middles[name], color=VERMILION, linewidth=1.2)
+        ax.axvline(middles[name], color=VERMILION, linewidth=1.2, label="value with every input at its median")
         ax.set_title(name)
         ax.ticklabel_format(axis="x", useOffset=False)
         ax.tick_params(axis="x", rotation=20)
@@ -124,6 +127,7 @@ def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) ->
     for ax in list(axes.flat)[len(draws) :]:
         ax.set_axis_off()
     figure.supylabel("draws", fontsize=10)
+    figure.legend(*(found[:1] for found in axes.flat[0].get_legend_handles_labels()), loc="outside lower center")
     return figure
 
 
@@ -139,5 +143,6 @@ def pictures(found: Mapping[str, tuple[Tensor, Tensor]]) -> Any:
         spread = sd.mean(0) if sd.ndim == 3 else sd
         image = picture(right, spread.numpy(), f"{name}: standard deviation", cmap="viridis", vmin=0, vmax=high(spread))
         bar = figure.colorbar(image, ax=right, fraction=0.046, pad=0.03, extend="max")
+        bar.set_label("in the unit of the picture", fontsize=9)
         bar.ax.tick_params(labelsize=9)
     return figure

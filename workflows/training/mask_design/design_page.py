@@ -22,10 +22,11 @@ def pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, byte
     """Draw the height map, PSF, laser suppression and losses of a designed mask, and return the PNG files by name."""
     pupil, psf, plain = terms.pupil(height), terms.psf(height), terms.plain()
     pitch = terms.recipe.steps[terms.settings.psf].params["pixel_pitch"]
+    bsr = metrics.bsr(psf.intensity, plain.intensity)
     drawings = {
         "height": optics.height(pupil=pupil),
         "psf": optics.psf(plain=plain, mask=psf, bands=terms.bands, pixel_pitch=pitch),
-        "suppression": optics.suppression(lsr=metrics.lsr(psf), bands=terms.bands, psf=psf),
+        "suppression": optics.suppression(lsr=metrics.lsr(psf), bands=terms.bands, psf=psf, bsr=bsr),
     }
     return drawings | ({"history": history(learnt.history)} if learnt.history else {})
 
@@ -34,13 +35,17 @@ def pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, byte
 def history(rows: Sequence[Mapping[str, float]]) -> Any:
     """Draw the loss of a mask design and the loss terms over the iterations, with a curve for each optimisation."""
     names = [name for name in dict.fromkeys(n for row in rows for n in row) if name not in ("start", "iteration")]
-    figure, axes = canvas(3.6 * len(names), 3.2, 1, len(names))
+    figure, axes = canvas(3.6 * max(len(names), 2), 3.2, 1, len(names))
+    starts = sorted({row["start"] for row in rows})
     for ax, name in zip(axes[0], names, strict=True):
-        for start in sorted({row["start"] for row in rows}):
+        for start in starts:
             own = [row for row in rows if row["start"] == start]
-            ax.plot([row["iteration"] for row in own], [row[name] for row in own], linewidth=1.2)
+            ax.plot([row["iteration"] for row in own], [row[name] for row in own], linewidth=1.2, label=f"{start:g}")
         ax.set_title(name)
         ax.set_xlabel("iteration")
+        ax.ticklabel_format(axis="y", useOffset=False)
+    if len(starts) > 1:
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), title="start", loc="outside right upper")
     return figure
 
 
@@ -60,6 +65,9 @@ def sections(bands: Mapping[str, Any], limits: Fabrication, shown: Mapping[str, 
         Section("By wavelength", bounds, _COLUMNS, list(zip(*columns, strict=True))),
     ]
     if "history" in shown:
-        text = "Each term is a mean over the bands of an iteration."
+        text = (
+            "The loss is the weighted sum of its terms. Each term is a mean over the bands of an iteration and has no "
+            "unit. The term `lsr` is a natural logarithm, and so negative, unless the recipe sets `log: false`."
+        )
         parts.append(Section("Learning", text, picture=shown["history"]))
     return parts

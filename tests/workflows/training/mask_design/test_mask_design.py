@@ -11,6 +11,7 @@ from safetensors.torch import load_file
 
 from neusee.nodes.doe import half_rings
 from neusee.workflows import load
+from neusee.workflows.report.figures import optics
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.loop.checkpoint import StateFile
 from neusee.workflows.training.mask_design import design_page, gradient_descent
@@ -71,7 +72,9 @@ def test_every_kind_lowers_its_loss_on_all_bands(kind, recipe, store, tmp_path):
     assert {"loss", "lsr", "bsr", "contrast"} <= set(rows[0])
 
 
-def test_the_file_is_the_mask_and_the_bounds_hold_on_it(recipe, store, tmp_path):
+def test_the_file_is_the_mask_and_the_bounds_hold_on_it(recipe, store, tmp_path, monkeypatch):
+    given, draw = {}, optics.suppression
+    monkeypatch.setattr(optics, "suppression", lambda **values: given.update(values) or draw(**values))
     folder = design(recipe, how(iterations=10), store, tmp_path, quiet)
     found = read(folder)
     again = load("first_light", [*SMALL, "doe=pixelwise", f"doe.file={folder / 'mask.safetensors'}"])
@@ -90,6 +93,14 @@ def test_the_file_is_the_mask_and_the_bounds_hold_on_it(recipe, store, tmp_path)
     text = (folder / "report.html").read_text()
     assert "median MTF" in text
     assert "even light" in text
+    assert given["bsr"].tolist() == found["bands"]["bsr"]  # the panel of the BSR is not empty
+
+
+def test_the_losses_of_several_starts_have_a_legend():
+    rows = [{"start": i, "iteration": n, "loss": 1.0 + i, "lsr": -n} for i in range(3) for n in range(4)]
+    figure = design_page.history.__wrapped__(rows)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["0", "1", "2"]
+    assert design_page.history.__wrapped__(rows[:4]).legends == []
 
 
 @pytest.mark.parametrize(("kind", "values"), [("pixelwise", {}), ("unet", {"starts": 2}),

@@ -1,0 +1,37 @@
+"""Figures of a calibration: the axes follow the levels that are not clipped."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from neusee.workflows.calibration import calibration_figures
+
+
+def drawn(last, whole):
+    mean = np.geomspace(1e3, 6e4, 12)
+    measured = np.stack([mean, 700 + 2.7 * mean])
+    measured[1, -1] *= last
+    predicted = np.stack([np.tile(mean, (50, 1)), np.tile(700 + 2.7 * mean, (50, 1))])
+    predicted[1] *= np.linspace(0.98, 1.02, 50)[:, None]
+    return calibration_figures.transfer.__wrapped__(measured, predicted, np.arange(12) < whole).axes[0]
+
+
+@pytest.mark.parametrize("last", [0.0, 1e-6, 0.1])
+def test_one_clipped_level_does_not_squeeze_the_curve(last):
+    ax = drawn(last, 11)
+    low, high = ax.get_ylim()
+    assert low > 700
+    (clipped,) = (line for line in ax.lines if line.get_label().startswith("clipped"))
+    assert low < clipped.get_ydata()[0] < high
+
+
+def test_without_a_clipped_level_nothing_is_marked_as_clipped():
+    assert not [line for line in drawn(1.0, 12).lines if line.get_label().startswith("clipped")]
+
+
+def test_the_axes_of_chains_are_read_without_adding_an_offset():
+    draws = 1054.0 + 1e-2 * np.random.default_rng(0).random((4, 100, 16, 1))
+    figure = calibration_figures.traces.__wrapped__(draws, ["offset, DN"])
+    figure.canvas.draw()
+    assert figure.axes[0].yaxis.get_offset_text().get_text() == ""
