@@ -103,8 +103,17 @@ def checked_body(raw: bytes) -> tuple[bytes, str]:
     body = rest[:-_SEALED]
     whole = raw.endswith(_END) and len(rest) > _SEALED
     if not whole or rest[-_SEALED:] != _SEAL + xxhash.xxh3_128_hexdigest(body).encode():
-        raise ValueError("checksum mismatch: the record has changed since it was written")
+        raise ValueError("checksum mismatch: the metadata have changed since they were written")
     return body, sign.decode(errors="replace")
+
+
+def is_sealed(raw: bytes) -> bool:
+    """Return True if `unseal_record` reads a record, without a look at its format version unless a secret is set."""
+    try:
+        unseal_record(raw) if secrets() else checked_body(raw)
+    except ValueError:
+        return False
+    return True
 
 
 def _parsed(text: bytes) -> dict[str, Any]:
