@@ -104,8 +104,8 @@ def ls_lines(store: Store) -> Iterator[str]:
         if is_kept(about):
             kept, size = kept + 1, size + _size(about)
     rows.sort(key=lambda row: row[: row.index("\0")])
-    for row in ("\0".join(_HEAD), *rows) if rows else ():
-        yield "  ".join(f"{cell:<{width}}" for cell, width in zip(row.split("\0"), widths, strict=True)).rstrip()
+    for line in ("\0".join(_HEAD), *rows) if rows else ():
+        yield "  ".join(f"{cell:<{width}}" for cell, width in zip(line.split("\0"), widths, strict=True)).rstrip()
     last = f"{_count(kept, 'result')}, {format_size(size)}, in {store.root}"
     if kept < len(rows):
         last += f"; of {_count(len(rows) - kept, 'more result')} the receipt alone"

@@ -107,15 +107,6 @@ def checked_body(raw: bytes) -> tuple[bytes, str]:
     return body, sign.decode(errors="replace")
 
 
-def is_sealed(raw: bytes) -> bool:
-    """Return True if `unseal_record` reads a record, without a look at its format version unless a secret is set."""
-    try:
-        unseal_record(raw) if secrets() else checked_body(raw)
-    except ValueError:
-        return False
-    return True
-
-
 def _parsed(text: bytes) -> dict[str, Any]:
     try:
         record = json.loads(text)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from typing import Any
 
-from neusee.workflows.keys.seal import FORMAT, is_sealed, seal_record, unseal_record
+from neusee.workflows.keys.seal import FORMAT, seal_record, unseal_record
 from neusee.workflows.store import metadata
 from neusee.workflows.store.metadata_fields import FIELDS, is_text
 from neusee.workflows.store.shared_folder import Disk, append, read_file
@@ -43,6 +43,8 @@ class Journal:
         """Open the journal of a store; ``others`` yields key and metadata of each result without its own file."""
         self._disk, self._others, self._guard = disk, others, threading.RLock()
         self._path = f"{disk.folder}/journal.jsonl"
+        self._rows: list[Row] = []
+        self._fileless = False
         self._forget()
 
     def append(self, key: str, about: Row) -> None:
@@ -102,7 +104,7 @@ class Journal:
         with suppress(OSError), open(self._path, "rb", opener=_opened) as file:
             for line in itertools.islice(file, 1, None):
                 key = line[_KEY].decode(errors="replace")
-                if line.startswith(_START) and is_sealed(line := line.rstrip(b"\n")):
+                if line.startswith(_START) and any(_parsed(line := line.rstrip(b"\n"))):
                     newest.pop(key, None)
                     newest[key] = line
         return newest
@@ -115,7 +117,7 @@ class Journal:
         return str(row["date"]), seal_record({**row, "kept": kept})
 
     def _forget(self) -> None:
-        self._rows: list[Row] = []
+        self._rows = []
         self._head, self._offset, self._fileless = b"", 0, False
 
     def _read(self) -> None:
