@@ -14,8 +14,12 @@ from neusee.workflows.store.byte_sizes import format_size, parse_size
 from neusee.workflows.store.metadata import is_kept
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from neusee.workflows.store.derived_files import DerivedFiles
     from neusee.workflows.store.result_store import Store
+
+_HEAD = ("date", "bytes", "seconds", "step", "recipe", "key", "")
 
 cache = typer.Typer(help="List, check, remove and keep stored results.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -28,7 +32,8 @@ def ls() -> None:
 
     For each result: when it was computed, its bytes and seconds, its step and the recipe that first needed it.
     """
-    say(ls_lines(the_store()))
+    for line in ls_lines(the_store()):
+        print(line)
 
 
 @cache.command("verify")
@@ -85,19 +90,28 @@ def why(key: Key) -> None:
 # --- what the commands print ------------------------------------------------------------------------------------------
 
 
-def ls_lines(store: Store) -> list[str]:
-    """Return a line for each cached result with its date, bytes, seconds, step, recipe and key, the newest last."""
-    entries = sorted(store.entries(), key=lambda entry: str(entry[1].get("date", "")))
-    pins = store.pinned()
-    rows = [_row(key, about, key in pins) for key, about in entries]
-    kept = [about for _, about in entries if is_kept(about)]
-    last = f"{_count(len(kept), 'result')}, {format_size(sum(map(_size, kept)))}, in {store.root}"
-    if len(kept) < len(entries):
-        last += f"; of {_count(len(entries) - len(kept), 'more result')} the receipt alone"
+def ls_lines(store: Store) -> Iterator[str]:
+    """Yield a line for each cached result with its date, bytes, seconds, step, recipe and key, the newest last.
+
+    Of each result, one short text is held in memory.
+    """
+    pins, widths = store.pinned(), [*map(len, _HEAD)]
+    rows, kept, size = list[str](), 0, 0
+    for key, about in store.entries():
+        row = _row(key, about, key in pins)
+        widths = [*map(max, widths, map(len, row))]
+        rows.append("\0".join(row))
+        if is_kept(about):
+            kept, size = kept + 1, size + _size(about)
+    rows.sort(key=lambda row: row[: row.index("\0")])
+    for line in ("\0".join(_HEAD), *rows) if rows else ():
+        yield "  ".join(f"{cell:<{width}}" for cell, width in zip(line.split("\0"), widths, strict=True)).rstrip()
+    last = f"{_count(kept, 'result')}, {format_size(size)}, in {store.root}"
+    if kept < len(rows):
+        last += f"; of {_count(len(rows) - kept, 'more result')} the receipt alone"
     if store.budget is not None:
         last += f"; the budget is {format_size(store.budget)}"
-    head = ["date", "bytes", "seconds", "step", "recipe", "key", ""]
-    return [*(columns([head, *rows]) if rows else []), last]
+    yield last
 
 
 def verify_lines(store: Store) -> tuple[list[str], int]:
@@ -124,9 +138,9 @@ def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list
 
     Raises `ValueError` for a budget that is not a size.
     """
-    abouts = dict(store.entries())
     swept = store.gc(None if budget is None else parse_size(budget), dry)
-    rows = [[*_row(key, abouts[key], False)[1:4], key[:8]] for key in swept.evicted if key in abouts]
+    abouts = ((key, store.about(key)) for key in swept.evicted)  # the receipts of what went
+    rows = [[*_row(key, about, False)[1:4], key[:8]] for key, about in abouts if about is not None]
     went = f"{_count(len(swept.evicted), 'value')} and {_count(swept.orphans, 'file')} that belonged to no result"
     freed, left = format_size(swept.freed), format_size(swept.left)
     last = f"{went} {'would go' if dry else 'went'}: {freed}; {left} stay in {store.root}"

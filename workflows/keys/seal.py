@@ -103,7 +103,7 @@ def checked_body(raw: bytes) -> tuple[bytes, str]:
     body = rest[:-_SEALED]
     whole = raw.endswith(_END) and len(rest) > _SEALED
     if not whole or rest[-_SEALED:] != _SEAL + xxhash.xxh3_128_hexdigest(body).encode():
-        raise ValueError("checksum mismatch: the record has changed since it was written")
+        raise ValueError("checksum mismatch: the metadata have changed since they were written")
     return body, sign.decode(errors="replace")
 
 

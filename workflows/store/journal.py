@@ -18,11 +18,13 @@ from typing import Any
 from neusee.workflows.keys.seal import FORMAT, seal_record, unseal_record
 from neusee.workflows.store import metadata
 from neusee.workflows.store.metadata_fields import FIELDS, is_text
-from neusee.workflows.store.shared_folder import Disk, append
+from neusee.workflows.store.shared_folder import Disk, append, read_file
 
 Row = dict[str, Any]
 _FIELDS = ("step", "recipe", "seconds", "bytes", "device", "peak", "date")
 _CHECKED = [(name, FIELDS[name]) for name in (*_FIELDS, "kept")]
+_START, NO_VALUE = b'{"key":"', b'"kept":false'  #: bytes that no text in JSON contains
+_KEY = slice(len(_START), len(_START) + 32)
 _NAMES = {"key", "node", "kept", *_FIELDS}
 _HEAD = re.compile(rb'\{"journal":"[0-9a-f]{16}","format":%d\}' % FORMAT)
 _SPARE = 20_000  #: superseded lines from which the file is rewritten
@@ -41,6 +43,8 @@ class Journal:
         """Open the journal of a store; ``others`` yields key and metadata of each result without its own file."""
         self._disk, self._others, self._guard = disk, others, threading.RLock()
         self._path = f"{disk.folder}/journal.jsonl"
+        self._rows: list[Row] = []
+        self._fileless = False
         self._forget()
 
     def append(self, key: str, about: Row) -> None:
@@ -71,19 +75,49 @@ class Journal:
             self._replace([{**row, "kept": False} if row["key"] in keys else row for row in self._rows])
 
     def compact(self) -> None:
-        """Rewrite the journal with the newest line of each existing result, and mark the evicted values."""
-        self._read()
-        known = {row["key"]: (i, row) for i, row in enumerate(self._rows)}
-        lines = []
-        for key, about in self._each():
-            at, row = known.get(key, (-1, row_of(key, about)))
-            lines.append((at, {**row, "kept": metadata.is_kept(about)}))
-        lines.sort(key=lambda line: (line[0], str(line[1].get("date"))))
+        """Rewrite the journal with the newest line of each existing result, and mark the evicted values.
+
+        Lines are copied as they are, so that a long journal needs little memory.
+        """
         with self._guard:
-            self._replace([row for _, row in lines])
+            newest = self._newest_lines()
+            place = {key: i for i, key in enumerate(newest)}
+            lines = list[tuple[int, str, bytes]]()
+            for key in metadata.names(self._disk):
+                with suppress(*metadata.UNREADABLE):
+                    kept = NO_VALUE not in read_file(self._disk.path(key, "json"))
+                    lines.append((place.get(key, -1), *self._line(key, newest.get(key), kept)))
+            for key, about in self._others():
+                raw = newest.get(key) or seal_record(row_of(key, about))
+                lines.append((place.get(key, -1), str(about.get("date")), raw))
+            lines.sort(key=lambda line: line[:2])
+            self._forget()
+            self._replace_lines([raw for _, _, raw in lines])
+            if self._fileless:
+                self._rows = list(_parsed(b"\n".join(raw for _, _, raw in lines)))
+            else:
+                self._forget()  # the next query reads the file
+
+    def _newest_lines(self) -> dict[str, bytes]:
+        """Return the newest undamaged line of each key, the newest last."""
+        newest = dict[str, bytes]()
+        with suppress(OSError), open(self._path, "rb", opener=_opened) as file:
+            for line in itertools.islice(file, 1, None):
+                key = line[_KEY].decode(errors="replace")
+                if line.startswith(_START) and any(_parsed(line := line.rstrip(b"\n"))):
+                    newest.pop(key, None)
+                    newest[key] = line
+        return newest
+
+    def _line(self, key: str, line: bytes | None, kept: bool) -> tuple[str, bytes]:
+        """Return the date and the line of a result, which is ``line`` if that is right."""
+        if line is not None and kept == (NO_VALUE not in line):
+            return "", line
+        row = row_of(key, metadata.read(self._disk, key)) if line is None else unseal_record(line)
+        return str(row["date"]), seal_record({**row, "kept": kept})
 
     def _forget(self) -> None:
-        self._rows: list[Row] = []
+        self._rows = []
         self._head, self._offset, self._fileless = b"", 0, False
 
     def _read(self) -> None:
@@ -121,12 +155,15 @@ class Journal:
     def _replace(self, rows: list[Row]) -> None:
         """Replace the journal file by the lines ``rows``; a line that another process adds meanwhile may be lost."""
         self._forget()
+        self._replace_lines([seal_record(row) for row in rows])
         self._rows = rows
+
+    def _replace_lines(self, lines: list[bytes]) -> None:
         self._head = f'{{"journal":"{os.urandom(8).hex()}","format":{FORMAT}}}'.encode()
-        raw = b"".join([self._head, *(b"\n" + seal_record(row) for row in rows)])
+        raw = b"\n".join([self._head, *lines])
         self._offset = len(raw)
         try:
-            if rows:
+            if lines:
                 self._disk.replace("journal.jsonl", raw)
         except OSError:
             self._fileless = True

@@ -112,7 +112,7 @@ class Maintained(Protocol):
 
     def unpin(self, key: str) -> None:
         """Allow the eviction of the value of ``key`` again."""
-        with suppress(FileNotFoundError):
+        with suppress(FileNotFoundError, NotADirectoryError):
             self.disk.unlink(f"{self.disk.folder}/pins/{key}")
 
     def pinned(self) -> set[str]:

@@ -30,7 +30,7 @@ def is_size(value: Any) -> bool:
 
 def is_number(value: Any) -> bool:
     """Return True for a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return type(value) is int or (type(value) is float and math.isfinite(value))
 
 
 def _is_payload(value: Any) -> bool:

@@ -140,10 +140,26 @@ class Store(Maintained):
 
     def entries(self) -> Iterator[tuple[str, Metadata]]:
         """Yield key and metadata of every result in the order of the keys, also of results without a stored value."""
-        for key in heapq.merge(metadata.names(self.disk), (key for key, _ in self.brief.each())):
-            about = self.about(key)
+        small, before = self.brief.keys(), ""
+        for key in heapq.merge(metadata.names(self.disk), sorted(small)):
+            about = self._listed(key, key in small) if key != before else None
+            before = key
             if about is not None:
                 yield key, about
+
+    def _listed(self, key: str, small: bool) -> Metadata | None:
+        """Return the metadata of a result as `about`, but remember nothing, so that a list of any length takes no room.
+
+        ``small`` tells whether the common file of small results has a line of the result.
+        """
+        if key in self._known or key in self._lost:
+            return self.about(key)
+        if small and is_kept(about := self.brief.find(key)):
+            return about
+        try:
+            return metadata.read(self.disk, key)
+        except UNREADABLE:
+            return self.about(key)  # missing meanwhile, damaged or not read
 
     def claim(self, key: str) -> Lease | None:
         """Return the lease of ``key``, the right to compute its result, or None while a running process holds it."""

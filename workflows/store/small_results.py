@@ -55,10 +55,14 @@ class SmallResults:
 
     def each(self) -> Iterator[tuple[str, Metadata]]:
         """Yield the key and the newest metadata of every small result."""
-        self._read_new_lines()
-        for key in sorted(self._lines):
+        for key in sorted(self.keys()):
             if (about := self.find(key)) is not None:
                 yield key, about
+
+    def keys(self) -> set[str]:
+        """Return the keys of all small results, some of which may be damaged."""
+        self._read_new_lines()
+        return set(self._lines)
 
     def compact(self) -> None:
         """Rewrite the file of small results with only its newest lines; lines added meanwhile may be lost.

@@ -24,7 +24,7 @@ def store(tmp_path):
 
 def test_results_are_listed_the_newest_last(store):
     store.pin(KEYS[0])
-    assert cache_commands.ls_lines(store) == [
+    assert list(cache_commands.ls_lines(store)) == [
         "date                 bytes  seconds  step  recipe  key",
         "2026-01-01 00:00:00  20 kB  0.500    s0    r       ab000000  pinned",
         "2026-01-02 00:00:00  20 kB  1.500    s1    r       ab111111",
@@ -34,7 +34,7 @@ def test_results_are_listed_the_newest_last(store):
 
 
 def test_an_empty_store_is_listed(tmp_path):
-    assert cache_commands.ls_lines(Store(tmp_path / "none", budget=10**9)) == [
+    assert list(cache_commands.ls_lines(Store(tmp_path / "none", budget=10**9))) == [
         f"0 results, 0 B, in {tmp_path / 'none'}; the budget is 1 GB"
     ]
 
