@@ -53,7 +53,8 @@ def psf(
     Error: single, 2e-6 of the brightest pixel, and 1e-4 of the value in a tail at 1e-8 of the brightest pixel;
         double, 1e-11; integrated, a further 1e-5 of the clear peak.
     Raises: ValueError where the window reaches beyond half the alias-free field, lambda f / (2 pitch), from the spot;
-        for a closed aperture, for heights or paths that are not finite, and for a pupil in half precision.
+        for a closed aperture, for heights or paths that are not finite or above 1e9 turns, and for a pupil in half
+        precision.
     Source: Goodman, Introduction to Fourier Optics, 3rd edition, eq. 5-14 (field in the focal plane of a lens).
     """
     camera = _Camera(focal_length, pixel_pitch, shape, angle, pixel, sensor).towards(direction)

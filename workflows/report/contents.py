@@ -53,6 +53,9 @@ TABLE: Mapping[str, Mapping[str, str]] = {
 #: Steps that only a figure reads. A run computes each of these steps if the recipe has the step.
 SHOWN = ("transfer",)
 
+#: Steps that give the error by the number of bands, by what they are the error of; each has one copy for each arm.
+SPECTRAL: Mapping[str, str] = {"spectral": "of the PSF of a white point", "laser_spectral": "of a laser spot"}
+
 BANDS = "bands"
 LINES = "line[*]"
 
@@ -66,7 +69,12 @@ def wanted(recipe: Recipe) -> tuple[str, ...]:
     """Return the steps that a run must give: outputs of the recipe, sources of expected numbers and of the report."""
     promised = [e.step for e in recipe.expect]
     shown = [s for s in (*(s for row in TABLE.values() for s in row.values()), *SHOWN) if s in recipe.steps]
-    return tuple(dict.fromkeys([*recipe.outputs, *promised, *shown]))
+    return tuple(dict.fromkeys([*recipe.outputs, *promised, *shown, *spectral_steps(recipe)]))
+
+
+def spectral_steps(recipe: Recipe) -> list[str]:
+    """Return the steps of the recipe that estimate the error by the number of spectral bands."""
+    return [name for name in recipe.steps if name.partition("[")[0] in SPECTRAL]
 
 
 def steps_of(recipe: Recipe) -> list[str]:
