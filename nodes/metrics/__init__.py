@@ -5,6 +5,7 @@ from neusee.nodes.metrics._peak_irradiance import Peak, peak_irradiance
 from neusee.nodes.metrics._picture_quality import Quality, quality
 from neusee.nodes.metrics._psf_contrast import Mtf, encircled, encircled_curve, mtf, over_clear_peak
 from neusee.nodes.metrics._saturated_pixels import Saturated, saturated
+from neusee.nodes.metrics._spectral_error import spectral_error
 from neusee.nodes.metrics._suppression_ratios import bsr, light_outside, lsr
 
 __all__ = [
@@ -27,4 +28,5 @@ __all__ = [
     "peak_irradiance",
     "quality",
     "saturated",
+    "spectral_error",
 ]

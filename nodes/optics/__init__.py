@@ -4,7 +4,7 @@ from neusee.nodes.optics._imaging._band_image import image
 from neusee.nodes.optics._imaging._channel_image import image_channels
 from neusee.nodes.optics._laser_direction import direction, field_of_view
 from neusee.nodes.optics._laser_spot import laser_irradiance
-from neusee.nodes.optics._phase_steps import mask_turns
+from neusee.nodes.optics._phase_steps import mask_turns, pupil_has_large_steps
 from neusee.nodes.optics._psf import psf
 from neusee.nodes.optics._pupil import pupil
 from neusee.nodes.optics._stop import stop
@@ -18,5 +18,6 @@ __all__ = [
     "mask_turns",
     "psf",
     "pupil",
+    "pupil_has_large_steps",
     "stop",
 ]

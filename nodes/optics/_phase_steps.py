@@ -5,6 +5,7 @@ from torch import Tensor
 
 from neusee.nodes.values import Pupil
 
+LARGE_STEPS = 0.1  #: share of steps above half a turn, from which the pupil counts as aliased
 _ROWS = 512  #: the least number of pupil rows in which phase steps are measured
 
 
@@ -26,6 +27,11 @@ def phase_steps(pupil: Pupil) -> tuple[float, float]:
         ]
     )
     return (float(steps.median()), float((steps > 0.5).double().mean())) if steps.numel() else (0.0, 0.0)
+
+
+def pupil_has_large_steps(pupil: Pupil) -> bool:
+    """Return True if so many phase steps exceed half a turn that the samples cannot follow the phase."""
+    return phase_steps(pupil)[1] > LARGE_STEPS
 
 
 def _steps(pupil: Pupil, band: int, one: list[Tensor], other: list[Tensor]) -> Tensor:

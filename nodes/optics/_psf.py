@@ -56,7 +56,7 @@ def psf(
         double, 1e-11; integrated, a further 1e-5 of the clear peak.
     Raises: ParameterError before the run, or ValueError, where the window reaches beyond half the alias-free field,
         lambda f / (2 pitch), from the spot; ParameterError for an angle of 1 rad or more; ValueError for a closed
-        aperture, for heights or paths that are not finite, and for a pupil in half precision.
+        aperture, for heights or paths that are not finite or above 1e9 turns, and for a pupil in half precision.
     Source: Goodman, Introduction to Fourier Optics, 3rd edition, eq. 5-14 (field in the focal plane of a lens).
     """
     camera = _Camera(focal_length, pixel_pitch, shape, angle, pixel, sensor).towards(direction)

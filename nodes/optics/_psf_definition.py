@@ -46,7 +46,7 @@ def _intensity(pupil: Pupil, camera: Geometry, band: int) -> Tensor:
         for x, weight_x in points:
             rows, columns = (_axis(camera, axis, shift, field.shape[axis], reach) for axis, shift in ((0, y), (1, x)))
             total = total + weight_y * weight_x * (rows @ field @ columns.T).abs().square()
-    light: Tensor = total * (reach**2 / pupil.aperture.double().square().sum())
+    light: Tensor = total * (reach**2 / pupil.aperture.detach().double().square().sum())
     return light
 
 

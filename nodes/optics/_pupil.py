@@ -8,7 +8,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_half
-from neusee.nodes.optics._phase_steps import phase_steps
+from neusee.nodes.optics._phase_steps import LARGE_STEPS, phase_steps
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, inside, opening, refuse_other_grid, stripes
 from neusee.nodes.optics._zernike import surface
 from neusee.nodes.shape_preview import without_values
@@ -96,7 +96,7 @@ def _(result: Pupil, height: Tensor, index: Tensor, bands: Bands, stop: Stop, *_
     text = f"phase step {median:.3f} turn between samples (median), {share:.1%} above half a turn"
     return [
         Check(f"throughput {passed:.4f} of the clear pupil {min(samples * pitch, diameter) * 1e3:#.3g} mm", passed > 0),
-        Check(text if share <= 0.1 else f"{text}: aliased, use a finer pupil pitch", share <= 0.1),
+        Check(text if share <= LARGE_STEPS else f"{text}: aliased, use a finer pupil pitch", share <= LARGE_STEPS),
     ]
 
 

@@ -365,7 +365,7 @@ _ELSEWHERE = {
         "calibrate.sufficient", "restore.wiener", "spectra.compress"),
     "copies, counts or states": ("metrics.saturated", "optics.stop", "restore.clipped", "sensor.crop", "sensor.limits",
         "spectra.filters"),
-    "has a stated error above 1e-11 against scikit-image": ("metrics.quality",),
+    "has a stated error above 1e-11": ("metrics.quality", "metrics.spectral_error"),
 }  # fmt: skip
 
 

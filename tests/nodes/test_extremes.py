@@ -173,6 +173,14 @@ def test_a_phase_that_is_no_number_is_refused(part, wrong):
         optics.psf(pupil, **LENS)
 
 
+@pytest.mark.parametrize("part", ["height", "path"])
+def test_a_phase_without_digits_is_refused(part):
+    """At 1e15 m neighbouring float64 numbers are 1e5 turns apart, and the PSF was that of a random phase."""
+    pupil = pupil_of(torch.zeros(16, 16))._replace(**{part: torch.full((16, 16), 1e15)})
+    with pytest.raises(ValueError, match=r"turns of phase, more than 1e\+09.*give heights and paths in metres"):
+        optics.psf(pupil, **LENS)
+
+
 def test_the_light_of_what_is_no_number_is_not_left_out():
     bands, responses = bands_of(2), torch.ones(3, 2, dtype=torch.float64)
     image = torch.rand(2, 5, 5, generator=torch.Generator().manual_seed(1))

@@ -146,6 +146,7 @@ CASES = {
     "metrics.peak_irradiance": Case("0", (SCENE, BANDS, LEVEL), WELL),
     "metrics.quality": Case("0", (PICTURE.float(), OTHER.float())),
     "metrics.saturated": Case("0", (RAW,), ADC),
+    "metrics.spectral_error": Case("0.height", (PUPIL, BANDS, LIGHT, RESPONSES), LENS),
     "optics.direction": Case("focal_length", (), {**LENS, "focal_length": number(0.11), "shape": (64, 64)}),
     "optics.image": Case("1.intensity", (SCENE, PSF)),
     "optics.image_channels": Case("1.intensity", (LOW_RANK, PSF, ROWS)),

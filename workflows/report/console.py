@@ -229,6 +229,7 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str
     """Return the lines to print after a run: steps left out, result table, verdict, report path, next commands."""
     lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
     lines += [left_out_line(doc)] if doc["left_out"] else []
+    lines += [doc["spectral"]["said"]] if doc.get("spectral") else []
     rows = [[row["name"], *row["cells"]] for row in doc["table"]["rows"]]
     lines += ["", *indented([["", *doc["table"]["columns"]], *rows])] if rows else []
     lines += [f"  {line}" for line in doc["table"]["legend"]]

@@ -53,6 +53,9 @@ TABLE: Mapping[str, Mapping[str, str]] = {
     "restored": {"quality": "restored_quality"},
 }
 
+#: Steps that give the error by the number of bands, by what they are the error of; each has one copy for each arm.
+SPECTRAL: Mapping[str, str] = {"spectral": "of the PSF of a white point", "laser_spectral": "of a laser spot"}
+
 BANDS = "bands"
 LINES = "line[*]"
 
@@ -63,17 +66,31 @@ FILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
 
 
 def wanted(recipe: Recipe) -> tuple[str, ...]:
-    """Return the steps that a run must give: the outputs, and the steps of the expected numbers that it compares."""
-    return tuple(dict.fromkeys([*recipe.outputs, *(e.step for e in compared(recipe)[0])]))
+    """Return the steps that a run must give: the outputs, the steps of the expected numbers, and the spectral errors.
+
+    An expected number counts if an output needs its step, and a spectral error if the outputs need all its inputs.
+    """
+    asked = _asked(recipe)
+    errors = (name for name in spectral_steps(recipe) if asked.issuperset(recipe.steps[name].sources))
+    return tuple(dict.fromkeys([*recipe.outputs, *(e.step for e in compared(recipe)[0]), *errors]))
 
 
 def compared(recipe: Recipe) -> tuple[list[Expectation], list[Expectation]]:
     """Return the expected numbers that a run compares, and the others, whose steps no output of the recipe needs."""
-    asked = set(needed(recipe.unsubstituted or recipe, recipe.outputs))
+    asked = _asked(recipe)
     found: tuple[list[Expectation], list[Expectation]] = ([], [])
     for number in recipe.expect:
         found[number.step not in asked].append(number)
     return found
+
+
+def _asked(recipe: Recipe) -> set[str]:
+    return set(needed(recipe.unsubstituted or recipe, recipe.outputs))
+
+
+def spectral_steps(recipe: Recipe) -> list[str]:
+    """Return the steps of the recipe that estimate the error by the number of spectral bands."""
+    return [name for name in recipe.steps if name.partition("[")[0] in SPECTRAL]
 
 
 def steps_of(recipe: Recipe) -> list[str]:

@@ -31,6 +31,7 @@ from neusee.workflows.recipe.paper_readings import in_force
 from neusee.workflows.report.contents import FIGURES, compared
 from neusee.workflows.report.result_numbers import expected, metrics, table
 from neusee.workflows.report.run_timing import said_of, timing
+from neusee.workflows.report.spectral_sampling import spectral_error
 from neusee.workflows.report.study_page import filled
 from neusee.workflows.report.tolerance_spent import spent
 from neusee.workflows.store.byte_sizes import format_size
@@ -76,6 +77,7 @@ def document(
         "readings": _readings(recipe),
         "left_out": [{"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"],
         "spent": spent(result),
+        "spectral": spectral_error(recipe, result.keys, result.value),
         "absent": [{"step": step, "where": where} for step, where in recipe.absent.items()],
         "timing": {**time, "said": said_of(time)},
         "steps": steps,

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._transform._pupil_field import Field, Screens, View
+from neusee.nodes.optics._transform._pupil_field import Field, Screens, View, refuse_too_many_turns
 from neusee.nodes.optics._transform._sample_axis import patch_of
 from neusee.nodes.optics._transform._scaled_transform import Method, propagate
 from neusee.nodes.optics._transform._workspace import Workspace, borrowed
@@ -88,6 +88,7 @@ class _Gradient(torch.autograd.Function):
 
 def _computed(screens: Screens, sampling: Sampling, keep: bool) -> tuple[Tensor, list[Tensor | None]]:
     """Return the PSF intensity, and the focal field of each view, or None instead of fields that are not stored."""
+    refuse_too_many_turns(screens, sampling.views)
     views, shape = sampling.views, (sampling.views[0].rows.n_out, sampling.views[0].columns.n_out)
     device, fields, done = screens.height.device, list[Tensor | None](), -1
     intensity = torch.empty(views[-1].band + 1, *shape, dtype=sampling.dtype, device=device)

@@ -1,6 +1,7 @@
 """The complex field in the pupil, computed patch by patch from amplitude, height and path, and never stored whole."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ from neusee.nodes._half_precision import refuse_not_finite
 from neusee.nodes.optics._transform._sample_axis import Axis, Source, centred
 from neusee.nodes.optics._transform._workspace import Workspace
 
+_MOST_TURNS = 1e9  #: turns of phase that float64 holds to 2e-7 turn
 _FEW_TURNS = 2.0  #: below this many turns a float32 phase is exact to 5e-7 rad, like a float64 phase after a cast
 
 
@@ -43,6 +45,16 @@ class Screens(NamedTuple):
         extents = [float(torch.stack(x.detach().aminmax()).abs().max()) for x in (height, path)]
         refuse_not_finite("no light has such a phase", height=extents[0], path=extents[1])
         return cls(amplitude, height, path, *extents)
+
+
+def refuse_too_many_turns(screens: Screens, views: Sequence[View]) -> None:
+    """Raise ValueError if the phase has more turns than float64 can hold to 1e-6 turn."""
+    turns = max(screens.highest * abs(view.turns_height) + screens.longest * view.turns_path for view in views)
+    if turns > _MOST_TURNS:
+        raise ValueError(
+            f"height {screens.highest:.3g} m and path {screens.longest:.3g} m are {turns:.2g} turns of phase, more "
+            f"than {_MOST_TURNS:.0e}, beyond which float64 loses the phase: give heights and paths in metres"
+        )
 
 
 class Field:
