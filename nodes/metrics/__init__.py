@@ -5,7 +5,7 @@ from neusee.nodes.metrics._peak_irradiance import Peak, peak_irradiance
 from neusee.nodes.metrics._picture_quality import Quality, quality
 from neusee.nodes.metrics._psf_contrast import Mtf, encircled, encircled_curve, mtf, over_clear_peak
 from neusee.nodes.metrics._saturated_pixels import Saturated, saturated
-from neusee.nodes.metrics._suppression_ratios import bsr, lsr
+from neusee.nodes.metrics._suppression_ratios import bsr, lsr, peak_bsr
 
 __all__ = [
     "Limits",
@@ -23,6 +23,7 @@ __all__ = [
     "most_unsuppressed",
     "mtf",
     "over_clear_peak",
+    "peak_bsr",
     "peak_irradiance",
     "quality",
     "saturated",

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from neusee.workflows.graph.step_record import Event, StepRecord
+from neusee.workflows.recipe.paper_readings import consequences
 from neusee.workflows.report.run_page import shape_of, unit_of
 from neusee.workflows.report.text_table import by_family, columns, indented
 from neusee.workflows.report.tolerance_spent import said_of_economies
@@ -191,7 +192,7 @@ def opening(recipe: Recipe, command: str) -> list[str]:
     values = sum(len(step.params) for step in recipe.steps.values())
     nodes = len({step.node.path for step in recipe.steps.values()})
     checked = f"checked  {len(recipe.steps)} steps of {nodes} nodes, {values} parameters: all right"
-    notes = [f"note     {line}" for line in recipe.notes]
+    notes = [f"note     {line}" for line in (*recipe.notes, *consequences(recipe.config.values))]
     return [f"neusee {command}: {recipe.title or recipe.name}", checked, *notes]
 
 
