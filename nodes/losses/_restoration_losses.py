@@ -1,6 +1,6 @@
 """Losses of a restored picture: differences from the true picture by pixel and by spatial frequency."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field
@@ -10,14 +10,21 @@ from neusee.nodes import node
 from neusee.nodes._half_precision import single
 from neusee.nodes.metrics._picture_quality import require_same_shape
 
+Reduction = Literal["mean", "sum"]
 _LEAST = 1e-30  #: least power, because the root has no gradient at 0
 
 
 @node()
 def charbonnier(
-    estimate: Tensor, truth: Tensor, *, epsilon: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-6
+    estimate: Tensor,
+    truth: Tensor,
+    *,
+    epsilon: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-6,
+    reduction: Reduction = "mean",
 ) -> Tensor:
     """Average sqrt(difference^2 + epsilon), an absolute difference of pictures that is smooth at 0.
+
+    ``reduction`` sum adds up the pixels instead, which is the only reduction that the paper names.
 
     Kornia's `charbonnier_loss` has a fixed epsilon of 1, and is a square for all differences of pictures in [0, 1].
 
@@ -28,23 +35,31 @@ def charbonnier(
     Source: NeuSee, section Two-Stage Training (L_REC), with the mean; epsilon is ours.
     """
     require_same_shape(estimate, truth)
-    return ((single(estimate) - single(truth)).square() + epsilon).sqrt().mean()
+    return _reduced(((single(estimate) - single(truth)).square() + epsilon).sqrt(), reduction)
 
 
 @node()
-def fft_l1(estimate: Tensor, truth: Tensor) -> Tensor:
+def fft_l1(estimate: Tensor, truth: Tensor, *, reduction: Reduction = "mean") -> Tensor:
     """Average the absolute difference between the spatial Fourier spectra of the estimated and the true picture.
+
+    ``reduction`` sum adds up the frequencies of a transform that is not normalised, as the paper prints. For n pixels,
+    the sum is n^(3/2) times the mean, so that the weight of the loss depends on the size of the picture.
 
     The transform is in float64: in single precision a coefficient near 0 has neither a reliable size nor a reliable
     direction, and the gradient is that direction.
 
     Shapes: estimate and truth (..., y, x) -> ().
-    Units:  those of the pictures: the transform is unitary, so the size of a picture does not matter.
+    Units:  those of the pictures: for the mean the transform is unitary, so the size of a picture does not matter.
     Error:  round-off of the type of the loss, 1e-7 in float32; a coefficient below 1e-15 has no gradient.
     Raises: ValueError for pictures of different shapes.
     Source: NeuSee, section Two-Stage Training (L_REC), with a unitary transform and the mean.
     """
     require_same_shape(estimate, truth)
-    spectrum: Tensor = torch.fft.fft2(estimate.double() - truth.double(), norm="ortho")
-    loss = (spectrum.real.square() + spectrum.imag.square() + _LEAST).sqrt().mean()
+    norm = "ortho" if reduction == "mean" else "backward"
+    spectrum: Tensor = torch.fft.fft2(estimate.double() - truth.double(), norm=norm)
+    loss = _reduced((spectrum.real.square() + spectrum.imag.square() + _LEAST).sqrt(), reduction)
     return loss.to(single(estimate).dtype)
+
+
+def _reduced(errors: Tensor, reduction: Reduction) -> Tensor:
+    return errors.mean() if reduction == "mean" else errors.sum()

@@ -6,7 +6,7 @@ from neusee.nodes.metrics._picture_quality import Quality, quality
 from neusee.nodes.metrics._psf_contrast import Mtf, encircled, encircled_curve, mtf, over_clear_peak
 from neusee.nodes.metrics._saturated_pixels import Saturated, saturated
 from neusee.nodes.metrics._spectral_error import spectral_error
-from neusee.nodes.metrics._suppression_ratios import bsr, light_outside, lsr
+from neusee.nodes.metrics._suppression_ratios import bsr, light_outside, lsr, peak_bsr
 
 __all__ = [
     "Limits",
@@ -25,6 +25,7 @@ __all__ = [
     "most_unsuppressed",
     "mtf",
     "over_clear_peak",
+    "peak_bsr",
     "peak_irradiance",
     "quality",
     "saturated",

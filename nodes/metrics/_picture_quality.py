@@ -40,7 +40,8 @@ def quality(
 
     Shapes: estimate and truth (3, y, x), linear sRGB -> three scalars, float64.
     Units:  none; PSNR dB. ``border`` pixels at each side do not count.
-    Error:  PSNR 2e-5 dB and SSIM 1e-5 against scikit-image.
+    Error:  PSNR 2e-5 dB and SSIM 1e-5 against scikit-image. Round-off of SSIM is 1e-7, also where an SSIM near 0 is the
+            small sum of positive and negative terms.
     Raises: ValueError for pictures of different shapes, and for pictures smaller than the window of SSIM.
     Source: Wang et al., IEEE Trans. Image Process. 13, 600 (2004); sRGB as IEC 61966-2-1.
     """

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes._half_precision import single
 from neusee.nodes.units import PositiveLength
 from neusee.nodes.values import Psf
 
@@ -31,7 +30,7 @@ def mtf(psf: Psf) -> Mtf:
 
     Shapes: psf.intensity (band, y, x) -> three of (band,) float64.
     Units:  none.
-    Error:  1e-7 in float32, plus the error of the window: light outside the window counts as lost, and the window sets
+    Error:  round-off 1e-7, plus the error of the window: light outside the window counts as lost, and the window sets
             the frequencies. The cut-off holds for a round aperture and a PSF sampled at points. Without light (1e-30)
             the contrast is 0. Only `rms` has a gradient: a median depends on one frequency, whose choice among equal
             values is arbitrary.
@@ -45,10 +44,10 @@ def _contrast(kernel: Tensor, clear_peak: float) -> tuple[Tensor, Tensor, Tensor
     y, x = kernel.shape
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in (y, x))
     inside = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= math.sqrt(4.0 * clear_peak / math.pi)
-    otf = torch.fft.rfft2(single(kernel))
-    whole = otf[0, 0].to(torch.complex128).abs()
+    otf = torch.fft.rfft2(kernel.double())
+    whole = otf[0, 0].abs()
     dark = whole <= _DARK
-    passed = otf[inside].to(torch.complex128).abs() / whole.where(~dark, 1.0)
+    passed = otf[inside].abs() / whole.where(~dark, 1.0)
     contrast = passed.where(~dark, 0.0).clamp_max(1.0)
     ordered = contrast.detach().sort().values
     rms: Tensor = torch.linalg.vector_norm(contrast) / math.sqrt(len(contrast))

@@ -103,6 +103,28 @@ def _(result: Tensor, *inputs: Any) -> list[Check]:
 
 
 @node(rtol=1e-6)
+def peak_bsr(image: Tensor, plain_image: Tensor) -> Tensor:
+    """Compute the ratio of the brightest pixel of the scene with the mask to the brightest pixel without the mask.
+
+    The paper scales the peak irradiance of a scene by its background suppression ratio, so that a mask that blurs has a
+    low ratio although no light is lost. `metrics.bsr` is the ratio of energies.
+
+    Shapes: image and plain_image (..., band, y, x) -> (..., band) float64.
+    Units:  none; about 1 for a mask that neither absorbs nor blurs.
+    Error:  that of the brightest pixels, 2e-7; a band without light (1e-30) has ratio 1.
+    Raises: ValueError for images of different shapes.
+    Source: NeuSee, Eq. (peak_irrad_coded).
+    """
+    if image.shape != plain_image.shape:
+        shapes = f"{tuple(image.shape)} with and {tuple(plain_image.shape)} without mask"
+        raise ValueError(f"image {shapes} differ in shape: use one scene for both")
+    kept, plain = (single(x).amax((-2, -1)).double() for x in (image, plain_image))
+    dark = plain <= _DARK  # false for NaN, so that NaN reaches the result
+    ratio: Tensor = torch.where(dark, 1.0, kept / plain.where(~dark, 1.0))
+    return ratio
+
+
+@node(rtol=1e-6)
 def light_outside(psf: Psf, pupil: Pupil) -> Tensor:
     """Compute the share of the light of a point that falls outside the window of its PSF, by band.
 

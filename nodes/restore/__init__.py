@@ -2,6 +2,7 @@
 
 from neusee.nodes.restore._colour_matrix import colour_matrix
 from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons
+from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
 from neusee.nodes.restore._inverse._wiener import wiener
 from neusee.nodes.restore._networks._critic import critic_slopes, critics, skip_critic_draws
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba, fft_mamba
@@ -23,6 +24,7 @@ __all__ = [
     "fft_mamba",
     "nafnet",
     "parameter_groups",
+    "richardson_lucy",
     "skip_critic_draws",
     "start_network",
     "unet",

@@ -18,6 +18,7 @@ from neusee.nodes.units import Electrons, Fraction
 Distribution = Literal["gaussian", "poisson"]
 _PART = 1 << 15  #: elements; torch splits larger arrays among threads, which is slow on a busy machine
 _DARK = 1e-30  #: e-; smaller numbers count as 0, because the gradient of the square root is unbounded near 0
+_MOST = 5.0  #: largest ratio of a sampled mean of the dark current to the given mean, 8 standard deviations above
 Spread = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
@@ -129,8 +130,19 @@ def normal(like: Tensor, rng: Generator) -> Tensor:
 
 
 @node()
-def dark_current(electrons: Tensor, *, mean: Electrons, full_well: Well | None = None, rng: Generator) -> Tensor:
-    """Add the thermal electrons of one exposure, sampled from a Poisson distribution with the given mean.
+def dark_current(
+    electrons: Tensor,
+    *,
+    mean: Electrons,
+    full_well: Well | None = None,
+    mean_of: Literal["sensor", "exposure"] = "sensor",
+    rng: Generator,
+) -> Tensor:
+    """Add the thermal electrons of one exposure, sampled from a Poisson distribution.
+
+    The mean of the distribution is ``mean``, for ``mean_of`` sensor. For ``mean_of`` exposure the mean is sampled once
+    for each exposure from a normal distribution with mean ``mean`` and half of it as standard deviation, as the paper
+    prints of the training; a negative sample counts as 0.
 
     ``full_well`` is used only to decide if the dark current is small enough to leave out: the electrons are compared
     with the signal up to the well, because a later step cuts off the signal of a laser above the well.
@@ -141,8 +153,10 @@ def dark_current(electrons: Tensor, *, mean: Electrons, full_well: Well | None =
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 (dark current).
     """
 
+    expected = mean if mean_of == "sensor" else _sampled_mean(mean, rng)
+
     def with_dark_current(part: Tensor) -> Tensor:
-        rate = torch.full(part.shape, mean, dtype=part.dtype, device=rng.device)
+        rate = torch.full(part.shape, expected, dtype=part.dtype, device=rng.device)
         return part + torch.poisson(rate, generator=rng).to(part)
 
     return _by_parts(with_dark_current, single(electrons), rng)
@@ -151,9 +165,15 @@ def dark_current(electrons: Tensor, *, mean: Electrons, full_well: Well | None =
 dark_current.preview(same_shape)
 
 
+def _sampled_mean(mean: float, rng: Generator) -> float:
+    drawn = torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)
+    return mean * max(0.0, min(_MOST, 1.0 + 0.5 * float(drawn)))
+
+
 @dark_current.skip_bound
-def _(electrons: TensorStats, *, mean: float, full_well: float | None) -> float:
-    return _share(mean, math.sqrt(mean), electrons, full_well)
+def _(electrons: TensorStats, *, mean: float, full_well: float | None, mean_of: str = "sensor") -> float:
+    most = mean if mean_of == "sensor" else _MOST * mean
+    return _share(most, math.sqrt(most), electrons, full_well)
 
 
 @node()

@@ -57,7 +57,7 @@ def grain(picture: Tensor, *, read: GrainDeviation = 1e-3, shot: GrainDeviation 
     Source: EMVA Standard 1288, release 4.0 Linear, section 2 (variance linear in the mean).
     """
     picture = single(picture)
-    normal = torch.randn(picture.shape, generator=rng, device=rng.device, dtype=picture.dtype)
+    normal = torch.randn(picture.shape, generator=rng, device=rng.device, dtype=torch.float32).to(picture)
     return picture + normal * (read**2 + shot**2 * picture.clamp_min(0)).sqrt()
 
 

@@ -143,6 +143,7 @@ CASES = {
     "metrics.limits": Case("0.clear_peak", (PSF,)),
     "metrics.lsr": Case("0.intensity", (PSF,)),
     "metrics.mtf": Case("0.intensity", (WIDE,)),
+    "metrics.peak_bsr": Case("0", (SCENE, PLAIN)),
     "metrics.peak_irradiance": Case("0", (SCENE, BANDS, LEVEL), WELL),
     "metrics.quality": Case("0", (PICTURE.float(), OTHER.float())),
     "metrics.saturated": Case("0", (RAW,), ADC),
@@ -157,6 +158,11 @@ CASES = {
     "restore.colour": Case("0", (PICTURE, rand(3, 3))),
     "restore.colour_matrix": Case("1", (BANDS, LIGHT, RESPONSES, LEVEL), {**SHUTTER, "quantum_efficiency": 0.56}),
     "restore.electrons": Case("0", (RAW,), {"gain": 1 / 0.37, "offset": 50.0}),
+    "restore.richardson_lucy": Case(
+        "0",
+        (WIDE_RAW, PSF, LIGHT, RESPONSES, BANDS, torch.zeros(3, 48, 48, dtype=torch.bool)),
+        {"read_noise": 5.0, "iterations": 3},
+    ),
     "restore.wiener": Case(
         "0", (WIDE_RAW, PSF, LIGHT, RESPONSES, BANDS, torch.zeros(3, 48, 48, dtype=torch.bool)), {"read_noise": 5.0}
     ),

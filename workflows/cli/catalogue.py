@@ -16,7 +16,7 @@ import typer
 from neusee.workflows.cli.command_frame import failing, say
 from neusee.workflows.cli.command_options import Debug
 from neusee.workflows.graph.diagnostics import nearest
-from neusee.workflows.recipe.paper_readings import READINGS
+from neusee.workflows.recipe.paper_readings import READINGS, SETTLED
 from neusee.workflows.report.text_table import columns
 
 if TYPE_CHECKING:
@@ -97,7 +97,8 @@ def node_lines(name: str) -> list[str]:
     if name == "glossary":
         return glossary_lines()
     if name == "reading":
-        return [line for row in READINGS for line in (*_reading(row.path), "")]
+        settled = [line for row in SETTLED for line in (f"{row.number}: {row.matter}", f"  no key: {row.why}", "")]
+        return [line for row in READINGS for line in (*_reading(row.path), "")] + settled
     nodes = dict(all_nodes())
     if name not in nodes:
         raise LookupError(f"there is no node {name}: {nearest(name, nodes)}")
@@ -197,7 +198,8 @@ def _reading(path: str) -> list[str]:
     return [
         f"{row.path} ({row.number}): {row.matter}",
         f"  coherent (in force by default): {row.coherent}, because {row.reason}",
-        f"  as printed (reading=as_printed): {row.as_printed}",
+        f"  as printed ({row.argument}): {row.as_printed}",
+        *([f"    {row.consequence}"] if row.consequence else []),
     ]
 
 

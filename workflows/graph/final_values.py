@@ -29,6 +29,11 @@ class Config:
 
     settings: Mapping[str, Setting] = field(default_factory=dict)
 
+    @property
+    def values(self) -> dict[str, Any]:
+        """Return the final values by recipe key, without their sources."""
+        return {path: setting.value for path, setting in self.settings.items()}
+
     def __getitem__(self, path: str) -> Setting:
         return self.settings[path]
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from neusee.workflows.graph.step_record import Event, StepRecord
+from neusee.workflows.recipe.paper_readings import consequences
 from neusee.workflows.report.run_page import shape_of, unchecked_lines, unit_of
 from neusee.workflows.report.text_table import by_family, columns, indented, lasts
 from neusee.workflows.report.tolerance_spent import said_of_economies
@@ -213,7 +214,7 @@ def opening(recipe: Recipe, command: str) -> list[str]:
     """Return the lines to print before a run: recipe title, numbers of checked steps and parameters, and notes."""
     found = contents_of(recipe)
     sizes = f"{found['steps']} steps of {found['nodes']} nodes, {found['parameters']} parameters"
-    notes = [f"note     {line}" for line in recipe.notes]
+    notes = [f"note     {line}" for line in (*recipe.notes, *consequences(recipe.config.values))]
     return [f"neusee {command}: {recipe.title or recipe.name}", f"checked  {sizes}: all right", *notes]
 
 

@@ -27,7 +27,7 @@ from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.step_record import StepRecord
 from neusee.workflows.recipe.distributions.nominal_values import told
-from neusee.workflows.recipe.paper_readings import in_force
+from neusee.workflows.recipe.paper_readings import consequences, in_force
 from neusee.workflows.report.contents import FIGURES, compared
 from neusee.workflows.report.result_numbers import expected, metrics, table
 from neusee.workflows.report.run_timing import said_of, timing
@@ -75,6 +75,7 @@ def document(
         "warnings": warned,
         "posterior": told(recipe.uncertain.standings) if recipe.uncertain else [],
         "readings": _readings(recipe),
+        "consequences": consequences(recipe.config.values),
         "left_out": [{"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"],
         "spent": spent(result),
         "spectral": spectral_error(recipe, result.keys, result.value),
@@ -195,10 +196,10 @@ def unchecked_lines(numbers: Sequence[Mapping[str, str]]) -> list[str]:
 
 def _readings(recipe: Recipe) -> list[dict[str, str]]:
     """Return a table row for each contradiction in the paper, with the interpretation that the recipe uses."""
-    values = {path: setting.value for path, setting in recipe.config.settings.items()}
+    values = recipe.config.values
     if not any(path.startswith("reading.") for path in values):
         return []
-    texts = ("name", "number", "matter", "reason")
+    texts = ("path", "number", "matter", "reason")
     return [
         {name: str(getattr(row, name)) for name in texts} | {"value": str(values[row.path]), "state": state}
         for row, state in in_force(values)

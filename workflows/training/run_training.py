@@ -97,7 +97,8 @@ def _key(recipe: Recipe, settings: Training, photographs: Photographs) -> str:
     """Return a digest of all settings that can change a trained network or mask, as a part of the folder name."""
     items = recipe.config.settings.items()
     values = {name: str(setting.value) for name, setting in items if not name.startswith(f"{KEY}.")}
-    usual = {"mask"} if settings.mask == MaskSettings() else set()  # so that trainings of older versions continue
+    defaults = {"mask": MaskSettings(), "clip": 10.0, "reduction": "mean"}
+    usual = {name for name, x in defaults.items() if getattr(settings, name) == x}  # so that older trainings continue
     block = settings.model_copy(update={"keep": 1, "show": 1}).model_dump(mode="json", exclude={"tensorboard", *usual})
     block["network"] = {"kind": settings.network.kind, "width": settings.network.width, **settings.network.options}
     return digest("training", values, block, [path.name for path in photographs.paths])[:8]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -29,7 +30,7 @@ from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import device_kind, stream_seed
 from neusee.workflows.recipe.blocks.train_block import Network, Stage, Training
-from neusee.workflows.training.loop.resumable_loop import STEEPEST, Losses, averaged, require_finite
+from neusee.workflows.training.loop.resumable_loop import Losses, averaged, require_finite
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.training_pictures import Sample, TrainingStream
@@ -176,12 +177,16 @@ class Learner:
         if self.stage.bsr:
             terms["BSR"] = (self.stage.bsr, (1.0 / sample.light.clamp_min(1e-30)).sum())
         if self.stage.reconstruction:
-            errors = (losses.charbonnier(e, t) + losses.fft_l1(e, t) for e, t in zip(estimate, truth, strict=True))
-            terms["reconstruction"] = (self.stage.reconstruction, sum(errors, zero))
+            terms["reconstruction"] = (self.stage.reconstruction, sum(self._errors(estimate, truth), zero))
         if self.stage.adversarial:
             scores = (-critic(e).mean() for critic, e in zip(self.critics, estimate, strict=True))
             terms["adversarial"] = (self.stage.adversarial, sum(scores, zero))
         return terms, truth, Scales(estimate.coarse.detach(), estimate.fine.detach())
+
+    def _errors(self, estimate: Scales, truth: Scales) -> Iterator[Tensor]:
+        how = {} if self.settings.reduction == "mean" else {"reduction": self.settings.reduction}
+        for e, t in zip(estimate, truth, strict=True):
+            yield losses.charbonnier(e, t, **how) + losses.fft_l1(e, t, **how)
 
     def _train_critics(self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator) -> Losses:
         """Train the critics to distinguish true from restored pictures, with equal random numbers in all processes."""
@@ -203,13 +208,14 @@ class Learner:
         return found
 
     def _move(self, optimiser: torch.optim.Optimizer, found: Mapping[str, float], parts: Sequence[nn.Module]) -> float:
-        """Clip the gradients of the modules ``parts``, apply one optimiser step, and return the largest gradient norm.
+        """Apply one optimiser step, and return the largest gradient norm of the modules ``parts`` before clipping.
 
-        The gradient of each module is clipped separately, because the laser suppression loss has a thousand times as
-        large a gradient for the mask as for a network. Raises `NotFinite` before the step.
+        The gradient of each module is clipped to ``train.clip`` separately, because the laser suppression loss has a
+        thousand times as large a gradient for the mask as for a network. Raises `NotFinite` before the step.
         """
         self.mesh.add_gradients(parts)
-        norm = max(float(nn.utils.clip_grad_norm_(part.parameters(), STEEPEST)) for part in parts)
+        largest = math.inf if self.settings.clip is None else self.settings.clip
+        norm = max(float(nn.utils.clip_grad_norm_(part.parameters(), largest)) for part in parts)
         require_finite({**found, "norm of the gradient": norm})
         optimiser.step()
         return norm

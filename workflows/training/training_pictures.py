@@ -8,7 +8,7 @@ that depend only on the mask are summed over all pictures, so that one picture i
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.scene import Photographs
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.graph.diagnostics import nearest
-from neusee.workflows.graph.recipe_graph import Recipe, dependents, needed
+from neusee.workflows.graph.recipe_graph import Recipe, Step, dependents, needed
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
@@ -65,7 +65,8 @@ class TrainingStream:
         require_steps(recipe, "train", (*outputs, settings.scene, *([learn] if learn else [])))
         self._inputs = Inputs.of(recipe, outputs) if recipe.uncertain and recipe.uncertain.names else None
         self.shape = _frame(recipe, settings.scene)
-        recipe = with_substitutions(frozen or recipe, outputs, {learn} if learn else ())
+        recipe = in_precision(frozen or recipe, settings.dtype)
+        recipe = with_substitutions(recipe, outputs, {learn} if learn else ())
         order = needed(recipe, outputs)
         self._lasers = [f"{n}.{_LASER[1]}" for n in order if recipe.steps[n].node.path == _LASER[0]]
         readers = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
@@ -180,6 +181,18 @@ class TrainingStream:
         count = self.settings.patches
         places = [[int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)] for _ in range(count)]
         return torch.stack([both[..., y : y + patch[0], x : x + patch[1]] for y, x in places], 1)
+
+
+def in_precision(recipe: Recipe, dtype: torch.dtype) -> Recipe:
+    """Return the recipe with steps in float64 if ``dtype`` is float64: steps with a choice of precision are double."""
+    if dtype != torch.float64:
+        return recipe
+    steps = {name: _precise(step) if "precision" in step.params else step for name, step in recipe.steps.items()}
+    return replace(recipe, steps=steps)
+
+
+def _precise(step: Step) -> Step:
+    return replace(step, params={**step.params, "precision": "double"})
 
 
 def require_steps(recipe: Recipe, block: str, names: Sequence[str]) -> None:

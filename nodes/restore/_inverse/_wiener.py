@@ -57,15 +57,8 @@ def wiener(
     Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; as least squares with a
             prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.
     """
-    if electrons.shape != clipped.shape or len(responses) != electrons.shape[-3]:
-        raise ValueError(
-            f"electrons {tuple(electrons.shape)}, clipped {tuple(clipped.shape)} and responses "
-            f"{tuple(responses.shape)} must have the same channels and pixels"
-        )
     electrons = single(electrons)
-    for name, values in {"electrons": [electrons], "psf": [psf.intensity], "glare": glare or ()}.items():
-        for x in values:
-            refuse_not_finite("the picture cannot be restored", **{name: x.sum(-1).sum(dtype=torch.float64)})
+    refuse_other_pictures(electrons, psf, responses, clipped, glare)
     size = (electrons.shape[-2], electrons.shape[-1])
     kernels = effective_psf(psf, illuminant, responses, bands).to(electrons)
     patterns = [crop(pattern.to(electrons), shape=size) for pattern in glare or ()]
@@ -83,6 +76,20 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[
             finite,
         )
     ]
+
+
+def refuse_other_pictures(
+    electrons: Tensor, psf: Psf, responses: Tensor, clipped: Tensor, glare: list[Tensor] | None
+) -> None:
+    """Raise ValueError for inputs that differ in channels or pixels, and for inputs that are not finite."""
+    if electrons.shape != clipped.shape or len(responses) != electrons.shape[-3]:
+        raise ValueError(
+            f"electrons {tuple(electrons.shape)}, clipped {tuple(clipped.shape)} and responses "
+            f"{tuple(responses.shape)} must have the same channels and pixels"
+        )
+    for name, values in {"electrons": [electrons], "psf": [psf.intensity], "glare": glare or ()}.items():
+        for x in values:
+            refuse_not_finite("the picture cannot be restored", **{name: x.sum(-1).sum(dtype=torch.float64)})
 
 
 def effective_psf(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:

@@ -98,6 +98,8 @@ class Training(SettingsBlock):
     average: Annotated[float, Field(ge=0, lt=1)] = 0.999
     precision: Literal["float32", "bfloat16", "float64"] = "float32"
     logarithm: bool = True
+    reduction: Literal["mean", "sum"] = "mean"  #: of the reconstruction loss over pixels and frequencies
+    clip: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = 10.0  #: largest gradient norm of a module
     mask: MaskSettings = MaskSettings()  #: settings of the mask design without images, which replaces stage 1
     stages: dict[Annotated[int, Field(ge=1, le=2)], Stage]
     keep: Number = 100

@@ -71,7 +71,8 @@ def _changed(step: Step, case: Case) -> dict[str, Any]:
     params = dict(step.params)
     for name in step.params:
         for path in (f"*.{name}", f"{step.node.path}.{name}"):
-            if path in case.params and (params[name] is not None or path[0] != "*"):
+            single = isinstance(params[name], int | float)  # not a range, as of a prior
+            if path in case.params and (single or path[0] != "*"):
                 new = case.params[path]
                 params[name] = new(step.params) if callable(new) else new
     return params

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -128,8 +129,9 @@ def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
     bound = max([step.node.rtol, ROUNDING, *(_HALVES.get(x.dtype, 0.0) for x in tensors_in(value))])
     dim = case.expect == "dim part" and step.node.path.startswith(_LIGHT)
     error = _dim_error(value, truth) if dim else _error(value, truth)
-    if isinstance(truth, Tensor) and truth.ndim == 0 and error > bound:
-        error *= _cancelled(step, inputs, truth, seed)
+    if error > bound and all(x.ndim == 0 for x in tensors_in(truth)):
+        scalars = enumerate(zip(tensors_in(value), tensors_in(truth), strict=True))
+        error = max(_over(a, b, _LEAST) * _cancelled(step, inputs, b, i, seed) for i, (a, b) in scalars)
     coarse = max(
         (_HALVES.get(x.dtype, 0.0) for x in tensors_in(inputs)), default=0.0
     )  # a gradient has the input's type
@@ -152,10 +154,13 @@ def _error(value: Any, truth: Any) -> float:
     return max((_over(a, b, _LEAST) for a, b in pairs), default=0.0)
 
 
-def _cancelled(step: Step, inputs: list[Any], truth: Tensor, seed: int) -> float:
-    """Return the inverse condition number of a scalar result f(x), |f| / sum |x df/dx|, but at most 1."""
+def _cancelled(step: Step, inputs: list[Any], truth: Tensor, part: int, seed: int) -> float:
+    """Return the inverse condition number of a scalar result f(x), |f| / sum |x df/dx|, but at most 1.
+
+    ``part`` is the position of ``truth`` among the scalars that the step returns.
+    """
     with torch.enable_grad():
-        slopes = _true_slopes(step, inputs, seed) or []
+        slopes = _true_slopes(step, inputs, seed, part) or []
     moved = sum(float((x.double() * g).abs().sum()) for x, g in zip(_pictures(inputs), slopes, strict=False))
     weight = float(_weight(truth))
     return min(1.0, weight * abs(float(truth)) / moved) if moved > 0 else 1.0
@@ -211,12 +216,17 @@ def _slight(picture: Tensor) -> float:
     return max(1.0 / (picture.numel() * max(top, _LEAST)), torch.finfo(picture.dtype).tiny)
 
 
-def _true_slopes(step: Step, inputs: list[Any], seed: int) -> list[Tensor] | None:
+def _true_slopes(step: Step, inputs: list[Any], seed: int, part: int | None = None) -> list[Tensor] | None:
     wide = each_tensor(lambda x: x.double() if _is_picture(x) else x, inputs)
     leaves = [id(w) for w, x in zip(tensors_in(wide), tensors_in(inputs), strict=True) if _is_picture(x)]
     reference = step.node.hooks.reference
-    slopes = None if reference is None else _slopes(wide, lambda given: _run(step, reference, given, seed), leaves)
-    return slopes or _slopes(wide, lambda given: _in_double(step, given, seed), leaves)
+    ways = [partial(_run, step, reference), partial(_in_double, step)] if reference else [partial(_in_double, step)]
+
+    def of(way: Any, given: list[Any]) -> Any:
+        value = way(given, seed)
+        return value if part is None else tensors_in(value)[part]
+
+    return next((slopes for way in ways if (slopes := _slopes(wide, partial(of, way), leaves))), None)
 
 
 def _slopes(inputs: list[Any], fn: Any, ids: list[int] | None = None) -> list[Tensor] | None:

@@ -16,8 +16,10 @@ from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.loop.resumable_loop import STEEPEST, Losses, averaged, require_finite
+from neusee.workflows.training.loop.resumable_loop import Losses, averaged, require_finite
 from neusee.workflows.training.training_pictures import require_steps
+
+_LARGEST_GRADIENT = 10.0  #: norm above which the gradient is clipped
 
 
 class Pairs:
@@ -84,7 +86,7 @@ class LiftLearner:
         estimate = lift_pictures(self.net, picture)
         loss = losses.mrae(estimate, cube, floor=self.settings.floor)
         loss.backward()
-        slope = float(nn.utils.clip_grad_norm_(self.net.parameters(), STEEPEST))
+        slope = float(nn.utils.clip_grad_norm_(self.net.parameters(), _LARGEST_GRADIENT))
         errors = {"MRAE": float(loss.detach()), "RMSE": _rmse(estimate.detach(), cube), "slope": slope, "rate": rate}
         require_finite(errors)
         self.optimiser.step()

@@ -21,7 +21,6 @@ Losses = dict[str, float]
 Progress = Callable[[str], None]  #: takes one line of text about the progress of a training
 Watch = Callable[[int, int, Mapping[str, float]], None]  #: takes the stage, its iterations so far, and the losses
 DOCUMENT = "training.json"  #: the file that a training writes last
-STEEPEST = 10.0  #: largest norm of a gradient; a larger gradient is clipped
 
 
 class NotFinite(ArithmeticError):
