@@ -20,7 +20,7 @@ import torch
 from neusee.workflows.engine.memory_use import there_is
 from neusee.workflows.engine.step_job import InputMissing, Lane, Outcome, StepJob, carry_out
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.keys.cache_key import Key, is_private
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
@@ -172,8 +172,10 @@ def work_here(chain: tuple[StepJob, ...], where: str, threads: int, room: float)
 
 
 def _one_here(work: StepJob, here: _Here) -> Outcome:
-    own = here.code.digest(work.step.node.fn.__module__)
-    if own != work.origin["code"]:
+    if is_private(work.key):
+        text = "the loaded code is not that of its file, so no other process can use the result: restart Python"
+        return Outcome(work, error=RunError(work.step, [], OSError(text)))
+    if here.code.of(work.step.node) != work.origin["code"]:
         text = f"the code of {work.step.node.path} differs on a worker: install the same version there"
         return Outcome(work, error=RunError(work.step, [], OSError(text)))
     outcome = carry_out(work, here.fetch, here.store)
