@@ -22,6 +22,7 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -119,6 +120,7 @@ class Node:
         accepts_low_rank: Sequence[str] = (),
         additive_inputs: Sequence[tuple[str, ...]] = (),
         before_run: bool = False,
+        depends: Sequence[str] = (),
     ) -> None:
         functools.update_wrapper(self, fn)
         self.fn, self.device, self.rtol = fn, device, rtol
@@ -137,6 +139,13 @@ class Node:
         self._keyword_only = [p for p in pars if p.kind is p.KEYWORD_ONLY and p.name != "rng"]
         self.bands = bands and self._declared(bands)
         self.before_run = before_run
+        if isinstance(depends, str) or not all(isinstance(entry, str) and entry for entry in depends):
+            raise ValueError(
+                f'{self.path}: depends={depends!r} must be a list of texts, such as ["table.csv", "env:X"]'
+            )
+        self.depends = tuple(depends)
+        #: the declared variables of the environment at the import, which a module may read only then
+        self.environment = {name: os.environ.get(name) for name in _variables(depends)}
         if before_run and (self.inputs or self.random):
             raise ValueError(f"{self.path}: before_run needs a node without inputs and without rng: omit before_run")
         _registered[fn.__module__, fn.__name__] = self
@@ -199,6 +208,10 @@ def registered_nodes() -> tuple[Node, ...]:
     return tuple(_registered.values())
 
 
+def _variables(depends: Sequence[str]) -> list[str]:
+    return [entry.removeprefix("env:") for entry in depends if entry.startswith("env:")]
+
+
 def _imported(module: str, name: str) -> Node:
     imported: Node = getattr(importlib.import_module(module), name)
     return imported
@@ -214,6 +227,7 @@ def node(
     accepts_low_rank: Sequence[str] = (),
     additive_inputs: Sequence[tuple[str, ...]] = (),
     before_run: bool = False,
+    depends: Sequence[str] = (),
 ) -> Callable[[Callable[..., Any]], Node]:
     """Return the decorator that turns a function into a node; ``rtol`` is the allowed error relative to the reference.
 
@@ -228,6 +242,8 @@ def node(
             its values are zero. The other inputs of the group are used only with the first input.
         before_run: True for a node without inputs and with a result of few numbers, which is also computed when a
             recipe is checked, so that the preflight of another node can use the result.
+        depends: what the code reads and no import shows: files beside the module, ``env:NAME``, names of modules. The
+            page ``recipes/guide/code_changes.md`` lists the constructs that need an entry.
     """
     return lambda fn: Node(
         fn,
@@ -239,6 +255,7 @@ def node(
         accepts_low_rank,
         additive_inputs,
         before_run,
+        depends,
     )
 
 

@@ -54,6 +54,7 @@ ACROSS = {
 #: Calls that import a module by a name that is only known when they run.
 DYNAMIC = {
     "__init__.py": "the names that workflows offers are imported when they are first used",
+    "keys/loaded_source.py": "a node imports a module when it runs, and the values of the module count before",
     "report/run_pictures.py": "report.contents names the function that draws each picture",
     "studies/run_study.py": "a kind of study names its room",
     "recipe/step_declarations.py": "a recipe names the family of a node",

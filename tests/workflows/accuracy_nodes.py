@@ -11,6 +11,7 @@ from neusee.nodes.units import Count, PositiveLength, Real, Shape
 from neusee.nodes.values import Bands, Psf
 
 CALLS: list[str] = []
+__depends__ = ("unaffected:STOP_AT",)
 STOP_AT: set[int] = set()  #: counts of bands at which `bands` behaves as if someone pressed Ctrl-C, once each
 
 

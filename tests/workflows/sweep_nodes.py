@@ -9,6 +9,7 @@ from neusee.nodes import ParameterError, node
 from neusee.nodes.units import Count, Electrons, Real, Wavelength
 
 CALLS: list[str] = []
+__depends__ = ("unaffected:INTERRUPT",)
 INTERRUPT: set[float] = set()  #: levels at which `noted` behaves as if someone pressed Ctrl-C, once each
 
 

@@ -22,7 +22,8 @@ from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.engine.write_behind import LARGE, WriteBehind
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.keys.cache_key import Key, device_kind, plain
+from neusee.workflows.keys.cache_key import Key, device_kind, is_private, plain
+from neusee.workflows.keys.input_file_digest import file_stamps
 from neusee.workflows.store.lease import Lease
 from neusee.workflows.store.metadata import INLINE
 from neusee.workflows.store.result_store import Store
@@ -118,7 +119,7 @@ class Executor(Protocol):
 
 def carry_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None = None) -> Outcome:
     """Compute one step and store its result if storing saves time; return an error as part of the outcome."""
-    if work.unlocked:
+    if work.unlocked or is_private(work.key):
         return _carried_out(work, fetch, store, None, Lease())
     lease = store.claim(work.key)
     if lease is None:
@@ -156,6 +157,7 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     """Compute a step and return its value with statistics, checks and costs."""
     step = work.step
     evaluate = partial(call, step, params=step.params, seed=work.seed, device=work.device)
+    stamps = file_stamps(step.params)
     began, clock = time.time(), time.perf_counter()
     size = sum(t.nbytes for t in tensors_in(inputs))
     with PeakMemory(work.device, size >= _WATCHED or not inputs) as peak, torch.no_grad():
@@ -166,7 +168,8 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
         bare = plain_of(value)
         checks = examine(step, bare, inputs)
     seconds = time.perf_counter() - clock
-    if work.origin["params"] != {name: plain(param) for name, param in step.params.items()}:
+    same = stamps == file_stamps(step.params)
+    if not same or work.origin["params"] != {name: plain(param) for name, param in step.params.items()}:
         raise RunError(step, [], OSError("an input file changed while it was read: run again"))
     found = sum(t.nbytes for t in tensors_in(bare))
     deviation = step.node.hooks.approximation_error(bare) if step.node.hooks.approximation_error else None
@@ -175,6 +178,9 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
 
 def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:
     """Store the metadata of a result, and also its value if reading is faster than computing the result again."""
+    if is_private(outcome.work.key):
+        outcome.value = plain_of(outcome.value)
+        return outcome
     work, value, about = outcome.work, outcome.value, _about(outcome)
     small = outcome.bytes <= INLINE
     try:

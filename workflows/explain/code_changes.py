@@ -7,7 +7,9 @@ from pathlib import Path
 
 from neusee.workflows.keys.code_digest import parts_file, source_file
 
-Parts = dict[str, dict[str, str]]  #: digests of definitions, by module
+Parts = dict[str, dict[str, str]]  #: digests of definitions, by module, and of all other dependencies
+_STATE, _SETTINGS = "state of ", "settings"
+_OTHER = frozenset({"Python", _SETTINGS, "closure", "neusee.workflows"})
 
 
 def edits(root: Path, old: str, new: str) -> list[str]:
@@ -15,10 +17,43 @@ def edits(root: Path, old: str, new: str) -> list[str]:
     before, after = _parts(root, old), _parts(root, new)
     if not before or not after:
         return []
-    inside = [text for name in after if name in before for text in _inside(name, before[name], after[name])]
-    came = [f"{_file(name)} is imported now" for name in after if name not in before]
-    gone = [f"{_file(name)} is no longer imported" for name in before if name not in after]
-    return sorted(inside, key=lambda text: text.startswith("the ")) + came + gone
+    names = [name for name in after if name in before and _is_module(name)]
+    inside = [text for name in names for text in _inside(name, before[name], after[name])]
+    came = [f"{_file(name)} is imported now" for name in after if name not in before and _is_module(name)]
+    gone = [f"{_file(name)} is no longer imported" for name in before if name not in after and _is_module(name)]
+    source = sorted(inside, key=lambda text: text.startswith("the ")) + came + gone
+    beside = [
+        text
+        for name in dict.fromkeys([*after, *before])
+        if not _is_module(name) and not name.startswith(_STATE)
+        for text in _beside(name, before.get(name, {}), after.get(name, {}))
+    ]
+    return source + beside or [
+        f"values in {_file(name.removeprefix(_STATE))} changed: a table, a constant, a default or a function"
+        for name in after
+        if name.startswith(_STATE) and before.get(name, after[name]) != after[name]
+    ]
+
+
+def _is_module(name: str) -> bool:
+    return all(part.isidentifier() for part in name.split(".")) and name not in _OTHER
+
+
+def _beside(name: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
+    """Return one text clause for each difference in versions, settings and declared dependencies."""
+    labels = [label for label in dict.fromkeys([*new, *old]) if old.get(label) != new.get(label)]
+    if not labels:
+        return []
+    if name in ("Python", _SETTINGS) or name.startswith("package "):
+        usual = "the usual one" if name == _SETTINGS else "none"
+        what = {_SETTINGS: "", "Python": "Python: "}.get(name, f"{name}: ")
+        return [
+            f"{what}{label + ': ' if name == _SETTINGS else ''}{old.get(label, usual)} -> {new.get(label, usual)}"
+            for label in labels
+        ]
+    if name == "closure":
+        return ["the values that the function of the node holds changed"]
+    return [f"{name} changed" if old and new else f"{name} is declared {'now' if new else 'no more'}"]
 
 
 def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:

@@ -1,8 +1,8 @@
 """Cache keys: the key of a result is a digest of everything that determines the result, and of nothing else.
 
-A key depends on the node with its code, the parameters, the content of input files, the keys of the inputs and the
-random stream. A key does not depend on tensors, the number of threads, the versions of libraries or, except for random
-nodes, the device.
+A key depends on the node with its code, the versions of the packages that the code imports, the parameters, the content
+of input files, the keys of the inputs and the random stream. A key does not depend on tensors, the number of threads
+or, except for random nodes, the device.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from neusee.workflows.keys.code_digest import Code
 
 Key = str
+PRIVATE = "private-"  #: first letters of the key of a result that holds for one process alone and is not stored
 
 
 def digest(*parts: Any) -> str:
@@ -38,13 +39,19 @@ def key_of(
     node = step.node
     parts: dict[str, Any] = {
         "node": node.path,
-        "code": code.digest(node.fn.__module__),
+        "code": code.of(node),
         "params": {name: plain(value) for name, value in step.params.items()},
         "inputs": [_keys_of(step.wires.get(name), keys) for name in node.inputs],
     }
     if node.random:
         parts["stream"] = [seed, step.name, device_kind(device)]
-    return digest(parts), parts
+    private = any(map(is_private, [parts["code"], *(keys[name] for name in step.sources)]))
+    return (PRIVATE + digest(parts)[:24] if private else digest(parts)), parts
+
+
+def is_private(key: Key) -> bool:
+    """Return True for the key of a result that holds for one process alone, whose code may not be that of its file."""
+    return key.startswith(PRIVATE)
 
 
 def stream_seed(seed: int, step: str) -> int:

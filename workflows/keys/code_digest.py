@@ -1,8 +1,13 @@
-"""Digests of the code of nodes: a digest covers a node's module and all modules of `neusee.nodes` that it imports.
+"""Digests of the code of nodes: what a node's module and all that it imports were loaded from, and what they hold.
 
-Helpers and constants affect a digest; comments, layout and docstrings do not. A file stores the summaries of source
-files, so that a run from the cache parses no source. The files ``code/<digest>.json`` store the digests of single
-definitions. Cache keys do not need these files; reports of changes use them to name the changed function.
+A digest covers by source each module of `neusee.nodes`, of the user, of an editable install and of a package with
+nodes; other packages by their version; the values of each loaded module; and what `depends=` declares. Comments,
+layout and docstrings that nobody reads do not count. What cannot be followed is refused. Loaded code that is not that
+of its file gives a private digest, whose results are not stored.
+
+A file stores the summaries of source files, so that a run from the cache parses no source. The files
+``code/<digest>.json`` store the digests of single definitions. Cache keys do not need these files; reports of changes
+use them to name the changed function.
 """
 
 from __future__ import annotations
@@ -11,27 +16,49 @@ import functools
 import json
 import os
 import sys
-import threading
-import warnings
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import xxhash
-from pydantic import TypeAdapter
+from neusee.nodes import Node
+from neusee.workflows.keys.cache_key import PRIVATE, digest, is_private
+from neusee.workflows.keys.code_memo import edition, read_memo, write_file, write_memo
+from neusee.workflows.keys.code_objects import PYTHON
+from neusee.workflows.keys.declared_dependencies import FREE, refusal, resolve, uncovered
+from neusee.workflows.keys.followed_imports import Imports
+from neusee.workflows.keys.loaded_source import compiled_as_written, edited_since, imported, say_once, source_of
+from neusee.workflows.keys.loaded_state import LoadedState, counted_values
+from neusee.workflows.keys.module_origin import Origin, module_path, origin_of
+from neusee.workflows.keys.process_settings import settings, workflows_digest
+from neusee.workflows.keys.reachable_code import reached
+from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
 
-from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.source_summary import ROOT, Summary, Use, module_file, summarise
-
-_LEFT_OUT = frozenset({ROOT, f"{ROOT}._node"})  #: modules that do not affect the result of a node
-_KEPT = 1000  #: number of summaries in the file
-_SUMMARIES = TypeAdapter(dict[str, Summary])
-_PYTHON = "{}.{}".format(*sys.version_info)  #: the text of a syntax tree depends on the version of Python
+_LEFT_OUT = frozenset({"neusee", ROOT, f"{ROOT}._node", f"{ROOT}.import_times"})  #: modules that decide no result
+_WORKFLOWS = "neusee.workflows"
 _THIS_PROCESS = os.urandom(8).hex()
+_PYTHON = "Python {}.{}".format(*sys.version_info)
 
-_edited_since: set[str] = set()  #: loaded modules whose source was edited after the import
-_frozen: dict[str, tuple[Any, str]] = {}  #: spec and source digest at the first reading, by module
+Parts = dict[str, dict[str, str]]  #: digests of definitions, versions or contents, by module or other dependency
+Names = dict[str, set[str]]  #: names that are used of each module; an empty name stands for all of them
+
+
+class Look(NamedTuple):
+    """What one module adds to a digest, and the modules that it leads to."""
+
+    parts: Parts
+    imports: Names
+    summary: Summary | None = None  #: None for a module that counts by its version
+    path: Path | None = None
+    state: str = ""
+    private: bool = False  #: True if the loaded code is not that of the file
+
+
+class Whole(NamedTuple):
+    """The digest of a module with all that it imports."""
+
+    code: str
+    looks: dict[str, Look]
+    names: Names
 
 
 class Code:
@@ -39,90 +66,190 @@ class Code:
 
     def __init__(self, memo: Path) -> None:
         self._memo = memo
-        self._summaries: dict[str, Summary] = _read(memo)
+        self._summaries: dict[str, Summary] = read_memo(memo)
         self._new = False
-        self._digests: dict[str, str] = {}
-        self._parts: dict[str, dict[str, dict[str, str]]] = {}  # definitions by digest and module
-        self._path = functools.cache(source_file)
+        self._wholes: dict[str, Whole] = {}
+        self._looks: dict[tuple[str, frozenset[str], bool], Look | None] = {}
+        self._origins: dict[tuple[str, frozenset[str]], Origin] = {}
+        self._codes: dict[int, tuple[Node, str]] = {}  # digest of each node, by id
+        self._parts: dict[str, Parts] = {}  # by digest
+
+    def of(self, node: Node) -> str:
+        """Return the digest of the code of a node, with what the node declares and what its function holds.
+
+        Raises `LookupError` with place and fix for code that reads what cannot be followed.
+        """
+        if id(node) not in self._codes:
+            self._codes[id(node)] = node, self._of(node)
+        return self._codes[id(node)][1]
 
     def digest(self, module: str) -> str:
-        """Return the digest of a module and of all modules of `neusee.nodes` that it imports, directly or not.
+        """Return the digest of a module and of all that it imports, directly or not.
 
         Raises `LookupError` if an imported module or its source cannot be determined.
         """
-        if module not in self._digests:
-            seen: dict[str, str] = {}
-            parts: dict[str, dict[str, str]] = {}
-            todo = [module]
-            while todo:
-                name = todo.pop()
-                if name not in seen:
-                    seen[name], parts[name], imports = self._look(name)
-                    todo += imports
-            code = self._digests[module] = digest(seen)
-            if _edited_since.isdisjoint(seen):  # otherwise the digest is valid only in this process
-                self._parts[code] = parts
-        return self._digests[module]
+        return self._whole(module).code
 
     def save(self) -> None:
         """Save the new digests of source files and of their functions; do nothing if the folder cannot be written."""
         if self._new:
             self._new = False
-            _write(self._memo, dict(list(self._summaries.items())[-_KEPT:]), self._memo.parent / "tmp")
+            write_memo(self._memo, self._summaries)
         for code, parts in self._parts.items():
             path = parts_file(self._memo.parent, code)
             if not os.path.exists(path):
-                _write(path, parts, self._memo.parent / "tmp")
+                write_file(path, json.dumps(parts).encode(), self._memo.parent / "tmp")
         self._parts = {}
 
-    def _look(self, module: str) -> tuple[str, dict[str, str], list[str]]:
-        path = self._path(module)
-        if path is None:
+    def _of(self, node: Node) -> str:
+        module = node.fn.__module__
+        code, whole = self.digest(module), self._whole(module)
+        self._refuse(whole, module, node)
+        plain = getattr(sys.modules.get(module), node.fn.__name__, None) is node
+        if plain and not node.depends:
+            return code
+        source = whole.looks[module].path or Path(module)
+        declared = resolve(node.depends, module, source, node.environment, lambda name: module_path(name) is not None)
+        parts, private = dict(declared.parts), is_private(code)
+        for name in declared.modules:
+            below = self._whole(name)
+            parts, private = {**parts, **_parts(below.looks)}, private or is_private(below.code)
+        if declared.changed:
+            private = True
+            say_once(module, f"{source.parent / declared.changed[0]} was changed after the import of {source}: restart")
+        if not plain:
+            state = LoadedState(sys.modules[module], (), self._follows(_packages(module)))
+            parts["closure"] = {node.path: state.digest({"function": node.fn})}
+            inner = [self._whole(name).code for name in sorted(state.modules - whole.looks.keys())]
+            parts["closure"].update({f"module {n}": each for n, each in enumerate(inner)})
+            private = private or any(map(is_private, inner))
+        return self._named(digest(code, parts), {**_parts(whole.looks), **parts}, private)
+
+    def _whole(self, module: str) -> Whole:
+        """Return the digest of a module with the modules that it leads to."""
+        if module in self._wholes:
+            return self._wholes[module]
+        looks: dict[str, Look] = {}
+        names: Names = {module: set()}
+        todo, packages = [module], _packages(module)
+        while todo:
+            name = todo.pop()
+            look = self._look(name, packages, name == module) if name not in looks else None
+            if look is not None:
+                looks[name] = look
+                for other, used in look.imports.items():
+                    names.setdefault(other, set()).update(used)
+                    todo.append(other)
+        if module not in looks or looks[module].summary is None:
             raise LookupError(f"{module} has no source file, so its nodes have no cache key: save the module as a file")
+        documents = any(look.summary.documents for look in looks.values() if look.summary)
+        state = {name: _digest_of(look, documents) for name, look in looks.items()}
+        code = digest(_PYTHON, settings(), state)
+        parts = {"Python": {"version": _PYTHON}, "settings": settings(), **_parts(looks)}
+        code = self._named(code, parts, any(look.private for look in looks.values()))
+        self._wholes[module] = Whole(code, looks, names)
+        return self._wholes[module]
+
+    def _named(self, code: str, parts: Parts, private: bool) -> str:
+        """Return a digest, private to this process where the loaded code is not that of the files."""
+        if private:
+            return PRIVATE + digest(code, _THIS_PROCESS)
+        self._parts[code] = parts
+        return code
+
+    def _refuse(self, whole: Whole, module: str, node: Node) -> None:
+        """Raise `LookupError` for the first construct that is not followed and not declared."""
+        own = {node.fn.__name__, "_"}
+        for name, look in whole.looks.items():
+            if look.summary is None or look.path is None or not look.summary.constructs:
+                continue
+            used = own if name == module else whole.names.get(name) or {""}
+            lines = [r for r in reached(look.summary.statements, None if "" in used else used)]
+            found = [item for item in look.summary.constructs if any(item.line in r for r in lines)]
+            left = uncovered(found, [*look.summary.depends, *node.depends])
+            if left is not None:
+                raise LookupError(refusal(left, look.path))
+
+    def _look(self, module: str, packages: frozenset[str], root: bool) -> Look | None:
+        key = (module, packages, root)
+        if key not in self._looks:
+            self._looks[key] = None if module in _LEFT_OUT else self._looked(module, packages, root)
+        return self._looks[key]
+
+    def _looked(self, module: str, packages: frozenset[str], root: bool) -> Look | None:
+        if f"{module}.".startswith(f"{_WORKFLOWS}."):
+            return Look({_WORKFLOWS: {"files": workflows_digest()}}, {})
+        origin = self._origin(module, packages)
+        if origin.kind in ("python", "folder"):
+            return None
+        if origin.kind in ("distribution", "absent"):
+            top = module.partition(".")[0]
+            return Look({f"package {top}": {"version": origin.version or "not installed"}}, {})
+        if origin.path is None:
+            raise LookupError(f"{module} has no source file, so its nodes have no cache key: save the module as a file")
+        if origin.kind == "binary":
+            return Look({f"file {origin.path.name}": {"content": source_of(module, origin.path)[1]}}, {})
+        return self._source(module, origin.path, packages, root)
+
+    def _source(self, module: str, path: Path, packages: frozenset[str], root: bool) -> Look:
+        """Return what a module adds whose source is followed."""
+        known = imported(module)
         summary = self._summary(module, path)
-        tree = summary.tree + (_THIS_PROCESS if module in _edited_since else "")
-        package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-        names = [n for item in summary.imports for n in self._imported(*item, package)]
-        for use in summary.uses:
-            used = self._used(use, package)
-            if used is not None:
-                names += used
-            elif module.startswith(ROOT):
-                what = "the package of all nodes is used, so the modules that a result depends on are unknown"
-                raise LookupError(f"{path}:{use[-1]}: {what}: import each name from its own module")
-        return tree, summary.definitions, [n for n in names if n.startswith(f"{ROOT}.") and n not in _LEFT_OUT]
+        follows = self._follows(packages)
+        inner = Imports(
+            module, path, lambda name: self._summary_of(name, packages), lambda name: self._origin(name, packages).kind
+        )
+        free = {entry.removeprefix(FREE) for entry in summary.depends if entry.startswith(FREE)}
+        imports = {name: used for name, used in inner.names(summary).items() if name.partition(".")[0] not in free}
+        state, private, parts = "", edited_since(module), {module: summary.definitions}
+        if known:
+            loaded = LoadedState(sys.modules[module], summary.functions if compiled_as_written(module) else (), follows)
+            state = loaded.digest(counted_values(sys.modules[module], summary, free, root))
+            parts[f"state of {module}"] = {"values": state}
+            for name in sorted(loaded.modules - imports.keys() - _LEFT_OUT):
+                imports[name] = {""}
+            if loaded.replaced and not private:
+                private = True
+                text = f"the loaded code of {loaded.replaced[0]}() is not that of {path}, so results are not stored"
+                say_once(module, f"{text}: restart Python, and delete __pycache__ if this is said again")
+        if summary.depends:
+            declared = resolve(summary.depends, module, path, {}, lambda name: module_path(name) is not None)
+            parts.update(declared.parts)
+            imports.update({name: {""} for name in declared.modules})
+            if declared.changed:
+                private = True
+                say_once(module, f"{path.parent / declared.changed[0]} was changed after the import of {path}: restart")
+        return Look(parts, imports, summary, path, state, private)
 
-    def _imported(self, level: int, base: str, name: str, package: str) -> Iterator[str]:
-        """Yield the modules that an import needs: a submodule, or the module that defines the imported name."""
-        base = _absolute(level, base, package)
-        submodule = f"{base}.{name}"
-        if name and submodule.startswith(ROOT) and self._path(submodule) is not None:
-            yield submodule
-            path = None if base in _LEFT_OUT else self._path(base)
-            if path is None or name not in self._summary(base, path).binds:
-                return
-        yield base
+    def _follows(self, packages: frozenset[str]) -> Callable[[str], bool]:
+        """Return the function that tells whether the source of a module is followed."""
+        return functools.cache(lambda name: self._followed(name, packages))
 
-    def _used(self, use: Use, package: str) -> list[str] | None:
-        """Return the modules in an expression such as ``name.a.b``, or None if it uses all of `neusee.nodes`."""
-        level, base, name, chain, _ = use
-        modules = [".".join(filter(None, (_absolute(level, base, package), name)))]
-        rest = chain.split(".") if chain else []
-        while rest and self._has_submodule(modules[-1], rest[0]):
-            modules.append(f"{modules[-1]}.{rest.pop(0)}")
-        whole = modules[-1] in ("neusee", ROOT) and (not rest or rest[0].startswith("__"))
-        return None if whole else modules[1:]
+    def _followed(self, module: str, packages: frozenset[str]) -> bool:
+        outside = module in _LEFT_OUT or f"{module}.".startswith(f"{_WORKFLOWS}.")
+        return not outside and self._origin(module, packages).kind == "source"
 
-    def _has_submodule(self, module: str, name: str) -> bool:
-        submodule, path = f"{module}.{name}", self._path(module) if module.startswith(ROOT) else None
-        is_package = path is not None and path.name == "__init__.py"
-        return submodule == ROOT or (is_package and self._path(submodule) is not None)
+    def _origin(self, module: str, packages: frozenset[str]) -> Origin:
+        key = (module, packages)
+        if key not in self._origins:
+            self._origins[key] = origin_of(module, packages)
+        return self._origins[key]
+
+    def _summary_of(self, module: str, packages: frozenset[str]) -> tuple[Path, Summary] | None:
+        """Return the file and the summary of a module whose source is followed, or None."""
+        origin = self._origin(module, packages)
+        if origin.kind != "source" or origin.path is None or module in _LEFT_OUT:
+            return None
+        return origin.path, self._summary(module, origin.path)
 
     def _summary(self, module: str, path: Path) -> Summary:
-        source = _source_digest(module, path)
-        name = f"{_PYTHON}:{source}"
+        source, found = source_of(module, path)
+        name = f"{PYTHON}:{edition()}:{found}"
         if name not in self._summaries:
-            self._summaries[name] = summarise(path.read_bytes())
+            try:
+                self._summaries[name] = summarise(source)
+            except (SyntaxError, ValueError) as error:
+                raise LookupError(f"{path}: {error}") from error
             self._new = True
         return self._summaries[name]
 
@@ -132,66 +259,25 @@ def parts_file(root: Path, code: str) -> Path:
     return root / "code" / f"{code}.json"
 
 
-def _absolute(level: int, base: str, package: str) -> str:
-    """Return the absolute name of the module ``base`` in a relative import with ``level`` leading dots."""
-    if not level:
-        return base
-    above = package.split(".")
-    return ".".join([*above[: len(above) - level + 1], *filter(None, [base])])
-
-
-def _write(path: Path, content: Any, folder: Path) -> None:
-    """Write a JSON file by atomic rename; do nothing if the folder cannot be written."""
-    part = folder / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
-    with suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-        path.parent.mkdir(exist_ok=True)
-        part.write_text(json.dumps(content))
-        os.replace(part, path)
-
-
-def _read(memo: Path) -> dict[str, Summary]:
-    """Return the saved summaries of source files, or an empty dict if their file is damaged or has an older format."""
-    try:
-        return _SUMMARIES.validate_json(memo.read_bytes())
-    except (OSError, ValueError):
-        return {}
-
-
 def source_file(module: str) -> Path | None:
     """Return the source file of a module without importing the module, or None if there is no source file."""
-    if module in sys.modules:
-        file = getattr(sys.modules[module], "__file__", None)
-        return Path(file) if file and os.path.isfile(file) else None
-    if not module.startswith(f"{ROOT}."):
-        return None
-    folders = getattr(sys.modules.get(ROOT), "__path__", ())
-    return next(filter(None, (module_file(folder, module.split(".")[2:]) for folder in folders)), None)
+    path = module_path(module)
+    return Path(path) if path else None
 
 
-def _source_digest(module: str, path: Path) -> str:
-    """Return the xxh3 digest of the source file of a module, computed only once if the module is imported."""
-    spec = getattr(sys.modules.get(module), "__spec__", None)
-    if spec is not None and module in _frozen and _frozen[module][0] is spec:
-        return _frozen[module][1]
-    source = xxhash.xxh3_128_hexdigest(path.read_bytes())
-    _edited_since.discard(module)
-    if spec is not None:
-        _frozen[module] = (spec, source)
-        if _edited(spec, path):
-            _edited_since.add(module)
-            warnings.warn(f"{path} was edited after its import: restart Python to reuse new results", stacklevel=2)
-    return source
+def _packages(module: str) -> frozenset[str]:
+    """Return the packages that are followed by source though they are installed: that of a node, and this one."""
+    return frozenset({"neusee", module.partition(".")[0]})
 
 
-def _edited(spec: Any, path: Path) -> bool:
-    """Return True if the source file has changed since Python wrote the byte code of the module."""
-    try:
-        with open(spec.cached or "", "rb") as file:
-            head = file.read(16)
-        stat = os.stat(path)
-        writable = os.access(os.path.dirname(spec.cached), os.W_OK) and not sys.dont_write_bytecode
-    except OSError:
-        return False
-    stamp = b"".join((int(n) & 0xFFFFFFFF).to_bytes(4, "little") for n in (stat.st_mtime, stat.st_size))
-    return writable and head[4:8] == bytes(4) and head[8:] != stamp
+def _parts(looks: dict[str, Look]) -> Parts:
+    return {name: part for look in looks.values() for name, part in look.parts.items()}
+
+
+def _digest_of(look: Look, documents: bool) -> list[Any]:
+    """Return what a module adds to the digest of a node."""
+    if look.summary is None:
+        return [look.parts]
+    source = look.summary.whole if documents else look.summary.tree
+    other = {name: part for name, part in look.parts.items() if name.startswith(("file ", "environment "))}
+    return [source, look.state, other]

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.source_summary import module_file, summarise
+from neusee.workflows.keys.source_summary import module_file, syntax_digest
 
 _HERE = Path(__file__).parents[1]
 _ROOT = "neusee.workflows"
@@ -43,7 +43,7 @@ def engine(*modules: str) -> str:
 def _parsed(source: bytes) -> tuple[str, list[ast.stmt]]:
     """Return the digest of a source file and the import statements at its top level."""
     imports: list[ast.stmt] = [item for item in ast.parse(source).body if isinstance(item, ast.Import | ast.ImportFrom)]
-    return summarise(source).tree, imports
+    return syntax_digest(source), imports
 
 
 def imported(statements: Iterable[ast.stmt]) -> Iterator[str]:

@@ -51,7 +51,7 @@ def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code) -> Foun
     if need.endswith("()"):
         step = _step(need[:-2], recipe)
         params = [[name, plain(value)] for name, value in step.params.items()]
-        return Found((), lambda values: Bound(step), [step.node.path, code.digest(step.node.fn.__module__), params])
+        return Found((), lambda values: Bound(step), [step.node.path, code.of(step.node), params])
     if match := _PARAMETER.fullmatch(need):
         value = _step(match["step"], recipe).params.get(match["name"])
         return Found((), lambda values: value, plain(value))

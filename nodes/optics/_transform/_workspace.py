@@ -8,6 +8,7 @@ from math import prod
 import torch
 from torch import Tensor
 
+__depends__ = ("unaffected:_idle",)
 _IDLE_AT_MOST = 2
 _idle: list["Workspace"] = []
 _lock = threading.Lock()

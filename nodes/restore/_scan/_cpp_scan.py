@@ -22,6 +22,17 @@ from torch import Tensor
 
 from neusee.nodes.restore._scan._torch_scan import refuse_twice
 
+#: what the code reads: the C++ source decides a result; compiler, processor and threads change it within rounding
+__depends__ = (
+    "_scan.cpp",
+    "unaffected:CXX",
+    "unaffected:XDG_CACHE_HOME",
+    "unaffected:ctypes",
+    "unaffected:subprocess",
+    "unaffected:platform",
+    "unaffected:pathlib.Path.home",
+    "unaffected:torch.get_num_threads",
+)
 CODE = Path(__file__).with_name("_scan.cpp")
 #: digest of the source: keys of cached results depend on this file, and so on the C++ source; a test compares both
 DIGEST = "379aa95ba41e1932"

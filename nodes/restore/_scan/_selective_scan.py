@@ -11,6 +11,8 @@ from torch import Tensor
 
 from neusee.nodes.restore._scan import _cpp_scan, _torch_scan
 
+#: the kernels differ only within rounding, but NEUSEE_SCAN chooses one for all
+__depends__ = ("env:NEUSEE_SCAN", "unaffected:triton", "unaffected:mamba_ssm")
 Backend = Literal["torch", "cpp", "triton", "mamba_ssm"]
 
 

@@ -20,6 +20,8 @@ from torch import Tensor
 
 from neusee.nodes.restore._scan._torch_scan import refuse_twice
 
+__depends__ = ("unaffected:triton",)
+
 #: Channels of a program, steps of a chunk, and warps: chosen, not measured. 1 / CHUNK of all states are stored.
 CHANNELS, CHUNK, WARPS = 16, 64, 2
 

@@ -60,7 +60,7 @@ LAYOUT = {
     ),
     "truth_more.py": "TWO = 2.0\nOFFSET = 1.0\nUNUSED = 5.0\n\n\ndef scaled(x):\n    return x * TWO\n",
     "truth_log.py": (
-        "import os\n\n\n"
+        "import os\n\n__depends__ = ('unaffected:os.environ', 'unaffected:open')\n\n\n"
         "def ran(name):\n"
         '    with open(os.environ["TRUTH_LOG"], "a") as file:\n'
         '        file.write(name + "\\n")\n'

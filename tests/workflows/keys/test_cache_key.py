@@ -185,7 +185,7 @@ def test_a_damaged_memo_is_made_again(trial, text):
     trial.run()
     (trial.store / "code.json").write_text(text)
     assert trial.run() == (30.5, *NONE)
-    assert len(json.loads((trial.store / "code.json").read_text())) > 3
+    assert len(json.loads((trial.store / "code.json").read_text().split("\n", 2)[2])) > 3
 
 
 CHAINS = {
@@ -208,6 +208,7 @@ def test_what_an_attribute_chain_reads_counts(trial, line):
     (trial.folder / "trial/_helper.py").write_text(f"{line}\ndef half(x):\n    return x / {CHAINS[line]}\n")
     before = Code(trial.store / "code.json").digest("neusee.nodes.trial._helper")
     trial.edit("trial_more.py", "TWO = 2.0", "TWO = 1.0")
+    forget()
     assert Code(trial.store / "code.json").digest("neusee.nodes.trial._helper") != before
 
 

@@ -1,0 +1,226 @@
+"""State of a loaded module: the values of its constants, tables, defaults and closures, and the functions it names.
+
+The source of a module says how its names get their values. What a process computes with are the values themselves: a
+table that another module filled, a constant or function that was replaced, a default that an import computed.
+Values of classes of other packages count by their type alone.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+import re
+import sys
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Mapping
+from enum import Enum
+from fractions import Fraction
+from pathlib import PurePath
+from types import BuiltinFunctionType, CellType, FunctionType, MethodType, ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+import xxhash
+
+from neusee.nodes import Node
+from neusee.workflows.keys.code_objects import function_code
+from neusee.workflows.keys.reachable_code import read_names, written_only
+from neusee.workflows.keys.source_summary import Summary
+
+_SKIPPED = re.compile(r"__\w+__|_abc_\w*|model_\w+|__pydantic\w*")  #: names of a class that its source decides
+_KINDS: tuple[tuple[str, tuple[type, ...]], ...] = (
+    ("text", (str, PurePath)),
+    ("object", (Enum,)),
+    ("plain", (bool, int, float, complex, bytes, type(None), type(...), range, slice, re.Pattern, Fraction)),
+    ("plain", (torch.dtype, torch.device, torch.Size, np.dtype, np.generic)),
+    ("plain", (operator.itemgetter, operator.attrgetter, operator.methodcaller)),
+    ("builtin", (BuiltinFunctionType,)),
+    ("module", (ModuleType,)),
+    ("function", (FunctionType,)),
+    ("class", (type,)),
+    ("array", (torch.Tensor, np.ndarray)),
+    ("table", (Mapping,)),
+    ("list", (list, tuple, deque)),
+    ("set", (set, frozenset)),
+    ("node", (Node,)),
+    ("partial", (functools.partial,)),
+    ("method", (MethodType,)),
+    ("cell", (CellType,)),
+    ("property", (property,)),
+    ("wrapped", (staticmethod, classmethod, functools.cached_property, functools.partialmethod)),
+)  #: how values of a type are described; any other value is an object
+
+
+@functools.cache
+def _how(kind: type) -> str:
+    """Return how values of a type are described."""
+    return next((how for how, kinds in _KINDS if issubclass(kind, kinds)), "object")
+
+
+class LoadedState:
+    """The state of a loaded module, as a digest, with the modules of the functions and classes that it names."""
+
+    def __init__(self, module: ModuleType, functions: Collection[str], followed: Callable[[str], bool]) -> None:
+        self.modules: set[str] = set()  #: modules of the functions, classes and objects that the module names
+        self.replaced: list[str] = []  #: functions of the module's own file whose code is not that of the file
+        self._name, self._file = module.__name__, getattr(module, "__file__", "") or ""
+        self._folder = self._file.rpartition("/")[0] or "."
+        self._functions, self._followed = frozenset(functions), followed
+        self._seen: dict[int, int] = {}
+        self._kept: list[Any] = []  # objects whose id is in _seen, so that no other object gets the same id
+
+    def digest(self, values: Mapping[str, Any]) -> str:
+        """Return the digest of named values of the module; names such as ``__file__`` do not count."""
+        state = [(name, self._of(value)) for name, value in sorted(values.items()) if not name.startswith("__")]
+        return xxhash.xxh3_128_hexdigest(repr(state).encode(errors="surrogatepass"))
+
+    def _of(self, value: Any) -> Any:
+        """Return a value as text and tuples that are the same in each process; a repeated object is its number."""
+        kind: Any = type(value)
+        how = _how(kind)
+        if how == "plain":
+            return kind.__name__, repr(value)
+        if how == "text":
+            return kind.__name__, self._placed(str(value))
+        if how == "builtin":
+            return kind.__name__, value.__qualname__
+        if how == "module":
+            return kind.__name__, self._noted(value.__name__)
+        if id(value) in self._seen:
+            return "again", self._seen[id(value)]
+        self._seen[id(value)] = len(self._seen)
+        self._kept.append(value)
+        return getattr(self, f"_{how}")(value)
+
+    def _array(self, value: Any) -> Any:
+        return type(value).__name__, *_array(value)
+
+    def _table(self, value: Any) -> Any:
+        return self._typed(value), [(self._of(key), self._of(part)) for key, part in list(value.items())]
+
+    def _list(self, value: Any) -> Any:
+        return self._typed(value), [self._of(part) for part in value]
+
+    def _set(self, value: Any) -> Any:
+        return self._typed(value), sorted((self._of(part) for part in value), key=repr)
+
+    def _node(self, value: Any) -> Any:
+        return "node", value.path, self._of(value.fn), [self._of(hook) for hook in _hooks(value)]
+
+    def _partial(self, value: Any) -> Any:
+        return "partial", self._of(value.func), self._of(value.args), self._of(value.keywords)
+
+    def _method(self, value: Any) -> Any:
+        return "method", self._of(value.__func__), self._of(value.__self__)
+
+    def _cell(self, value: Any) -> Any:
+        return self._of(_content(value))
+
+    def _property(self, value: Any) -> Any:
+        return "property", self._of(value.fget), self._of(value.fset)
+
+    def _wrapped(self, value: Any) -> Any:
+        return type(value).__name__, self._of(getattr(value, "__func__", None) or getattr(value, "func", None))
+
+    def _object(self, value: Any) -> Any:
+        """Return an object that is no container: by its parts if the source of its class is followed, else by type."""
+        kind = type(value)
+        if kind is SimpleNamespace or self._followed(kind.__module__):
+            return self._typed(value), [(name, self._of(part)) for name, part in _attributes(value)]
+        inner = getattr(value, "__wrapped__", None) if kind.__module__ != "typing" else None
+        return self._typed(value), self._of(inner) if callable(inner) else ""
+
+    def _function(self, function: FunctionType) -> Any:
+        """Return a function by module and name, with its defaults and closure if it is local."""
+        home, code = str(function.__globals__.get("__name__")), function.__code__
+        self._noted(home)
+        own = home == self._name and code.co_filename == self._file
+        if own and self._functions and function_code(code) not in self._functions:
+            self.replaced.append(function.__qualname__)
+        local = own or not _found(home, function)
+        parts = (function.__defaults__, function.__kwdefaults__, function.__closure__) if local else ()
+        exact = function_code(code) if local and not own and self._followed(home) else ""
+        return "function", home, code.co_qualname, exact, [part and self._of(part) for part in parts]
+
+    def _class(self, kind: type) -> Any:
+        name = ("class", self._noted(kind.__module__), kind.__qualname__)
+        if kind.__module__ != self._name:
+            return name
+        bases = [(base.__module__, base.__qualname__) for base in kind.__mro__[1:]]
+        for base in kind.__mro__[1:]:
+            self._noted(base.__module__)
+        parts = [(name, part) for name, part in vars(kind).items() if not _SKIPPED.fullmatch(name) or _is_method(part)]
+        return name, bases, [(name, self._of(part)) for name, part in parts]
+
+    def _typed(self, value: Any) -> str:
+        return f"{self._noted(type(value).__module__)}.{type(value).__qualname__}"
+
+    def _noted(self, module: str) -> str:
+        """Note the module of something that the state contains, if its source is followed."""
+        if module != self._name and module not in self.modules and self._followed(module):
+            self.modules.add(module)
+        return module
+
+    def _placed(self, text: str) -> str:
+        """Return a text without the folder of the module, so that it is the same for each place of installation."""
+        return text.replace(self._folder, "<folder>") if self._folder in text else text
+
+
+def counted_values(module: ModuleType, summary: Summary, free: Collection[str], root: bool) -> dict[str, Any]:
+    """Return the values of a loaded module that count: of a node's own module, those that its nodes reach."""
+    values = {name: value for name, value in vars(module).items() if name not in free}
+    nodes = [name for name, value in values.items() if root and isinstance(value, Node)]
+    if nodes:
+        names = read_names(summary.statements, [*nodes, "_"])
+        return {name: value for name, value in values.items() if name in names}
+    noted = written_only(summary.statements)
+    return {name: value for name, value in values.items() if name not in noted}
+
+
+def _hooks(node: Node) -> Iterator[Any]:
+    for name in node.hooks.__slots__:
+        yield getattr(node.hooks, name)
+    yield from (node.channel_sum_form, node.low_rank_form)
+
+
+def _array(value: Any) -> tuple[Any, ...]:
+    """Return type, shape and digest of a tensor or an array."""
+    if isinstance(value, torch.Tensor):
+        if value.device.type == "meta" or value.layout != torch.strided:
+            return str(value.dtype), tuple(value.shape)
+        flat = value.detach().cpu().contiguous().reshape(-1)
+        raw = flat.resolve_conj().resolve_neg().view(torch.uint8).numpy().tobytes() if flat.numel() else b""
+    else:
+        raw = repr(value.tolist()).encode() if value.dtype.hasobject else value.tobytes()
+    return str(value.dtype), tuple(value.shape), xxhash.xxh3_128_hexdigest(raw)
+
+
+def _attributes(value: Any) -> list[tuple[str, Any]]:
+    """Return the attributes of an object, from its ``__dict__`` and its slots."""
+    slots = {slot for base in type(value).__mro__ for slot in _named(vars(base).get("__slots__", ()))}
+    found = {slot: getattr(value, slot) for slot in sorted(slots) if not slot.startswith("__") and hasattr(value, slot)}
+    return list({**found, **getattr(value, "__dict__", {})}.items())
+
+
+def _named(slots: Any) -> Iterator[str]:
+    return iter((slots,) if isinstance(slots, str) else tuple(slots))
+
+
+def _content(cell: CellType) -> Any:
+    try:
+        return cell.cell_contents
+    except ValueError:
+        return None
+
+
+def _found(module: str, function: FunctionType) -> bool:
+    """Return True if a function is what its module has under its name, so that the source of the module decides it."""
+    found: Any = sys.modules.get(module)
+    for name in function.__qualname__.split("."):
+        found = getattr(found, name, None)
+    return found is function
+
+
+def _is_method(part: Any) -> bool:
+    return isinstance(part, FunctionType | staticmethod | classmethod | property)

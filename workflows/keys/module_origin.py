@@ -1,0 +1,157 @@
+"""Origin of an imported module: Python itself, an installed distribution with its version, or a source file.
+
+A module of an installed distribution counts by the version of the distribution. A module of the user, of an editable
+install, or of a package that has nodes counts by its source.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.machinery
+import importlib.util
+import os
+import re
+import sys
+import sysconfig
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+Kind = Literal["python", "distribution", "source", "binary", "folder", "absent", "nowhere"]
+_STANDARD = tuple({sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")})
+_INSTALLED = frozenset({"site-packages", "dist-packages"})
+_fixed: dict[str, Origin] = {}  #: origins of packages that do not change while a process runs
+distributions_of: dict[str, list[str]] = {}  #: names of distributions by module, where both names differ
+_BUILD_IN_VERSION = frozenset({"torch"})  #: its version ends with its build, such as ``+cu124``, which is a device
+
+
+class Origin(NamedTuple):
+    """Where the code of a module is from."""
+
+    kind: Kind
+    path: Path | None = None  #: of a source file, or of a compiled module
+    version: str = ""  #: name and version of a distribution
+
+
+def origin_of(module: str, packages: frozenset[str]) -> Origin:
+    """Return the origin of a module without importing it; the source of each of ``packages`` counts if installed."""
+    top = module.partition(".")[0]
+    if top in _fixed and top not in packages:
+        return _fixed[top]
+    if top in ("builtins", "__future__") or (top in sys.stdlib_module_names and not _shadowed(top)):
+        return _fixed.setdefault(top, Origin("python"))
+    if module != top and top not in packages and (above := origin_of(top, packages)).kind == "distribution":
+        return above
+    file = module_path(module)
+    if file is None:
+        return _without_file(module, top, packages)
+    if top not in packages and not _INSTALLED.isdisjoint(Path(file).parts) and (version := version_of(top)):
+        return _fixed.setdefault(top, Origin("distribution", None, version))
+    path = Path(file)
+    return Origin("source" if path.suffix == ".py" else "binary", path)
+
+
+def module_path(module: str) -> str | None:
+    """Return the file of a module, or None; a loaded module knows its file, and another one is searched."""
+    if module in sys.modules:
+        file = getattr(sys.modules[module], "__file__", None)
+        return file if file and os.path.isfile(file) else None
+    parent, _, name = module.rpartition(".")
+    if not parent:
+        spec = _spec(module)
+        return spec.origin if spec is not None and spec.has_location else None
+    folders = getattr(sys.modules[parent], "__path__", ()) if parent in sys.modules else _folders(parent)
+    return next(filter(None, (_file_in(folder, name) for folder in folders)), None)
+
+
+def module_file(folder: str | Path, names: Sequence[str]) -> Path | None:
+    """Return the source file of a module or package below a folder, or None if there is no such file.
+
+    ``names`` are the parts of the module's name.
+    """
+    stem = os.path.join(folder, *names)
+    files = (f"{stem}.py", os.path.join(stem, "__init__.py"))
+    return next((Path(file) for file in files if os.path.isfile(file)), None)
+
+
+def version_of(top: str) -> str:
+    """Return name and version of the distribution that contains a top-level module, or an empty text."""
+    found = _released(top)
+    if not found:
+        if top not in distributions_of or not all(map(_released, distributions_of[top])):
+            distributions_of[top] = sorted(set(_distributions().get(top, ())))
+        found = ", ".join(map(_released, distributions_of[top]))
+    return found
+
+
+def _released(name: str) -> str:
+    """Return name and version of an installed distribution, or an empty text."""
+    version = _releases().get(_plain(name), "")
+    return version and f"{name} {version.partition('+')[0] if name in _BUILD_IN_VERSION else version}"
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[-_.]+", "_", name).lower()
+
+
+@functools.cache
+def _releases() -> dict[str, str]:
+    """Return the version of each installed distribution, read from the names of the folders of its metadata."""
+    found: dict[str, str] = {}
+    for folder in filter(os.path.isdir, sys.path):
+        if not _INSTALLED.isdisjoint(Path(folder).parts):
+            for entry in os.listdir(folder):
+                name, _, version = entry.removesuffix(".dist-info").partition("-")
+                if entry.endswith(".dist-info"):
+                    found.setdefault(_plain(name), version)
+    return found
+
+
+@functools.cache
+def _distributions() -> dict[str, list[str]]:
+    return dict(metadata.packages_distributions())
+
+
+def _without_file(module: str, top: str, packages: frozenset[str]) -> Origin:
+    """Return the origin of a module without a file: a folder of modules, a built-in part, or a missing module."""
+    if module in sys.modules:
+        if getattr(sys.modules[module], "__path__", None) is not None:
+            return Origin("folder")
+        installed = "" if top in packages or module == top else version_of(top)
+        return Origin("distribution", None, installed) if installed else Origin("nowhere")
+    if "." not in module:
+        spec = _spec(module)
+        return Origin("absent" if spec is None else "folder")
+    return Origin("absent")
+
+
+def _folders(package: str) -> list[str]:
+    """Return the folders of a package that is not loaded."""
+    parent, _, name = package.rpartition(".")
+    if not parent:
+        spec = _spec(package)
+        return list(spec.submodule_search_locations or ()) if spec is not None else []
+    above = getattr(sys.modules[parent], "__path__", ()) if parent in sys.modules else _folders(parent)
+    return [path for folder in above if os.path.isdir(path := os.path.join(folder, name))]
+
+
+def _spec(top: str) -> importlib.machinery.ModuleSpec | None:
+    try:
+        return importlib.util.find_spec(top)
+    except (ValueError, ImportError):
+        return None
+
+
+def _file_in(folder: str, name: str) -> str | None:
+    found = module_file(folder, [name])
+    if found is not None:
+        return str(found)
+    files = (os.path.join(folder, f"{name}{suffix}") for suffix in importlib.machinery.EXTENSION_SUFFIXES)
+    return next((file for file in files if os.path.isfile(file)), None)
+
+
+def _shadowed(top: str) -> bool:
+    """Return True if a loaded module with a name of the standard library is a file of somebody else."""
+    file = getattr(sys.modules.get(top), "__file__", None)
+    return bool(file) and (not str(file).startswith(_STANDARD) or not _INSTALLED.isdisjoint(Path(str(file)).parts))

@@ -1,0 +1,35 @@
+"""Settings of a process that decide what any code computes: number types of torch, and the code of `neusee.workflows`.
+
+The number of threads and deterministic algorithms change results only within rounding and do not count.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from pathlib import Path
+
+import torch
+
+_USUAL = {"default dtype": "torch.float32", "default device": "cpu", "matmul precision": "highest", "TF32": "True"}
+
+
+def settings() -> dict[str, str]:
+    """Return the settings of torch that differ from those of a new process."""
+    now = {
+        "default dtype": str(torch.get_default_dtype()),
+        "default device": str(torch.get_default_device()),
+        "matmul precision": torch.get_float32_matmul_precision(),
+        "TF32": str(torch.backends.cudnn.allow_tf32),
+    }
+    return {name: value for name, value in now.items() if value != _USUAL[name]}
+
+
+@functools.cache
+def workflows_digest() -> str:
+    """Return the digest of all source files of `neusee.workflows`, for a node that imports any of them."""
+    folder = Path(__file__).parents[1]
+    text = hashlib.blake2b(digest_size=16)
+    for path in sorted(folder.rglob("*.py")):
+        text.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
+    return text.hexdigest()

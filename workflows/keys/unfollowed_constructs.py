@@ -1,0 +1,262 @@
+"""Constructs of source code that read what no import shows: files, environment variables, names at run time, a clock.
+
+A digest of code does not cover what these constructs read, so a node declares it with ``depends=``. Code below
+``if __name__ == "__main__"`` and files that are written do not count. A file counts unless its path comes from an
+argument of the function that reads it, because the file of a parameter is part of the key.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple
+
+_CLOCK = "a clock, a process or a machine decides"
+_DRAWN = "random numbers without a seed: draw them from a parameter rng"
+_RUN = "code that no import names is run"
+_BY_NAME = "a module is imported by a name that only a run knows"
+_VARIABLE = "an environment variable is read"
+_FILE = "a file is read that is no parameter"
+
+_LEGACY = ("rand", "randn", "randint", "random", "normal", "uniform", "choice", "permutation", "shuffle", "poisson")
+
+#: What the names of Python and of libraries do, by their first parts.
+_NAMES: Mapping[str, tuple[str, str]] = {
+    **dict.fromkeys(("os.environ", "os.environb", "os.getenv", "os.getenvb"), ("env", _VARIABLE)),
+    **dict.fromkeys(("importlib.import_module", "__import__", "importlib.__import__", "runpy"), ("import", _BY_NAME)),
+    **dict.fromkeys(("sys.modules", "importlib.util", "importlib.machinery"), ("import", _BY_NAME)),
+    **dict.fromkeys(("pkgutil.iter_modules", "pkgutil.walk_packages", "importlib.metadata"), ("import", _BY_NAME)),
+    **dict.fromkeys(("exec", "eval", "compile", "ctypes.CDLL", "ctypes.cdll", "types.FunctionType"), ("run", _RUN)),
+    **dict.fromkeys(("subprocess", "os.system", "os.popen", "multiprocessing", "types.CodeType"), ("run", _RUN)),
+    **dict.fromkeys(
+        ("pickle.load", "pickle.loads", "marshal.loads", "cffi", "torch.utils.cpp_extension"), ("run", _RUN)
+    ),
+    **dict.fromkeys(("torch.ops.load_library", "torch.classes.load_library", "torch.hub"), ("run", _RUN)),
+    **dict.fromkeys(("importlib.resources", "pkgutil.get_data", "__file__", "__spec__", "__loader__"), ("file", _FILE)),
+    **dict.fromkeys(("inspect.getsource", "inspect.getsourcelines", "inspect.getfile", "linecache"), ("file", _FILE)),
+    **dict.fromkeys(("sqlite3", "urllib", "http", "requests", "httpx", "socket", "ftplib"), ("file", _FILE)),
+    **dict.fromkeys(("os.getcwd", "pathlib.Path.cwd"), ("file", _FILE)),
+    **dict.fromkeys(("pathlib.Path.home", "os.path.expanduser", "sys.path", "sys.argv"), ("state", _CLOCK)),
+    **dict.fromkeys(("os.cpu_count", "os.getpid", "os.uname", "platform", "getpass", "uuid"), ("state", _CLOCK)),
+    **dict.fromkeys(("time.time", "time.time_ns", "time.localtime", "time.gmtime", "time.strftime"), ("state", _CLOCK)),
+    **dict.fromkeys(("datetime.datetime.now", "datetime.datetime.today", "datetime.date.today"), ("state", _CLOCK)),
+    **dict.fromkeys(("torch.get_num_threads", "torch.get_num_interop_threads", "psutil"), ("state", _CLOCK)),
+    **dict.fromkeys(
+        ("torch.cuda.is_available", "torch.cuda.device_count", "torch.cuda.get_device_name"), ("state", _CLOCK)
+    ),
+    **dict.fromkeys(("os.urandom", "secrets", "torch.initial_seed", "torch.seed", "random"), ("state", _DRAWN)),
+    **{
+        f"numpy.random.{name}": ("state", _DRAWN)
+        for name in ("rand", "randn", "randint", "random", "normal", "uniform")
+    },
+    **{f"numpy.random.{name}": ("state", _DRAWN) for name in _LEGACY},
+}
+_BUILTINS = frozenset({"exec", "eval", "compile", "__import__", "__file__", "__spec__", "__loader__"})
+_METHODS = frozenset({"open", "read_text", "read_bytes", "iterdir", "glob", "rglob"})  #: of a path
+_READERS = re.compile(  #: functions of libraries that read a file
+    r"(open|io\.open|codecs\.open|os\.open|glob\.i?glob|os\.(listdir|scandir|walk)|"
+    r"(numpy|torch)\.(load|loadtxt|genfromtxt|fromfile|memmap|from_file)|"
+    r"PIL\.Image\.open|safetensors\.safe_open|safetensors\.\w+\.(load_file|safe_open)|h5py\.File|scipy\.io\.loadmat|"
+    r"pandas\.read_\w+|.*\.imread|.*\.imopen|gzip\.open|bz2\.open|lzma\.open|zipfile\.ZipFile|tarfile\.open|"
+    r"torchvision\.io\.\w+|OpenEXR\.\w*File|fileinput\.\w+)"
+)
+#: a text that is the name of a file of data
+_FILE_NAME = re.compile(
+    r"[\w./~ -]*\w\.(json5?|jsonl|ya?ml|toml|ini|cfg|csv|tsv|txt|dat|bin|np[yz]|mat|h5|hdf5|pt|pth|pkl|pickle|"
+    r"safetensors|png|jpe?g|tiff?|exr|bmp|gz|zip|xml|html?|j2|jinja2?|tmpl|cpp|cc|cu|c|hpp?|so|cl|glsl|db|sqlite|"
+    r"parquet|fits|spd|tbl)"
+)
+
+
+class Construct(NamedTuple):
+    """A construct that is not followed: its kind, what it names (or nothing), its text, the reason, and the line."""
+
+    kind: str  #: file, env, import, run or state
+    name: str
+    text: str
+    why: str
+    line: int
+
+
+def constructs(tree: ast.Module, bound: Mapping[str, str]) -> list[Construct]:
+    """Return each construct of a module that is not followed; ``bound`` has the full name of each imported name."""
+    own = {name for item in ast.walk(tree) for name in _bound_here(item)}
+    found = [*_named(tree, bound, own), *_read(tree, bound, own), *_file_names(tree)]
+    return sorted(set(found), key=lambda item: (item.line, item))
+
+
+def dotted(item: ast.expr, bound: Mapping[str, str]) -> str:
+    """Return the full name of an expression such as ``np.random.rand``, or an empty text for any other expression."""
+    parts: list[str] = []
+    while isinstance(item, ast.Attribute):
+        parts.append(item.attr)
+        item = item.value
+    if not isinstance(item, ast.Name):
+        return ""
+    return ".".join([bound.get(item.id, item.id), *reversed(parts)]).removeprefix("builtins.")
+
+
+def literal_import(call: ast.expr, bound: Mapping[str, str]) -> str | None:
+    """Return the module in a call such as ``import_module("a.b")``, or None for any other expression."""
+    if not isinstance(call, ast.Call) or not call.args or dotted(call.func, bound) not in _IMPORTERS:
+        return None
+    first = call.args[0]
+    return first.value if isinstance(first, ast.Constant) and isinstance(first.value, str) else None
+
+
+_IMPORTERS = ("importlib.import_module", "importlib.__import__", "__import__", "importlib.util.find_spec")
+
+
+def _bound_here(item: ast.AST) -> Iterator[str]:
+    """Yield the names that a statement or an argument binds, so that they hide a builtin of the same name."""
+    if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        yield item.name
+    elif isinstance(item, ast.arg):
+        yield item.arg
+    elif isinstance(item, ast.Name) and not isinstance(item.ctx, ast.Load):
+        yield item.id
+
+
+def _named(tree: ast.Module, bound: Mapping[str, str], own: set[str]) -> Iterator[Construct]:
+    """Yield each use of a name that reads what no import shows, such as ``os.environ``."""
+    known = {id(call.func) for call in ast.walk(tree) if isinstance(call, ast.Call) and literal_import(call, bound)}
+    known |= {id(part) for use in ast.walk(tree) if isinstance(use, ast.Attribute) for part in [use.value]}
+    names = {id(use): name for use, name in _variables(tree, bound)}
+    for item in ast.walk(tree):
+        if not isinstance(item, ast.Attribute | ast.Name) or id(item) in known or not isinstance(item.ctx, ast.Load):
+            continue
+        full = dotted(item, bound)
+        first = full.partition(".")[0]
+        if isinstance(item, ast.Name) and item.id in own and item.id not in bound:
+            continue
+        if first not in _BUILTINS and _first_name(item) not in bound:
+            continue
+        if entry := _entry(full):
+            yield Construct(entry[0], names.get(id(_environ(item)), ""), full, entry[1], item.lineno)
+
+
+def _entry(full: str) -> tuple[str, str] | None:
+    """Return what a full name such as ``os.environ.get`` does, or None for any other name."""
+    parts = full.split(".")
+    return next((_NAMES[name] for n in range(len(parts), 0, -1) if (name := ".".join(parts[:n])) in _NAMES), None)
+
+
+def _first_name(item: ast.expr) -> str:
+    while isinstance(item, ast.Attribute):
+        item = item.value
+    return item.id if isinstance(item, ast.Name) else ""
+
+
+def _environ(item: ast.expr) -> ast.expr:
+    return item.value if isinstance(item, ast.Attribute) and item.attr in ("get", "__getitem__", "pop") else item
+
+
+def _variables(tree: ast.Module, bound: Mapping[str, str]) -> Iterator[tuple[ast.expr, str]]:
+    """Yield the expression and the variable of each ``os.environ["X"]``, ``os.environ.get("X")`` and so on."""
+    for item in ast.walk(tree):
+        key: ast.expr | None = None
+        if isinstance(item, ast.Subscript):
+            use, key = item.value, item.slice
+        elif isinstance(item, ast.Call) and item.args:
+            use, key = _environ(item.func), item.args[0]
+        if (
+            isinstance(key, ast.Constant)
+            and isinstance(key.value, str)
+            and (_entry(dotted(use, bound)) or " ")[0] == "env"
+        ):
+            yield use, key.value
+
+
+def _read(tree: ast.Module, bound: Mapping[str, str], own: set[str]) -> Iterator[Construct]:
+    """Yield each call that reads a file whose path does not come from an argument of the function around it."""
+    for scope, item in _with_scope(tree, ()):
+        if not isinstance(item, ast.Call):
+            continue
+        full = dotted(item.func, bound)
+        method = isinstance(item.func, ast.Attribute) and item.func.attr in _METHODS
+        called = _READERS.fullmatch(full) and (_first_name(item.func) in bound or (full == "open" and full not in own))
+        if called:
+            path = item.args[0] if item.args else next((word.value for word in item.keywords), None)
+        elif method and isinstance(item.func, ast.Attribute) and _first_name(item.func) not in bound:
+            path = item.func.value
+        else:
+            continue
+        if path is not None and not _writes(item) and not _given(path, scope, frozenset()):
+            yield Construct("file", _literal(path), ast.unparse(item)[:60], _FILE, item.lineno)
+
+
+def _writes(call: ast.Call) -> bool:
+    """Return True if the mode of a call of ``open`` creates or extends a file."""
+    modes = [*call.args[:2], *(word.value for word in call.keywords if word.arg == "mode")]
+    texts = [m.value for m in modes if isinstance(m, ast.Constant) and isinstance(m.value, str)]
+    return any(re.fullmatch(r"[wax][bt+]*", text) for text in texts)
+
+
+def _literal(path: ast.AST) -> str:
+    """Return the text of a literal, or an empty text for anything else."""
+    return path.value if isinstance(path, ast.Constant) and isinstance(path.value, str) else ""
+
+
+Scope = tuple[ast.AST, ...]  #: the functions around an expression, the outermost first
+
+
+def _with_scope(item: ast.AST, scope: Scope) -> Iterator[tuple[Scope, ast.AST]]:
+    """Yield each part of a module with the functions around it."""
+    todo: list[tuple[Scope, ast.AST]] = [(scope, item)]
+    while todo:
+        around, part = todo.pop()
+        yield around, part
+        if isinstance(part, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            around = (*around, part)
+        todo += [(around, child) for child in ast.iter_child_nodes(part)]
+
+
+def _given(path: ast.expr, scope: Scope, seen: frozenset[str]) -> bool:
+    """Return True if a path comes from an argument of a function around it, through any local names."""
+    names = [part for part in ast.walk(path) if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Load)]
+    return any(_name_given(name.id, scope, seen) for name in names)
+
+
+def _name_given(name: str, scope: Scope, seen: frozenset[str]) -> bool:
+    if name in seen:
+        return False
+    for function in reversed(scope):
+        if name in _arguments(function):
+            return True
+        values = [value for target, value in _assigned(function) if target == name]
+        if values:
+            return any(_given(value, scope, seen | {name}) for value in values)
+    return False
+
+
+def _arguments(function: ast.AST) -> set[str]:
+    inner = getattr(function, "args", None)
+    return {part.arg for part in ast.walk(inner) if isinstance(part, ast.arg)} if inner is not None else set()
+
+
+def _assigned(function: ast.AST) -> Iterator[tuple[str, ast.expr]]:
+    """Yield each local name of a function with an expression that gives it its value."""
+    for item in ast.walk(function):
+        if isinstance(item, ast.Assign):
+            pairs: Iterable[tuple[ast.AST, ast.expr | None]] = [(target, item.value) for target in item.targets]
+        elif isinstance(item, ast.AnnAssign | ast.AugAssign | ast.NamedExpr):
+            pairs = [(item.target, item.value)]
+        elif isinstance(item, ast.For | ast.AsyncFor | ast.comprehension):
+            pairs = [(item.target, item.iter)]
+        elif isinstance(item, ast.withitem):
+            pairs = [(item.optional_vars, item.context_expr)] if item.optional_vars else []
+        else:
+            continue
+        for target, value in pairs:
+            if value is not None:
+                yield from ((part.id, value) for part in ast.walk(target) if isinstance(part, ast.Name))
+
+
+def _file_names(tree: ast.Module) -> Iterator[Construct]:
+    """Yield each text that is the name of a file of data, where it may become a path: in a call or as a constant."""
+    said = [item for item in ast.walk(tree) if isinstance(item, ast.Raise | ast.JoinedStr)]
+    spoken = {id(part) for item in said for part in ast.walk(item)}
+    for item in ast.walk(tree):
+        if isinstance(item, ast.Constant) and id(item) not in spoken and _FILE_NAME.fullmatch(text := _literal(item)):
+            yield Construct("file", text, repr(text), _FILE, item.lineno)
