@@ -30,9 +30,7 @@ Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cu
 OneDevice = Annotated[str, typer.Option("--device", help="Where to compute: cpu or cuda.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print only the path of the page.")]
 Exact = Annotated[bool, typer.Option("--exact", help="Compute every step in full; omit nothing.")]
-Memory = Annotated[
-    str, typer.Option("--memory", help="Limit of a device's memory, such as 6 GB, as far as earlier runs tell.")
-]
+Memory = Annotated[str, typer.Option("--memory", help="Limit of the memory of the program, and of each GPU: 6 GB.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the folder of results.")]
 
 

@@ -57,7 +57,7 @@ def run(
     if not silent:
         say(console.opening(recipe, " ".join(command[1:])))
     store = the_store()
-    if limit is not None:
+    if executor == "local":
         _refuse_too_large(recipe, store, device, limit)
     cheaper = with_substitutions(recipe, contents.wanted(recipe))
     table = console.RunTable(cheaper, contents.steps_of(cheaper), console.mode_for(silent))
@@ -73,13 +73,13 @@ def run(
         raise typer.Exit(MISSED)
 
 
-def _refuse_too_large(recipe: Recipe, store: Store, device: str, memory: int) -> None:
-    """End the command before anything runs if earlier runs show that the memory is too small."""
+def _refuse_too_large(recipe: Recipe, store: Store, device: str, memory: int | None) -> None:
+    """End the command before anything runs if the limit of memory, or the memory that is free, is too small."""
     from neusee.workflows.engine.local_executor import lanes_of
     from neusee.workflows.explain.run_forecast import planned
 
     if refused := planned(recipe, store, lanes_of(device.split(","), memory)).refused:
-        fail(f"--memory: {refused}")
+        fail(f"{'memory' if memory is None else '--memory'}: {refused}; nothing was run")
 
 
 def validate(words: Words = None, debug: Debug = False) -> None:
@@ -105,9 +105,9 @@ def plan(
 ) -> None:
     """Show which steps a run would compute, where and for how long.
 
-    Nothing is computed. Seconds, bytes and memory come from earlier runs of the same step, even at another size;
-    a step that never ran shows a question mark. With --devices the run is simulated on machines that you do not
-    have: makespan, utilisation and critical path.
+    Nothing is computed. Bytes follow from the shape of each result; seconds and memory from laws of each node that
+    were measured, and from earlier runs on this machine. A guess for a node without a measurement is marked. With
+    --devices the run is simulated on machines that you do not have: makespan, utilisation and critical path.
     """
     recipe, _ = load(words, exact=exact)
     from neusee.workflows.explain import run_forecast

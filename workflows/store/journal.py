@@ -19,7 +19,7 @@ from neusee.workflows.store import metadata
 from neusee.workflows.store.shared_folder import Disk, append
 
 Row = dict[str, Any]
-_FIELDS = ("step", "recipe", "seconds", "bytes", "device", "peak", "date")
+_FIELDS = ("step", "recipe", "seconds", "bytes", "device", "peak", "size", "date")
 _TEXT, _NUMBER = str | None, int | float | None
 _KINDS = {"key": str, "step": _TEXT, "node": _TEXT, "seconds": _NUMBER, "bytes": _NUMBER, "kept": bool}
 _HEAD = re.compile(rb'\{"journal":"[0-9a-f]{16}"\}')
@@ -54,7 +54,7 @@ class Journal:
     def rows(self) -> list[Row]:
         """Return every line of the journal as a dict, which the caller must not change.
 
-        The fields of a line are key, step, recipe, node, seconds, bytes, device, peak, date and kept.
+        The fields of a line are key, step, recipe, node, seconds, bytes, device, peak, size, date and kept.
         """
         self._read()
         return self._rows
