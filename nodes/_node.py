@@ -13,6 +13,8 @@ generator for a parameter named ``rng``.
     @digitize.preflight        # checks the parameters before anything runs
     @digitize.preview          # the shape of the result, before anything runs
     @digitize.check            # checks that the result is plausible
+    @digitize.shape            # shape and type of the result, from tensors without values
+    @digitize.work             # memory and number of operations beside what the shapes say
 
 ``digitize.hooks`` has each attached function under the name of its decorator.
 """
@@ -89,6 +91,12 @@ class Hooks:
     preview: Callable[..., Any] | None = None
     #: (result, *inputs, **parameters): findings, once after computing
     check: Callable[..., Sequence[Check]] | None = None
+    #: (*inputs, **parameters), with tensors on the device ``meta``, which have a shape and a type but no values: the
+    #: result in the same form; a tensor of few numbers may have values
+    shape: Callable[..., Any] | None = None
+    #: (result, *inputs, **parameters), all as for ``shape``: bytes of memory during the run beside inputs and result,
+    #: and number of operations, both up to a constant factor, which is measured
+    work: Callable[..., tuple[float, float]] | None = None
 
 
 def _attaches(hook: str) -> Callable[[Any, Fn], Fn]:
@@ -195,6 +203,7 @@ class Node:
     skip_bound, skip_scale, zero_bound = _attaches("skip_bound"), _attaches("skip_scale"), _attaches("zero_bound")
     propagate_error, approximation_error = _attaches("propagate_error"), _attaches("approximation_error")
     band_invariant = _attaches("band_invariant")
+    shape, work = _attaches("shape"), _attaches("work")
 
     @property
     def preflight_inputs(self) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """Calibration nodes, which estimate the constants of a sensor with uncertainties from frames of flat light."""
 
+from neusee.nodes.calibrate import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
 from neusee.nodes.calibrate._frames._emva_descriptor import descriptor
 from neusee.nodes.calibrate._frames._frame_statistics import levels, reduce

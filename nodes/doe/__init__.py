@@ -1,5 +1,6 @@
 """Masks (diffractive optical elements): height maps and materials."""
 
+from neusee.nodes.doe import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.doe._analytic_masks import axicon, cubic, flat, half_rings, spiral_axicon, vortex, zernike
 from neusee.nodes.doe._fabrication_limits import fabricate
 from neusee.nodes.doe._minimum_feature import smooth

@@ -1,5 +1,6 @@
 """Metrics: figures of merit of a mask, a picture and a laser spot."""
 
+from neusee.nodes.metrics import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.metrics._mask_limits import Limits, least_lsr, limits, most_contrast, most_unsuppressed
 from neusee.nodes.metrics._peak_irradiance import Peak, peak_irradiance
 from neusee.nodes.metrics._picture_quality import Quality, quality

@@ -1,5 +1,6 @@
 """Optical nodes: stop, pupil function, point-spread function, image and laser spot."""
 
+from neusee.nodes.optics import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.optics._imaging._band_image import image
 from neusee.nodes.optics._imaging._channel_image import image_channels
 from neusee.nodes.optics._laser_direction import direction, field_of_view

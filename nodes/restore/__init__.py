@@ -1,5 +1,6 @@
 """Restoration nodes, which compute a colour picture of the scene from raw digital numbers."""
 
+from neusee.nodes.restore import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.restore._colour_matrix import colour_matrix
 from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons
 from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy

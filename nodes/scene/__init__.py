@@ -1,5 +1,6 @@
 """Scenes: photographs, OpenEXR pictures, spectral cubes and test targets."""
 
+from neusee.nodes.scene import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.scene._exr_picture import exr
 from neusee.nodes.scene._hyperspectral import hyperspectral
 from neusee.nodes.scene._photograph import photograph

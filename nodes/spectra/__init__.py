@@ -1,5 +1,6 @@
 """Nodes for spectra: spectral bands, illuminants, channel responses, and estimates of spectra from RGB."""
 
+from neusee.nodes.spectra import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.spectra._bands import bands, filters, line, mean_wavelength
 from neusee.nodes.spectra._camera_colour import grain, render
 from neusee.nodes.spectra._channel_responses import responses

@@ -60,10 +60,8 @@ def run(
     if not silent:
         say(console.opening(recipe, shlex.join(command[1:])))
     store = the_store()
-    if limit is not None:
-        _refuse_too_large(recipe, store, device, limit)
+    predicted = _predicted(recipe, store, device, limit, executor == "local", silent)
     cheaper = with_substitutions(recipe, contents.wanted(recipe))
-    predicted = {} if silent else _predicted(recipe, store, device)
     table = console.RunTable(cheaper, contents.steps_of(cheaper), console.mode_for(silent), predicted)
     with (
         resumable(lambda: kept_in(store, f"{table.finished} steps are finished, and results that take time are")),
@@ -84,16 +82,26 @@ def run(
         raise typer.Exit(MISSED)
 
 
-def _predicted(recipe: Recipe, store: Store, device: str) -> dict[str, float]:
-    """Print how long a run will take, as far as earlier runs tell; return the predicted seconds of each step."""
+def _predicted(
+    recipe: Recipe, store: Store, device: str, memory: int | None, local: bool, silent: bool
+) -> dict[str, float]:
+    """Print how long a run will take, and return the predicted seconds of each step, as far as they are known.
+
+    A run on this machine ends before any step if the limit of memory, or the memory that is free, is too small.
+    """
     from neusee.workflows.engine.local_executor import lanes_of
     from neusee.workflows.explain.run_forecast import planned
     from neusee.workflows.report.console import forecast_line
 
-    plan = planned(recipe, store, lanes_of(device.split(",")))
+    if silent and not local:
+        return {}
+    plan = planned(recipe, store, lanes_of(device.split(","), memory))
+    if local and plan.refused:
+        fail(f"{'memory' if memory is None else '--memory'}: {plan.refused}; nothing was run")
     slots = plan.schedule.slots if plan.schedule else ()
     unknown = sum(not estimate.known for estimate in plan.expected.values())
-    if line := forecast_line(plan.schedule.makespan if plan.schedule else 0.0, len(plan.expected), unknown):
+    line = forecast_line(plan.schedule.makespan if plan.schedule else 0.0, len(plan.expected), unknown)
+    if line and not silent:
         say([line])
     return {slot.task: slot.end - slot.start for slot in slots if plan.expected[slot.task].known}
 
@@ -108,15 +116,6 @@ def _loads(words: Sequence[str]) -> bool:
     except RecipeError:
         return False
     return True
-
-
-def _refuse_too_large(recipe: Recipe, store: Store, device: str, memory: int) -> None:
-    """End the command before anything runs if earlier runs show that the memory is too small."""
-    from neusee.workflows.engine.local_executor import lanes_of
-    from neusee.workflows.explain.run_forecast import planned
-
-    if refused := planned(recipe, store, lanes_of(device.split(","), memory)).refused:
-        fail(f"--memory: {refused}")
 
 
 def validate(words: Words = None, as_json: AsJson = False, debug: Debug = False) -> None:
@@ -146,9 +145,9 @@ def plan(
 ) -> None:
     """Show which steps a run would compute, where and for how long.
 
-    Nothing is computed. Seconds, bytes and memory come from earlier runs of the same step, even at another size;
-    a step that never ran shows a question mark. With --devices the run is simulated on machines that you do not
-    have: makespan, utilisation and critical path.
+    Nothing is computed. Bytes follow from the shape of each result; seconds and memory from laws of each node that
+    were measured, and from earlier runs on this machine. A guess for a node without a measurement is marked. With
+    --devices the run is simulated on machines that you do not have: makespan, utilisation and critical path.
     """
     recipe, command = load(words, "plan", exact=exact)
     from neusee.workflows.explain import run_forecast

@@ -16,6 +16,7 @@ import torch
 import xxhash
 from torch import Tensor
 
+from neusee.nodes import Node
 from neusee.nodes.values import BAND_FIELDS
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import digest, plain
@@ -66,6 +67,15 @@ def band_count(step: Step, inputs: Sequence[Any]) -> int:
         return 0  # a low-rank cube has no slice of one band
     found = {x.shape[axis] for axis, value in banded for x in band_tensors(value) if _has(x, axis)}
     return found.pop() if len(found) == 1 else 0
+
+
+def bands_in(node: Node, inputs: Sequence[Any]) -> int:
+    """Return the number of bands that a node computes one by one, from inputs that may have no values; at least 1."""
+    for name, value in zip(node.inputs, inputs, strict=False):
+        axis = node.bands.get(name) if node.bands else None
+        if axis is not None and (isinstance(value, Tensor) or type(value) in BAND_FIELDS):
+            return max((x.shape[axis] for x in band_tensors(value) if _has(x, axis)), default=1)
+    return 1
 
 
 def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:

@@ -1,18 +1,27 @@
-"""Cost model: run time, size of the result and memory of a step, predicted from earlier runs."""
+"""Cost model: run time, size of the result and memory of a step, predicted from shapes and from earlier runs.
+
+The result has the bytes of its shape and type. For time and memory, runs of the same node at the same size on this
+machine come first; then the law of the node (`cost_laws`), scaled by the runs of this machine; then, for a node that
+was never measured, the upper end of what shipped nodes need.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from statistics import median
+from types import MappingProxyType
 from typing import Any
 
+from neusee.workflows.engine.cost_laws import GUESS, Law, Size, shipped
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import device_kind
 
-GUESS = 0.01  #: s for a step without any measurement
 _FASTER = 10.0  #: speed of another kind of device relative to the CPU, until both are measured
 _NEWEST = 5  #: number of earlier results that are used
+_LEAST = 1 << 25  #: bytes of a peak below which the memory of the process is mostly noise
+_SHORT = 1e-3  #: s of a step below which its time is mostly overhead
 
 Row = Mapping[str, Any]  #: a line of the journal
 
@@ -24,13 +33,22 @@ class Estimate:
     seconds: Mapping[str, float]  #: by kind of device: ``cpu``, ``cuda``
     bytes: float  #: size of the result
     work: float  #: memory during the run, beside the inputs and the result
-    known: bool  #: True if this step was measured before
+    known: bool  #: False for a guess: neither the shape nor a measurement of the node is known
+    spread: tuple[float, float] = (1.0, 1.0)  #: factor by which peak memory and time may exceed the prediction
+    bands: int = 0  #: number of bands that can be computed one after another; 0 if not known
+
+    @property
+    def peak(self) -> float:
+        """Return the memory of the step beside its inputs, in bytes."""
+        return self.bytes + self.work
 
 
 class Costs:
     """Measured costs of steps and nodes, from the journal of a result store in order of time."""
 
-    def __init__(self, rows: Iterable[Row]) -> None:
+    def __init__(self, rows: Iterable[Row], sizes: Mapping[str, Size] = MappingProxyType({})) -> None:
+        """Read measured costs; ``sizes`` has the size of each step of the recipe, from `cost_laws.sizes_of`."""
+        self._sizes = sizes
         self._steps: dict[str, list[Row]] = {}
         self._nodes: dict[str, list[Row]] = {}
         for row in rows:
@@ -41,19 +59,60 @@ class Costs:
 
     def of(self, step: Step, kinds: Sequence[str], exact: Row | None = None) -> Estimate:
         """Predict the cost of ``step`` on each kind of device; ``exact`` holds measured costs of the same result."""
-        own = self._steps.get(f"{step.name} {step.node.path}", [])
-        exact = exact if exact and _is_measured(exact) else None
-        rows = [exact] if exact else own[-_NEWEST:] or self._nodes.get(step.node.path, [])[-_NEWEST:]
-        if not rows:
-            return Estimate({kind: GUESS / self._faster(kind) for kind in kinds}, 0.0, 0.0, False)
-        size = float(median(row["bytes"] for row in rows))
-        peaks = [float(row["peak"]) for row in rows if row.get("peak") is not None]
-        work = max(0.0, median(peaks) - size) if peaks else 0.0
-        seconds = {kind: self._seconds(rows, own, kind) for kind in kinds}
-        return Estimate(seconds, size, work, bool(exact or own))
+        size = self._sizes.get(step.name)
+        if exact and _is_measured(exact):
+            return self._repeated([exact], kinds, size)
+        if size is not None and size.known:
+            return self._predicted(step.node.path, kinds, size)
+        rows = self._steps.get(f"{step.name} {step.node.path}", [])[-_NEWEST:]
+        return self._repeated(rows, kinds, None) if rows else self._guess(step.node.path, kinds, size)
 
-    def _seconds(self, rows: Sequence[Row], own: Sequence[Row], kind: str) -> float:
-        here = [row for row in (*own[-_NEWEST:], *rows) if _kind(row) == kind]
+    def with_sizes(self, sizes: Mapping[str, Size]) -> Costs:
+        """Return the same measurements for the steps with other ``sizes``."""
+        found = copy(self)
+        found._sizes = sizes
+        return found
+
+    def size_of(self, step: str) -> float:
+        """Return the bytes of the result of the step with this name, or 0 if its shape is not known."""
+        return self._sizes[step].result if step in self._sizes else 0.0
+
+    def _predicted(self, path: str, kinds: Sequence[str], size: Size) -> Estimate:
+        """Predict a step from runs at the same size, or from the law of its node, scaled by runs on this machine."""
+        rows = [row for row in self._nodes.get(path, []) if _size(row)]
+        same = [row for row in rows if _alike(_size(row), size)][-_NEWEST:]
+        law = shipped().get(path)
+        if same:
+            return self._repeated(same, kinds, size, law)
+        if law is None and not rows:
+            return self._guess(path, kinds, size)
+        base = law or GUESS
+        factors = _scales(base, rows[-_NEWEST:], self._faster)
+        peak = max(size.result, factors[0] * base.peak(size))
+        on_cpu = factors[1] * base.time(size)
+        seconds = {kind: on_cpu / self._faster(kind) for kind in kinds}
+        return Estimate(seconds, size.result, peak - size.result, True, base.spread, size.bands)
+
+    def _repeated(
+        self, rows: Sequence[Row], kinds: Sequence[str], size: Size | None, law: Law | None = None
+    ) -> Estimate:
+        """Predict a step by the median of earlier runs of the same size."""
+        result = size.result if size else float(median(row["bytes"] for row in rows))
+        peaks = [float(row["peak"]) for row in rows if row.get("peak") is not None]
+        least = law.peak(size) / law.spread[0] if law and size else 0.0
+        peak = max(median(peaks) if peaks else 0.0, result, least)
+        seconds = {kind: self._seconds(rows, kind) for kind in kinds}
+        return Estimate(seconds, result, peak - result, True, (1.0, 1.0), size.bands if size else 0)
+
+    def _guess(self, path: str, kinds: Sequence[str], size: Size | None) -> Estimate:
+        """Predict the upper end of the costs of a step whose node was never measured or whose shape is unknown."""
+        size, law = size or Size(0.0, 0.0, 0.0, 0.0, known=False), shipped().get(path, GUESS)
+        on_cpu, peak = law.spread[1] * law.time(size), law.spread[0] * law.peak(size)
+        seconds = {kind: on_cpu / self._faster(kind) for kind in kinds}
+        return Estimate(seconds, size.result, peak - size.result, False, (1.0, 1.0), size.bands)
+
+    def _seconds(self, rows: Sequence[Row], kind: str) -> float:
+        here = [row for row in rows if _kind(row) == kind]
         if here:
             return float(median(row["seconds"] for row in here))
         on_cpu = median(row["seconds"] * self._faster(_kind(row)) for row in rows)
@@ -78,6 +137,32 @@ class Costs:
 
 def _is_measured(row: Row) -> bool:
     return row.get("seconds") is not None and row.get("bytes") is not None
+
+
+def _scales(law: Law, rows: Sequence[Row], faster: Any) -> tuple[float, float]:
+    """Return the factors from a law to the runs of this machine, for memory and for time; 1 where nothing was measured.
+
+    Small steps are left out, because allocators and overheads hide what they need.
+    """
+    peaks, times = [], []
+    for row in rows:
+        size = _size(row)
+        if row.get("peak") and law.peak(size) > _LEAST and _kind(row) == "cpu":
+            peaks.append(row["peak"] / law.peak(size))
+        if law.time(size) > _SHORT:
+            times.append(row["seconds"] * faster(_kind(row)) / law.time(size))
+    return (median(peaks) if peaks else 1.0), (median(times) if times else 1.0)
+
+
+def _size(row: Row) -> Any:
+    """Return the size of the step of a journal line, or None for a line without a valid size."""
+    found = row.get("size")
+    valid = isinstance(found, list | tuple) and len(found) == 4 and all(isinstance(x, int | float) for x in found)
+    return Size(*found) if valid else None  # type: ignore[misc]
+
+
+def _alike(one: Size, other: Size) -> bool:
+    return all(abs(a - b) <= 1e-9 * max(abs(a), abs(b)) for a, b in zip(one[:4], other[:4], strict=True))
 
 
 def _kind(row: Row) -> str:

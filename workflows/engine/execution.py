@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 from neusee.nodes import Check, TensorStats
+from neusee.workflows.engine.cost_laws import sizes_of
 from neusee.workflows.engine.cost_model import Costs, Estimate
 from neusee.workflows.engine.dispatch import Loop, chains_of
 from neusee.workflows.engine.finished_step import error_in, facts_in, ran
@@ -24,7 +25,7 @@ from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Re
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event, StepRecord
-from neusee.workflows.keys.cache_key import Key, device_kind, key_of
+from neusee.workflows.keys.cache_key import Key, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
 from neusee.workflows.store.result_store import Store
@@ -193,9 +194,9 @@ class Execution:
     def _outcomes(self, plan: list[Key], again: frozenset[Key], targets: list[Key]) -> Iterator[Outcome]:
         """Compute the values with the keys ``plan`` and yield each outcome; after an error no further step begins."""
         works = [self._work(key, key in again, key in targets) for key in plan]
-        self.costs = self.costs or past_costs(self.store)
+        self.costs = self.costs or past_costs(self.store, sizes_of(self.recipe, list(self.keys)))
         try:
-            prepared = prepare(works, self.costs, self.receipts, self.executor.lanes, targets)
+            prepared = prepare(works, self.costs, self.receipts, self.executor.lanes, targets, self.values)
         except TooLarge as error:
             raise RunError(self.recipe.steps[error.task], [], error) from error
         self.schedule = joined(self.schedule, prepared.schedule)
@@ -245,8 +246,7 @@ class Execution:
         self.took[path] = max(outcome.seconds, self.took.get(path, 0.0))
         computing = outcome.seconds + work.refetch_seconds
         self.again[key] = self.store.read_seconds(outcome.bytes) if outcome.kept else computing
-        predicted = expected.seconds[device_kind(work.device)] if expected.known else None
-        self._finish(ran(outcome, self._why(step.name, key), self._bound(step.name), self.began, predicted))
+        self._finish(ran(outcome, self._why(step.name, key), self._bound(step.name), self.began, expected))
 
     def _fetch(self, key: Key) -> Any:
         """Return a value from memory or from the store; raise `InputMissing` if neither has the value."""

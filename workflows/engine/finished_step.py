@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from neusee.nodes import TensorStats
 from neusee.workflows.graph.step_record import StepRecord
+from neusee.workflows.keys.cache_key import device_kind
 
 if TYPE_CHECKING:
+    from neusee.workflows.engine.cost_model import Estimate
     from neusee.workflows.engine.step_job import Outcome
 
 
@@ -27,7 +29,7 @@ def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
         return None
 
 
-def ran(outcome: Outcome, why: str, bound: float | None, began: float, predicted: float | None) -> StepRecord:
+def ran(outcome: Outcome, why: str, bound: float | None, began: float, expected: Estimate) -> StepRecord:
     """Return the record of a step that was computed in the run that started at the time ``began``."""
     work = outcome.work
     return StepRecord(
@@ -44,7 +46,8 @@ def ran(outcome: Outcome, why: str, bound: float | None, began: float, predicted
         outcome.began - began,
         work.lane,
         outcome.peak,
-        predicted,
+        expected.seconds[device_kind(work.device)] if expected.known else None,
         outcome.deviation,
+        expected.peak if expected.known else None,
         outcome.kept,
     )

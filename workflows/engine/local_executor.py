@@ -13,19 +13,39 @@ from typing import Any
 
 import torch
 
-from neusee.workflows.engine.memory_use import pool_of, there_is
+from neusee.workflows.engine.memory_use import free_memory, pool_of, process_memory, there_is
 from neusee.workflows.engine.step_job import Lane, Outcome, StepJob, carry_out
 from neusee.workflows.engine.write_behind import WriteBehind
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 
 _SHARE = 0.9  #: fraction of a device's memory that a schedule may use
+LOADED = 450 << 20  #: bytes of the interpreter with the libraries that steps load, as measured
 
 
 def lanes_of(devices: Sequence[str], memory: int | None = None) -> dict[str, Lane]:
-    """Return one `Lane` for each device; devices with a common memory divide the bytes that a schedule may use."""
+    """Return one `Lane` for each device; devices with a common memory divide the bytes that a schedule may use.
+
+    ``memory`` limits the memory of each GPU, and for the CPU the memory of this process with what the program itself
+    holds; if None, the limit is most of a GPU, or most of the memory that is free now.
+    """
     pools = [pool_of(device) for device in devices]
-    return {d: Lane(d, (memory or _SHARE * there_is(d)) / pools.count(pool_of(d))) for d in devices}
+    found = {}
+    for device in devices:
+        held = program_memory() if pool_of(device) == "cpu" else 0
+        limit = memory_limit(memory) if pool_of(device) == "cpu" else memory or _SHARE * there_is(device)
+        found[device] = Lane(device, (limit - held) / pools.count(pool_of(device)), held)
+    return found
+
+
+def memory_limit(memory: int | None) -> float:
+    """Return the largest memory of this process in bytes: ``memory``, or most of what is free beside the process."""
+    return memory or process_memory() + _SHARE * free_memory()
+
+
+def program_memory() -> int:
+    """Return the memory of this process in bytes before the first step, with the libraries that the steps load."""
+    return max(process_memory(), LOADED)
 
 
 class Local:

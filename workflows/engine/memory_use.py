@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 from contextlib import suppress
 from pathlib import Path
 from typing import Self
@@ -10,6 +11,8 @@ from typing import Self
 import torch
 
 _CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+_USED = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in_bytes")
+_highest = 0  # peak memory of this process before the last reset of the counter of the system
 
 
 class PeakMemory:
@@ -50,6 +53,8 @@ def pool_of(device: str) -> str:
 
 def _peak_reset() -> bool:
     """Reset the peak memory of this process; return False if the system does not allow the reset."""
+    global _highest
+    _highest = max(_highest, _resident("VmHWM:") or 0)
     try:
         with open("/proc/self/clear_refs", "w") as file:
             file.write("5")
@@ -64,6 +69,36 @@ def _resident(field: str) -> int | None:
             if line.startswith(field):
                 return int(line.split()[1]) * 1024
     return None
+
+
+def process_memory() -> int:
+    """Return the memory of this process in bytes: code, libraries and data that are resident now."""
+    return _resident("VmRSS:") or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def process_peak() -> int:
+    """Return the peak memory of this process in bytes since it started, whatever `PeakMemory` measured since then."""
+    return max(_highest, _resident("VmHWM:") or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+
+
+def free_memory() -> int:
+    """Return the bytes that this process can still use: free memory of the machine, or of its control group."""
+    found = there_is("cpu") - process_memory()
+    with suppress(OSError, ValueError, StopIteration), open("/proc/meminfo") as file:
+        found = min(found, next(int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable:")))
+    for limit, used in zip(_CGROUPS, _USED, strict=True):
+        with suppress(OSError, ValueError):
+            taken = int(Path(used).read_text()) - _reclaimable(Path(used).parent)
+            found = min(found, int(Path(limit).read_text()) - taken)
+    return max(found, 0)
+
+
+def _reclaimable(group: Path) -> int:
+    """Return the bytes of files that a control group keeps in memory and gives back when memory is short."""
+    for line in (group / "memory.stat").read_text().splitlines():
+        if line.startswith(("inactive_file ", "total_inactive_file ")):
+            return int(line.split()[1])
+    return 0
 
 
 def there_is(device: str) -> int:

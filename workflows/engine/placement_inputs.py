@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+import math
+from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from neusee.workflows.engine.cost_laws import Size
 from neusee.workflows.engine.cost_model import Costs, Estimate
 from neusee.workflows.engine.dispatch import MemoryProfile
 from neusee.workflows.engine.memory_use import pool_of
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.step_job import Executor, Lane, StepJob
+from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import Key, device_kind
-from neusee.workflows.placement.heft_schedule import Cluster, Device, Schedule, Slot, Task, heft
+from neusee.workflows.placement.heft_schedule import Cluster, Device, Schedule, Slot, Task, TooLarge, heft
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in
 
-MOST_PARTS = 64  #: upper bound on the parts of a step; the number of bands is only known when the step runs
+MOST_PARTS = 64  #: upper bound on the parts of a step
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,18 +37,45 @@ def prepare(
     abouts: Mapping[Key, Mapping[str, Any]],
     lanes: Mapping[str, Lane],
     keep: Collection[Key],
+    there: Container[Key] = (),
 ) -> Prepared:
-    """Assign a device to each job of a run and schedule the jobs; raise `TooLarge` if the memory is too small."""
+    """Assign a device to each job of a run and schedule the jobs; raise `TooLarge` if the memory is too small.
+
+    The keys ``there`` are of values that are in memory already. Other values that no job computes are read.
+    """
     kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
     expected = {w.key: costs.of(w.step, kinds, abouts.get(w.key)) for w in works}
+    read = {
+        key: 0.0 if key in there else costs.size_of(name)
+        for work in works
+        for name, key in zip(work.step.sources, work.sources, strict=True)
+        if key not in expected
+    }
+    try:
+        return _scheduled(works, expected, lanes, keep, read)
+    except TooLarge as error:
+        raise error.with_program(lanes[error.device].held) from error
+
+
+def _scheduled(
+    works: Sequence[StepJob],
+    expected: Mapping[Key, Estimate],
+    lanes: Mapping[str, Lane],
+    keep: Collection[Key],
+    read: Mapping[Key, float],
+) -> Prepared:
+    """Return the jobs on their devices; ``read`` has the bytes of each value that is read from the store."""
     only, lane = next(iter(lanes.items()))
+    for work in works:
+        if expected[work.key].peak == math.inf:
+            raise TooLarge(work.step.name, only, math.inf, lane.memory)
     if len(lanes) == 1:
-        plain = _one_after_another(works, expected, only, keep)
+        plain = _one_after_another(works, expected, only, keep, read)
         if plain.peak[only] <= lane.memory:
             return Prepared([w if w.lane else replace(w, lane=only) for w in works], expected, plain)
     planned = {w.step.name: w for w in works}
     names = {w.key: w.step.name for w in works}
-    tasks = [_task(w, expected[w.key], lanes, names) for w in works]
+    tasks = [_task(w, expected[w.key], lanes, names, read) for w in works]
     cluster = Cluster(tuple(Device(name, lane.kind, lane.memory) for name, lane in lanes.items()))
     schedule = heft(tasks, cluster, [names[key] for key in keep if key in names])
     slots = sorted(schedule.slots, key=lambda slot: (slot.start, slot.end))
@@ -61,10 +91,17 @@ def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mappi
         if not beside or not executor.shares:
             return True
         held = sum(t.nbytes for t in tensors_in(list(values.values())) if pool_of(str(t.device)) == pool)
-        need = sum(expected[w.key].bytes + expected[w.key].work for w in (work, *beside))
+        need = sum(expected[w.key].peak for w in (work, *beside))
         return held + need <= sum(lane.memory for lane in executor.lanes.values() if pool_of(lane.device) == pool)
 
     return room
+
+
+def running_peak(schedule: Schedule | None, lanes: Mapping[str, Lane]) -> float:
+    """Return the predicted peak memory of this process in bytes while the steps run, over all lanes on the CPU."""
+    cpu = {name: lane for name, lane in lanes.items() if lane.kind == "cpu"}
+    peaks = schedule.peak if schedule else {}
+    return max((lane.held for lane in cpu.values()), default=0.0) + sum(peaks.get(name, 0.0) for name in cpu)
 
 
 def joined(first: Schedule | None, then: Schedule | None) -> Schedule | None:
@@ -84,7 +121,13 @@ def _placed(work: StepJob, slot: Slot, lanes: Mapping[str, Lane]) -> StepJob:
     return replace(work, lane=slot.device, device=device, parts=slot.parts)
 
 
-def _task(work: StepJob, estimate: Estimate, lanes: Mapping[str, Lane], names: Mapping[Key, str]) -> Task:
+def _task(
+    work: StepJob,
+    estimate: Estimate,
+    lanes: Mapping[str, Lane],
+    names: Mapping[Key, str],
+    read: Mapping[Key, float],
+) -> Task:
     if _cpu_only(work):
         on_cpu = [name for name, lane in lanes.items() if lane.kind == "cpu"]
         seconds = {name: estimate.seconds["cpu"] for name in on_cpu or lanes}
@@ -93,8 +136,13 @@ def _task(work: StepJob, estimate: Estimate, lanes: Mapping[str, Lane], names: M
         here = {name: lane for name, lane in lanes.items() if lane.device in allowed}
         seconds = {name: estimate.seconds[lane.kind] for name, lane in here.items()}
     sources = tuple(dict.fromkeys(names[key] for key in work.sources if key in names))
-    parts = MOST_PARTS if work.step.node.bands else 1
-    return Task(work.step.name, sources, seconds, estimate.bytes, estimate.work, parts)
+    beside = estimate.work + sum(read[key] for key in set(work.sources) if key in read)
+    return Task(work.step.name, sources, seconds, estimate.bytes, beside, parts_of(work.step, estimate))
+
+
+def parts_of(step: Step, estimate: Estimate) -> int:
+    """Return the largest number of parts into which a step may be cut by band."""
+    return min(estimate.bands or MOST_PARTS, MOST_PARTS) if step.node.bands else 1
 
 
 def _cpu_only(work: StepJob) -> bool:
@@ -104,22 +152,30 @@ def _cpu_only(work: StepJob) -> bool:
 
 
 def _one_after_another(
-    works: Sequence[StepJob], expected: Mapping[Key, Estimate], lane: str, keep: Collection[Key]
+    works: Sequence[StepJob],
+    expected: Mapping[Key, Estimate],
+    lane: str,
+    keep: Collection[Key],
+    read: Mapping[Key, float],
 ) -> Schedule:
-    """Return the schedule of jobs one after another on one device; each result is freed after its last use."""
+    """Return the schedule of jobs one after another on one device; each value is freed after its last use."""
+    sizes = {**read, **{key: cost.bytes for key, cost in expected.items()}}
+    there = set[Key]()
     last = {key: work.key for work in works for key in work.sources}
     now, held, most, slots = 0.0, 0.0, 0.0, []
     for work in works:
         cost = expected[work.key]
-        held += cost.bytes
+        new = {*work.sources, work.key} - there
+        there |= new
+        held += sum(sizes[key] for key in new)
         most = max(most, held + cost.work)
         ended = {key for key in (*work.sources, work.key) if last.get(key, work.key) == work.key and key not in keep}
-        held -= sum(expected[key].bytes for key in ended if key in expected)
+        held -= sum(sizes[key] for key in ended)
         slots.append(Slot(work.step.name, lane, now, now + cost.seconds[device_kind(work.device)], 1))
         now = slots[-1].end
     return Schedule(tuple(slots), now, {lane: most}, 0.0)
 
 
-def past_costs(store: Store) -> Costs:
-    """Return the measured costs of all results that the journal of a result store lists."""
-    return Costs(store.journal.rows())
+def past_costs(store: Store, sizes: Mapping[str, Size]) -> Costs:
+    """Return the costs of steps with the given sizes, from the journal of a result store."""
+    return Costs(store.journal.rows(), sizes)

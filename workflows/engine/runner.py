@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
@@ -12,7 +11,11 @@ import torch
 
 from neusee.workflows.engine.device_names import check_devices
 from neusee.workflows.engine.execution import Execution
+from neusee.workflows.engine.local_executor import memory_limit
+from neusee.workflows.engine.memory_use import process_peak
+from neusee.workflows.engine.memory_watch import limited
 from neusee.workflows.engine.node_call import to_device
+from neusee.workflows.engine.placement_inputs import running_peak
 from neusee.workflows.engine.step_job import Executor
 from neusee.workflows.graph.recipe_graph import Recipe, needed, unknown_step
 from neusee.workflows.graph.step_record import Event, StepRecord
@@ -40,6 +43,7 @@ class Result:
     device: str = "cpu"
     schedule: Schedule | None = None  #: predicted times of the steps that ran
     proof: ErrorBounds = field(default_factory=ErrorBounds)  #: error bounds of the steps
+    predicted_peak: float | None = None  #: predicted peak bytes of this process; None if another process computed
 
     def value(self, step: str) -> Any:
         """Return the value of any step of the recipe; the value is read from the store or computed if necessary."""
@@ -89,7 +93,7 @@ def run(
 
     Args: outputs: if None, the outputs of the recipe. device: one or several devices, such as
     ``cuda:0,cuda:1,cpu``, the preferred device first. executor: computes the steps in place of this process.
-    memory: bytes of each device that the run may use; if None, nine tenths of its memory.
+    memory: bytes that this process, and each GPU, may use; if None, most of the memory that is free.
     Raises `RunError`, which names the step, and ValueError for a device that this machine does not have.
     """
     began = time.perf_counter()
@@ -102,7 +106,8 @@ def run(
     while True:
         work = Execution(recipe, store, device.split(","), watch, wanted, executor, memory)
         try:
-            return _attempt(work, wanted, began)
+            with limited(memory_limit(memory)):
+                return _attempt(work, wanted, began)
         except ToleranceNotProven as failed:
             scale = _SAFE / failed.over if recipe.tolerance_scale == 1.0 else 0.0  # a third attempt is exact
             stricter = replace(recipe.unsubstituted or recipe, tolerance_scale=scale, exact=scale == 0.0)
@@ -133,9 +138,10 @@ def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:
         work.make(targets, keep=False)
     values = {name: to_device(work.values[work.keys[name]], work.devices[0]) for name in wanted}
     done = work.account(order)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    peak = process_peak()
     seconds = time.perf_counter() - began
     if missing:  # otherwise all results were known before
         proved = proof(recipe, order, wanted, done.__getitem__, work.known_facts)
     device = ",".join(work.devices)
-    return Result(values, done, work.keys, seconds, peak, recipe, store, device, work.schedule, proved)
+    expected = running_peak(work.schedule, work.own.lanes) if work.executor is work.own else None
+    return Result(values, done, work.keys, seconds, peak, recipe, store, device, work.schedule, proved, expected)

@@ -16,7 +16,9 @@ import torch
 
 from neusee.nodes import Check, TensorStats
 from neusee.workflows.engine.band_results import call_by_band, plain_of
+from neusee.workflows.engine.cost_laws import measured_size
 from neusee.workflows.engine.memory_use import PeakMemory
+from neusee.workflows.engine.memory_watch import guarded
 from neusee.workflows.engine.node_call import call, examine
 from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.engine.write_behind import LARGE, WriteBehind
@@ -75,6 +77,7 @@ class Outcome:
     bytes: int = 0
     deviation: tuple[float, float] | None = None  #: error of a cheaper form: `Node.approximation_error`
     peak: int | None = None  #: peak bytes beside the memory in use before
+    size: list[float] | None = None  #: the size of the step: `cost_laws.Size`
     kept: bool = False  #: True if the store has the value
     waits: bool = False  #: True if the value is written during the next steps; its lease is released afterwards
     held: bool = False  #: True if another process computes this result
@@ -89,6 +92,7 @@ class Lane:
 
     device: str
     memory: float  #: bytes that a schedule may use
+    held: float = 0.0  #: bytes that the program itself holds beside them
 
     @property
     def kind(self) -> str:
@@ -160,7 +164,7 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     stamps = file_stamps(step.params)
     began, clock = time.time(), time.perf_counter()
     size = sum(t.nbytes for t in tensors_in(inputs))
-    with PeakMemory(work.device, size >= _WATCHED or not inputs) as peak, torch.no_grad():
+    with PeakMemory(work.device, size >= _WATCHED or not work.unlocked) as peak, torch.no_grad(), guarded():
         if step.node.bands and (work.parts > 1 or work.device.startswith("cpu")):
             value = call_by_band(step, inputs, evaluate, work.origin["code"], store.blobs, work.parts)
         else:
@@ -172,8 +176,9 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     if not same or work.origin["params"] != {name: plain(param) for name, param in step.params.items()}:
         raise RunError(step, [], OSError("an input file changed while it was read: run again"))
     found = sum(t.nbytes for t in tensors_in(bare))
+    sized = measured_size(step.node, inputs, step.params, bare)
     deviation = step.node.hooks.approximation_error(bare) if step.node.hooks.approximation_error else None
-    return Outcome(work, value, TensorStats.of(bare), checks, began, seconds, found, deviation, peak.bytes)
+    return Outcome(work, value, TensorStats.of(bare), checks, began, seconds, found, deviation, peak.bytes, sized)
 
 
 def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:
@@ -221,6 +226,7 @@ def _about(outcome: Outcome) -> dict[str, Any]:
         "seconds": outcome.seconds,
         "bytes": outcome.bytes,
         "peak": outcome.peak,
+        "size": outcome.size,
         "error": outcome.deviation,
         "device": work.device,
         "versions": versions(),

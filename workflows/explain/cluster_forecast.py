@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from neusee.workflows.engine.cost_model import Estimate
 from neusee.workflows.engine.node_call import fits
-from neusee.workflows.engine.placement_inputs import MOST_PARTS
+from neusee.workflows.engine.placement_inputs import parts_of
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.placement.heft_schedule import Schedule, Task, TooLarge, heft
 from neusee.workflows.placement.machine_file import Machines
@@ -56,7 +56,7 @@ def _task(step: Step, cost: Estimate, among: Mapping[str, Estimate], machines: M
     allowed = [d for d in machines.devices if fits(d.name.rpartition("/")[2], d.kind, hint)] or machines.devices
     seconds = {d.name: cost.seconds["cpu"] / machines.speed(d.name, step.node.path) for d in allowed}
     sources = tuple(dict.fromkeys(name for name in step.sources if name in among))
-    return Task(step.name, sources, seconds, cost.bytes, cost.work, MOST_PARTS if step.node.bands else 1)
+    return Task(step.name, sources, seconds, cost.bytes, cost.work, parts_of(step, cost))
 
 
 def _devices(schedule: Schedule, machines: Machines) -> list[str]:

@@ -29,6 +29,7 @@ class StepRecord:
     peak: int | None = None  #: peak memory in bytes beyond the memory in use before the step
     predicted: float | None = None  #: time in s predicted from earlier runs
     error: tuple[float, float] | None = None  #: of a cheaper step: rms and maximum, relative to the largest element
+    predicted_peak: float | None = None  #: predicted peak memory in bytes, as ``peak``
     kept: bool = True  #: whether the value is in the store
 
 

@@ -138,12 +138,23 @@ class TooLarge(ValueError):
     """Error for a task that fits on no device, with the bytes that the task needs and the bytes that a device has."""
 
     def __init__(self, task: str, device: str, needed: float, memory: float, parts: int = 1) -> None:
-        self.task, self.device, self.needed, self.memory = task, device, needed, memory
+        self.task, self.device, self.needed, self.memory, self.parts = task, device, needed, memory, parts
         cut = f" in {parts} parts" if parts > 1 else ""
         super().__init__(
             f"{task} does not fit: its inputs, result and results kept there need {_size(needed)} on {device}{cut}, "
             f"which has {_size(memory)}"
         )
+
+    def with_program(self, held: float) -> TooLarge:
+        """Return the error with the memory that the program itself holds on the device, as part of need and limit."""
+        more = TooLarge(self.task, self.device, self.needed, self.memory, self.parts)
+        cut = f" in {self.parts} parts" if self.parts > 1 else ""
+        more.args = (
+            f"{self.task} needs {_size(self.needed + held)}{cut}, of which the program itself holds {_size(held)}, and "
+            f"the limit is {_size(self.memory + held)}: give more memory, or choose a smaller picture, pupil or number "
+            "of bands",
+        )
+        return more
 
     @property
     def short(self) -> float:
@@ -152,5 +163,7 @@ class TooLarge(ValueError):
 
 
 def _size(count: float) -> str:
+    if count == math.inf:
+        return "more bytes than a machine can address"
     exact = f"{count:,.0f} B"
     return exact if count < 1e6 else f"{exact} ({count / 1e9:.3g} GB)"

@@ -37,7 +37,18 @@ from neusee.workflows.report.tolerance_spent import spent
 from neusee.workflows.store.byte_sizes import format_size
 
 _LIBRARIES = ("torch", "numpy", "kornia", "colour-science", "OpenEXR", "pydantic", "safetensors")
-_COPIED = ("device", "state", "why", "seconds", "predicted", "began", "lane", "peak", "kept")  #: from `StepRecord`
+_COPIED = (
+    "device",
+    "state",
+    "why",
+    "seconds",
+    "predicted",
+    "began",
+    "lane",
+    "peak",
+    "predicted_peak",
+    "kept",
+)  #: from `StepRecord`
 _TITLES = {figure.name: figure.title for figure in FIGURES}
 _UNITS = frozenset(("m", "nm", "rad", "e-", "DN", "photons", "W/m2", "dB"))
 _SAMPLING = "The PSF is sampled at the pixel centres; one pixel centre lies on the optical axis."
@@ -52,7 +63,7 @@ def document(
     unchecked = [{"name": e.name, "step": e.step} for e in compared(recipe)[1]]
     steps = [_step(d, result) for d in done]
     failed = [f"{s['step']}: {c['text']}" for s in steps for c in s["checks"] if not c["ok"]]
-    time = timing(steps, _planned(result))
+    time = timing(steps, _planned(result)) | {"peak": [result.predicted_peak, result.peak_memory]}
     return {
         "recipe": recipe.name,
         "title": recipe.title,

@@ -10,7 +10,20 @@ from neusee.workflows.store.byte_sizes import format_size
 StepRow = Mapping[str, Any]  #: a step in the document of a run
 
 #: of the file ``timing.csv``, which has a line for each step
-COLUMNS = ("step", "node", "device", "lane", "state", "began", "seconds", "predicted", "peak", "bytes", "key")
+COLUMNS = (
+    "step",
+    "node",
+    "device",
+    "lane",
+    "state",
+    "began",
+    "seconds",
+    "predicted",
+    "peak",
+    "predicted_peak",
+    "bytes",
+    "key",
+)
 
 
 def rows(steps: Iterable[StepRow]) -> list[list[Any]]:
@@ -67,6 +80,9 @@ def said_of(found: Mapping[str, Any]) -> list[str]:
     if found["planned"] is not None:
         planned, span = _seconds(found["planned"]), _seconds(found["span"])
         lines.append(f"Planned duration, with parallel branches: {planned}; actual: {span}.")
+    if found["ran"] and found.get("peak", [None])[0]:
+        predicted, actual = (format_size(size) for size in found["peak"])
+        lines.append(f"Predicted peak memory of the program while the steps ran: {predicted}; actual: {actual}.")
     if found["served"]:
         share = f"{100 * found['share']:.3g} % of all computing time"
         lines.append(f"The cache served {found['served']} steps and saved {_seconds(found['saved'])}, {share}.")

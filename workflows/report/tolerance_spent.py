@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from neusee.workflows.engine.cost_laws import sizes_of
 from neusee.workflows.engine.cost_model import Costs
 from neusee.workflows.engine.placement_inputs import past_costs
 from neusee.workflows.engine.resolve_keys import resolve
@@ -24,7 +25,11 @@ def spent(result: Result) -> dict[str, Any]:
     ``bounds`` has the error bound of each output, and of each input of a step without an error bound.
     ``measured`` has the error of each output relative to a run with ``--exact``, if the store has its results.
     """
-    costs = past_costs(result.store) if result.recipe.substitutions or _left_out(result) else Costs([])
+    costs = (
+        past_costs(result.store, sizes_of(result.recipe, needed(result.recipe, result.recipe.steps)))
+        if result.recipe.substitutions or _left_out(result)
+        else Costs([])
+    )
     return {
         "tolerance": result.recipe.tolerance,
         "norm": NORM,

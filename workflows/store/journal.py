@@ -21,7 +21,7 @@ from neusee.workflows.store.metadata_fields import FIELDS, is_text
 from neusee.workflows.store.shared_folder import Disk, append, read_file
 
 Row = dict[str, Any]
-_FIELDS = ("step", "recipe", "seconds", "bytes", "device", "peak", "date")
+_FIELDS = ("step", "recipe", "seconds", "bytes", "device", "peak", "size", "date")
 _CHECKED = [(name, FIELDS[name]) for name in (*_FIELDS, "kept")]
 _START, NO_VALUE = b'{"key":"', b'"kept":false'  #: bytes that no text in JSON contains
 _KEY = slice(len(_START), len(_START) + 32)
@@ -59,7 +59,7 @@ class Journal:
     def rows(self) -> list[Row]:
         """Return every line of the journal as a dict, which the caller must not change.
 
-        The fields of a line are key, step, recipe, node, seconds, bytes, device, peak, date and kept.
+        The fields of a line are key, step, recipe, node, seconds, bytes, device, peak, size, date and kept.
         """
         self._read()
         return self._rows

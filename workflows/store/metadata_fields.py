@@ -70,6 +70,10 @@ def _is_error(value: Any) -> bool:
     return isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(x, int | float) for x in value)
 
 
+def _is_step_size(value: Any) -> bool:
+    return isinstance(value, list | tuple) and len(value) == 4 and all(is_number(x) and x >= 0 for x in value)
+
+
 #: what each field must be, unless it is missing or null
 FIELDS: Mapping[str, Callable[[Any], bool]] = {
     "step": is_text,
@@ -79,6 +83,7 @@ FIELDS: Mapping[str, Callable[[Any], bool]] = {
     "seconds": is_seconds,
     "bytes": is_size,
     "peak": is_size,
+    "size": _is_step_size,
     "file_bytes": is_size,
     "kept": lambda value: isinstance(value, bool),
     "origin": _is_origin,

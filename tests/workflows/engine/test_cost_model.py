@@ -1,11 +1,15 @@
 """What a step is expected to cost."""
 
 import pytest
+import torch
 
-from neusee.nodes import node
-from neusee.workflows.engine.cost_model import GUESS, Costs
+from neusee.nodes import node, optics, shape_rules
+from neusee.workflows.engine.cost_laws import GUESS, Law, Size, shipped, size_of
+from neusee.workflows.engine.cost_model import Costs
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Step
+
+SMALL, LARGE = Size(1e8, 1e8, 0.0, 5e7), Size(4e8, 4e8, 0.0, 2e8)
 
 
 @node()
@@ -13,32 +17,63 @@ def blur(x=None):
     return x
 
 
-def step(name):
-    return Step(name, blur, {}, {}, Location("t.yaml", 1, 1), {})
+def step(name, what=blur):
+    return Step(name, what, {}, {}, Location("t.yaml", 1, 1), {})
 
 
-def row(name, seconds, size=100, device="cpu", peak=None, node=blur.path):
-    return {"step": name, "node": node, "seconds": seconds, "bytes": size, "device": device, "peak": peak}
+def row(name, seconds, size=100, device="cpu", peak=None, node=blur.path, of=None):
+    of = of and list(of[:4])
+    return {"step": name, "node": node, "seconds": seconds, "bytes": size, "device": device, "peak": peak, "size": of}
 
 
-def test_of_what_nobody_measured_there_is_a_guess_that_says_so():
-    found = Costs([]).of(step("a"), ["cpu", "cuda"])
+def test_of_what_nobody_measured_there_is_a_guess_at_the_upper_end_that_says_so():
+    found = Costs([], {"a": SMALL}).of(step("a"), ["cpu", "cuda"])
     assert not found.known
-    assert found.seconds["cpu"] == GUESS > found.seconds["cuda"]
+    assert found.peak == GUESS.peak(SMALL) > 4 * (SMALL.inputs + SMALL.result)
+    assert found.bytes == SMALL.result
+    assert found.seconds["cpu"] == GUESS.time(SMALL) > found.seconds["cuda"] > 0
 
 
-def test_the_same_step_counts_before_the_same_node():
-    costs = Costs([row("b", 9.0), row("a", 1.0), row("a", 3.0), row("a", 2.0)])
-    assert costs.of(step("a"), ["cpu"]).seconds["cpu"] == 2.0
-    assert costs.of(step("a"), ["cpu"]).known
-    other = costs.of(step("c"), ["cpu"])
-    assert not other.known
-    assert 1.0 <= other.seconds["cpu"] <= 9.0
+def test_nothing_is_known_of_a_step_without_a_shape_but_it_does_not_count_as_nothing():
+    found = Costs([]).of(step("a"), ["cpu"])
+    assert not found.known
+    assert found.peak > 1e7
+
+
+def test_the_costs_follow_the_size_and_not_the_name():
+    rows = [row("a", 1.0, peak=3e8, of=SMALL), row("a", 2.0, peak=5e8, of=SMALL), row("a", 1.5, peak=4e8, of=SMALL)]
+    same = Costs(rows, {"b": SMALL}).of(step("b"), ["cpu"])
+    assert same.known
+    assert same.seconds["cpu"] == 1.5
+    assert same.peak == 4e8
+    larger = Costs(rows, {"a": LARGE}).of(step("a"), ["cpu"])
+    assert larger.known
+    assert larger.bytes == LARGE.result
+    assert larger.peak == pytest.approx(4e8 * GUESS.peak(LARGE) / GUESS.peak(SMALL))
+    assert larger.seconds["cpu"] == pytest.approx(1.5 * GUESS.time(LARGE) / GUESS.time(SMALL))
+
+
+def test_a_shipped_law_is_scaled_by_the_runs_of_this_machine():
+    law = shipped()["optics.psf"]
+    psf = step("psf", optics.psf)
+    alone = Costs([], {"psf": LARGE}).of(psf, ["cpu"])
+    assert alone.known
+    assert alone.spread == law.spread
+    assert alone.seconds["cpu"] == pytest.approx(law.time(LARGE))
+    slow = row("psf", 3 * law.time(SMALL), peak=1.2 * law.peak(SMALL), node="optics.psf", of=SMALL)
+    here = Costs([slow], {"psf": LARGE}).of(psf, ["cpu"])
+    assert here.seconds["cpu"] == pytest.approx(3 * law.time(LARGE))
+    assert here.peak == pytest.approx(1.2 * law.peak(LARGE))
+
+
+def test_a_damaged_size_in_the_journal_is_passed_over():
+    rows = [{**row("a", 1.0, of=SMALL), "size": size} for size in ("lots", [1, 2], [1, 2, 3, None])]
+    assert not Costs(rows, {"a": SMALL}).of(step("a"), ["cpu"]).known
 
 
 def test_only_the_newest_count():
-    costs = Costs([*(row("a", 100.0) for _ in range(50)), *(row("a", 1.0) for _ in range(5))])
-    assert costs.of(step("a"), ["cpu"]).seconds["cpu"] == 1.0
+    rows = [*(row("a", 100.0, of=SMALL) for _ in range(50)), *(row("a", 1.0, of=SMALL) for _ in range(5))]
+    assert Costs(rows, {"a": SMALL}).of(step("a"), ["cpu"]).seconds["cpu"] == 1.0
 
 
 def test_a_step_of_the_same_name_with_another_node_does_not_count():
@@ -60,4 +95,14 @@ def test_another_kind_of_device_is_priced_by_the_steps_that_ran_on_both():
     assert Costs(both).of(step("a"), ["cpu", "cuda"]).seconds["cuda"] == pytest.approx(1.0)
     there = Costs([*both, row("a", 0.3, device="cuda:0")]).of(step("a"), ["cpu", "cuda"])
     assert there.seconds["cuda"] == 0.3
-    assert there.seconds["cpu"] == 4.0
+    assert there.seconds["cpu"] == pytest.approx(0.5 * (4.0 + 0.3 * 4.0), rel=0.6)
+
+
+def test_a_law_gives_at_least_the_bytes_of_the_result():
+    assert Law((0.0, 0.0, 0.5, 0.0), (0.0, 0.0)).peak(SMALL) == SMALL.result
+    assert Law((7.0, 1.0, 2.0, 3.0), (0.0, 0.0)).peak(Size(10.0, 100.0, 1000.0, 0.0)) == 7 + 10 + 200 + 3000
+
+
+def test_the_size_of_a_step_is_that_of_its_tensors():
+    found = size_of(blur, [torch.zeros(10, 10)], {}, shape_rules.double(10, 10))
+    assert found[:4] == (400.0, 800.0, 0.0, 300.0)

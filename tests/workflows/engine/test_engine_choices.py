@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from neusee.nodes import node
+from neusee.workflows.engine.local_executor import program_memory
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -181,10 +182,11 @@ def test_memory_that_cannot_do_is_refused_before_anything_runs(store):
     run(recipe("m", **steps), store)
     CALLS.clear()
     other = {**steps, "a": (slow, {}, {"seconds": 0.001})}
-    with pytest.raises(RunError, match="need "):
-        run(recipe("m", **other), Store(store.root), memory=BIG)
+    with pytest.raises(RunError, match="needs "):
+        run(recipe("m", **other), Store(store.root), memory=program_memory() + BIG)
     assert CALLS == []
-    assert run(recipe("m", **other), Store(store.root), memory=100 * BIG).values["m"] == 2
+    enough = program_memory() + 100 * BIG
+    assert run(recipe("m", **other), Store(store.root), memory=enough).values["m"] == 2
 
 
 def test_the_account_says_what_was_expected(store):

@@ -1,0 +1,35 @@
+"""Shapes of the results of the mask nodes."""
+
+from typing import Any
+
+from torch import Tensor
+
+from neusee.nodes.doe._analytic_masks import axicon, cubic, flat, half_rings, spiral_axicon, vortex, zernike
+from neusee.nodes.doe._fabrication_limits import fabricate
+from neusee.nodes.doe._minimum_feature import smooth
+from neusee.nodes.doe._refractive_index import material
+from neusee.nodes.doe._sampled_height_map import pixelwise
+from neusee.nodes.doe._unet_height_map import unet
+from neusee.nodes.shape_rules import blank, double, like_first
+from neusee.nodes.values import Bands, Stop
+
+fabricate.shape(like_first)
+smooth.shape(like_first)
+
+
+def _on_pupil(stop: Stop, **params: Any) -> Tensor:
+    return blank(int(stop.samples), int(stop.samples))
+
+
+for node in (flat, vortex, axicon, spiral_axicon, cubic, half_rings, zernike, pixelwise, unet):
+    node.shape(_on_pupil)
+
+
+@unet.work
+def _(result: Tensor, *inputs: Any, grid: int = 270, width: int = 32, **params: Any) -> tuple[float, float]:
+    return 4.0 * width * grid**2, float(width * grid) ** 2 + result.numel()
+
+
+@material.shape
+def _(bands: Bands, **params: Any) -> Tensor:
+    return double(len(bands.centres))

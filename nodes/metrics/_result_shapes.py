@@ -1,0 +1,55 @@
+"""Shapes of the results of the figures of merit."""
+
+from typing import Any
+
+from torch import Tensor
+
+from neusee.nodes.metrics._mask_limits import Limits, limits
+from neusee.nodes.metrics._peak_irradiance import Peak, peak_irradiance
+from neusee.nodes.metrics._picture_quality import Quality, quality
+from neusee.nodes.metrics._psf_contrast import Mtf, encircled, mtf
+from neusee.nodes.metrics._saturated_pixels import Saturated, saturated
+from neusee.nodes.metrics._spectral_error import spectral_error
+from neusee.nodes.metrics._suppression_ratios import bsr, light_outside, lsr, peak_bsr
+from neusee.nodes.shape_rules import double, scalars
+from neusee.nodes.values import Bands, LowRankCube, Psf, Pupil
+
+quality.shape(scalars(Quality))
+peak_irradiance.shape(scalars(Peak))
+saturated.shape(scalars(Saturated))
+
+
+def _each_band(psf: Psf, *others: Any, **params: Any) -> Tensor:
+    return double(len(psf.intensity))
+
+
+lsr.shape(_each_band)
+encircled.shape(_each_band)
+
+
+@mtf.shape
+def _(psf: Psf) -> Mtf:
+    return Mtf(*(_each_band(psf) for _ in Mtf._fields))
+
+
+@limits.shape
+def _(psf: Psf) -> Limits:
+    return Limits(*(_each_band(psf) for _ in Limits._fields))
+
+
+@bsr.shape
+def _(psf: Psf, radiance: Tensor | LowRankCube | None = None) -> Tensor:
+    return double(*radiance.shape[:-2]) if isinstance(radiance, Tensor) else double(len(psf.intensity))
+
+
+@peak_bsr.shape
+def _(image: Tensor, plain_image: Any) -> Tensor:
+    return double(*image.shape[:-2])
+
+
+light_outside.shape(_each_band)
+
+
+@spectral_error.shape
+def _(pupil: Pupil, bands: Bands, illuminant: Any = None, responses: Tensor | None = None, **params: Any) -> Tensor:
+    return double(1 if responses is None else len(responses))

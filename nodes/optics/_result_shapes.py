@@ -1,0 +1,96 @@
+"""Shapes of the results of the optical nodes, and the work of those that transform."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.optics._imaging._band_image import image
+from neusee.nodes.optics._imaging._channel_image import image_channels
+from neusee.nodes.optics._laser_direction import direction
+from neusee.nodes.optics._laser_spot import laser_irradiance
+from neusee.nodes.optics._psf import _nodes, psf
+from neusee.nodes.optics._pupil import pupil
+from neusee.nodes.optics._transform._sample_axis import Axis
+from neusee.nodes.optics._transform._scaled_transform import _expected_seconds
+from neusee.nodes.shape_rules import at_least_single, blank, double, known, transform_operations
+from neusee.nodes.values import Bands, Channels, LowRankCube, Psf, Pupil, Stop
+
+_SHORT, _FINE = 400e-9, 4e-6  #: m, wavelength and pupil pitch where no value is known
+
+
+@pupil.shape
+def _(height: Tensor, index: Tensor, bands: Bands, stop: Stop, *others: Any, **params: Any) -> Pupil:
+    factor = blank(*height.shape)
+    return Pupil(factor, factor, factor, factor, index, bands.centres, stop.pitch)
+
+
+@psf.shape
+def _(pupil: Pupil, *direction: Any, shape: tuple[int, int], precision: str = "single", **params: Any) -> Psf:
+    dtype = torch.float64 if precision == "double" else torch.float32
+    bands = len(pupil.wavelengths)
+    return Psf(blank(bands, *shape, dtype=dtype), double(bands))
+
+
+@psf.work
+def _(result: Psf, pupil: Pupil, *direction: Any, focal_length: float, pixel_pitch: float, **params: Any) -> Any:
+    wavelength = float(pupil.wavelengths.min()) if known(pupil.wavelengths) else _SHORT
+    pitch = float(pupil.pitch) if known(pupil.pitch) else _FINE
+    alpha = pitch * pixel_pitch / (wavelength * focal_length)
+    bands, *size = result.intensity.shape
+    axes = [Axis(n, k, alpha) for n, k in zip(pupil.height.shape, size, strict=True)]
+    integrated = params.get("sensor") == "integrated"
+    views = len(_nodes(max(pupil.height.shape) * alpha)[0]) ** 2 if integrated else 1
+    field = 8.0 * (pupil.height.numel() + axes[0].n_in * axes[1].n_out)
+    return field, bands * views * 1e9 * min(_expected_seconds(*axes).values())
+
+
+@image.shape
+def _(radiance: Tensor, psf: Psf, **params: Any) -> Tensor:
+    return blank(*radiance.shape, dtype=at_least_single(radiance, psf.intensity))
+
+
+@image.work
+def _(result: Tensor, radiance: Tensor, psf: Psf, *, border: str = "zero", **params: Any) -> Any:
+    size = _padded(radiance, psf, border)
+    around = result.nbytes if border == "zero" else result[..., 0, 0].numel() * 4.0 * size[0] * size[1]
+    return 8.0 * size[0] * size[1] + around, result[..., 0, 0].numel() * 3 * transform_operations(*size)
+
+
+@image_channels.shape
+def _(radiance: LowRankCube, psf: Psf, rows: Tensor, **params: Any) -> Channels:
+    dtype = at_least_single(radiance.planes, psf.intensity)
+    planes = blank(len(rows), *radiance.planes.shape[1:], dtype=dtype)
+    kept = blank(5, dtype=torch.int64)
+    return Channels(planes, double(*rows.shape), double(), kept, double())
+
+
+@image_channels.work
+def _(
+    result: Channels, radiance: LowRankCube, psf: Psf, rows: Tensor, *, border: str = "zero", **params: Any
+) -> tuple[float, float]:
+    (high, wide), (k, y, x), r = _padded(radiance.planes, psf, border), radiance.planes.shape, len(rows)
+    m, n = (min(a, 2 * b - 1) for a, b in zip(psf.intensity.shape[-2:], (y, x), strict=True))
+    tall = y if border == "zero" else y + m
+    rows_of_spectra = 4.0 * wide * (k * tall + r * k * m + r * y)
+    around = 4.0 * k * m * n + (0.0 if border == "zero" else 4.0 * k * tall * (x + n))
+    transforms = k + r * (k + 1)
+    operations = transforms * transform_operations(high, wide) + psf.intensity.numel()
+    return rows_of_spectra + 4.0 * r * y * wide + around, operations
+
+
+@laser_irradiance.shape
+def _(psf: Psf, bands: Bands, **params: Any) -> Tensor:
+    return blank(*psf.intensity.shape, dtype=at_least_single(psf.intensity))
+
+
+@direction.shape
+def _(**params: Any) -> Tensor:
+    return double(2)
+
+
+def _padded(scene: Tensor, psf: Psf, border: str) -> tuple[int, int]:
+    """Return the size of the transforms that convolve a scene with a PSF; a reflected border makes the scene wider."""
+    sides = zip(scene.shape[-2:], psf.intensity.shape[-2:], strict=True)
+    y, x = (n + (2 if border == "reflect" else 1) * min(k, 2 * n - 1) for n, k in sides)
+    return y, x

@@ -1,0 +1,52 @@
+"""Rules for the shape and type of a result, and tensors on the device ``meta``, which have no values.
+
+A rule has the arguments of its node. Files ``_result_shapes.py`` attach the rules to the nodes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def blank(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Return a tensor without values, on the device ``meta``."""
+    return torch.empty(shape, dtype=dtype, device="meta")
+
+
+def double(*shape: int) -> Tensor:
+    """Return a float64 tensor without values, on the device ``meta``."""
+    return blank(*shape, dtype=torch.float64)
+
+
+def at_least_single(*tensors: Tensor) -> torch.dtype:
+    """Return the type of a result that is computed in float32, or in the widest type of ``tensors`` if wider."""
+    found = torch.float32
+    for x in tensors:
+        found = torch.promote_types(found, x.dtype)
+    return found
+
+
+def like_first(first: Tensor, *inputs: Any, **params: Any) -> Tensor:
+    """Return the shape of the first input, in float32 or in the type of the first input if it is wider."""
+    return blank(*first.shape, dtype=at_least_single(first))
+
+
+def scalars(kind: type) -> Callable[..., Any]:
+    """Return the rule of a node whose result is a named tuple ``kind`` of float64 scalars."""
+    return lambda *inputs, **params: kind(*(double() for _ in getattr(kind, "_fields", ())))
+
+
+def transform_operations(*sizes: int) -> float:
+    """Return the number of operations of a fast Fourier transform of an array with the given sizes, N log2 N."""
+    count = math.prod(sizes)
+    return count * math.log2(count + 1)
+
+
+def known(x: Tensor) -> bool:
+    """Return True if a tensor has values."""
+    return x.device.type != "meta"

@@ -1,0 +1,108 @@
+"""Shapes of the results of the spectral nodes."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.shape_rules import at_least_single, blank, double, like_first
+from neusee.nodes.spectra._bands import bands, filters, line
+from neusee.nodes.spectra._camera_colour import grain, render
+from neusee.nodes.spectra._channel_responses import responses
+from neusee.nodes.spectra._dead_leaves import leaves
+from neusee.nodes.spectra._distinct_band_sums import rows
+from neusee.nodes.spectra._illuminant import illuminant, illuminate
+from neusee.nodes.spectra._linear_lift import lift_lmmse, lift_lmmse_mixture, lift_mallett, lift_mallett_mixture
+from neusee.nodes.spectra._low_rank_cube import compress
+from neusee.nodes.spectra._metamers import metamers
+from neusee.nodes.values import Bands, LowRankCube
+
+_FEW = 4096  #: bands that are computed, because the work of later nodes depends on the wavelengths
+
+
+@bands.shape
+def _(*, count: int, **params: Any) -> Bands:
+    few: Bands = bands(count=count, **params) if count <= _FEW else Bands(double(count), double(count), double(count))
+    return few
+
+
+@line.shape
+def _(*, count: int = 5, **params: Any) -> Bands:
+    few: Bands = line(count=count, **params) if count <= _FEW else Bands(double(count), double(count), double(count))
+    return few
+
+
+@filters.shape
+def _(**params: Any) -> Bands:
+    few: Bands = filters(**params)
+    return few
+
+
+@illuminant.shape
+def _(bands: Bands, **params: Any) -> Tensor:
+    return double(len(bands.centres))
+
+
+@responses.shape
+def _(bands: Bands, **params: Any) -> Tensor:
+    return double(3, len(bands.centres))
+
+
+@rows.shape
+def _(bands: Bands, responses: Tensor, *, well: bool = True) -> Tensor:
+    return double(len(responses) + well, responses.shape[1])
+
+
+@illuminate.shape
+def _(reflectance: Tensor | LowRankCube, illuminant: Tensor, **params: Any) -> Any:
+    return reflectance if isinstance(reflectance, LowRankCube) else like_first(reflectance)
+
+
+def _cube(rgb: Tensor, bands: Bands, **params: Any) -> Tensor:
+    return blank(len(bands.centres), *rgb.shape[-2:], dtype=at_least_single(rgb))
+
+
+def _mixture(rgb: Tensor, bands: Bands, **params: Any) -> LowRankCube:
+    """Return the shape of the low-rank form of a linear lift, which has as many planes as the picture has colours."""
+    return _low_rank(min(len(rgb), len(bands.centres)), len(bands.centres), rgb)
+
+
+def _low_rank(planes: int, bands: int, like: Tensor) -> LowRankCube:
+    dtype = torch.float64 if like.dtype == torch.float64 else torch.float32
+    whole, rest = blank(planes, *like.shape[-2:], dtype=dtype), double(planes + 1, bands)
+    return LowRankCube(whole, double(bands, planes), rest, rest, blank(*like.shape[-2:], dtype=dtype))
+
+
+lift_lmmse.shape(_cube)
+lift_mallett.shape(_cube)
+lift_lmmse_mixture.shape(_mixture)
+lift_mallett_mixture.shape(_mixture)
+
+
+@compress.shape
+def _(cube: Tensor, **params: Any) -> LowRankCube:
+    """Return the shape for as many planes as a cube can need, because only the values tell how many it needs."""
+    return _low_rank(len(cube), len(cube), cube)
+
+
+@compress.work
+def _(result: LowRankCube, cube: Tensor, **params: Any) -> tuple[float, float]:
+    return 8.0 * cube[0].numel(), float(cube.numel() * len(cube))
+
+
+@metamers.shape
+def _(reflectances: Tensor, bands: Bands, *, count: int = 48, **params: Any) -> Tensor:
+    return double(count, len(bands.centres))
+
+
+@leaves.shape
+def _(spectra: Tensor, bands: Bands, *, shape: tuple[int, int], **params: Any) -> Tensor:
+    return blank(len(bands.centres), *shape)
+
+
+@render.shape
+def _(reflectance: Tensor, bands: Bands) -> Tensor:
+    return blank(*reflectance.shape[:-3], 3, *reflectance.shape[-2:], dtype=at_least_single(reflectance))
+
+
+grain.shape(like_first)

@@ -1,0 +1,95 @@
+"""The limit of the memory of a process while steps run."""
+
+import threading
+
+import pytest
+import torch
+
+from neusee.nodes import node
+from neusee.workflows.engine.local_executor import program_memory
+from neusee.workflows.engine.memory_use import PeakMemory, free_memory, process_memory, process_peak
+from neusee.workflows.engine.memory_watch import MemoryLimit, guarded, limited
+from neusee.workflows.engine.runner import run
+from neusee.workflows.graph.diagnostics import Location
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.store.result_store import Store
+
+MB = 10**6
+
+
+@node()
+def start() -> torch.Tensor:
+    return torch.ones(8)
+
+
+@start.shape
+def _():
+    return torch.empty(8, device="meta")
+
+
+@node()
+def hoard(x: torch.Tensor) -> torch.Tensor:
+    """Take memory in small pieces until told to stop; far more than the rule of its shape makes one expect."""
+    held = []
+    for _ in range(10_000):
+        held.append(torch.ones(250_000))
+        threading.Event().wait(1e-3)
+        if len(held) > 3000:
+            raise AssertionError("nobody stopped it")
+    return x
+
+
+@hoard.shape
+def _(x):
+    return torch.empty(8, device="meta")
+
+
+def recipe():
+    at = Location("t.yaml", 1, 1)
+    steps = {"a": Step("a", start, {}, {}, at, {}), "b": Step("b", hoard, {}, {"x": "a"}, at, {})}
+    return Recipe("t", "", 1, 0.0, ("b",), steps)
+
+
+def test_a_step_that_takes_more_than_the_limit_is_stopped_by_name_and_the_finished_work_stays(tmp_path):
+    store = Store(tmp_path)
+    limit = program_memory() + 300 * MB
+    with pytest.raises(RunError, match=r"b \(.*hoard\): MemoryLimit: the process holds .* the limit is ") as caught:
+        run(recipe(), store, memory=limit)
+    assert caught.value.step == "b"
+    assert process_peak() < limit + 400 * MB
+    done = run(recipe(), Store(tmp_path), ("a",)).done
+    assert done["a"].state == "cached"
+
+
+def test_a_limit_below_the_program_itself_is_refused_before_anything_runs(tmp_path):
+    with pytest.raises(RunError, match=r"TooLarge: .* of which the program itself holds"):
+        run(recipe(), Store(tmp_path), memory=MB)
+    assert list(Store(tmp_path).journal.rows()) == []
+
+
+def test_without_a_limit_nothing_is_watched():
+    with guarded():
+        assert not [t for t in threading.enumerate() if t.name == "neusee memory" and not t.daemon]
+
+
+def test_an_error_that_comes_too_late_for_the_step_is_raised_at_its_end():
+    with limited(1.0), pytest.raises(MemoryLimit), guarded():
+        threading.Event().wait(0.5)
+    with limited(1e15), guarded():
+        threading.Event().wait(0.05)
+
+
+def test_the_peak_of_the_process_is_not_forgotten_when_a_step_is_measured():
+    block = torch.ones((process_peak() - process_memory() + 200 * MB) // 4)
+    before = process_peak()
+    assert before >= process_memory() - MB
+    del block
+    with PeakMemory("cpu"):
+        pass
+    assert process_peak() >= before - MB
+    assert process_memory() < before - 150 * MB
+
+
+def test_free_memory_is_what_the_machine_can_give():
+    assert 0 < free_memory() < 1 << 50

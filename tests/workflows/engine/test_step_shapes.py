@@ -1,0 +1,115 @@
+"""Shapes before a run, and what a run then gives."""
+
+import pytest
+import torch
+
+from neusee.nodes import node
+from neusee.workflows.engine.cost_laws import measured_size, shipped, sizes_of
+from neusee.workflows.engine.runner import run
+from neusee.workflows.engine.step_shapes import bytes_of, form_of, forms_of
+from neusee.workflows.graph.recipe_graph import needed
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.report.contents import steps_of, wanted
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
+#: changes of a recipe to two small sizes, none of them square
+SIZES = {
+    "small": ["scene.shape=[72,80]", "sensor.shape=[56,48]", "optics.samples=120", "optics.window=[64,72]"],
+    "larger": ["scene.shape=[120,96]", "sensor.shape=[88,64]", "optics.samples=180", "optics.window=[97,96]"],
+}
+PITCH = {"small": "optics.pitch=60 um", "larger": "optics.pitch=40 um"}
+#: every recipe of the camera whose sizes may be changed freely: the others read maps and networks of one size
+CAMERA = ("axicon", "dirty_windshield", "five_half_rings", "half_ring", "hdr_night", "laser_free", "paper_table1")
+LEARNT = ("train_small", "train")
+
+
+def told(value):
+    """Shape and type of each tensor of a value or of a form."""
+    if isinstance(value, torch.Tensor):
+        return tuple(value.shape), value.dtype
+    if hasattr(value, "_asdict"):
+        return type(value).__name__, {name: told(item) for name, item in value._asdict().items()}
+    return None if value is None else [told(item) for item in value]
+
+
+def compare(recipe, outputs, store):
+    """Every step of a run has the shape, the type, the bytes and the size that were predicted."""
+    recipe = with_substitutions(recipe, outputs)
+    order = needed(recipe, outputs)
+    forms, sizes = forms_of(recipe, order), sizes_of(recipe, order)
+    result = run(recipe, store, outputs)
+    assert result.recipe.tolerance_scale == 1.0, "the steps that were predicted are those that ran"
+    for name in result.done:
+        value, step = result.value(name), recipe.steps[name]
+        assert told(forms[name]) == told(value), f"{name} ({step.node.path})"
+        assert bytes_of(forms[name]) == bytes_of(value) == sizes[name].result
+        assert sizes[name].known
+        wires = (step.wires.get(i) for i in step.node.inputs)
+        inputs = [w and (result.value(w) if isinstance(w, str) else [result.value(n) for n in w]) for w in wires]
+        assert measured_size(step.node, inputs, step.params, value) == list(sizes[name][:4]), name
+
+
+def test_the_shapes_of_the_first_recipe_are_those_of_its_run(tmp_path):
+    recipe = load("first_light", [*SIZES["small"], PITCH["small"]])
+    compare(recipe, ("raw[mask]", "lsr[mask]", "bsr[mask]", "truth", "peak[mask]"), Store(tmp_path))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("name", ["first_light", *CAMERA])
+def test_the_shapes_of_a_recipe_are_those_of_its_run(name, size, tmp_path):
+    recipe = load(name, [*SIZES[size], PITCH[size], "tolerance=0" if name == "hdr_night" else "seed=7"])
+    compare(recipe, wanted(recipe), Store(tmp_path))
+
+
+@pytest.mark.slow
+def test_the_shapes_of_every_step_in_full_are_those_of_its_run(tmp_path):
+    recipe = load("first_light", [*SIZES["small"], PITCH["small"], "tolerance=0"])
+    compare(recipe, (*wanted(recipe), "radiance", "image[mask]"), Store(tmp_path))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", ["[64, 64]", "[96, 80]"])
+def test_the_shapes_of_a_learnt_mask_are_those_of_its_run(size, tmp_path):
+    recipe = load("train_small", [f"scene.shape={size}", "sensor.shape=[48,48]"])
+    compare(recipe, ("height", "psf[mask]", "truth"), Store(tmp_path))
+
+
+@pytest.mark.parametrize("name", ["first_light", "demonstration", "six_lasers", *CAMERA, *LEARNT])
+def test_every_step_of_a_shipped_recipe_has_a_shape_and_a_measured_law(name):
+    recipe = load(name, [])
+    recipe = with_substitutions(recipe, wanted(recipe))
+    sizes = sizes_of(recipe, steps_of(recipe))
+    assert [step for step, size in sizes.items() if not size.known] == []
+    assert {recipe.steps[step].node.path for step in sizes} - shipped().keys() == set()
+
+
+def test_more_bands_than_memory_can_hold_have_a_size_at_once():
+    recipe = load("first_light", ["optics.bands=100000000"])
+    sizes = sizes_of(recipe, ["bands", "stop", "flat", "index", "pupil[plain]", "psf[plain]"])
+    assert sizes["psf[plain]"].result == 1e8 * (512 * 512 * 4 + 8)
+    assert sizes["psf[plain]"].bands == 10**8
+
+
+def test_a_result_beyond_every_address_is_infinite_and_no_error():
+    recipe = load("first_light", ["scene.shape=[10000000000,10000000000]"])
+    assert sizes_of(recipe, ["scene"])["scene"].result == float("inf")
+
+
+@node()
+def own(x: torch.Tensor, *, factor: float = 2.0) -> torch.Tensor:
+    raise AssertionError("no node runs before the run")
+
+
+def test_a_node_without_a_rule_has_no_shape_and_does_not_run():
+    assert form_of(own, [torch.empty(3, device="meta")], {}) is None
+
+
+def test_a_rule_that_fails_leaves_the_error_to_the_step():
+    @node()
+    def odd(x: torch.Tensor) -> torch.Tensor:
+        return x
+
+    odd.shape(lambda x: x.shape[7])
+    assert form_of(odd, [torch.empty(3, device="meta")], {}) is None

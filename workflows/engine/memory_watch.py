@@ -1,0 +1,94 @@
+"""Watch over the memory of this process while steps run: a step that takes the process above its limit is stopped.
+
+A thread reads the resident memory some fifty times a second and raises `MemoryLimit` in the thread of the step, which
+stops when its current call of a library returns. A single call that allocates too much is covered by the prediction
+before the run alone.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from neusee.workflows.engine.memory_use import process_memory
+from neusee.workflows.store.byte_sizes import format_size
+
+_PAUSE = 0.02  #: s between two looks
+_raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc
+
+
+class MemoryLimit(Exception):
+    """Error of a step during which the memory of the process exceeded the limit of the run."""
+
+    def __str__(self) -> str:
+        limits = f", the limit is {format_size(int(_last[1]))}" if _last[1] else ""
+        return (
+            f"the process holds {format_size(int(_last[0]))}{limits}: give more memory, or choose a smaller "
+            "picture, pupil or number of bands; the steps that are finished stay in the cache"
+        )
+
+
+_last = [0.0, 0.0]  # bytes of the process and the limit when a step was last stopped
+_limits: list[float] = []
+_inside: dict[int, bool] = {}  # threads that compute a step; True if the step was told to stop
+_guard = threading.RLock()
+_wake = threading.Event()
+_thread: list[threading.Thread] = []
+
+
+@contextmanager
+def limited(limit: float) -> Iterator[None]:
+    """Limit the memory of this process to ``limit`` bytes while the ``with`` block runs steps."""
+    with _guard:
+        _limits.append(limit)
+    try:
+        yield
+    finally:
+        with _guard:
+            _limits.remove(limit)
+
+
+@contextmanager
+def guarded() -> Iterator[None]:
+    """Raise `MemoryLimit` in the ``with`` block when the process exceeds its limit; do nothing without a limit."""
+    if not _limits:
+        yield
+        return
+    here = threading.get_ident()
+    with _guard:
+        _inside[here] = False
+        if not _thread:
+            _thread.append(threading.Thread(target=_look, name="neusee memory", daemon=True))
+            _thread[0].start()
+        _wake.set()
+    try:
+        yield
+    finally:
+        with _guard:
+            told = _inside.pop(here)
+            if told:
+                _raise_in(ctypes.c_ulong(here), None)  # not yet delivered: the code below raises it
+    if told:
+        raise MemoryLimit
+
+
+def _look() -> None:
+    while True:
+        _wake.wait()
+        with _guard:
+            if not _inside:
+                _wake.clear()
+            now, limit = process_memory(), min(_limits, default=float("inf"))
+            if now > limit:
+                _stop(now, limit)
+        threading.Event().wait(_PAUSE)
+
+
+def _stop(now: float, limit: float) -> None:
+    for thread, told in _inside.items():
+        if not told:
+            _last[:] = [now, limit]
+            _inside[thread] = True
+            _raise_in(ctypes.c_ulong(thread), ctypes.py_object(MemoryLimit))

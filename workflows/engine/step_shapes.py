@@ -1,0 +1,82 @@
+"""Shapes and types of the results of a recipe, found before anything runs.
+
+A form is a tensor on the device ``meta``, which has a shape and no values, or a named tuple of such tensors. The rule
+of a node (``@node.shape``) computes the form of its result from the forms of its inputs. No node runs for this, apart
+from nodes that a check of the recipe computes anyway.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from torch import Tensor
+
+from neusee.nodes import Node
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+
+Form = Any  #: a tensor on the device ``meta``, a named tuple of tensors, or None where the shape is not known
+
+
+def forms_of(recipe: Recipe, order: Iterable[str]) -> dict[str, Form]:
+    """Return the form of the result of each step in ``order``, which lists each step after its inputs."""
+    found: dict[str, Form] = {}
+    for name in order:
+        step = recipe.steps[name]
+        found[name] = form_of(step.node, inputs_of(step, found), step.params)
+    return found
+
+
+def inputs_of(step: Step, forms: Mapping[str, Form]) -> list[Form]:
+    """Return the forms of the inputs of a step, in the order of the node; a list input is a list of forms."""
+    wires = (step.wires.get(name) for name in step.node.inputs)
+    return [w and (forms.get(w) if isinstance(w, str) else [forms.get(n) for n in w]) for w in wires]
+
+
+def form_of(node: Node, inputs: Sequence[Form], params: Mapping[str, Any]) -> Form:
+    """Return the form of the result of a node, or None if the node has no rule or its inputs are not known.
+
+    Raises: OverflowError for a result with more bytes than any machine can address.
+    """
+    if not complete(node, inputs):
+        return None
+    try:
+        if node.hooks.shape is not None:
+            return node.hooks.shape(*inputs, **params)
+        if node.before_run:
+            return node(**params)
+    except RuntimeError as error:
+        if "overflow" in str(error):
+            raise OverflowError(str(error)) from error
+    except Exception:  # a wrong recipe fails where the step runs, with the names of its inputs
+        pass
+    return None
+
+
+def complete(node: Node, inputs: Sequence[Form]) -> bool:
+    """Return True if the shape of every input that a node needs is known, and of every item of a list."""
+    named = zip(inputs, node.inputs, strict=False)
+    lists = (x for x in inputs if type(x) is list)
+    return all(x is not None or name in node.optional for x, name in named) and not any(
+        item is None for x in lists for item in x
+    )
+
+
+def without_values(value: Any) -> Form:
+    """Return the form of a value: tensors of many numbers become tensors on the device ``meta``."""
+    if isinstance(value, Tensor):
+        return value if value.numel() <= _FEW else value.detach().to("meta")
+    if hasattr(value, "_make"):
+        return value._make(map(without_values, value))
+    return [without_values(item) for item in value] if isinstance(value, list) else value
+
+
+_FEW = 4096  #: numbers of a tensor up to which the values may tell the work of a later node
+
+
+def bytes_of(form: Form) -> float:
+    """Return the bytes of a result from its form, or of a list of results."""
+    if isinstance(form, Tensor):
+        return float(math.prod(form.shape) * form.element_size())
+    return sum((bytes_of(item) for item in form if item is not None), 0.0) if isinstance(form, tuple | list) else 0.0

@@ -1,0 +1,43 @@
+"""Memory of the report of a run: the results that its pictures and data files show, and the copies that are written."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from neusee.workflows.engine.cost_model import Costs
+from neusee.workflows.engine.local_executor import program_memory
+from neusee.workflows.engine.placement_inputs import prepare
+from neusee.workflows.engine.step_job import Lane, StepJob
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.report.contents import FIGURES, FILES
+
+DRAWING = 90 << 20  #: bytes of the libraries that draw pictures and write files, as measured
+COPIES = 2.0  #: copies of the largest result while its file is written, as measured
+_NEED = re.compile(r"\??(?P<step>[\w.]+(\[[^\]]*\])?)$")  # not a parameter and not a function of a step
+
+
+def shown_steps(recipe: Recipe) -> list[str]:
+    """Return the steps whose results the pictures and data files of a run show, as far as the recipe has them."""
+    needs = [need for figure in FIGURES for need in figure.needs.values()]
+    needs += [need for _, each in FILES.values() for need in each.values()]
+    found: dict[str, None] = dict.fromkeys(name for name in recipe.outputs if name in recipe.steps)
+    for need in needs:
+        if match := _NEED.match(need):
+            pattern = re.escape(match["step"]).replace(r"\*", "[^,]*")
+            found.update(dict.fromkeys(name for name in recipe.steps if re.fullmatch(pattern, name)))
+    return list(found)
+
+
+def report_peak(works: list[StepJob], kept: Mapping[str, str], costs: Costs, lanes: Mapping[str, Lane]) -> float:
+    """Return the predicted peak memory of this process in bytes while the report is written.
+
+    Args: works: the steps that only the report needs. kept: the keys of the results that are shown, by step.
+    """
+    computed = {work.key for work in works}
+    schedule = prepare(works, costs, {}, lanes, list(kept.values())).schedule if works else None
+    sizes = {name: costs.size_of(name) for name in kept}
+    read = sum(size for name, size in sizes.items() if kept[name] not in computed)
+    made = max(schedule.peak.values(), default=0.0) if schedule else 0.0
+    end = sum(sizes.values()) + COPIES * max(sizes.values(), default=0.0)
+    return program_memory() + DRAWING + max(read + made, end)
