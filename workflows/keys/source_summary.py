@@ -113,7 +113,7 @@ class _Run(ast.NodeTransformer):
     def visit_If(self, item: ast.If) -> list[ast.stmt] | ast.AST:
         test = ast.unparse(item.test)
         if test in ("TYPE_CHECKING", "typing.TYPE_CHECKING", "__name__ == '__main__'"):
-            return [self.visit(part) for part in item.orelse] or ast.Pass()
+            return [self.visit(part) for part in item.orelse] or ast.copy_location(ast.Pass(), item)
         return self.generic_visit(item)
 
 

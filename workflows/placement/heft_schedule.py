@@ -137,7 +137,7 @@ def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
         for j in graph.sources[i]:
             left[j] -= 1
         held -= sum(graph.own[j] for j in (*graph.sources[i], i) if not left[j] and j not in graph.kept)
-    if needed > device.memory:
+    if graph.tasks and needed > device.memory:
         task = graph.tasks[largest]
         raise TooLarge(task.name, device.name, needed, device.memory, task.parts)
     schedule = board.schedule()
