@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 UNREAD = "unread"  #: code of a value to which no step refers
+_KNOWN = "there are: "  #: text before a list of known names
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -43,7 +44,17 @@ class RecipeError(ValueError):
 def _table(diagnostics: tuple[Diagnostic, ...]) -> str:
     left = max((len(str(d.mark)) for d in diagnostics), default=0)
     middle = min(max((len(d.path) for d in diagnostics), default=0), 40)
-    return "\n".join(f"{d.mark!s:<{left}}   {d.path:<{middle}}   {d.message}" for d in diagnostics)
+    shown = zip(diagnostics, _lists_once(d.message for d in diagnostics), strict=True)
+    return "\n".join(f"{d.mark!s:<{left}}   {d.path:<{middle}}   {message}" for d, message in shown)
+
+
+def _lists_once(messages: Iterable[str]) -> Iterator[str]:
+    """Yield messages, with a list of known names in the first message alone if many messages end with this list."""
+    known = set[str]()
+    for message in messages:
+        before, found, names = message.partition(_KNOWN)
+        yield f"{before}see the names above" if found and "," in names and names in known else message
+        known.add(names)
 
 
 def nearest(name: str, among: Iterable[str]) -> str:
@@ -52,4 +63,4 @@ def nearest(name: str, among: Iterable[str]) -> str:
     close = difflib.get_close_matches(str(name), names, 1, 0.6)
     if close:
         return f"did you mean {close[0]}?"
-    return f"there are: {', '.join(names[:12])}{', …' if len(names) > 12 else ''}" if names else "there are none"
+    return f"{_KNOWN}{', '.join(names[:12])}{', …' if len(names) > 12 else ''}" if names else "there are none"
