@@ -64,8 +64,8 @@ def require_writable(out: Path) -> None:
     """End the command, before anything runs, if the folder ``out`` of the results cannot be made or written."""
     from tempfile import TemporaryFile
 
-    above = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.exists())
     try:
+        above = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.exists())
         if not above.is_dir():
             raise NotADirectoryError(f"{above} is a file")
         TemporaryFile(dir=above).close()
