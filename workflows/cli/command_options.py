@@ -48,6 +48,7 @@ Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the fo
 
 
 _COUNT = re.compile(r"(?P<what>(?:stage \d, )?\D{0,20})(?P<done>\d+)(?: draws)?(?: of |/)(?:about )?(?P<all>\d+)\b")
+_COUNT_AT_END = re.compile(r"(?P<what>)\((?P<done>\d+) of (?P<all>\d+)\)$")
 
 
 class ProgressLines:
@@ -65,7 +66,7 @@ class ProgressLines:
     def _left(self, line: str) -> str:
         now, before = self._clock(), self._before
         self._before = now
-        if not (count := _COUNT.match(line)):
+        if not (count := _COUNT_AT_END.search(line) or _COUNT.match(line)):
             return ""
         what, done, whole = count["what"], int(count["done"]), int(count["all"])
         if what not in self._began or done <= self._last[what]:  # a stopped study may begin with any count

@@ -52,14 +52,7 @@ def evaluate(
     """
     name, changes, _ = split(words)
     check_device(device)
-    options = {
-        "pipelines": pipelines,
-        "data": data,
-        "scenes": scenes,
-        "strengths": strengths,
-        "small": small,
-        "reference": reference,
-    }
+    options = {"data": data, "scenes": scenes, "strengths": strengths, "small": small, "reference": reference}
     folder = _evaluate(
         name,
         changes=changes,
@@ -72,7 +65,7 @@ def evaluate(
         device=device,
         out=out,
         progress=progress_lines(quiet or as_json),
-        command=["neusee", "evaluate", name, *changes, *option_words(options)],
+        command=["neusee", "evaluate", name, *changes, *option_words({"pipelines": pipelines, **options})],
     )
     say_folder(folder, as_json)
 

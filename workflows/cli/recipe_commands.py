@@ -27,6 +27,7 @@ from neusee.workflows.cli.interruption import kept_in, print_warning, resumable,
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
+    from neusee.workflows.simulation.simulate_recipe import Simulation
     from neusee.workflows.store.result_store import Store
 
 Where = Annotated[
@@ -69,17 +70,23 @@ def run(
         table,
     ):
         done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit)
-    if as_json:
-        say_json({"report": str(done.page), **done.document})
-    elif quiet:
-        say([str(done.page)])
+    if silent:
+        _say_briefly(done, as_json)
     else:
         hints = console.next_commands(recipe, command[2 : -1 if exact else None], _loads)
         say(console.closing(done.document, str(done.page), hints))
-    for line in done.document["warnings"] if silent else ():
-        print_warning(line)
     if done.document["missed"]:
         raise typer.Exit(MISSED)
+
+
+def _say_briefly(done: Simulation, as_json: bool) -> None:
+    """Print the path of the page of a run, or its document as JSON, and the warnings of the run on stderr."""
+    if as_json:
+        say_json({"report": str(done.page), **done.document})
+    else:
+        say([str(done.page)])
+    for line in done.document["warnings"]:
+        print_warning(line)
 
 
 def _predicted(

@@ -233,7 +233,7 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str
     lines += [doc["spectral"]["said"]] if doc.get("spectral") else []
     rows = [[row["name"], *row["cells"]] for row in doc["table"]["rows"]]
     lines += ["", *indented([["", *doc["table"]["columns"]], *rows])] if rows else []
-    lines += [f"  {line}" for line in doc["table"]["legend"]]
+    lines += [f"  {line}" for line in (*doc["table"]["legend"], *doc["table"].get("balance", ()))]
     lines += ["", f"{doc['verdict']}  ({doc['counts']}, {doc['seconds']:.2f} s)"]
     lines += [
         f"  missed: {e['name']} = {e['found']:.5g}, expected {e['wanted']:.5g} ± {100 * e['rtol']:.2g} %"

@@ -58,15 +58,15 @@ def writable_folder(out: str | os.PathLike[str]) -> Path:
     A folder that does not exist yet is not made: the nearest existing folder above it must be writable.
     """
     root = Path(out)
-    existing = next(path for path in (root, *root.absolute().parents) if path.exists() or path.is_symlink())
-    if not existing.is_dir():
-        raise ValueError(f"{existing} is not a folder, so that no results can be written to {root}: {_OTHER_FOLDER}")
     try:
-        os.rmdir(tempfile.mkdtemp(prefix=".neusee.", dir=existing))
+        existing = next(path for path in (root, *root.absolute().parents) if path.exists() or path.is_symlink())
+        if existing.is_dir():
+            os.rmdir(tempfile.mkdtemp(prefix=".neusee.", dir=existing))
+            return root
+        text = f"{existing} is not a folder, so that no results can be written to {root}"
     except OSError as error:
-        text = f"the folder {existing} cannot be written ({error.strerror}), so that {root} cannot hold results"
-        raise ValueError(f"{text}: {_OTHER_FOLDER}") from None
-    return root
+        text = f"the folder {error.filename} cannot be written ({error.strerror}), so that {root} cannot hold results"
+    raise ValueError(f"{text}: {_OTHER_FOLDER}")
 
 
 @contextmanager

@@ -59,9 +59,8 @@ def document(
 ) -> dict[str, Any]:
     """Return the report of a run, apart from its pictures, as a document of JSON values."""
     recipe, done = result.recipe, list(result.done.values())
-    found, warned = expected(recipe, result.value), list(dict.fromkeys(warnings))
-    unchecked = [{"name": e.name, "step": e.step} for e in compared(recipe)[1]]
-    steps = [_step(d, result) for d in done]
+    found, unchecked = expected(recipe, result.value), _unchecked(recipe)
+    steps, warned = [_step(d, result) for d in done], list(dict.fromkeys(warnings))
     failed = [f"{s['step']}: {c['text']}" for s in steps for c in s["checks"] if not c["ok"]]
     time = timing(steps, _planned(result)) | {"peak": [result.predicted_peak, result.peak_memory]}
     return {
@@ -197,6 +196,10 @@ def _sampling(recipe: Recipe) -> list[str]:
     """Return a note on the sampling of the PSF, because every LSR depends on the sampling."""
     kinds = {step.params.get("sensor") for step in recipe.steps.values() if step.node.path == "optics.psf"}
     return [_SAMPLING] if "point" in kinds else ["The PSF is integrated over each pixel."] if kinds else []
+
+
+def _unchecked(recipe: Recipe) -> list[dict[str, str]]:
+    return [{"name": number.name, "step": number.step} for number in compared(recipe)[1]]
 
 
 def unchecked_lines(numbers: Sequence[Mapping[str, str]]) -> list[str]:

@@ -47,9 +47,9 @@ COMMANDS = {
     "train": ["train", "train_lift", *LIFT],
     "calibrate": ["calibrate", "calibrate", "flats.shape=[32, 32]", "--draws", "100", "--walkers", "16"],
 }  # fmt: skip
-SLOW = ("evaluate", "train", "calibrate")
+FAST = {"sweep": ("a full disk", "a file in its place", "errors of the device"), "study": ("the folder /proc",)}
 CASES = [
-    pytest.param(command, fault, marks=pytest.mark.slow if command in SLOW else ())
+    pytest.param(command, fault, marks=() if command == "run" or fault in FAST.get(command, ()) else pytest.mark.slow)
     for command in COMMANDS
     for fault in cache_faults.FAULTS
 ]
@@ -121,6 +121,17 @@ def test_a_read_only_cache_is_read_and_told(call, tmp_path, monkeypatch):
     assert states["raw"] == "run"
     assert err.startswith("warning: the cache")
     assert len(json.loads(out)["warnings"]) == 1
+
+
+@pytest.mark.parametrize("mode", [0o555, 0o000])
+def test_results_that_may_not_be_written_are_refused_before_anything_runs(mode, call, tmp_path, monkeypatch):
+    monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "closed").mkdir(mode=mode)
+    with cache_faults.without_privileges():
+        code, _, err = call(*COMMANDS["run"], "--out", "closed/deep/runs")
+    assert code == 2
+    assert err.startswith("--out closed/deep/runs: results cannot be written there ([Errno 13] Permission denied")
+    assert not (tmp_path / "cache").exists()
 
 
 def test_the_helper_does_break_what_it_says(tmp_path):

@@ -294,6 +294,11 @@ def test_a_study_that_goes_on_takes_the_rate_of_now(capsys):
     assert found == ["[40/50] a", "[41/50] b; about 1 min 30 s left", "[43/50] c; about 47 s left"]
 
 
+def test_a_count_at_the_end_of_a_line_counts(capsys):
+    found = lines_of(capsys, (5, "dark[1/2] left out: 0.1 (1 of 3)"), (5, "psf: 0 (2 of 3)"))
+    assert found == ["dark[1/2] left out: 0.1 (1 of 3); about 10 s left", "psf: 0 (2 of 3); about 5 s left"]
+
+
 def test_a_count_that_begins_again_takes_its_own_rate(capsys):
     found = lines_of(capsys, (5, "1/2 a"), (5, "2/2 b"), (60, "1/2 c"), (1, "x 64 of 200"), (1, "no count"))
     assert found == [

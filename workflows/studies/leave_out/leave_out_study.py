@@ -50,8 +50,8 @@ def study(
         progress(f"{output.output}: {error}{failure[output.holds]}")
     for row in comparison.rows():
         rows.append(row)
-        done = f"{len(rows)} of {len(comparison.found)}"
-        progress(f"{done}: {row.name} {row.kind}: {row.rms:.2g}, stated at most {row.bound:.2g}{failure[row.holds]}")
+        error = f"{row.rms:.2g}, stated at most {row.bound:.2g}{failure[row.holds]}"
+        progress(f"{row.name} {row.kind}: {error} ({len(rows)} of {len(comparison.found)})")
     result = LeaveOutResult(output_errors, rows, list(measure_scenes(recipe, store, progress)) if contents else [])
     document = study_run.document({"tolerance": recipe.tolerance, "failed": result.failed, **_document(result)})
     return study_run.write(runs, digest(document["rows"]), document, _report(recipe, result))
