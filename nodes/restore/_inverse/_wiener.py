@@ -24,7 +24,7 @@ _ROWS = 64  #: rows of a picture at a time, so that their float64 copies fit in 
 _LIGHT = 0.999  #: share of the light that the unknown border around the picture is wide enough for
 
 
-@node(additive_inputs=[("glare",)])
+@node(rtol=3e-4, additive_inputs=[("glare",)])
 def wiener(
     electrons: Tensor,
     psf: Psf,
@@ -52,7 +52,8 @@ def wiener(
             laser that does not clip is taken for scene. The result may be negative: beside lamps hundreds of
             times as bright as the scene it rings. The iteration ends by its residual, or after 20 steps on the finest
             grid: behind five half-rings rms 0.005 to 0.02 of the contrast from the converged answer (512 to 2048 pixels
-            a side), behind a plain lens 1e-3; float32 adds 3e-4. Gradients: of the exact answer, first order only.
+            a side), behind a plain lens 1e-3; float32 adds 3e-4. Gradients: of the exact answer, first order only;
+            float32 adds up to 2e-3 of the largest.
     Raises: ValueError where shapes or bands differ, and for pictures and PSFs that are not finite.
     Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; as least squares with a
             prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.

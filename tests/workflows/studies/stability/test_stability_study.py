@@ -215,3 +215,18 @@ def test_a_slope_beyond_the_type_of_its_picture_is_no_fault_of_the_step(picture)
         return 1 + 1e7 * (x.float() - x.float().detach()) if x.dtype != torch.float64 else 1 + 1e7 * (x - x.detach())
 
     assert judge_step(step_of(steep), [picture], BY_NAME["float16"], 0).mark == "pass"
+
+
+def test_cancellation_counts_in_each_scalar_of_a_result(picture):
+    signed = torch.cat([picture, -picture.flip(-1) * (1 + 1e-6)])
+
+    @node()
+    def exact(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return x.abs().mean(), x.sum()  # the second is a sum of terms that cancel
+
+    @node()
+    def wrong(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return x.abs().mean(), x.sum() + (1e-3 * x.abs().sum() if x.dtype == torch.float32 else 0.0)
+
+    assert judge_step(step_of(exact), [signed], BY_NAME["usual"], 0).mark != "fail"
+    assert judge_step(step_of(wrong), [signed], BY_NAME["usual"], 0).mark == "fail"
