@@ -43,6 +43,7 @@ def check_steps(checked: Iterable[CheckedStep], checker: Checker, outputs: Itera
         inputs = _inputs(each.step, known)
         found = checker.preflight(each.step, inputs, lambda wire: _params(by_name, wire), each.params, each.value)
         if found is None:
+            notes[name] = [] if outputs is None or name in computed else _set_aside(each.step, inputs, checker)
             continue
         notes[name] = found
         try:
@@ -58,6 +59,14 @@ def check_steps(checked: Iterable[CheckedStep], checker: Checker, outputs: Itera
             checker.diagnostics.append(Diagnostic(*place, problem))
     for name in by_name:
         checker.notes.update(dict.fromkeys(notes.get(name, ())))
+
+
+def _set_aside(step: Step, inputs: Mapping[str, Any], checker: Checker) -> list[str]:
+    """Return the last mistake as a note if it comes from the inputs of a step that no output of the recipe needs."""
+    if all(inputs.get(name) is None for name in step.node.preflight_inputs):
+        return []
+    problem = checker.diagnostics.pop()
+    return [f"{problem.path}: {problem.message} (no output needs the step {step.name})"]
 
 
 def refuse_indices(recipe: Recipe) -> Iterator[Diagnostic]:

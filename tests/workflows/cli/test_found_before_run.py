@@ -84,6 +84,15 @@ def test_a_step_that_a_cheaper_form_replaces_or_that_nobody_needs_is_not_judged_
     assert (code, err) == (0, "")
 
 
+def test_what_no_output_needs_is_noted(neusee):
+    code, out, _ = neusee(
+        "validate", "first_light", "lasers.green.angle=[10 mrad, 0 mrad]", "outputs=[lsr]", "expect=null"
+    )
+    assert code == 0
+    assert "carries only 1.91 mm" in out
+    assert "(no output needs the step laser_psf[mask,green])" in out
+
+
 def test_more_values_than_can_be_counted_are_refused(refused):
     assert "exceeds 2**60 bytes" in refused("scene=siemens", "scene.shape=[10000000000,10000000000]")
 
