@@ -53,7 +53,7 @@ TABLE: Mapping[str, Mapping[str, str]] = {
     "restored": {"quality": "restored_quality"},
 }
 
-#: Steps that give the error by the number of bands, by what they are the error of; each has one copy for each arm.
+#: Steps that give the error by the number of bands, by what they are the error of.
 SPECTRAL: Mapping[str, str] = {"spectral": "of the PSF of a white point", "laser_spectral": "of a laser spot"}
 
 BANDS = "bands"
