@@ -120,7 +120,7 @@ class Code:
         if not plain:
             state = LoadedState(sys.modules[module], (), self._follows(_packages(module)))
             parts["closure"] = {node.path: state.digest({"function": node.fn})}
-            inner = [self._whole(name).code for name in sorted(state.modules - whole.looks.keys())]
+            inner = [self._whole(name).code for name in sorted(state.modules.keys() - whole.looks.keys())]
             parts["closure"].update({f"module {n}": each for n, each in enumerate(inner)})
             private = private or any(map(is_private, inner))
         return self._named(digest(code, parts), {**_parts(whole.looks), **parts}, private)
@@ -206,8 +206,8 @@ class Code:
             loaded = LoadedState(sys.modules[module], summary.functions if compiled_as_written(module) else (), follows)
             state = loaded.digest(counted_values(sys.modules[module], summary, free, root))
             parts[f"state of {module}"] = {"values": state}
-            for name in sorted(loaded.modules - imports.keys() - _LEFT_OUT):
-                imports[name] = {""}
+            for name in sorted(loaded.modules):
+                imports.setdefault(name, set()).update(loaded.modules[name])
             if loaded.replaced and not private:
                 private = True
                 text = f"the loaded code of {loaded.replaced[0]}() is not that of {path}, so results are not stored"

@@ -62,7 +62,7 @@ class LoadedState:
     """The state of a loaded module, as a digest, with the modules of the functions and classes that it names."""
 
     def __init__(self, module: ModuleType, functions: Collection[str], followed: Callable[[str], bool]) -> None:
-        self.modules: set[str] = set()  #: modules of the functions, classes and objects that the module names
+        self.modules: dict[str, set[str]] = {}  #: names of functions and classes that the module holds, by module
         self.replaced: list[str] = []  #: functions of the module's own file whose code is not that of the file
         self._name, self._file = module.__name__, getattr(module, "__file__", "") or ""
         self._folder = self._file.rpartition("/")[0] or "."
@@ -134,7 +134,7 @@ class LoadedState:
     def _function(self, function: FunctionType) -> Any:
         """Return a function by module and name, with its defaults and closure if it is local."""
         home, code = str(function.__globals__.get("__name__")), function.__code__
-        self._noted(home)
+        self._noted(home, function.__qualname__)
         own = home == self._name and code.co_filename == self._file
         if own and self._functions and function_code(code) not in self._functions:
             self.replaced.append(function.__qualname__)
@@ -144,22 +144,23 @@ class LoadedState:
         return "function", home, code.co_qualname, exact, [part and self._of(part) for part in parts]
 
     def _class(self, kind: type) -> Any:
-        name = ("class", self._noted(kind.__module__), kind.__qualname__)
+        name = ("class", self._noted(kind.__module__, kind.__qualname__), kind.__qualname__)
         if kind.__module__ != self._name:
             return name
         bases = [(base.__module__, base.__qualname__) for base in kind.__mro__[1:]]
         for base in kind.__mro__[1:]:
-            self._noted(base.__module__)
+            self._noted(base.__module__, base.__qualname__)
         parts = [(name, part) for name, part in vars(kind).items() if not _SKIPPED.fullmatch(name) or _is_method(part)]
         return name, bases, [(name, self._of(part)) for name, part in parts]
 
     def _typed(self, value: Any) -> str:
-        return f"{self._noted(type(value).__module__)}.{type(value).__qualname__}"
+        kind = type(value)
+        return f"{self._noted(kind.__module__, kind.__qualname__)}.{kind.__qualname__}"
 
-    def _noted(self, module: str) -> str:
-        """Note the module of something that the state contains, if its source is followed."""
-        if module != self._name and module not in self.modules and self._followed(module):
-            self.modules.add(module)
+    def _noted(self, module: str, name: str = "") -> str:
+        """Note a function or class that the state contains, or a whole module, if its source is followed."""
+        if module != self._name and self._followed(module):
+            self.modules.setdefault(module, set()).add(name.partition(".")[0])
         return module
 
     def _placed(self, text: str) -> str:
