@@ -13,7 +13,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report.contents import FIGURES, FILES
 
 DRAWING = 90 << 20  #: bytes of the libraries that draw pictures and write files, as measured
-COPIES = 2.0  #: copies of the largest result while its file is written, as measured
+COPIES = 3.2  #: copies of the largest result while its file is written, as measured
 _NEED = re.compile(r"\??(?P<step>[\w.]+(\[[^\]]*\])?)$")  # not a parameter and not a function of a step
 
 

@@ -139,3 +139,35 @@ def test_a_plan_says_what_is_refused_and_a_run_refuses_it_first(neusee, here):
     code, _, err = neusee("run", *more)
     assert code == 2
     assert "--memory" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "step"),
+    [
+        (("--memory", "1 MB"), " needs "),
+        (("--memory", "20 GB", "scene.shape=[40000,40000]"), "cube.mixture needs 1"),
+        (("optics.bands=100000000",), "channels needs 2"),
+    ],
+)
+def test_what_cannot_fit_is_refused_on_an_empty_cache_before_any_work(neusee, here, words, step):
+    code, _, err = neusee("run", "first_light", *words)
+    assert code == 2
+    assert err.startswith("--memory: " if "--memory" in words else "memory: ")
+    assert step in err
+    assert "the limit is" in err
+    assert not (here / "runs").exists()
+    assert not list((here / "cache").glob("**/journal.jsonl"))
+
+
+def test_a_plan_of_what_never_ran_has_numbers_and_names_the_guesses(neusee, here, monkeypatch):
+    from neusee.workflows.engine import cost_laws
+
+    code, out, _ = neusee("plan", "first_light")
+    assert code == 0
+    assert "guess" not in out
+    assert "?" not in out
+    assert "while the steps run, of which the program itself holds" in out
+    laws = {path: law for path, law in cost_laws.shipped().items() if path != "restore.wiener"}
+    monkeypatch.setattr("neusee.workflows.engine.cost_model.shipped", lambda: laws)
+    line = next(line for line in neusee("plan", "first_light")[1].splitlines() if line.startswith("deconvolved"))
+    assert line.count("guess: ") == 3

@@ -6,6 +6,7 @@ import torch
 from neusee.nodes import node, optics, shape_rules
 from neusee.workflows.engine.cost_laws import GUESS, Law, Size, shipped, size_of
 from neusee.workflows.engine.cost_model import Costs
+from neusee.workflows.engine.placement_inputs import MOST_PARTS, parts_of
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Step
 
@@ -106,3 +107,12 @@ def test_a_law_gives_at_least_the_bytes_of_the_result():
 def test_the_size_of_a_step_is_that_of_its_tensors():
     found = size_of(blur, [torch.zeros(10, 10)], {}, shape_rules.double(10, 10))
     assert found[:4] == (400.0, 800.0, 0.0, 300.0)
+
+
+def test_a_step_is_cut_into_no_more_parts_than_it_has_bands():
+    few, many = SMALL._replace(bands=5), SMALL._replace(bands=1000)
+    psf = step("psf", optics.psf)
+    assert parts_of(psf, Costs([], {"psf": few}).of(psf, ["cpu"])) == 5
+    assert parts_of(psf, Costs([], {"psf": many}).of(psf, ["cpu"])) == MOST_PARTS
+    assert parts_of(psf, Costs([], {"psf": SMALL}).of(psf, ["cpu"])) == MOST_PARTS
+    assert parts_of(step("a"), Costs([], {"a": few}).of(step("a"), ["cpu"])) == 1

@@ -55,7 +55,7 @@ def test_a_line_for_each_result_and_each_receipt(tmp_path):
         {"key": key_of(1), "step": "s", "recipe": "r", "seconds": 1.0, "bytes": 4000, "device": "cpu", "peak": 77},
     ]
     for i, row in enumerate(expected):
-        row |= {"date": about(i)["date"], "node": "a.b", "kept": i == 0}
+        row |= {"date": about(i)["date"], "node": "a.b", "kept": i == 0, "size": None}
     assert store.journal.rows() == expected
     assert Store(tmp_path).journal.rows() == expected
 
