@@ -30,7 +30,7 @@ from torch import Tensor
 
 from neusee.workflows.keys.seal import FORMAT, NotRead, OtherFormat, check_signature, secrets, signature
 from neusee.workflows.store.layout_check import is_band, is_checksum, is_shape
-from neusee.workflows.store.shared_folder import Disk
+from neusee.workflows.store.shared_folder import Disk, open_now
 
 _SMALL = 4096  #: bytes up to which a blob is not synced to disk: a torn blob fails its checksum
 _WRITERS = 8
@@ -91,7 +91,7 @@ class Blobs:
     def about(self, name: str) -> Blob:
         """Return the type, shape and checksum of a stored band; raise `Damaged` if its file is missing or damaged."""
         try:
-            with open(self.path(name), "rb") as file:
+            with open(self.path(name), "rb", opener=open_now) as file:
                 return _trailer(file.fileno(), name)[0]
         except (OSError, *_UNREADABLE) as error:
             raise self._damaged(name, error) from None
@@ -170,7 +170,7 @@ class Blobs:
         size = expected[0].nbytes
         for i, (name, blob) in enumerate(zip(names, expected, strict=True)):
             try:
-                with open(self.path(name), "rb") as file:
+                with open(self.path(name), "rb", opener=open_now) as file:
                     at = address and address + i * size
                     _load(file, blob, into[i * size : (i + 1) * size], at, verify)
             except (OSError, *_UNREADABLE) as error:

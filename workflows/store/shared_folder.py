@@ -70,14 +70,17 @@ class Disk:
             file.write(raw)
             file.flush()
             self.share(part)
-            os.replace(part, f"{self.folder}/{name}")
+            self.rename(part, f"{self.folder}/{name}")
 
     def rename(self, part: str, path: str) -> None:
-        """Rename a complete file to its final name, and replace an existing file of that name."""
+        """Rename a complete file to its final name, and replace what has that name; a folder is put aside."""
         try:
             os.replace(part, path)
         except FileNotFoundError:
             self.make_folder(os.path.dirname(path))
+            os.replace(part, path)
+        except IsADirectoryError:
+            self.put_aside(path)
             os.replace(part, path)
 
     def link(self, part: str, path: str) -> bool:
@@ -137,7 +140,7 @@ class Disk:
             file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
             self.share(path)
             return file
-        except PermissionError:
+        except (PermissionError, IsADirectoryError):
             return os.open(path, os.O_RDONLY)
 
     def sweep(self, dry: bool = False, patience: float = math.inf) -> list[tuple[str, int]]:
@@ -189,12 +192,12 @@ class Disk:
 def append(path: str, raw: bytes, flags: int = 0) -> int:
     """Append bytes to a file in one write; return the number of written bytes. ``flags`` are flags of `os.open`.
 
-    A symbolic link is deleted, and counts as a missing file.
+    A symbolic link or a pipe is deleted, and counts as a missing file.
     """
     try:
-        file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | flags, 0o666)
+        file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | flags, 0o666)
     except OSError as error:
-        if error.errno != errno.ELOOP:
+        if error.errno not in (errno.ELOOP, errno.ENXIO):
             raise
         os.unlink(path)
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path) from None
@@ -220,6 +223,11 @@ def read_file(path: str, most: int = MOST_READ) -> bytes:
         return raw
     finally:
         os.close(file)
+
+
+def open_now(path: str, flags: int) -> int:
+    """Open a file, as `open` asks its ``opener`` to do, without waiting for a pipe in its place."""
+    return os.open(path, flags | os.O_NONBLOCK)
 
 
 def entries(folder: str) -> list[os.DirEntry[str]]:

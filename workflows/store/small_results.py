@@ -48,8 +48,10 @@ class SmallResults:
         raw = seal_record(about)
         try:
             self._write(raw)
-        except FileNotFoundError:
+        except (FileNotFoundError, IsADirectoryError):
             self._disk.prepare()
+            if os.path.isdir(self._path):
+                self._disk.put_aside(self._path)
             self._write(raw, os.O_CREAT)
             self._disk.share(self._path)
 

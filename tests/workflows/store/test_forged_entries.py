@@ -414,6 +414,26 @@ def rewrites_values(seed):
     return rng.choice(FORGERIES) in (damage_json, forge_tensors)
 
 
+@pytest.mark.parametrize("place", ["??/*.json", "??/*.safetensors", "bands/*/*", "journal.jsonl", "tmp/.lock"])
+@pytest.mark.parametrize("kind", [os.mkdir, os.mkfifo])
+@pytest.mark.parametrize("value", VALUES.values(), ids=VALUES)
+def test_what_is_no_file_is_replaced_by_one(tmp_path, place, kind, value):
+    Store(tmp_path).put(KEY, value, ABOUT)
+    for path in tmp_path.glob(place):
+        path.unlink()
+        kind(path)
+    assert heals(tmp_path, value)
+    assert Store(tmp_path).put_small(OTHER, BIG[:3], ABOUT)
+    Store(tmp_path).gc()
+    (tmp_path / "brief.jsonl").unlink()
+    kind(tmp_path / "brief.jsonl")
+    store = Store(tmp_path)
+    assert not store.has(OTHER)
+    if kind is os.mkdir:
+        assert store.put_small(OTHER, BIG[:3], ABOUT)
+        assert Store(tmp_path).has(OTHER)
+
+
 def test_forged_and_damaged_entries_do_no_harm(tmp_path):
     wrong = attacks(tmp_path, range(150))
     assert all(map(rewrites_values, wrong))
