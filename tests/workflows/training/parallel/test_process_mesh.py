@@ -100,8 +100,9 @@ def test_two_processes_find_the_gradients_of_one(done):
     same(data, one)
     same(band, one)
     assert not data["shared"]["steps"]
-    assert band["shared"]["steps"] == ["image[mask]", "image[plain]", "psf[mask]", "radiance"]
-    assert band["shared"]["cut"] == band["shared"]["sums"] == ["image[mask]", "image[plain]"]
+    assert band["shared"]["steps"] == ["bsr[mask]", "image[mask]", "image[plain]", "psf[mask]", "radiance"]
+    assert band["shared"]["cut"] == ["bsr[mask]", "image[mask]", "image[plain]"]
+    assert band["shared"]["sums"] == ["image[mask]", "image[plain]"]
 
 
 @pytest.mark.slow
@@ -149,7 +150,7 @@ def test_four_processes_find_the_gradients_of_one(tmp_path):
         for mesh in among:
             same(stepped(found[name, mesh]), stepped(found[name, "1x1"]))
     shared = stepped(found["by band", "2x2"])["shared"]
-    assert shared["cut"] == ["image[mask]", "image[plain]"]
+    assert shared["cut"] == ["bsr[mask]", "image[mask]", "image[plain]"]
     assert shared["sums"] == [], "the peak of each band is asked for"
 
 
