@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 from neusee.nodes import Node
 from neusee.workflows.keys.cache_key import PRIVATE, digest, is_private
-from neusee.workflows.keys.code_memo import edition, read_memo, write_file, write_memo
+from neusee.workflows.keys.code_memo import EDITION, read_memo, write_file, write_memo
 from neusee.workflows.keys.code_objects import PYTHON
 from neusee.workflows.keys.declared_dependencies import FREE, refusal, resolve, uncovered
 from neusee.workflows.keys.followed_imports import Imports
@@ -244,7 +244,7 @@ class Code:
 
     def _summary(self, module: str, path: Path) -> Summary:
         source, found = source_of(module, path)
-        name = f"{PYTHON}:{edition()}:{found}"
+        name = f"{PYTHON}:{EDITION}:{found}"
         if name not in self._summaries:
             try:
                 self._summaries[name] = summarise(source)

@@ -5,7 +5,6 @@ A file that is damaged, or of another format, is ignored and written again.
 
 from __future__ import annotations
 
-import functools
 import json
 import os
 import threading
@@ -20,6 +19,9 @@ from pydantic import TypeAdapter
 from neusee.workflows.keys.module_origin import distributions_of
 from neusee.workflows.keys.source_summary import Summary
 
+_SUMMARISING = ("source_summary", "unfollowed_constructs", "reachable_code", "code_objects")
+#: digest of the code that summarises a source file, so that an older summary is not used
+EDITION = xxhash.xxh3_64_hexdigest(b"".join(Path(__file__).with_name(f"{n}.py").read_bytes() for n in _SUMMARISING))
 _KEPT = 1000  #: number of summaries in the file
 _SUMMARIES = TypeAdapter(dict[str, Summary])
 _NAMES = TypeAdapter(dict[str, list[str]])
@@ -55,14 +57,6 @@ def write_file(path: Path, content: bytes, folder: Path) -> None:
         path.parent.mkdir(exist_ok=True)
         part.write_bytes(content)
         os.replace(part, path)
-
-
-@functools.cache
-def edition() -> str:
-    """Return the digest of the code that summarises a source file, so that an older summary is not used."""
-    folder = Path(__file__).parent
-    parts = ("source_summary", "unfollowed_constructs", "reachable_code", "code_objects")
-    return xxhash.xxh3_64_hexdigest(b"".join((folder / f"{name}.py").read_bytes() for name in parts))
 
 
 def _checksum(*parts: Any) -> str:

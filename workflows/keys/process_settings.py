@@ -13,6 +13,8 @@ import torch
 
 _USUAL = {"default dtype": "torch.float32", "default device": "cpu", "matmul precision": "highest", "TF32": "True"}
 
+torch.get_default_device()  # imports what it needs now, because a process may lose the right to read files later
+
 
 def settings() -> dict[str, str]:
     """Return the settings of torch that differ from those of a new process."""

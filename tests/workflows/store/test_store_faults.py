@@ -36,6 +36,8 @@ import torch
 
 from neusee.nodes import node
 
+__depends__ = ("unaffected:os",)
+
 
 def ran(name):
     file = os.open(os.environ["FAULT_LOG"], os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
