@@ -43,7 +43,9 @@ def origin_of(module: str, packages: frozenset[str]) -> Origin:
         return _fixed.setdefault(top, Origin("python"))
     if module != top and top not in packages and (above := origin_of(top, packages)).kind == "distribution":
         return above
-    file = module_path(module)
+    file = getattr(sys.modules.get(module), "__file__", None) if module == top else None
+    if file is None or _INSTALLED.isdisjoint(Path(file).parts):
+        file = module_path(module)
     if file is None:
         return _without_file(module, top, packages)
     if top not in packages and not _INSTALLED.isdisjoint(Path(file).parts) and (version := version_of(top)):
@@ -155,3 +157,6 @@ def _shadowed(top: str) -> bool:
     """Return True if a loaded module with a name of the standard library is a file of somebody else."""
     file = getattr(sys.modules.get(top), "__file__", None)
     return bool(file) and (not str(file).startswith(_STANDARD) or not _INSTALLED.isdisjoint(Path(str(file)).parts))
+
+
+_releases()  # now, because a process may lose the right to read the folders later
