@@ -46,7 +46,7 @@ def _(result: Tensor, *inputs: Psf) -> list[Check]:
     ]
 
 
-@node(rtol=1e-6, bands={"psf": 0, "radiance": -3, "return": -1}, accepts_low_rank=("radiance",))
+@node(rtol=1e-6, bands={"psf": 0, "radiance": -3, "return": -1})
 def bsr(psf: Psf, radiance: Tensor | LowRankCube | None = None) -> Tensor:
     """Compute the background suppression ratio: the share of the scene's light that a mask leaves in the field.
 
@@ -134,7 +134,8 @@ def light_outside(psf: Psf, pupil: Pupil) -> Tensor:
     Shapes: psf.intensity (band, y, x), pupil (v, u) -> (band,) float64.
     Units:  none; 0 where the window holds all light.
     Error:  1e-6 of the light. The light of a PSF sampled at points is that of the window only if no pixel is wider than
-            lambda f / D. A pupil without light has no light outside: 0.
+            lambda f / D. A pupil without light has no light outside: 0. The height and the path of the pupil have no
+            effect, not even where they are NaN.
     Source: conservation of energy: Goodman, Introduction to Fourier Optics, 3rd ed., section 2.1.5 (Parseval).
     """
     passed, clear = (x.double().square().sum() for x in (pupil.amplitude, pupil.aperture))

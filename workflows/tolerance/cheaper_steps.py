@@ -11,7 +11,7 @@ import math
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.graph.recipe_graph import METRIC_TOLERANCE, Recipe, Step, Substitution, Wire, in_order, needed
 from neusee.workflows.tolerance.error_propagation import unbounded_steps
@@ -119,18 +119,7 @@ class _Draft:
         for reader in readers:
             changed = {i: _exchanged(wire, image.name, name) for i, wire in reader.wires.items()}
             self.rewired[reader.name] = replace(reader, wires=changed)
-        self._share(radiance, cube)
         self.substitutions.append(Substitution(image.name, name, within, "only sums over its bands are needed"))
-
-    def _share(self, radiance: str, cube: str) -> None:
-        """Give the low-rank form of a spectral cube to the other steps that accept this form and return no cube."""
-        from neusee.nodes.values import LowRankCube
-
-        for name in self.readers.get(radiance, ()):
-            reader = self.rewired.get(name, self.recipe.steps[name])
-            taken = [i for i in reader.node.accepts_low_rank if reader.wires.get(i) == radiance]
-            if taken and LowRankCube not in get_args(reader.node.hints["return"]):
-                self.rewired[name] = replace(reader, wires={**reader.wires, **dict.fromkeys(taken, cube)})
 
     def spectral(self, image: str, readers: Sequence[Step]) -> tuple[str, str] | None:
         """Return the steps that give all ``readers`` the wavelength bands and the camera responses.

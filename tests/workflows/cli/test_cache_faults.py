@@ -130,7 +130,8 @@ def test_results_that_may_not_be_written_are_refused_before_anything_runs(mode, 
     with cache_faults.without_privileges():
         code, _, err = call(*COMMANDS["run"], "--out", "closed/deep/runs")
     assert code == 2
-    assert err.startswith("--out closed/deep/runs: results cannot be written there ([Errno 13] Permission denied")
+    assert err.startswith("--out: the folder ")
+    assert "cannot be written (Permission denied), so that closed/deep/runs cannot hold results" in err
     assert not (tmp_path / "cache").exists()
 
 

@@ -10,7 +10,7 @@ from neusee.workflows.report.spectral_sampling import spectral_error
 from neusee.workflows.store.result_store import Store
 
 SMALL = ["optics.samples=128", "optics.pitch=60 um", "optics.window=[64, 64]", "sensor.shape=[48, 48]",
-         "scene.shape=[64, 64]", "restore=null", "steps.restored_quality=null", "outputs=[lsr]",
+         "scene.shape=[64, 64]", "restore=null", "steps.restored_quality=null", "outputs=[lsr, outside, raw]",
          "optics.bands=5"]  # fmt: skip
 
 

@@ -50,6 +50,7 @@ class Case:
 #: by node and case: words of the node's docstring about NaN in the inputs, if the result cannot show NaN
 _STATED = {
     ("restore.clipped", "NaN"): "so is what is not a number",
+    ("metrics.light_outside", "NaN"): "have no effect, not even where they are NaN",
     ("metrics.saturated", "NaN"): "so does a pixel that is NaN",
 }
 
