@@ -8,6 +8,7 @@ from torch import Tensor
 from neusee.nodes.restore._colour_matrix import colour_matrix
 from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons
 from neusee.nodes.restore._inverse._fft_grid import halvings
+from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
 from neusee.nodes.restore._inverse._wiener import wiener
 from neusee.nodes.restore._networks._fft_mamba import fft_mamba
 from neusee.nodes.restore._networks._nafnet import nafnet
@@ -18,7 +19,7 @@ from neusee.nodes.values import Psf
 _SYSTEM = 35.0  #: bytes for each element of a dense system: the matrix, its factors and copies
 _SOLVED = 400.0  #: operations of a dense solution that take as long as one operation of a transform
 
-for node in (electrons, wiener, fft_mamba, nafnet, unet):
+for node in (electrons, wiener, richardson_lucy, fft_mamba, nafnet, unet):
     node.shape(like_first)
 
 

@@ -77,7 +77,7 @@ def test_hooks_take_what_the_node_takes(node):
         node.hooks.reference,
         node.hooks.skip_bound,
         node.hooks.preflight,
-        node.hooks.preview,
+        node.hooks.shape,
         node.hooks.check,
     ):
         taken = {} if hook is None else inspect.signature(hook).parameters

@@ -33,7 +33,8 @@ from neusee.workflows.keys.process_settings import settings, workflows_digest
 from neusee.workflows.keys.reachable_code import reached
 from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
 
-_LEFT_OUT = frozenset({"neusee", ROOT, f"{ROOT}._node", f"{ROOT}.import_times"})  #: modules that decide no result
+#: modules that decide no result; `is_left_out` adds the rules for the shapes of the results
+_LEFT_OUT = frozenset({"neusee", ROOT, f"{ROOT}._node", f"{ROOT}.import_times", f"{ROOT}.shape_rules"})
 _WORKFLOWS = "neusee.workflows"
 _THIS_PROCESS = os.urandom(8).hex()
 _PYTHON = "Python {}.{}".format(*sys.version_info)
@@ -173,7 +174,7 @@ class Code:
     def _look(self, module: str, packages: frozenset[str], root: bool) -> Look | None:
         key = (module, packages, root)
         if key not in self._looks:
-            self._looks[key] = None if module in _LEFT_OUT else self._looked(module, packages, root)
+            self._looks[key] = None if is_left_out(module) else self._looked(module, packages, root)
         return self._looks[key]
 
     def _looked(self, module: str, packages: frozenset[str], root: bool) -> Look | None:
@@ -226,7 +227,7 @@ class Code:
         return functools.cache(lambda name: self._followed(name, packages))
 
     def _followed(self, module: str, packages: frozenset[str]) -> bool:
-        outside = module in _LEFT_OUT or f"{module}.".startswith(f"{_WORKFLOWS}.")
+        outside = is_left_out(module) or f"{module}.".startswith(f"{_WORKFLOWS}.")
         return not outside and self._origin(module, packages).kind == "source"
 
     def _origin(self, module: str, packages: frozenset[str]) -> Origin:
@@ -238,7 +239,7 @@ class Code:
     def _summary_of(self, module: str, packages: frozenset[str]) -> tuple[Path, Summary] | None:
         """Return the file and the summary of a module whose source is followed, or None."""
         origin = self._origin(module, packages)
-        if origin.kind != "source" or origin.path is None or module in _LEFT_OUT:
+        if origin.kind != "source" or origin.path is None or is_left_out(module):
             return None
         return origin.path, self._summary(module, origin.path)
 
@@ -252,6 +253,11 @@ class Code:
                 raise LookupError(f"{path}: {error}") from error
             self._new = True
         return self._summaries[name]
+
+
+def is_left_out(module: str) -> bool:
+    """Return True for a module of the package that decides no result, such as the rules for the shapes of results."""
+    return module in _LEFT_OUT or (module.startswith(f"{ROOT}.") and module.endswith("._result_shapes"))
 
 
 def parts_file(root: Path, code: str) -> Path:

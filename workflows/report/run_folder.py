@@ -57,7 +57,7 @@ def writable_folder(out: str | os.PathLike[str]) -> Path:
 
     A folder that does not exist yet is not made: the nearest existing folder above it must be writable.
     """
-    root = Path(out)
+    root = existing = Path(out)
     try:
         existing = next(path for path in (root, *root.absolute().parents) if path.exists() or path.is_symlink())
         if existing.is_dir():
@@ -65,7 +65,7 @@ def writable_folder(out: str | os.PathLike[str]) -> Path:
             return root
         text = f"{existing} is not a folder, so that no results can be written to {root}"
     except OSError as error:
-        text = f"the folder {error.filename} cannot be written ({error.strerror}), so that {root} cannot hold results"
+        text = f"the folder {existing} cannot be written ({error.strerror}), so that {root} cannot hold results"
     raise ValueError(f"{text}: {_OTHER_FOLDER}")
 
 

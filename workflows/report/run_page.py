@@ -74,11 +74,7 @@ def document(
         "tolerance": recipe.tolerance,
         "seed": recipe.seed,
         "counts": state_counts(done),
-        "verdict": verdict(found, failed, len(unchecked)),
-        "missed": [e["name"] for e in found if not e["ok"]],
-        "failed": failed,
-        "expected": found,
-        "unchecked": unchecked,
+        **_judgement(found, failed, unchecked),
         "table": table(recipe, result.keys, result.value),
         "metrics": metrics(recipe, result.keys, result.value),
         "notes": [*_sampling(recipe), *recipe.notes, *unchecked_lines(unchecked), *warned],
@@ -96,6 +92,19 @@ def document(
         "missing": [{"name": n, "title": _TITLES.get(n, n), "why": why} for n, why in missing.items()],
         "facts": _facts(result),
         "inputs": _inputs(recipe),
+    }
+
+
+def _judgement(
+    found: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked: Sequence[Mapping[str, str]]
+) -> dict[str, Any]:
+    """Return which expected numbers and checks a run met, and which it missed."""
+    return {
+        "verdict": verdict(found, failed, len(unchecked)),
+        "missed": [e["name"] for e in found if not e["ok"]],
+        "failed": failed,
+        "expected": found,
+        "unchecked": unchecked,
     }
 
 
