@@ -40,11 +40,25 @@ def _(*inputs: Any, **params: Any) -> Tensor:
 
 @wiener.work
 def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any) -> tuple[float, float]:
-    y, x = (n + min(k, 2 * n) for n, k in zip(electrons.shape[-2:], psf.intensity.shape[-2:], strict=True))
+    y, x = _torus(electrons, psf)
     coarse = max(electrons.shape[-2:]) / 2 ** halvings((electrons.shape[-2], electrons.shape[-1]))
     unknowns = len(electrons) * coarse**2  # of the coarsest grid, which is solved as a dense system
     operations = len(electrons) * transform_operations(y, x) + unknowns**3 / _SOLVED
     return max(31.0 * len(electrons) * y * x, _SYSTEM * unknowns**2), operations
+
+
+@richardson_lucy.work
+def _(
+    result: Tensor, electrons: Tensor, psf: Psf, *others: Any, iterations: int = 40, **params: Any
+) -> tuple[float, float]:
+    y, x = _torus(electrons, psf)
+    return 4.0 * len(electrons) * y * x, 4.0 * (iterations + 1) * len(electrons) * transform_operations(y, x)
+
+
+def _torus(picture: Tensor, psf: Psf) -> tuple[int, int]:
+    """Return the size of the transforms that deconvolve a picture, whose border they extend by the PSF."""
+    y, x = (n + min(k, 2 * n) for n, k in zip(picture.shape[-2:], psf.intensity.shape[-2:], strict=True))
+    return y, x
 
 
 def _layers(result: Tensor, *inputs: Any, width: int = 32, **params: Any) -> tuple[float, float]:
