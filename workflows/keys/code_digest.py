@@ -33,8 +33,7 @@ from neusee.workflows.keys.process_settings import settings, workflows_digest
 from neusee.workflows.keys.reachable_code import reached
 from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
 
-#: modules that decide no result; `is_left_out` adds the rules for the shapes of the results
-_LEFT_OUT = frozenset({"neusee", ROOT, f"{ROOT}._node", f"{ROOT}.import_times", f"{ROOT}.shape_rules"})
+_LEFT_OUT = frozenset({"neusee", ROOT, f"{ROOT}._node", f"{ROOT}.import_times"})  #: modules that decide no result
 _WORKFLOWS = "neusee.workflows"
 _THIS_PROCESS = os.urandom(8).hex()
 _PYTHON = "Python {}.{}".format(*sys.version_info)
@@ -174,7 +173,7 @@ class Code:
     def _look(self, module: str, packages: frozenset[str], root: bool) -> Look | None:
         key = (module, packages, root)
         if key not in self._looks:
-            self._looks[key] = None if is_left_out(module) else self._looked(module, packages, root)
+            self._looks[key] = None if _decides_nothing(module) else self._looked(module, packages, root)
         return self._looks[key]
 
     def _looked(self, module: str, packages: frozenset[str], root: bool) -> Look | None:
@@ -227,7 +226,7 @@ class Code:
         return functools.cache(lambda name: self._followed(name, packages))
 
     def _followed(self, module: str, packages: frozenset[str]) -> bool:
-        outside = is_left_out(module) or f"{module}.".startswith(f"{_WORKFLOWS}.")
+        outside = _decides_nothing(module) or f"{module}.".startswith(f"{_WORKFLOWS}.")
         return not outside and self._origin(module, packages).kind == "source"
 
     def _origin(self, module: str, packages: frozenset[str]) -> Origin:
@@ -239,7 +238,7 @@ class Code:
     def _summary_of(self, module: str, packages: frozenset[str]) -> tuple[Path, Summary] | None:
         """Return the file and the summary of a module whose source is followed, or None."""
         origin = self._origin(module, packages)
-        if origin.kind != "source" or origin.path is None or is_left_out(module):
+        if origin.kind != "source" or origin.path is None or _decides_nothing(module):
             return None
         return origin.path, self._summary(module, origin.path)
 
@@ -255,8 +254,8 @@ class Code:
         return self._summaries[name]
 
 
-def is_left_out(module: str) -> bool:
-    """Return True for a module of the package that decides no result, such as the rules for the shapes of results."""
+def _decides_nothing(module: str) -> bool:
+    """Return True for a module that decides no result, such as the rules for the shapes of a family of nodes."""
     return module in _LEFT_OUT or (module.startswith(f"{ROOT}.") and module.endswith("._result_shapes"))
 
 
