@@ -11,9 +11,8 @@ generator for a parameter named ``rng``.
     @digitize.skip_bound       # upper bound of the change if the step is skipped
     @digitize.propagate_error  # upper bound of the error that errors of the inputs cause
     @digitize.preflight        # checks the parameters before anything runs
-    @digitize.preview          # the shape of the result, before anything runs
     @digitize.check            # checks that the result is plausible
-    @digitize.shape            # shape and type of the result, from tensors without values
+    @digitize.shape            # shape and type of the result, before anything runs
     @digitize.work             # memory and number of operations beside what the shapes say
 
 ``digitize.hooks`` has each attached function under the name of its decorator.
@@ -84,15 +83,13 @@ class Hooks:
     #: (parameters): True if the result is the same for every band
     band_invariant: Callable[[Mapping[str, Any]], bool] | None = None
     #: (*, parameters): notes for the user, before anything runs; may raise `ParameterError`; an argument with the name
-    #: of an input receives what is known of that input before the run, as ``preview`` gives it, else None
+    #: of an input receives what is known of that input before the run, as ``shape`` gives it, else None
     preflight: Callable[..., Sequence[str]] | None = None
-    #: (what is known of each input or None, *, parameters): what is known of the result before the run: a large tensor
-    #: has its shape alone (device ``meta``), a small tensor may have its values; None if nothing is known
-    preview: Callable[..., Any] | None = None
     #: (result, *inputs, **parameters): findings, once after computing
     check: Callable[..., Sequence[Check]] | None = None
-    #: (*inputs, **parameters), with tensors on the device ``meta``, which have a shape and a type but no values: the
-    #: result in the same form; a tensor of few numbers may have values
+    #: (what is known of each input, None where nothing is, **parameters): what is known of the result before the run:
+    #: tensors on the device ``meta``, which have a shape and a type but no values; a tensor of few numbers may have
+    #: values. A rule that fails, such as one that needs an unknown input, leaves the result unknown
     shape: Callable[..., Any] | None = None
     #: (result, *inputs, **parameters), all as for ``shape``: bytes of memory during the run beside inputs and result,
     #: and number of operations, both up to a constant factor, which is measured
@@ -199,7 +196,6 @@ class Node:
         return model
 
     reference, preflight, check = _attaches("reference"), _attaches("preflight"), _attaches("check")
-    preview = _attaches("preview")
     skip_bound, skip_scale, zero_bound = _attaches("skip_bound"), _attaches("skip_scale"), _attaches("zero_bound")
     propagate_error, approximation_error = _attaches("propagate_error"), _attaches("approximation_error")
     band_invariant = _attaches("band_invariant")

@@ -1,6 +1,7 @@
 """Rules for the shape and type of a result, and tensors on the device ``meta``, which have no values.
 
-A rule has the arguments of its node. Files ``_result_shapes.py`` attach the rules to the nodes.
+A rule has the arguments of its node; an input of which nothing is known is None, and a rule that needs it
+fails. Files ``_result_shapes.py`` attach the rules to the nodes.
 """
 
 from __future__ import annotations
@@ -12,9 +13,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+_MOST = 2**60  #: bytes of a tensor; more than any machine has, and torch cannot count much further
+
 
 def blank(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Return a tensor without values, on the device ``meta``."""
+    """Return a tensor without values, on the device ``meta``; raise OverflowError above 2**60 bytes."""
+    if math.prod(shape) * dtype.itemsize > _MOST:
+        raise OverflowError(
+            f"a result of {' x '.join(map(str, shape))} values exceeds 2**60 bytes: choose smaller sizes"
+        )
     return torch.empty(shape, dtype=dtype, device="meta")
 
 

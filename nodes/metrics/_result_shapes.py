@@ -9,7 +9,7 @@ from neusee.nodes.metrics._peak_irradiance import Peak, peak_irradiance
 from neusee.nodes.metrics._picture_quality import Quality, quality
 from neusee.nodes.metrics._psf_contrast import Mtf, encircled, mtf
 from neusee.nodes.metrics._saturated_pixels import Saturated, saturated
-from neusee.nodes.metrics._spectral_error import spectral_error
+from neusee.nodes.metrics._spectral_error import _SIDE, spectral_error
 from neusee.nodes.metrics._suppression_ratios import bsr, light_outside, lsr, peak_bsr
 from neusee.nodes.shape_rules import double, scalars
 from neusee.nodes.values import Bands, LowRankCube, Psf, Pupil
@@ -53,3 +53,9 @@ light_outside.shape(_each_band)
 @spectral_error.shape
 def _(pupil: Pupil, bands: Bands, illuminant: Any = None, responses: Tensor | None = None, **params: Any) -> Tensor:
     return double(1 if responses is None else len(responses))
+
+
+@spectral_error.work
+def _(result: Tensor, pupil: Pupil, bands: Bands, *others: Any, **params: Any) -> tuple[float, float]:
+    values = 2.0 * len(bands.centres) * _SIDE**2
+    return 4.0 * values, values + pupil.height.numel()

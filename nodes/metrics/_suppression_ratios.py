@@ -10,7 +10,6 @@ from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.metrics._mask_limits import least_lsr
 from neusee.nodes.optics._imaging._light_in_field import light_in_field
-from neusee.nodes.shape_preview import without_values
 from neusee.nodes.values import LowRankCube, Psf, Pupil
 
 _DARK = 1e-30  #: light below which a band counts as dark
@@ -27,11 +26,6 @@ def lsr(psf: Psf) -> Tensor:
     Source: NeuSee, section Sensor Image (LSR).
     """
     return psf.intensity.amax((-2, -1)).double() / psf.clear_peak.to(psf.intensity.device)
-
-
-@lsr.preview
-def _(psf: Psf | None) -> Tensor | None:
-    return None if psf is None else without_values(len(psf.clear_peak), dtype=torch.float64)
 
 
 @lsr.check
@@ -89,11 +83,6 @@ def _(psf: Psf, radiance: Tensor | LowRankCube | None = None) -> Tensor:
     kept, whole = full[..., m // 2 : m // 2 + y, n // 2 : n // 2 + x].sum((-2, -1)), scene.sum((-2, -1))
     dark = whole <= _DARK
     return torch.where(dark, 1.0, kept / whole.where(~dark, 1.0)).reshape(cube.shape[:-2])
-
-
-@bsr.preview
-def _(psf: Psf | None, radiance: Tensor | LowRankCube | None = None) -> Tensor | None:
-    return None if psf is None else without_values(len(psf.clear_peak), dtype=torch.float64)
 
 
 @bsr.check

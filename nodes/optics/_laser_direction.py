@@ -80,11 +80,6 @@ def _(
     return []
 
 
-@direction.preview
-def _(*, angle: tuple[float, float] | None, **params: Any) -> Tensor | None:
-    return None if angle is None else torch.tensor(angle, dtype=torch.float64)
-
-
 def angle_notes(angle: tuple[float, float]) -> list[str]:
     """Return a note for an angle that differs by more than 1 % from its sine.
 

@@ -1,7 +1,7 @@
 """The laser spot on the sensor: a PSF scaled by the irradiance that saturates a pixel behind the clear lens."""
 
 import math
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from pydantic import Field
@@ -10,7 +10,6 @@ from torch import Tensor
 from neusee.nodes import Check, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
-from neusee.nodes.shape_preview import without_values
 from neusee.nodes.units import PositiveLength, Time
 from neusee.nodes.values import Bands, Psf
 
@@ -66,11 +65,6 @@ def _(psf: TensorStats, bands: TensorStats, *, strength: float, **sensor: float)
     ends = torch.tensor([bands.min], dtype=torch.float64)  # the saturation irradiance falls with wavelength
     saturating: Tensor = saturation(Bands(ends, ends, ends), **sensor)
     return _LSR * strength * float(saturating)
-
-
-@laser_irradiance.preview
-def _(psf: Psf | None, *others: Any, **params: Any) -> Tensor | None:
-    return None if psf is None else without_values(*psf.intensity.shape)
 
 
 @laser_irradiance.check

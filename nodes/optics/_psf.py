@@ -15,7 +15,6 @@ from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
 from neusee.nodes.optics._transform._pupil_field import View
 from neusee.nodes.optics._transform._sample_axis import Axis, centred
 from neusee.nodes.optics._transform._scaled_transform import Method
-from neusee.nodes.shape_preview import without_values
 from neusee.nodes.units import Angle, PositiveLength, Shape
 from neusee.nodes.values import Psf, Pupil
 
@@ -24,8 +23,8 @@ class _Camera(Geometry):
     """The geometry of lens, sensor and source, to which the direction of a laser is added."""
 
     def towards(self, direction: Tensor | None) -> "_Camera":
-        """Return the camera with ``direction`` added to the angle of the source."""
-        y, x = (0.0, 0.0) if direction is None else direction.tolist()
+        """Return the camera with ``direction``, if it is known, added to the angle of the source."""
+        y, x = (0.0, 0.0) if direction is None or direction.is_meta else direction.tolist()
         return self._replace(angle=(self.angle[0] + y, self.angle[1] + x))
 
 
@@ -77,19 +76,11 @@ def _(*, pupil: Pupil | None = None, direction: Tensor | None = None, **params: 
     notes = angle_notes(camera.angle)
     for parameter, view in (("focal_length", camera), ("direction.angle", camera.towards(direction))):
         try:
-            if pupil is not None:
+            if pupil is not None and not (pupil.wavelengths.is_meta or pupil.pitch.is_meta):
                 _refuse_aliases(pupil, view)
         except ValueError as error:
             raise ParameterError(parameter, str(error)) from None
     return notes
-
-
-@psf.preview
-def _(pupil: Pupil | None, *others: Any, shape: tuple[int, int], **params: Any) -> Psf | None:
-    if pupil is None:
-        return None
-    count = len(pupil.wavelengths)
-    return Psf(without_values(count, *shape), without_values(count, dtype=torch.float64))
 
 
 @psf.check

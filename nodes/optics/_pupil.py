@@ -11,7 +11,6 @@ from neusee.nodes._half_precision import refuse_half
 from neusee.nodes.optics._phase_steps import LARGE_STEPS, phase_steps
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, inside, opening, refuse_other_grid, stripes
 from neusee.nodes.optics._zernike import surface
-from neusee.nodes.shape_preview import without_values
 from neusee.nodes.units import Count, Length, Waves
 from neusee.nodes.values import Bands, Dirt, Pupil, Stop
 
@@ -77,15 +76,6 @@ def _shapes(height: Tensor, index: Tensor, bands: Bands, grid: PupilGrid, dirt: 
     if dirt is not None and dirt.amplitude.shape != height.shape:
         found, wanted = tuple(dirt.amplitude.shape), tuple(height.shape)
         raise ValueError(f"dirt is {found} and height is {wanted}: compute both from one `stop` step")
-
-
-@pupil.preview
-def _(height: Any, index: Any, bands: Bands | None, stop: Stop | None, *others: Any, **params: Any) -> Pupil | None:
-    if bands is None or stop is None:
-        return None
-    samples, count = int(stop.samples), len(bands.centres)
-    plane, excess = without_values(samples, samples), without_values(count, dtype=torch.float64)
-    return Pupil(plane, plane, plane, plane, excess, bands.centres, stop.pitch)
 
 
 @pupil.check

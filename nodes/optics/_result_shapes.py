@@ -20,9 +20,9 @@ _SHORT, _FINE = 400e-9, 4e-6  #: m, wavelength and pupil pitch where no value is
 
 
 @pupil.shape
-def _(height: Tensor, index: Tensor, bands: Bands, stop: Stop, *others: Any, **params: Any) -> Pupil:
-    factor = blank(*height.shape)
-    return Pupil(factor, factor, factor, factor, index, bands.centres, stop.pitch)
+def _(height: Any, index: Any, bands: Bands, stop: Stop, *others: Any, **params: Any) -> Pupil:
+    factor = blank(int(stop.samples), int(stop.samples))
+    return Pupil(factor, factor, factor, factor, double(len(bands.centres)), bands.centres, stop.pitch)
 
 
 @psf.shape
@@ -85,8 +85,8 @@ def _(psf: Psf, bands: Bands, **params: Any) -> Tensor:
 
 
 @direction.shape
-def _(**params: Any) -> Tensor:
-    return double(2)
+def _(*, angle: tuple[float, float] | None = None, **params: Any) -> Tensor:
+    return double(2) if angle is None else torch.tensor(angle, dtype=torch.float64)
 
 
 def _padded(scene: Tensor, psf: Psf, border: str) -> tuple[int, int]:

@@ -8,7 +8,6 @@ from neusee.nodes._half_precision import single
 from neusee.nodes.metrics._saturated_pixels import clipped as at_the_end
 from neusee.nodes.sensor._digitization import Bits
 from neusee.nodes.sensor._saturation import Well
-from neusee.nodes.shape_preview import same_shape
 from neusee.nodes.units import Electrons, Gain
 
 
@@ -30,9 +29,6 @@ def _(*, offset: float, offset_subtracted: bool = True, **params: object) -> lis
     if offset and not offset_subtracted:
         return [f"an offset of {offset:g} e- stays in the picture: set offset_subtracted: true to remove the offset"]
     return []
-
-
-electrons.preview(same_shape)
 
 
 @node(rtol=0.0)
@@ -64,9 +60,6 @@ def colour(channels: Tensor, matrix: Tensor) -> Tensor:
     channels = single(channels)
     flat = matrix.to(channels) @ channels.flatten(-2)
     return flat.reshape(*flat.shape[:-1], *channels.shape[-2:])
-
-
-colour.preview(same_shape)
 
 
 @colour.reference

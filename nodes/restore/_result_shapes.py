@@ -8,6 +8,7 @@ from torch import Tensor
 from neusee.nodes.restore._colour_matrix import colour_matrix
 from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons
 from neusee.nodes.restore._inverse._fft_grid import halvings
+from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
 from neusee.nodes.restore._inverse._wiener import wiener
 from neusee.nodes.restore._networks._fft_mamba import fft_mamba
 from neusee.nodes.restore._networks._nafnet import nafnet
@@ -18,7 +19,7 @@ from neusee.nodes.values import Psf
 _SYSTEM = 35.0  #: bytes for each element of a dense system: the matrix, its factors and copies
 _SOLVED = 400.0  #: operations of a dense solution that take as long as one operation of a transform
 
-for node in (electrons, wiener, fft_mamba, nafnet, unet):
+for node in (electrons, wiener, richardson_lucy, fft_mamba, nafnet, unet):
     node.shape(like_first)
 
 
@@ -39,11 +40,25 @@ def _(*inputs: Any, **params: Any) -> Tensor:
 
 @wiener.work
 def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any) -> tuple[float, float]:
-    y, x = (n + min(k, 2 * n) for n, k in zip(electrons.shape[-2:], psf.intensity.shape[-2:], strict=True))
+    y, x = _torus(electrons, psf)
     coarse = max(electrons.shape[-2:]) / 2 ** halvings((electrons.shape[-2], electrons.shape[-1]))
     unknowns = len(electrons) * coarse**2  # of the coarsest grid, which is solved as a dense system
     operations = len(electrons) * transform_operations(y, x) + unknowns**3 / _SOLVED
     return max(31.0 * len(electrons) * y * x, _SYSTEM * unknowns**2), operations
+
+
+@richardson_lucy.work
+def _(
+    result: Tensor, electrons: Tensor, psf: Psf, *others: Any, iterations: int = 40, **params: Any
+) -> tuple[float, float]:
+    y, x = _torus(electrons, psf)
+    return 4.0 * len(electrons) * y * x, 4.0 * (iterations + 1) * len(electrons) * transform_operations(y, x)
+
+
+def _torus(picture: Tensor, psf: Psf) -> tuple[int, int]:
+    """Return the size of the transforms that deconvolve a picture, whose border they extend by the PSF."""
+    y, x = (n + min(k, 2 * n) for n, k in zip(picture.shape[-2:], psf.intensity.shape[-2:], strict=True))
+    return y, x
 
 
 def _layers(result: Tensor, *inputs: Any, width: int = 32, **params: Any) -> tuple[float, float]:

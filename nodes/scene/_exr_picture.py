@@ -13,7 +13,6 @@ from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.input_files import not_finite, once_per_version, refuse_large_picture
 from neusee.nodes.scene._crop_to_frame import enlarged, framed
 from neusee.nodes.scene._spectral_exr import PartHeader, exr_parts, part_headers
-from neusee.nodes.shape_preview import without_values
 from neusee.nodes.units import DataFile, Shape
 
 White = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -59,17 +58,17 @@ def _(*, file: Path, shape: Shape | None = None, part: str | None = None, **para
     return notes + enlarged(found.size, shape)
 
 
-@exr.preview
-def _(*, file: Path, shape: Shape | None = None, part: str | None = None, **params: Any) -> Tensor:
-    return without_values(3, *(shape or _chosen(file, part)[1].size))
-
-
 @exr.check
 def _(result: Tensor, *, file: Path, part: str | None = None, **params: Any) -> list[Check]:
     linear = _linear(file, part)
     below, least = int((linear < 0).sum()), float(linear.min())
     text = f"peak {float(result.max()):.4g}, mean {float(result.mean()):.3g}"
     return [Check(text + (f"; {below} of {linear.numel()} values were negative, down to {least:.2g}" if below else ""))]
+
+
+def picture_size(file: Path, part: str | None) -> tuple[int, int]:
+    """Return the numbers of rows and columns of the picture in an OpenEXR file, from the header of its part."""
+    return _chosen(file, part)[1].size
 
 
 def _chosen(file: Path, part: str | None) -> tuple[int, PartHeader, list[str]]:

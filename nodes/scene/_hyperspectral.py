@@ -9,7 +9,6 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.scene._crop_to_frame import enlarged, framed
 from neusee.nodes.scene._cube_files import Layout, cube_and_wavelengths, exr_size, size_and_type, wrong_values
-from neusee.nodes.shape_preview import without_values
 from neusee.nodes.spectra._spectral_tables import Table, require_range
 from neusee.nodes.units import DataFile, Shape, Wavelength
 from neusee.nodes.values import Bands
@@ -59,18 +58,10 @@ def _(
 ) -> list[str]:
     if file.suffix != ".exr":
         _refuse_missing_range(file, start, stop)
-    notes = enlarged(_rows_and_columns(file, variable, layout), shape)
+    notes = enlarged(rows_and_columns(file, variable, layout), shape)
     if problem := wrong_values(file, variable):
         raise ParameterError("file", problem)
     return notes
-
-
-@hyperspectral.preview
-def _(
-    bands: Bands | None, *, file: Path, variable: str | None, layout: Layout, shape: Shape | None, **params: Any
-) -> Tensor | None:
-    size = shape or _rows_and_columns(file, variable, layout)
-    return None if bands is None else without_values(len(bands.centres), *size)
 
 
 def _refuse_missing_range(file: Path, start: float | None, stop: float | None) -> None:
@@ -80,7 +71,7 @@ def _refuse_missing_range(file: Path, start: float | None, stop: float | None) -
         raise ParameterError(name, text)
 
 
-def _rows_and_columns(file: Path, variable: str | None, layout: Layout) -> tuple[int, int]:
+def rows_and_columns(file: Path, variable: str | None, layout: Layout) -> tuple[int, int]:
     """Return the numbers of rows and columns of a cube, from the header of its file."""
     if file.suffix == ".exr":
         return exr_size(file)

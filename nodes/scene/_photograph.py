@@ -9,7 +9,6 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.input_files import once_per_version, refuse_large_picture
 from neusee.nodes.scene._crop_to_frame import enlarged, framed
-from neusee.nodes.shape_preview import without_values
 from neusee.nodes.units import DataFile, Shape
 
 _MODES = ("RGB", "L", "P", "1", "I", "I;16", "I;16B")
@@ -50,11 +49,6 @@ def _(*, file: Path, shape: Shape | None = None) -> list[str]:
     notes = [f"{file.name}: colour profile {profile!r} is ignored, and the file read as sRGB"] if profile else []
     notes += [f"{file.name}: picture turned upright by EXIF orientation {turned}"] if turned != 1 else []
     return notes + enlarged(size, shape)
-
-
-@photograph.preview
-def _(*, file: Path, shape: Shape | None = None) -> Tensor:
-    return without_values(3, *(shape or read_header(file)[2]))
 
 
 def read_header(file: Path) -> tuple[str, int, tuple[int, int]]:

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.shape_preview import without_values
 from neusee.nodes.units import Fraction, Shape
 
 Kind = Literal["flat", "edge", "slanted_edge", "siemens", "points"]
@@ -42,11 +41,6 @@ def _(*, low: float = 0.0, high: float = 1.0, **params: Any) -> list[str]:
     if low > high:
         raise ParameterError("low", f"low {low:g} is above high {high:g}: exchange the two numbers")
     return []
-
-
-@targets.preview
-def _(*, shape: tuple[int, int], **params: Any) -> Tensor:
-    return without_values(3, *shape)
 
 
 @targets.check

@@ -11,7 +11,6 @@ from torch import Generator, Tensor
 from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Well
-from neusee.nodes.shape_preview import same_shape, without_values
 from neusee.nodes.units import Gain, Shape
 
 Rounding = Literal["nearest", "dithered_floor"]
@@ -50,9 +49,6 @@ def _(electrons: TensorStats, *, capacity: float) -> float:
 @full_well.propagate_error
 def _(electrons: ErrorBound, **params: Any) -> float:
     return electrons.rms
-
-
-full_well.preview(same_shape)
 
 
 @full_well.check
@@ -144,9 +140,6 @@ def _(*, gain: float, bits: int = 16, **params: object) -> list[str]:
     return [f"the largest digital number is {top} DN = {top / gain:.0f} e-"]
 
 
-digitize.preview(same_shape)
-
-
 @digitize.check
 def _(result: Tensor, *inputs: Tensor, bits: int = 16, **params: Any) -> list[Check]:
     high, low = (int(torch.count_nonzero(result == end)) / max(1, result.numel()) for end in (2**bits - 1, 0))
@@ -187,11 +180,6 @@ def _(*, shape: tuple[int, int], image: Tensor | None = None) -> list[str]:
     if image is not None and (problem := _too_small(image, shape)):
         raise ParameterError("shape", problem)
     return []
-
-
-@crop.preview
-def _(image: Tensor | None, *, shape: tuple[int, int]) -> Tensor | None:
-    return None if image is None else without_values(*image.shape[:-2], *shape)
 
 
 @crop.propagate_error

@@ -13,7 +13,6 @@ from neusee.nodes import Check, ErrorBound, TensorStats, node
 from neusee.nodes._half_precision import refuse_not_finite, single
 from neusee.nodes.sensor._channel_sums import weighted
 from neusee.nodes.sensor._saturation import Efficiency, Well, photons_per_joule, photons_that_fill, saturation
-from neusee.nodes.shape_preview import same_shape, without_values
 from neusee.nodes.units import PositiveLength, Time
 from neusee.nodes.values import Bands, Channels
 
@@ -63,13 +62,6 @@ def _(
         return weighted(irradiance._replace(planes=irradiance.planes.double()), weights)
     channels = [(row[:, None, None] * irradiance.double()).sum(-3) for row in weights.to(irradiance.device)]
     return torch.stack(channels, -3)
-
-
-@expose.preview
-def _(irradiance: Tensor | None, bands: Any, responses: Tensor | None, *others: Any, **params: Any) -> Tensor | None:
-    if irradiance is None or responses is None:
-        return None
-    return without_values(*irradiance.shape[:-3], len(responses), *irradiance.shape[-2:])
 
 
 @expose.check
@@ -158,11 +150,6 @@ def _(plain_image: ErrorBound, *others: object, result: TensorStats, **params: A
     return result.max * share / (1.0 - share) if share < 1.0 else math.inf
 
 
-@level.preview
-def _(plain_image: Any, bands: Bands | None, responses: Any, **params: Any) -> Tensor | None:
-    return None if bands is None else without_values(len(bands.centres), dtype=torch.float64)
-
-
 @level.preflight
 def _(*, strength: float, rule: str = "channel_sum", **params: object) -> list[str]:
     notes = (
@@ -196,9 +183,6 @@ def add_photons(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: lis
 @add_photons.propagate_error
 def _(photons: ErrorBound, *added: list[ErrorBound] | None, **params: Any) -> float:
     return math.fsum(part.rms for part in (photons, *chain.from_iterable(filter(None, added))))
-
-
-add_photons.preview(same_shape)
 
 
 @add_photons.check

@@ -12,7 +12,6 @@ from torch import Generator, Tensor
 from neusee.nodes import Check, ErrorBound, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Efficiency, Well
-from neusee.nodes.shape_preview import same_shape
 from neusee.nodes.units import Electrons, Fraction
 
 Distribution = Literal["gaussian", "poisson"]
@@ -63,9 +62,6 @@ def _(*, mean: str = "additive", mean_shift: float = 0.0, **params: object) -> l
     if mean == "literal" and mean_shift < 1:
         return [f"photon noise as the paper prints: the mean is {mean_shift:.0%} of the light"]
     return []
-
-
-photon_noise.preview(same_shape)
 
 
 @photon_noise.check
@@ -162,9 +158,6 @@ def dark_current(
     return _by_parts(with_dark_current, single(electrons), rng)
 
 
-dark_current.preview(same_shape)
-
-
 def _sampled_mean(mean: float, rng: Generator) -> float:
     drawn = torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)
     return mean * max(0.0, min(_MOST, 1.0 + 0.5 * float(drawn)))
@@ -197,9 +190,6 @@ def read_noise(
         return part + normal(part, rng).mul_(read_noise).add_(offset)
 
     return _by_parts(with_read_noise, single(electrons), rng)
-
-
-read_noise.preview(same_shape)
 
 
 @read_noise.skip_bound

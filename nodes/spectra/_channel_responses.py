@@ -2,11 +2,9 @@
 
 from typing import Literal
 
-import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.shape_preview import without_values
 from neusee.nodes.spectra._spectral_tables import measured_camera, observer
 from neusee.nodes.values import Bands
 
@@ -37,7 +35,7 @@ def responses(bands: Bands, *, camera: Camera = "CIE 1931") -> Tensor:
 
 @responses.preflight
 def _(*, bands: Bands | None = None, camera: Camera = "CIE 1931") -> list[str]:
-    if bands is None:
+    if bands is None or bands.centres.is_meta:
         return []
     centres = bands.centres * 1e9
     low, high = _SEEN[camera]
@@ -53,11 +51,6 @@ def _(*, bands: Bands | None = None, camera: Camera = "CIE 1931") -> list[str]:
         f"no channel of {camera} sees {len(unseen)} of {len(centres)} bands, {which}: the largest relative response is "
         f"{largest:.2g}, below {_UNSEEN:g}, so their light is missing from the picture; choose {low:g} to {high:g} nm"
     ]
-
-
-@responses.preview
-def _(bands: Bands | None, **params: object) -> Tensor | None:
-    return None if bands is None else without_values(3, len(bands.centres), dtype=torch.float64)
 
 
 @responses.check

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes._half_precision import single
-from neusee.nodes.shape_preview import same_shape, without_values
 from neusee.nodes.spectra._spectral_tables import daylight, light, require_range
 from neusee.nodes.units import Temperature
 from neusee.nodes.values import Bands, LowRankCube
@@ -48,11 +47,6 @@ def _(*, kind: str = "daylight", temperature: float = 6504.0) -> list[str]:
             f"CIE daylight is defined from 4000 K to 25000 K, not at {temperature:g} K: choose kind A or an LED",
         )
     return []
-
-
-@illuminant.preview
-def _(bands: Bands | None, **params: Any) -> Tensor | None:
-    return None if bands is None else without_values(len(bands.centres), dtype=torch.float64)
 
 
 @illuminant.check
@@ -122,9 +116,6 @@ def _(reflectance: Tensor | LowRankCube, illuminant: Tensor, *, times: str = "on
 @illuminate.preflight
 def _(*, times: str = "once") -> list[str]:
     return ["the illuminant is applied twice, as the paper prints: its spectrum is squared"] if times == "twice" else []
-
-
-illuminate.preview(same_shape)
 
 
 @illuminate.check

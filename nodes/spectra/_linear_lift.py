@@ -8,7 +8,6 @@ from torch import Tensor
 
 from neusee.nodes import Check, Node, node
 from neusee.nodes._half_precision import single
-from neusee.nodes.shape_preview import without_values
 from neusee.nodes.spectra._low_rank_cube import Share, as_low_rank_cube, compress, plane_checks
 from neusee.nodes.spectra._principal_planes import Source, few_planes
 from neusee.nodes.spectra._spectral_tables import mallett, paints, require_range, to_srgb
@@ -104,14 +103,8 @@ def _attach(lift: Node, low_rank: Node, matrix: Callable[[Bands], Tensor]) -> No
         planes: LowRankCube = compress.hooks.reference(lifted(rgb, bands), within=within)
         return planes
 
-    lift.preview(cube_preview)
     low_rank.check(plane_checks)
     lift.low_rank_form = low_rank
-
-
-def cube_preview(rgb: Tensor | None, bands: Bands | None, **params: object) -> Tensor | None:
-    """Return a spectral cube without values, in the size of a picture, or None for an unknown picture or bands."""
-    return None if rgb is None or bands is None else without_values(len(bands.centres), *rgb.shape[-2:])
 
 
 def lift_checks(result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None = None) -> list[Check]:

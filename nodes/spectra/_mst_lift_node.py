@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.network_weights import empty
-from neusee.nodes.spectra._linear_lift import cube_preview, lift_checks, needs_rgb
+from neusee.nodes.spectra._linear_lift import lift_checks, needs_rgb
 from neusee.nodes.spectra._mst_plus_plus import BANDS, MSTPlusPlus
 from neusee.nodes.units import DataFile
 from neusee.nodes.values import Bands
@@ -61,9 +61,6 @@ def _(*, weights: Path | None = None, untrained: str = "refuse", **params: Any) 
         )
         raise ParameterError("weights", text)
     return ["MST++ is untrained: the spectra have no meaning"]
-
-
-lift_mst_plus_plus.preview(cube_preview)
 
 
 @lift_mst_plus_plus.check

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.shape_rules import at_least_single, blank, double, like_first
-from neusee.nodes.spectra._bands import bands, filters, line
 from neusee.nodes.spectra._camera_colour import grain, render
 from neusee.nodes.spectra._channel_responses import responses
 from neusee.nodes.spectra._dead_leaves import leaves
@@ -15,27 +14,8 @@ from neusee.nodes.spectra._illuminant import illuminant, illuminate
 from neusee.nodes.spectra._linear_lift import lift_lmmse, lift_lmmse_mixture, lift_mallett, lift_mallett_mixture
 from neusee.nodes.spectra._low_rank_cube import compress
 from neusee.nodes.spectra._metamers import metamers
+from neusee.nodes.spectra._mst_lift_node import lift_mst_plus_plus
 from neusee.nodes.values import Bands, LowRankCube
-
-_FEW = 4096  #: bands that are computed, because the work of later nodes depends on the wavelengths
-
-
-@bands.shape
-def _(*, count: int, **params: Any) -> Bands:
-    few: Bands = bands(count=count, **params) if count <= _FEW else Bands(double(count), double(count), double(count))
-    return few
-
-
-@line.shape
-def _(*, count: int = 5, **params: Any) -> Bands:
-    few: Bands = line(count=count, **params) if count <= _FEW else Bands(double(count), double(count), double(count))
-    return few
-
-
-@filters.shape
-def _(**params: Any) -> Bands:
-    few: Bands = filters(**params)
-    return few
 
 
 @illuminant.shape
@@ -73,8 +53,8 @@ def _low_rank(planes: int, bands: int, like: Tensor) -> LowRankCube:
     return LowRankCube(whole, double(bands, planes), rest, rest, blank(*like.shape[-2:], dtype=dtype))
 
 
-lift_lmmse.shape(_cube)
-lift_mallett.shape(_cube)
+for node in (lift_lmmse, lift_mallett, lift_mst_plus_plus):
+    node.shape(_cube)
 lift_lmmse_mixture.shape(_mixture)
 lift_mallett_mixture.shape(_mixture)
 

@@ -77,13 +77,26 @@ def test_hooks_take_what_the_node_takes(node):
         node.hooks.reference,
         node.hooks.skip_bound,
         node.hooks.preflight,
-        node.hooks.preview,
+        node.hooks.shape,
         node.hooks.check,
     ):
         taken = {} if hook is None else inspect.signature(hook).parameters
         for p in taken.values():
             known = p.name in own or p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL) or p.name == "result"
             assert known or p.kind is not p.KEYWORD_ONLY, f"{node.path}: a hook asks for {p.name}"
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("nodes/**/*.py")), ids=lambda p: str(p.relative_to(ROOT)))
+def test_rules_for_shapes_are_used_by_nothing_that_computes_a_result(path):
+    """No cache key covers a file of rules, so only the family imports the file, to attach the rules to its nodes."""
+    imported = {
+        name
+        for item in ast.walk(ast.parse(path.read_text()))
+        if isinstance(item, ast.ImportFrom)
+        for name in (item.module, *(f"{item.module}.{alias.name}" for alias in item.names))
+    }
+    assert path.name == "_result_shapes.py" or "neusee.nodes.shape_rules" not in imported
+    assert path.name == "__init__.py" or not [name for name in imported if name.endswith("._result_shapes")]
 
 
 @every_file

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 from neusee.nodes import Node
 from neusee.workflows.engine.band_results import bands_in
-from neusee.workflows.engine.step_shapes import Form, bytes_of, complete, form_of, inputs_of, without_values
 from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.recipe.step_shapes import Form, bytes_of, complete, form_of, inputs_of, without_values
 
 _UPPER = 4.0  #: peak memory and time of a node that was never measured, as a multiple of what its tensors alone take
 _LEAST = 1 << 26  #: bytes of a result whose shape is not known, at the least

@@ -173,7 +173,7 @@ class Code:
     def _look(self, module: str, packages: frozenset[str], root: bool) -> Look | None:
         key = (module, packages, root)
         if key not in self._looks:
-            self._looks[key] = None if module in _LEFT_OUT else self._looked(module, packages, root)
+            self._looks[key] = None if _decides_nothing(module) else self._looked(module, packages, root)
         return self._looks[key]
 
     def _looked(self, module: str, packages: frozenset[str], root: bool) -> Look | None:
@@ -226,7 +226,7 @@ class Code:
         return functools.cache(lambda name: self._followed(name, packages))
 
     def _followed(self, module: str, packages: frozenset[str]) -> bool:
-        outside = module in _LEFT_OUT or f"{module}.".startswith(f"{_WORKFLOWS}.")
+        outside = _decides_nothing(module) or f"{module}.".startswith(f"{_WORKFLOWS}.")
         return not outside and self._origin(module, packages).kind == "source"
 
     def _origin(self, module: str, packages: frozenset[str]) -> Origin:
@@ -238,7 +238,7 @@ class Code:
     def _summary_of(self, module: str, packages: frozenset[str]) -> tuple[Path, Summary] | None:
         """Return the file and the summary of a module whose source is followed, or None."""
         origin = self._origin(module, packages)
-        if origin.kind != "source" or origin.path is None or module in _LEFT_OUT:
+        if origin.kind != "source" or origin.path is None or _decides_nothing(module):
             return None
         return origin.path, self._summary(module, origin.path)
 
@@ -252,6 +252,11 @@ class Code:
                 raise LookupError(f"{path}: {error}") from error
             self._new = True
         return self._summaries[name]
+
+
+def _decides_nothing(module: str) -> bool:
+    """Return True for a module that decides no result, such as the rules for the shapes of a family of nodes."""
+    return module in _LEFT_OUT or (module.startswith(f"{ROOT}.") and module.endswith("._result_shapes"))
 
 
 def parts_file(root: Path, code: str) -> Path:

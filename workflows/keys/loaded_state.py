@@ -29,6 +29,7 @@ from neusee.workflows.keys.reachable_code import read_names, written_only
 from neusee.workflows.keys.source_summary import Summary
 
 _SKIPPED = re.compile(r"__\w+__|_abc_\w*|model_\w+|__pydantic\w*")  #: names of a class that its source decides
+_FORETELLING = frozenset({"shape", "work"})  #: hooks that only tell the size and the cost of a result before the run
 _KINDS: tuple[tuple[str, tuple[type, ...]], ...] = (
     ("text", (str, PurePath)),
     ("object", (Enum,)),
@@ -181,7 +182,8 @@ def counted_values(module: ModuleType, summary: Summary, free: Collection[str], 
 
 def _hooks(node: Node) -> Iterator[Any]:
     for name in node.hooks.__slots__:
-        yield getattr(node.hooks, name)
+        if name not in _FORETELLING:
+            yield getattr(node.hooks, name)
     yield from (node.channel_sum_form, node.low_rank_form)
 
 

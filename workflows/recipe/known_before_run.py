@@ -12,6 +12,7 @@ from torch import Tensor
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step, Wire, in_order
 from neusee.workflows.recipe.parameters import Checker
+from neusee.workflows.recipe.step_shapes import Form, bytes_of, form_of, inputs_of, tensors_of
 from neusee.workflows.recipe.text.yaml_values import Value
 
 _CHEAPER = ("channel_sum_form", "low_rank_form", "accepts_channel_sums", "accepts_low_rank")
@@ -40,15 +41,15 @@ def check_steps(checked: Iterable[CheckedStep], checker: Checker, outputs: Itera
     computed = set(in_order(sources, [name for name in outputs or () if name in by_name]))
     for name in by_name if outputs is None else in_order(sources, by_name):
         each = by_name[name]
-        inputs = _inputs(each.step, known)
+        inputs = dict(zip(each.step.node.inputs, inputs_of(each.step, known), strict=True))
         found = checker.preflight(each.step, inputs, lambda wire: _params(by_name, wire), each.params, each.value)
         if found is None:
             notes[name] = [] if outputs is None or name in computed else _set_aside(each.step, inputs, checker)
             continue
         notes[name] = found
         try:
-            known[name] = _preview(each.step, inputs)
-        except ValueError as error:
+            known[name] = _form(each.step, known)
+        except (ValueError, OverflowError) as error:
             checker.diagnostics.append(Diagnostic(each.value.key, each.value.name, str(error)))
         if name in computed and (problem := _too_large(each.step, inputs, known.get(name), memory)):
             del known[name]
@@ -73,7 +74,7 @@ def refuse_indices(recipe: Recipe) -> Iterator[Diagnostic]:
     """Yield a diagnostic for each expected number whose index or field the result cannot have."""
     known: dict[str, Any] = {}
     for name in in_order({name: step.sources for name, step in recipe.steps.items()}, [e.step for e in recipe.expect]):
-        known[name] = _preview(recipe.steps[name], _inputs(recipe.steps[name], known))
+        known[name] = _form(recipe.steps[name], known)
     for expected in recipe.expect:
         if problem := _wrong_index(expected, known.get(expected.step)):
             yield Diagnostic(expected.mark, f"expect.{expected.name}.at = {list(expected.at)}", problem)
@@ -93,20 +94,11 @@ def _params(by_name: Mapping[str, CheckedStep], wire: Wire) -> Mapping[Any, Valu
     return {} if source is None else source.params.items
 
 
-def _inputs(step: Step, known: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what is known of each input of a step; a list input has a list, an unknown input None."""
-    return {
-        name: [known.get(one) for one in wire] if isinstance(wire, tuple) else known.get(wire or "")
-        for name, wire in step.wires.items()
-    }
-
-
-def _preview(step: Step, inputs: Mapping[str, Any]) -> Any:
-    """Return what is known of the result of a step before the run, or None."""
+def _form(step: Step, known: Mapping[str, Form]) -> Form:
+    """Return what is known of the result of a step; a step that is computed before the run tells its own mistakes."""
     if step.node.before_run:
         return step.node(**step.params)
-    hook = step.node.hooks.preview
-    return None if hook is None else hook(*inputs.values(), **step.params)
+    return form_of(step.node, inputs_of(step, known), step.params)
 
 
 def _too_large(step: Step, inputs: Mapping[str, Any], result: Any, memory: float) -> str:
@@ -116,24 +108,15 @@ def _too_large(step: Step, inputs: Mapping[str, Any], result: Any, memory: float
     """
     if result is None or any(getattr(step.node, name) for name in _CHEAPER):
         return ""
-    needed = _bytes(result) + max([_bytes(value) for value in inputs.values()], default=0)
+    single = [one for value in inputs.values() for one in (value if type(value) is list else [value])]
+    needed = bytes_of(result) + max(map(bytes_of, single), default=0.0)
     if needed <= memory:
         return ""
-    sizes = " x ".join(map(str, max(_tensors(result), key=Tensor.numel).shape))
+    sizes = " x ".join(map(str, max(tensors_of(result), key=Tensor.numel).shape))
     return (
         f"the step {step.name.partition('[')[0]} needs {needed / _GB:.4g} GB for a result of {sizes} values and one "
         f"input, and this machine has {memory / _GB:.3g} GB: choose a smaller shape, or fewer bands or samples"
     )
-
-
-def _bytes(value: Any) -> int:
-    return sum(tensor.numel() * tensor.element_size() for tensor in _tensors(value))
-
-
-def _tensors(value: Any) -> list[Tensor]:
-    """Return the tensors of a result, which is a tensor or a named tuple of tensors."""
-    parts = value if isinstance(value, tuple) else (value,)
-    return [part for part in parts if isinstance(part, Tensor)]
 
 
 def _wrong_index(expected: Expectation, known: Any) -> str:

@@ -57,8 +57,7 @@ def writable_folder(out: str | os.PathLike[str]) -> Path:
 
     A folder that does not exist yet is not made: the nearest existing folder above it must be writable.
     """
-    root = Path(out)
-    existing = root
+    root = existing = Path(out)
     try:
         existing = next(path for path in (root, *root.absolute().parents) if path.exists() or path.is_symlink())
         if existing.is_dir():

@@ -74,11 +74,7 @@ def document(
         "tolerance": recipe.tolerance,
         "seed": recipe.seed,
         "counts": state_counts(done),
-        "verdict": verdict(found, failed, len(unchecked)),
-        "missed": [e["name"] for e in found if not e["ok"]],
-        "failed": failed,
-        "expected": found,
-        "unchecked": unchecked,
+        **_judgement(found, failed, unchecked),
         "table": table(recipe, result.keys, result.value),
         "metrics": metrics(recipe, result.keys, result.value),
         "notes": [*_sampling(recipe), *recipe.notes, *unchecked_lines(unchecked), *warned],
@@ -96,6 +92,26 @@ def document(
         "missing": [{"name": n, "title": _TITLES.get(n, n), "why": why} for n, why in missing.items()],
         "facts": _facts(result),
         "inputs": _inputs(recipe),
+    }
+
+
+def _judgement(
+    found: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked: Sequence[Mapping[str, str]]
+) -> dict[str, Any]:
+    """Return which expected numbers and checks a run met, and which it missed."""
+    return {
+        **_comparisons(found, failed, unchecked),
+    }
+
+
+def _comparisons(found: list[dict[str, Any]], failed: list[str], unchecked: list[dict[str, str]]) -> dict[str, Any]:
+    """Return the expected numbers of a run, compared and not compared, the checks that failed, and a verdict."""
+    return {
+        "verdict": verdict(found, failed, len(unchecked)),
+        "missed": [e["name"] for e in found if not e["ok"]],
+        "failed": failed,
+        "expected": found,
+        "unchecked": unchecked,
     }
 
 

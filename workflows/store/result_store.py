@@ -17,9 +17,9 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.keys.seal import NotRead, Unsigned
+from neusee.workflows.keys.seal import NotRead
 from neusee.workflows.store import metadata, payload
 from neusee.workflows.store.bandwidth import Speeds
 from neusee.workflows.store.budget_eviction import LOW, CacheBudget
@@ -30,24 +30,21 @@ from neusee.workflows.store.maintenance import Maintained
 from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept
 from neusee.workflows.store.shared_folder import Disk
 from neusee.workflows.store.small_results import SmallResults
+from neusee.workflows.store.store_warnings import Warned
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from neusee.workflows.store.band_files import Blobs
 
-
-_CONSEQUENCE = "the run goes on, but results are not stored, so that the next run computes them again"
 _USED = 3600.0  #: smallest time in s between two records of the use of a value
 
 
-class Store(Maintained):
+class Store(Warned, Maintained):
     """Store of computed results in a folder, each under its cache key.
 
     A failure of the folder gives a missing result, never a wrong result.
     """
-
-    failures: ClassVar[list[str]] = []  #: the warnings of all stores of this process, for the reports of studies
 
     def __init__(
         self, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
@@ -71,8 +68,6 @@ class Store(Maintained):
         self._known: dict[str, Metadata] = {}
         self._lost: set[str] = set()  # damaged results that the user may have no permission to move
         self._used: set[str] = set()
-        self.failure = ""  #: the warning after the first write that failed
-        self._told = False
 
     def __reduce__(self) -> tuple[Any, ...]:  # another process receives the path and opens the store
         return partial(type(self), self.root, verify=self.verify, budget=self.budget), ()
@@ -213,13 +208,6 @@ class Store(Maintained):
             self.report_failure(error)
             return False
 
-    def report_failure(self, error: Exception) -> None:
-        """Warn that the folder cannot be written, once for each store; `failure` keeps the text for reports."""
-        if not self.failure:
-            self.failure = f"the cache {self.root} cannot be written ({error}): {_CONSEQUENCE}"
-            self.failures.append(self.failure)
-            warnings.warn(self.failure, stacklevel=5)
-
     def _write(self, key: str, value: Any, about: Metadata) -> bool:
         began = time.perf_counter()
         entry, tensors, bands = payload.described(key, value, about, self.blobs)
@@ -297,11 +285,3 @@ class Store(Maintained):
                 self.brief.append(metadata.receipt(small))
             if not os.path.lexists(self.disk.path(key, "json")):
                 self._lost.discard(key)
-
-    def leave(self, error: NotRead) -> None:
-        """Issue one warning for all results that are left alone, because they are of another format or unsigned."""
-        if not self._told:
-            what = "without a signature by NEUSEE_CACHE_SECRET" if isinstance(error, Unsigned) else "of another version"
-            text = f"results {what} in {self.root} are not read, and count as missing"
-            warnings.warn(f"{text}: `neusee cache gc` removes those that nobody used for a week", stacklevel=4)
-        self._told = True

@@ -9,7 +9,6 @@ from torch.nn.functional import conv2d, pad
 
 from neusee.nodes import Check, node
 from neusee.nodes.optics._transform._chirp_transform import smooth
-from neusee.nodes.shape_preview import same_shape
 from neusee.nodes.values import Psf
 
 Border = Literal["zero", "reflect"]
@@ -46,9 +45,6 @@ def _(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
         scene = pad(scene, (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2))
     flat = scene.reshape(-1, *scene.shape[-3:])
     return conv2d(flat, kernel.flip(-1, -2)[:, None], groups=len(kernel)).reshape(radiance.shape)
-
-
-image.preview(same_shape)
 
 
 @image.check

@@ -104,7 +104,7 @@ def test_an_expected_number_that_the_change_affects_is_dropped_rather_than_refus
 
 
 def test_what_is_known_before_the_run_is_what_the_run_gives(tmp_path):
-    """Shapes of every step that has a preview, against the results of a run in full."""
+    """Shapes of every step that has a rule, against the results of a run in full."""
     from neusee.workflows import load, run
     from neusee.workflows.graph.recipe_graph import in_order
     from neusee.workflows.store.result_store import Store
@@ -112,8 +112,7 @@ def test_what_is_known_before_the_run_is_what_the_run_gives(tmp_path):
     recipe = load("first_light", SMALL)
     known = {}
     for name in in_order({name: step.sources for name, step in recipe.steps.items()}, recipe.steps):
-        step = recipe.steps[name]
-        known[name] = known_before_run._preview(step, known_before_run._inputs(step, known))
+        known[name] = known_before_run._form(recipe.steps[name], known)
     found = {name: value for name, value in known.items() if value is not None}
     assert {"raw[mask]", "truth", "psf[plain]", "spot[mask,green]", "lsr[mask]", "level"} <= found.keys()
     results = run(recipe, Store(tmp_path / "store"), outputs=list(found)).values

@@ -1,14 +1,17 @@
 """Shapes before a run, and what a run then gives."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from neusee.nodes import node
+from neusee.nodes.values import Bands
 from neusee.workflows.engine.cost_laws import measured_size, shipped, sizes_of
 from neusee.workflows.engine.runner import run
-from neusee.workflows.engine.step_shapes import bytes_of, form_of, forms_of
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.recipe.loading import load
+from neusee.workflows.recipe.step_shapes import bytes_of, form_of, forms_of
 from neusee.workflows.report.contents import steps_of, wanted
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -85,16 +88,28 @@ def test_every_step_of_a_shipped_recipe_has_a_shape_and_a_measured_law(name):
     assert {recipe.steps[step].node.path for step in sizes} - shipped().keys() == set()
 
 
+@node()
+def countless() -> Bands:
+    raise AssertionError("no node runs before the run")
+
+
+countless.shape(lambda: Bands(*(torch.empty(10**8, dtype=torch.float64, device="meta") for _ in Bands._fields)))
+
+
 def test_more_bands_than_memory_can_hold_have_a_size_at_once():
-    recipe = load("first_light", ["optics.bands=100000000"])
-    sizes = sizes_of(recipe, ["bands", "stop", "flat", "index", "pupil[plain]", "psf[plain]"])
+    """The check of a recipe refuses so many bands, so the parameters are changed after it; bands of the user's own."""
+    recipe = load("first_light", ["optics.bands=3"])
+    steps = {**recipe.steps, "bands": replace(recipe.steps["bands"], node=countless, params={})}
+    sizes = sizes_of(replace(recipe, steps=steps), ["bands", "stop", "flat", "index", "pupil[plain]", "psf[plain]"])
     assert sizes["psf[plain]"].result == 1e8 * (512 * 512 * 4 + 8)
     assert sizes["psf[plain]"].bands == 10**8
 
 
 def test_a_result_beyond_every_address_is_infinite_and_no_error():
-    recipe = load("first_light", ["scene.shape=[10000000000,10000000000]"])
-    assert sizes_of(recipe, ["scene"])["scene"].result == float("inf")
+    recipe = load("first_light", [])
+    scene = recipe.steps["scene"]
+    steps = {"scene": replace(scene, params={**scene.params, "shape": (10**10, 10**10)})}
+    assert sizes_of(replace(recipe, steps=steps), ["scene"])["scene"].result == float("inf")
 
 
 @node()
@@ -113,3 +128,35 @@ def test_a_rule_that_fails_leaves_the_error_to_the_step():
 
     odd.shape(lambda x: x.shape[7])
     assert form_of(odd, [torch.empty(3, device="meta")], {}) is None
+
+
+def test_a_rule_that_does_not_need_an_unknown_input_tells_the_shape():
+    """A mask of the user's own has no rule; the pupil function, and with it the check of the PSF window, is known."""
+    from neusee.nodes.optics import pupil, stop
+    from neusee.nodes.spectra import bands
+
+    three, grid = bands(start=4e-7, stop=7e-7, count=3), stop(samples=8, pitch=1e-5, diameter=8e-5)
+    form = form_of(pupil, [None, None, three, grid, None], {})
+    assert told(form) == told(pupil(torch.zeros(8, 8), torch.ones(3).double(), three, grid))
+    assert torch.equal(form.wavelengths, three.centres)
+    assert form_of(pupil, [torch.zeros(8, 8), None, None, grid, None], {}) is None
+
+
+def test_a_rule_knows_what_the_header_of_a_picture_says(tmp_path):
+    """The picture is stored on its side, and the EXIF orientation turns it upright."""
+    from PIL import Image
+
+    from neusee.nodes.scene import photograph
+
+    orientation = Image.Exif()
+    orientation[0x0112] = 6
+    Image.new("RGB", (40, 24)).save(tmp_path / "a.jpg", exif=orientation)
+    params = {"file": tmp_path / "a.jpg", "shape": None}
+    assert told(form_of(photograph, [], params)) == told(photograph(**params)) == ((3, 40, 24), torch.float32)
+
+
+def test_the_direction_of_a_laser_is_known_with_its_values():
+    from neusee.nodes.optics import direction
+
+    assert form_of(direction, [], {"angle": (1e-3, 2e-3)}).tolist() == [1e-3, 2e-3]
+    assert told(form_of(direction, [], {"angle": None})) == ((2,), torch.float64)

@@ -161,6 +161,31 @@ def test_a_loaded_module_keeps_the_digest_of_the_code_that_runs(trial):
     assert Code(trial.store / "code.json").digest("neusee.nodes.trial._head") != before
 
 
+def test_an_edit_of_the_rule_for_a_shape_computes_nothing_again(trial):
+    """The rule hangs on a node of the family, and the second node imports the family, which imports the rule."""
+    rule = "@head.shape\ndef _(*, start):\n    return torch.empty((3,), device='meta')\n"
+    head = "import torch\nfrom neusee.nodes.trial._head import head\n\n\n"
+    (trial.folder / "trial/_result_shapes.py").write_text(head + rule)
+    trial.edit("trial/__init__.py", "from neusee.nodes.trial._head", "from . import _result_shapes\nfrom ._head")
+    trial.edit("trial/_tail.py", "from pathlib", "from neusee.nodes.trial import head\nfrom pathlib")
+    first = trial.run()
+    assert first[1:] == ("run", "run")
+    trial.edit("trial/_result_shapes.py", "(3,)", "(4,)")
+    assert trial.run() == (first[0], "not needed", "cached")
+
+
+def test_no_rule_for_a_shape_is_in_the_digest_of_a_shipped_node(tmp_path):
+    from neusee.workflows.recipe.step_declarations import all_nodes
+
+    code = Code(tmp_path / "code.json")
+    for _, each in all_nodes():
+        code.digest(each.fn.__module__)
+    code.save()
+    covered = {name for path in (tmp_path / "code").glob("*.json") for name in json.loads(path.read_text())}
+    assert "neusee.nodes.optics._psf" in covered
+    assert [name for name in covered if name.endswith(("_result_shapes", "shape_rules"))] == []
+
+
 def test_only_what_is_imported_counts(trial):
     trial.run()
     head, tail = (Code(trial.store / "code.json").digest(f"neusee.nodes.trial.{n}") for n in ("_head", "_tail"))

@@ -37,8 +37,8 @@ def test_an_error_larger_than_the_tolerance_is_a_warning(store):
     rows = {(step, index): number for step, _, index, number in doc["metrics"]}
     assert max(rows["spectral", i] for i in range(3)) == errors["of the PSF of a white point"]
     assert rows["outside[mask]", 0] > rows["outside[plain]", 0] > 0
-    assert doc["table"]["columns"][3] == "outside"
-    assert doc["table"]["rows"][0]["cells"][3].endswith("%")
+    assert "outside" in doc["table"]["columns"]
+    assert doc["table"]["rows"][0]["cells"][doc["table"]["columns"].index("outside")].endswith("%")
 
 
 def test_a_smaller_error_is_a_number_beside_the_tolerance(store):

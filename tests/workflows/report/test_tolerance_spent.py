@@ -117,7 +117,11 @@ def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
     after = spent(result)
     assert set(after["measured"]) == set(recipe.outputs)
     assert after["measured"]["raw[mask]"] == error_of(result["raw[mask]"], full["raw[mask]"])
-    assert after["economies"][0]["full_seconds"] == pytest.approx(full.done[after["economies"][0]["step"]].seconds)
+    economy = after["economies"][0]
+    alike = [
+        step.seconds for name, step in full.done.items() if name.startswith(economy["step"].partition("[")[0] + "[")
+    ]
+    assert min(alike) - 1e-9 <= economy["full_seconds"] <= max(alike) + 1e-9  # arms of one size are one measurement
     assert spent(full)["economies"] == []
     assert spent(full)["exact"]
     assert "measured" in said_of_economies(after)

@@ -1,8 +1,8 @@
-"""Shapes and types of the results of a recipe, found before anything runs.
+"""Shapes, types and small values of the results of a recipe, found before anything runs.
 
-A form is a tensor on the device ``meta``, which has a shape and no values, or a named tuple of such tensors. The rule
-of a node (``@node.shape``) computes the form of its result from the forms of its inputs. No node runs for this, apart
-from nodes that a check of the recipe computes anyway.
+A form is a tensor on the device ``meta``, which has a shape and no values, a tensor of few numbers, or a named tuple of
+such tensors. The rule of a node (``@node.shape``) computes the form of its result from the forms of its inputs. No node
+runs for this, apart from those with ``before_run``, whose results have few numbers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 from neusee.nodes import Node
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 
-Form = Any  #: a tensor on the device ``meta``, a named tuple of tensors, or None where the shape is not known
+Form = Any  #: a tensor, a named tuple of tensors, or None where the shape is not known
 
 
 def forms_of(recipe: Recipe, order: Iterable[str]) -> dict[str, Form]:
@@ -35,20 +35,19 @@ def inputs_of(step: Step, forms: Mapping[str, Form]) -> list[Form]:
 
 
 def form_of(node: Node, inputs: Sequence[Form], params: Mapping[str, Any]) -> Form:
-    """Return the form of the result of a node, or None if the node has no rule or its inputs are not known.
+    """Return the form of the result of a node, or None if the node has no rule or the rule needs an unknown input.
 
     Raises: OverflowError for a result with more bytes than any machine can address.
     """
-    if not complete(node, inputs):
-        return None
     try:
         if node.hooks.shape is not None:
             return node.hooks.shape(*inputs, **params)
-        if node.before_run:
-            return node(**params)
+        return node(**params) if node.before_run else None
     except RuntimeError as error:
         if "overflow" in str(error):
             raise OverflowError(str(error)) from error
+    except OverflowError:
+        raise
     except Exception:  # a wrong recipe fails where the step runs, with the names of its inputs
         pass
     return None
@@ -77,6 +76,11 @@ _FEW = 4096  #: numbers of a tensor up to which the values may tell the work of 
 
 def bytes_of(form: Form) -> float:
     """Return the bytes of a result from its form, or of a list of results."""
+    return float(sum(math.prod(tensor.shape) * tensor.element_size() for tensor in tensors_of(form)))
+
+
+def tensors_of(form: Form) -> list[Tensor]:
+    """Return the tensors of a result, or of a list of results."""
     if isinstance(form, Tensor):
-        return float(math.prod(form.shape) * form.element_size())
-    return sum((bytes_of(item) for item in form if item is not None), 0.0) if isinstance(form, tuple | list) else 0.0
+        return [form]
+    return [tensor for item in form for tensor in tensors_of(item)] if isinstance(form, tuple | list) else []
