@@ -26,6 +26,7 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 TARGET = Path(__file__).parents[2] / "workflows" / "engine" / "node_costs.json"
 SMALLEST = 16e6  #: B; below, memory that earlier steps freed hides what a step needs
+SMALL_PART = 1e6  #: B of the inputs, the result or the work; below, they cannot be what takes the memory
 MEMORY_FLOOR, TIME_FLOOR = 32e6, 5e-3  #: B and s to which an error is relative at least: below is noise
 LARGE, LONG = 32e6, 10e-3  #: B and s from which a run counts for the spread
 
@@ -106,7 +107,8 @@ def law(rows):
     known = [(size, peak) for size, peak in known if peak > SMALLEST] or known
     totals = [sum(size[:2]) for size, _ in known]
     constant = float(max(totals, default=1) > 3 * min(totals, default=1))  # sizes too alike cannot tell it from a slope
-    columns = [(constant, *size[:3]) for size, _ in known]
+    used = [max((size[i] for size, _ in known), default=0) > SMALL_PART for i in range(3)]
+    columns = [(constant, *(x * use for x, use in zip(size[:3], used, strict=True))) for size, _ in known]
     peaks = np.array([peak for _, peak in known])
     memory = fitted(columns, peaks, MEMORY_FLOOR) if known else np.array([0.0, 0.0, 1.0, 0.0])
     steps = [(1.0, size[3]) for size, _, _ in rows]

@@ -104,7 +104,9 @@ def _judgement(
     }
 
 
-def _comparisons(found: list[dict[str, Any]], failed: list[str], unchecked: list[dict[str, str]]) -> dict[str, Any]:
+def _comparisons(
+    found: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked: Sequence[Mapping[str, str]]
+) -> dict[str, Any]:
     """Return the expected numbers of a run, compared and not compared, the checks that failed, and a verdict."""
     return {
         "verdict": verdict(found, failed, len(unchecked)),

@@ -80,7 +80,7 @@ def test_a_step_that_a_cheaper_form_replaces_or_that_nobody_needs_is_not_judged_
     """All 31 bands of this scene take 0.5 GB, but only three planes of them are computed."""
     monkeypatch.setattr(known_before_run, "machine_memory", lambda: 2e8)
     code, _, err = neusee("validate", "first_light", "scene=siemens", "scene.shape=[2048,2048]", "optics.pixel=zoh",
-                          "outputs=[bsr]")  # fmt: skip
+                          "outputs=[raw]")  # fmt: skip
     assert (code, err) == (0, "")
 
 

@@ -25,7 +25,7 @@ def test_a_limit_that_suffices_for_the_steps_and_not_for_the_report_is_refused(t
 
 
 def test_a_larger_picture_needs_more_for_steps_and_report(tmp_path):
-    sizes = (["scene.shape=[400,400]", "sensor.shape=[320,320]"], [], ["scene.shape=[1300,1300]"])
+    sizes = (["scene.shape=[400,400]", "sensor.shape=[320,320]"], [], ["scene.shape=[1000,1000]"])
     plans = [planned(load("first_light", changes), Store(tmp_path), lanes_of(["cpu"], 10**11)) for changes in sizes]
     assert plans[0].running < plans[2].running
     assert plans[0].reporting < plans[1].reporting < plans[2].reporting

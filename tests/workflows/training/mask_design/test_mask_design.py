@@ -19,7 +19,7 @@ from neusee.workflows.training.mask_design.design_run import DesignError, MaskTr
 from neusee.workflows.training.mask_design.design_terms import Terms
 
 SMALL = ["optics.samples=64", "optics.pitch=126 um", "optics.window=[80, 80]", "optics.bands=5",
-         "scene.shape=[80, 80]", "sensor.shape=[64, 64]"]  # fmt: skip
+         "scene.shape=[80, 80]", "sensor.shape=[64, 64]", "lasers.green.angle=[0 mrad, 0 mrad]"]  # fmt: skip
 QUICK = {"bands": 3, "grid": 32, "width": 4, "modes": 20, "rings": 10, "waves": 1.0, "noise": 0.3, "scale": 0.2,
          "max_height": "4 um", "polish": 10, "weights": {"lsr": 1.0, "bsr": 2.0, "contrast": 0.5}}  # fmt: skip
 
