@@ -58,8 +58,10 @@ def richardson_lucy(
     patterns = [crop(pattern.to(electrons), shape=size) for pattern in glare or ()]
     patterns = [p / peak for p in patterns if (peak := float((p.detach().abs() * known).max())) > 0]
     wide = torus(size, edge(kernels, size))
-    transfer = torch.fft.rfft2(wrapped(kernels, wide))
-    return _climb(electrons, known, transfer, wide, patterns, iterations, read_noise**2)
+    total = kernels.sum((-2, -1), keepdim=True)
+    total = torch.where(total > 0, total, 1.0)
+    transfer = torch.fft.rfft2(wrapped(kernels / total, wide))  # of sum 1, so that no scale of the PSF overflows
+    return _climb(electrons, known, transfer, wide, patterns, iterations, read_noise**2) / total
 
 
 @richardson_lucy.check

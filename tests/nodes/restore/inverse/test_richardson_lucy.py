@@ -40,12 +40,12 @@ def blur_matrix(values, picture, wide):
 def by_matrix(counts, known, design, iterations, variance, patterns=()):
     """The multiplicative update of Richardson and Lucy from its definition, with all pixels of the grid unknown."""
     mean = (counts * known).sum() / known.sum()
-    scene, strengths = np.full(design.shape[1], mean), np.full(len(patterns), mean)
+    scene, strengths = np.full(design.shape[1], mean / design.sum(1).max()), np.full(len(patterns), mean)
     columns = np.array(patterns).reshape(len(patterns), known.size).T
     for _ in range(iterations):
         expected = design @ scene + columns @ strengths + variance
         ratio = known * np.maximum(counts + variance, 0) / expected
-        scene = scene * (design.T @ ratio) / np.maximum(design.T @ known, 1e-3)
+        scene = scene * (design.T @ ratio) / np.maximum(design.T @ known, 1e-3 * design.sum(1).max())
         strengths = strengths * (columns.T @ ratio) / (columns.T @ known)
     return scene
 
@@ -73,7 +73,8 @@ def test_each_step_raises_the_likelihood():
     matrix = blur_matrix(values, size, wide)
     counts = rng.poisson(500 * rng.random(size)).astype(float)
     hidden, scores = torch.zeros(1, *size, dtype=torch.bool), []
-    scene, share = np.full(wide[0] * wide[1], counts.mean()), np.maximum(matrix.sum(0), 1e-3)
+    scene = np.full(wide[0] * wide[1], counts.mean() / matrix.sum(1).max())
+    share = np.maximum(matrix.sum(0), 1e-3 * matrix.sum(1).max())
     for _ in range(6):
         expected = matrix @ scene
         scores.append((counts.ravel() * np.log(expected) - expected).sum())
@@ -144,3 +145,15 @@ def test_single_precision_keeps_the_stated_error():
     exact = restore.richardson_lucy(seen, *inputs, read_noise=10.0)
     rounded = restore.richardson_lucy(seen.float(), *inputs, read_noise=10.0).double()
     assert float((rounded - exact).abs().max() / exact.max()) < 1e-4
+
+
+def test_no_scale_of_picture_and_psf_overflows():
+    values, rng = kernel(), np.random.default_rng(4)
+    counts = torch.from_numpy(rng.random((1, 24, 24)) * 900).float()
+    clipped = torch.zeros(1, 24, 24, dtype=torch.bool)
+    found = [
+        restore.richardson_lucy(counts * by, psf_of(values.astype(np.float32) * by), *GREY, clipped, read_noise=0.0)
+        for by in (1.0, 1e18)
+    ]
+    assert found[1].isfinite().all()
+    assert torch.allclose(found[1], found[0], rtol=1e-3, atol=1e-3 * float(found[0].max()))
