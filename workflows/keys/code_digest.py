@@ -247,11 +247,14 @@ class Code:
         name = f"{PYTHON}:{EDITION}:{found}"
         if name not in self._summaries:
             try:
-                self._summaries[name] = summarise(source)
+                self._summaries[name] = _summarised(source)
             except (SyntaxError, ValueError) as error:
                 raise LookupError(f"{path}: {error}") from error
             self._new = True
         return self._summaries[name]
+
+
+_summarised = functools.lru_cache(1000)(summarise)  #: several stores in one process parse a source once
 
 
 def _decides_nothing(module: str) -> bool:

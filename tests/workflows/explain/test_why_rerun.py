@@ -583,7 +583,7 @@ PACKAGED = {
     "sensor.read_noise=20 e-": "well[mask] <- read[mask]: sensor.read_noise 10.5 -> 20 e- (argument 2)",
     "optics.bands=25": "scene_photons[mask] <- bands: optics.bands 31 -> 25 (argument 2)",
     "doe=axicon": "pupil[mask] <- fabricated <- height: doe.half_rings -> doe.axicon (doe/axicon.yaml:5:11)",
-    "restore=unet": "restored",
+    "sensor.shape=[320, 320]": "raw[mask]: sensor.shape [640, 640] -> [320, 320] (argument 2)",
     "seed=8": "digital[mask]: seed 7 -> 8 (argument 2)",
 }
 

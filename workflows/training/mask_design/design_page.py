@@ -22,7 +22,7 @@ def pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, byte
     """Draw the height map, PSF, laser suppression and losses of a designed mask, and return the PNG files by name."""
     pupil, psf, plain = terms.pupil(height), terms.psf(height), terms.plain()
     pitch = terms.recipe.steps[terms.settings.psf].params["pixel_pitch"]
-    bsr = metrics.bsr(psf.intensity, plain.intensity)
+    bsr = metrics.bsr(psf)
     drawings = {
         "height": optics.height(pupil=pupil),
         "psf": optics.psf(plain=plain, mask=psf, bands=terms.bands, pixel_pitch=pitch),
