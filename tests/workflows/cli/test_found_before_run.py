@@ -103,6 +103,7 @@ def test_an_expected_number_that_the_change_affects_is_dropped_rather_than_refus
     assert "not compared" in out
 
 
+@pytest.mark.slow
 def test_what_is_known_before_the_run_is_what_the_run_gives(tmp_path):
     """Shapes of every step that has a rule, against the results of a run in full."""
     from neusee.workflows import load, run

@@ -287,6 +287,7 @@ def test_a_number_a_band_is_a_list(store, monkeypatch):
     assert recipe.run(store).metrics()["lsr"] == pytest.approx([0, 1 / 960, 2 / 960])
 
 
+@pytest.mark.slow
 def test_several_threads_run_several_recipes_on_one_store(store):
     scales = [float(i % 7) for i in range(70)]
     with ThreadPoolExecutor(8) as pool:

@@ -136,6 +136,7 @@ def test_the_command_line_shows_what_stands_in(tmp_path, monkeypatch):
     assert "cheaper  image[mask] (at most" in done.output
 
 
+@pytest.mark.slow
 def test_the_command_line_shows_a_run_that_could_not_prove_its_tolerance(tmp_path, monkeypatch):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(cheaper_steps, "_LEAST", 0.0)  # so fine a tolerance would not even be tried
@@ -146,6 +147,7 @@ def test_the_command_line_shows_a_run_that_could_not_prove_its_tolerance(tmp_pat
     assert "\n  cube  " in done.output
 
 
+@pytest.mark.slow
 def test_the_page_says_it(recipe, warm, tmp_path):
     done = simulate(recipe, warm, tmp_path / "runs", ["neusee"])
     page, doc = done.page.read_text(), json.loads((done.folder / "provenance.json").read_text())

@@ -195,6 +195,7 @@ def killed(ward: Ward, count: int) -> None:
     assert ward.leftovers() == []
 
 
+@pytest.mark.slow
 def test_a_killed_run_does_no_harm(ward):
     killed(ward, 5)
 
@@ -245,6 +246,7 @@ def test_damage_is_seen_and_mended(ward, suffix, damage):
     ward.well()
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     which=st.integers(0, 4), suffix=st.sampled_from(["json", "safetensors"]), at=st.floats(0, 1), bit=st.integers(0, 7)
@@ -411,6 +413,7 @@ def test_a_stopped_owner_is_followed_and_does_no_harm_when_it_wakes(ward):
     assert len(ward.lines()) == 2
 
 
+@pytest.mark.slow
 def test_two_who_evict_and_two_who_compute_do_no_harm(ward):
     """Each evictor leaves room for two values of nine, over and over, while others write and read them."""
     evict = "for _ in range(60):\n    type(store)(store.root).gc(budget=200_000)"

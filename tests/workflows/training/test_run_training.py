@@ -99,6 +99,7 @@ def test_both_stages_at_64_pixels_and_31_bands(tmp_path, photographs):
     assert sorted(path.name for path in (folder / "pictures").iterdir()) == ["stage1_000003.png", "stage2_000003.png"]
 
 
+@pytest.mark.slow
 def test_a_killed_training_goes_on_to_the_same_weights(tmp_path, tiny, photographs):
     whole = trained(tiny, tmp_path / "whole")
     code = f"""
@@ -247,6 +248,7 @@ def test_it_runs_as_printed_too(tmp_path, photographs):
 BOARD = pytest.mark.skipif(not importlib.util.find_spec("tensorboard"), reason='pip install -e ".[tensorboard]"')
 
 
+@pytest.mark.slow
 @BOARD
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of TensorBoard's own
 def test_tensorboard_shows_each_iteration_once_and_the_pictures(tmp_path, photographs):

@@ -261,6 +261,7 @@ def rows_of(folder):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_a_study_that_was_stopped_goes_on_and_writes_its_folder(nodes, recipe, store, tmp_path):
     nodes.STOP_AT.add(17)
     lines = []

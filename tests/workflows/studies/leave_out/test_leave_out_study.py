@@ -215,6 +215,7 @@ def test_a_single_pixel_tells_nothing_of_its_noise():
     assert least_error(torch.tensor([100.0]), torch.tensor([103.0])) == 0
 
 
+@pytest.mark.slow
 def test_the_camera_holds_what_it_states(study):
     doc, _, folder = study(replace(load("dirty_windshield", SMALL), outputs=OUTPUTS), contents=False)
     rows = rows_of(doc)

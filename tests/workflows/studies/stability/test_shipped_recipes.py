@@ -27,7 +27,7 @@ def failing(recipe, store, folder, **cases):
     return [tuple(row[name] for name in columns) for row in rows if row["mark"] == "fail"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_no_cell_of_a_shipped_recipe_fails(recipe, store, tmp_path):
     assert failing(recipe, store, tmp_path) == []

@@ -249,6 +249,7 @@ def test_a_polynomial_that_tells_nothing_is_not_believed():
 # --- the study --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_deviations_are_those_of_the_closed_form(tmp_path, store):
     """Dark noise K**2 (sigma**2 + dark) + 1/12 with sigma of 10.5 ± 0.5: variance K**4 (4 m**2 s**2 + 2 s**4)."""
     folder = study_recipe("uncertainty", load("first_light", NOISE), store, tmp_path, most=400)
@@ -273,6 +274,7 @@ def test_points_of_sobol_find_the_same_with_fewer(tmp_path, store):
     assert doc["draws"] <= 256
 
 
+@pytest.mark.slow
 def test_what_was_stopped_goes_on_with_the_same(tmp_path, store, monkeypatch):
     recipe = small("developed_quality, saturated, raw", *LAWS)
     whole = study_recipe("uncertainty", recipe, Store(tmp_path / "whole"), tmp_path / "a", most=80)
@@ -298,6 +300,7 @@ def test_what_was_stopped_goes_on_with_the_same(tmp_path, store, monkeypatch):
         assert all((a[name] == b[name]).all() for name in a)
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_page_and_fails_where_too_few_draws_were_allowed(tmp_path, store, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NEUSEE_CACHE", str(store.root))
