@@ -124,7 +124,7 @@ def test_walkers_pass(tmp_path):
     assert not failing(found)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_move_that_is_wrong_is_found(tmp_path, monkeypatch):
     """The snooker of emcee to 3.1.6, which `calibrate` refuses: its draws are too narrow in every direction."""
     monkeypatch.setitem(emcee_sampler._MOVES, "snooker", DESnookerMove)

@@ -110,7 +110,7 @@ def test_what_is_imaged_in_a_few_planes_needs_the_gathered_psf(tmp_path):
     done = processes(tmp_path, [("few", mesh, "step", FEW) for mesh in ("1x1", "1x2")])
     one, band = (stepped(done["few", mesh]) for mesh in ("1x1", "1x2"))
     same(band, one)
-    assert band["shared"] == {"steps": ["psf[mask]"], "cut": [], "sums": []}
+    assert band["shared"] == {"steps": ["bsr[mask]", "psf[mask]", "radiance"], "cut": ["bsr[mask]"], "sums": []}
 
 
 def test_one_that_fails_ends_all(done):
