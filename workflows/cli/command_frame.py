@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from neusee.workflows.store.result_store import Store
 
 DEFAULT = "first_light"
-_LONG, _MOST = 3, 100  #: commas of a list of names that is printed once; lines of an error that are printed
+_MOST = 100  #: lines of an error that are printed
 
 
 def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int]:
@@ -72,17 +72,12 @@ def refusing() -> Iterator[None]:
         yield
     except RecipeError as error:
         count = len(error.diagnostics)
-        fail("\n".join([*without_repeats(str(error)), f"{count} problem{'s' * (count > 1)}, nothing was run"]))
+        fail("\n".join([*_first_lines(str(error)), f"{count} problem{'s' * (count > 1)}, nothing was run"]))
 
 
-def without_repeats(text: str) -> list[str]:
-    """Return the lines of an error, each list of names in full only once, and at most `_MOST` lines."""
-    lines, seen = text.splitlines(), set[str]()
-    for i, line in enumerate(lines):
-        before, colon, names = line.rpartition(": ")
-        if names.count(", ") >= _LONG and names in seen:
-            lines[i] = f"{before}{colon}as listed above"
-        seen.add(names)
+def _first_lines(text: str) -> list[str]:
+    """Return the lines of an error, at most `_MOST` of them, and how many more there are."""
+    lines = text.splitlines()
     more = len(lines) - _MOST
     return [*lines[:_MOST], f"and {more} more like these"] if more > 0 else lines
 
