@@ -9,6 +9,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
+from neusee.nodes.exact_convolution import exact_convolutions
 
 _WINDOW = 11  #: width in pixels of the Gaussian window of SSIM
 _STRIPE = 118  #: rows that are compared at a time: 128 with the margin of the window
@@ -98,13 +99,10 @@ def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _ssim(p: Tensor, q: Tensor) -> Tensor:
-    """Return the structural similarity (SSIM) at each pixel whose window lies inside the picture.
-
-    On CUDA, TF32 is switched off.
-    """
+    """Return the structural similarity (SSIM) at each pixel whose window lies inside the picture."""
     from kornia.metrics import ssim
 
     pictures = (x.reshape(1, -1, *x.shape[-2:]) for x in (p, q))
-    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+    with exact_convolutions(p):
         similar: Tensor = ssim(*pictures, _WINDOW, eps=0.0, padding="valid")
     return similar

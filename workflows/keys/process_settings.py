@@ -11,6 +11,8 @@ from pathlib import Path
 
 import torch
 
+from neusee.nodes.exact_convolution import tf32_setting
+
 _USUAL = {"default dtype": "torch.float32", "default device": "cpu", "matmul precision": "highest", "TF32": "True"}
 
 torch.get_default_device()  # imports what it needs now, because a process may lose the right to read files later
@@ -22,7 +24,7 @@ def settings() -> dict[str, str]:
         "default dtype": str(torch.get_default_dtype()),
         "default device": str(torch.get_default_device()),
         "matmul precision": torch.get_float32_matmul_precision(),
-        "TF32": str(torch.backends.cudnn.allow_tf32),
+        "TF32": str(tf32_setting()),
     }
     return {name: value for name, value in now.items() if value != _USUAL[name]}
 

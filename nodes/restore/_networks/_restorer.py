@@ -16,6 +16,7 @@ from neusee.nodes import Check, ParameterError
 from neusee.nodes._half_precision import refuse_not_finite, single
 from neusee.nodes._mirror_padding import mirrored
 from neusee.nodes.bicubic_resize import resize
+from neusee.nodes.exact_convolution import exact_convolutions
 from neusee.nodes.network_weights import empty, loaded, same_layout
 from neusee.nodes.restore._networks._tiles import tiled
 from neusee.nodes.units import Count
@@ -129,8 +130,7 @@ def restored(
         raise ValueError(f"a picture {tuple(picture.shape)} is not a colour picture: give (3, y, x)")
     refuse_not_finite("the network would spread them to every pixel", picture=picture)
     net = loaded(make, _needed(weights)).requires_grad_(False).eval().to(picture.device)
-    exact = torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False)
-    with exact, torch.autocast(picture.device.type, enabled=False):
+    with exact_convolutions(picture, deterministic=True), torch.autocast(picture.device.type, enabled=False):
         y, x = picture.shape[-2:]
         whole = picture.float()[None]
         seen = whole if reduce == 1 else resize(whole, -(-y // reduce), -(-x // reduce))
