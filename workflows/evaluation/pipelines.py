@@ -11,7 +11,7 @@ from pathlib import Path
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError, nearest
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.recipe.text.composition import groups_of, packaged
+from neusee.workflows.recipe.text.option_groups import groups_of, packaged
 from neusee.workflows.recipe.text.overrides import Override
 
 NONE = "none"  #: name of the restorer that restores nothing, and of the case without a laser

@@ -23,7 +23,8 @@ from neusee.workflows.recipe.graph_cache import CachedGraph, cache_graph, cached
 from neusee.workflows.recipe.known_before_run import CheckedStep, check_steps, refuse_indices
 from neusee.workflows.recipe.parameters import Checker
 from neusee.workflows.recipe.step_declarations import Declared, declare, device_of
-from neusee.workflows.recipe.text.composition import Composed, compose, groups_of, packaged
+from neusee.workflows.recipe.text.composition import Composed, compose
+from neusee.workflows.recipe.text.option_groups import groups_of, shared_folders
 from neusee.workflows.recipe.text.overrides import Override, arguments_in
 from neusee.workflows.recipe.text.python_overrides import overrides_of
 from neusee.workflows.recipe.text.references import References
@@ -115,7 +116,7 @@ def check(composed: Composed) -> Recipe:
         cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
     config = Config(_final_values(wiring, bound, checker, uncertain) | dict(_settings(blocks, checker)))
     nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
-    notes = (*checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
+    notes = (*composed.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
     parts = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
     return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting)
 
@@ -187,13 +188,17 @@ def _defaults(step: Declared, bound: dict[str, Step]) -> Iterator[tuple[str, Set
 
 
 def recipes() -> list[Titled]:
-    """Return the names and titles of the packaged recipes."""
-    return [_titled(path) for path in sorted(packaged().glob("*.yaml"))]
+    """Return names and titles of all recipes that a name finds: those of the user, and the packaged recipes."""
+    found: dict[str, Path] = {}
+    for folder in shared_folders():
+        for path in sorted(folder.glob("*.yaml")):
+            found.setdefault(path.stem, path)
+    return [_titled(path) for _, path in sorted(found.items())]
 
 
 def groups(beside: Path | None = None) -> dict[str, list[Titled]]:
-    """Return the options of all groups: the packaged options, and option files beside the recipe of a user."""
-    folders = [folder for folder in (beside, packaged()) if folder]
+    """Return the options of all groups: those in ``beside``, those of the user, and the packaged options."""
+    folders = [folder for folder in (beside, *shared_folders()) if folder]
     return {
         group: [_titled(next(p for f in folders if (p := f / group / f"{name}.yaml").is_file())) for name in names]
         for group, names in groups_of(*folders).items()

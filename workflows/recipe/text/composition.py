@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import functools
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib.resources import files
 from pathlib import Path
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, nearest
+from neusee.workflows.recipe.text.option_groups import (
+    NAME,
+    Choice,
+    Groups,
+    choices_of,
+    packaged,
+    search_folders,
+    shared_folders,
+    shown,
+)
 from neusee.workflows.recipe.text.overrides import Override, apply, read_override
-from neusee.workflows.recipe.text.yaml_values import Value, Where, kind, read
-
-_NAME = re.compile(r"[\w-]+")
+from neusee.workflows.recipe.text.yaml_values import Value, Where, read
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +33,7 @@ class Composed:
     whole: bool = True  #: whether every named group could be read
     #: paths of the values in options that arguments replaced, each with the argument, such as ``scene=siemens``
     replaced: tuple[tuple[Where, str], ...] = ()
+    notes: tuple[str, ...] = ()  #: on options that hide others of the same name
 
     def without(self, key: str) -> Composed:
         """Return the recipe without the block ``key``."""
@@ -37,34 +44,20 @@ class Composed:
         return replace(self, diagnostics=(*self.diagnostics, *diagnostics))
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """Entry of ``defaults`` in a recipe: a group and its option, or None for no option."""
-
-    group: str
-    option: str | None
-    mark: Location
-    shown: str  #: the entry as the user wrote it, for a message
-
-
-@functools.cache
-def packaged() -> Path:
-    """Return the folder of the recipes that are installed with neusee."""
-    return Path(str(files("neusee.recipes")))
-
-
 def locate(recipe: str | Path, folder: Path) -> Path:
-    """Return the path of a recipe file from the name of a packaged recipe or from a path that ends in ``.yaml``."""
+    """Return the path of a recipe file from a name, such as that of a packaged recipe, or from a path to ``.yaml``."""
     if str(recipe).endswith((".yaml", ".yml")):
         path = folder / Path(recipe).expanduser()
         if path.is_file():
             return path
         there = [str(p.relative_to(folder)) for p in path.parent.glob("*.yaml") if p.is_relative_to(folder)]
         raise RecipeError([Diagnostic(Location("recipe"), str(recipe), f"no such file; {nearest(str(recipe), there)}")])
-    path = packaged() / f"{recipe}.yaml"
-    if _NAME.fullmatch(str(recipe)) and path.is_file():
-        return path
-    names = [p.stem for p in packaged().glob("*.yaml")]
+    shared = shared_folders()
+    if NAME.fullmatch(str(recipe)):
+        for above in shared:
+            if (path := above / f"{recipe}.yaml").is_file():
+                return path
+    names = [p.stem for above in shared for p in above.glob("*.yaml")]
     raise RecipeError([Diagnostic(Location("recipe"), str(recipe), f"no such recipe; {nearest(str(recipe), names)}")])
 
 
@@ -80,21 +73,21 @@ def compose(recipe: str | Path, arguments: Sequence[str | Override], folder: Pat
             overrides.append(argument if isinstance(argument, Override) else read_override(argument, mark))
         except RecipeError as error:
             diagnostics += error.diagnostics
-    choices, rest = _choose(document.root, overrides, path.parent, diagnostics)
-    options = [_option(choice, path.parent, folder, diagnostics) for choice in choices if choice.option is not None]
+    groups = Groups(search_folders(path, folder), folder, _merged, diagnostics)
+    choices, rest = _choose(document.root, overrides, groups)
+    options = [groups.option(choice) for choice in choices if choice.option is not None]
     root = _merged((*(option for option in options if option is not None), document.root))
     for override in rest:
         root = apply(root, override, diagnostics, [choice.group for choice in choices])
-    replaced = tuple(_replaced(document.root, choices, path.parent, folder))
-    return Composed(path.stem, document.title, root, tuple(diagnostics), None not in options, replaced)
+    replaced = tuple(_replaced(document.root, choices, groups))
+    notes = (*_hiding(path, recipe), *groups.notes)
+    return Composed(path.stem, document.title, root, tuple(diagnostics), None not in options, replaced, notes)
 
 
-def shown(path: Path, folder: Path) -> str:
-    """Return the path of a file relative to the packaged recipes or to ``folder``, or else the full path."""
-    for above in (packaged(), folder):
-        if path.is_relative_to(above):
-            return path.relative_to(above).as_posix()
-    return str(path)
+def _hiding(path: Path, recipe: str | Path) -> list[str]:
+    """Return a note if the name of a recipe means a file of the user, which hides a packaged recipe."""
+    hides = path.parent != packaged() and path.stem == str(recipe) and (packaged() / path.name).is_file()
+    return [f"{recipe} is {path}, which hides the packaged recipe"] if hides else []
 
 
 def merge(below: Value, above: Value) -> Value:
@@ -124,29 +117,18 @@ def _new_step(value: Value) -> bool:
 # --- groups ---------------------------------------------------------------------------------------------------------
 
 
-def groups_of(*folders: Path) -> dict[str, list[str]]:
-    """Return the names of the options of each group; a group is a folder of YAML files in one of ``folders``."""
-    options: dict[str, set[str]] = {}
-    for folder in folders:
-        for path in folder.glob("*/*.yaml"):
-            options.setdefault(path.parent.name, set()).add(path.stem)
-    return {group: sorted(options[group]) for group in sorted(options)}
-
-
-def _choose(
-    root: Value, overrides: list[Override], beside: Path, diagnostics: list[Diagnostic]
-) -> tuple[list[Choice], list[Override]]:
+def _choose(root: Value, overrides: list[Override], groups: Groups) -> tuple[list[Choice], list[Override]]:
     """Return the option of each group after overrides such as ``laser=six``, and the overrides of single values."""
-    choices = {choice.group: choice for choice in _defaults(root, diagnostics)}
-    groups = groups_of(beside, packaged())
+    choices = {choice.group: choice for choice in choices_of(root, groups.diagnostics)}
+    names = groups.names()
     rest = []
     for o in overrides:
         group, data = o.path[0], o.value.data if o.value else None
-        of_values = group not in choices and (group in root.items or group not in groups)
+        of_values = group not in choices and (group in root.items or group not in names)
         if len(o.path) > 1 or isinstance(data, dict | list) or of_values:
             rest.append(o)
         elif message := _group_fault(o, choices):
-            diagnostics.append(Diagnostic(o.mark, o.text, message))
+            groups.diagnostics.append(Diagnostic(o.mark, o.text, message))
         elif o.sign == "~":
             del choices[group]
         else:
@@ -154,14 +136,15 @@ def _choose(
     return list(choices.values()), rest
 
 
-def _replaced(root: Value, choices: Iterable[Choice], beside: Path, folder: Path) -> Iterator[tuple[Where, str]]:
+def _replaced(root: Value, choices: Iterable[Choice], groups: Groups) -> Iterator[tuple[Where, str]]:
     """Yield the path of each value in an option that the recipe names and an argument replaces or removes."""
     chosen = {choice.group: choice for choice in choices}
-    for written in _defaults(root, []):
+    silent = replace(groups, diagnostics=[], notes=[])
+    for written in choices_of(root, []):
         now = chosen.get(written.group)
         if written.option is None or (now and now.option == written.option):
             continue
-        option = _option(written, beside, folder, [])
+        option = silent.option(written)
         shown = now.shown if now else f"~{written.group}"
         yield from ((leaf.path, shown) for leaf in (option.leaves() if option else ()))
 
@@ -173,54 +156,3 @@ def _group_fault(o: Override, choices: Mapping[str, Choice]) -> str:
     if o.sign == "~":
         return f"is not a group of this recipe; {nearest(group, choices)}"
     return "" if o.sign else f"this recipe has no group {group}; to add the group, write +{o.text}"
-
-
-def _defaults(root: Value, diagnostics: list[Diagnostic]) -> Iterator[Choice]:
-    """Yield the entries in the list ``defaults`` of a recipe; report the entries that cannot be read."""
-    given = root.items.get("defaults")
-    if given is None:
-        return
-    if not isinstance(given.data, list):
-        diagnostics.append(Diagnostic(given.mark, "defaults", f"must be a list of `group: option`, not {kind(given)}"))
-        return
-    lines: dict[str, int] = {}
-    for entry in given.data:
-        pair = list(entry.items.items()) if isinstance(entry.data, dict) else []
-        if len(pair) != 1 or isinstance(pair[0][1].data, dict | list):
-            diagnostics.append(Diagnostic(entry.mark, entry.name, "must be one `group: option`, such as `doe: axicon`"))
-            continue
-        group, option = str(pair[0][0]), pair[0][1]
-        if group in lines:
-            message = f"given twice, first in line {lines[group]}"
-            diagnostics.append(Diagnostic(entry.mark, f"defaults.{group}", message))
-            continue
-        lines[group] = entry.mark.line
-        yield Choice(group, None if option.data is None else str(option.data), option.mark, f"{group}: {option.data}")
-
-
-def _option(choice: Choice, beside: Path, folder: Path, diagnostics: list[Diagnostic]) -> Value | None:
-    """Return the values of an option of a group; a file beside the recipe takes precedence over a packaged file."""
-    names = (choice.group, str(choice.option))
-    for above in dict.fromkeys((beside, packaged())):
-        path = above / choice.group / f"{names[1]}.yaml"
-        if all(map(_NAME.fullmatch, names)) and path.is_file():
-            return _read_option(path, folder, diagnostics)
-    groups = groups_of(packaged(), beside)
-    if choice.group in groups:
-        message = f"no option {choice.option} in {choice.group}; {nearest(names[1], groups[choice.group])}"
-    else:
-        message = f"no group {choice.group}; {nearest(choice.group, groups)}"
-    diagnostics.append(Diagnostic(choice.mark, choice.shown, message))
-    return None
-
-
-def _read_option(path: Path, folder: Path, diagnostics: list[Diagnostic]) -> Value | None:
-    try:
-        root = read(path, shown(path, folder)).root
-    except RecipeError as error:
-        diagnostics += error.diagnostics
-        return None
-    if "defaults" in root.items:
-        message = "belongs in a recipe: an option of a group cannot name other groups"
-        diagnostics.append(Diagnostic(root.items["defaults"].key, "defaults", message))
-    return root

@@ -7,10 +7,10 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from neusee.workflows.graph.diagnostics import UNREAD, Diagnostic
-from neusee.workflows.recipe.text.composition import packaged
+from neusee.workflows.recipe.text.option_groups import packaged
 from neusee.workflows.recipe.text.overrides import RESERVED
 from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
@@ -199,7 +199,26 @@ class References:
             user = f" (needed at {targets[meant].mark})" if meant in targets else ""
             code = "" if shown else UNREAD
             self.diagnostics.append(Diagnostic(leaf.key, leaf.name, f"unknown{hint}{user}", code))
-        self.diagnostics += [problem for path, problem in self.lacking if path not in misspelt]
+        lacking = [(path, problem) for path, problem in self.lacking if path not in misspelt]
+        whole = dict(self._incomplete({path for path, _ in lacking}))
+        self.diagnostics += whole.values()
+        self.diagnostics += [problem for path, problem in lacking if path[0] not in whole or len(path) != 2]
+
+    def _incomplete(self, lacking: set[Where]) -> Iterator[tuple[str | int, Diagnostic]]:
+        """Yield one diagnostic for each block of the user that lacks values, at the block instead of at each step."""
+        for key in dict.fromkeys(path[0] for path in sorted(lacking, key=str)):
+            block = self.root.items.get(str(key))
+            paths = sorted(dotted(path[1:]) for path in lacking if path[0] == key and len(path) == 2)
+            if block is None or not block.mark.line or _place(block) == "packaged" or not isinstance(block.data, dict):
+                continue
+            if len(paths) < (3 if _place(block) == "recipe" else 1):
+                continue
+            names = ", ".join(paths[:6]) + (f" and {len(paths) - 6} more" if len(paths) > 6 else "")
+            needs = f"lacks {names}, which steps need"
+            how = "extend an option that has them, such as `defaults: [small]`"
+            if _place(block) == "recipe":
+                how = "give them, or name an option that has them in `defaults`"
+            yield key, Diagnostic(block.key, str(key), f"{needs}: {how}")
 
     def _unused(self) -> list[Value]:
         blocks = (block for key, block in self.root.items.items() if key not in RESERVED)
@@ -213,6 +232,14 @@ class References:
         known = {*self.used, *(path for path, _ in self.lacking)}
         known |= {(name,) for name in (*RESERVED, "defaults")} if len(leaf.path) == 1 else set()
         return _nearest(leaf.path, known)
+
+
+def _place(block: Value) -> Literal["packaged", "option", "recipe"]:
+    """Return where a block of a recipe is from: a packaged file, an option of a group of the user, or his recipe."""
+    folder = Path(block.mark.folder)
+    if packaged() in (folder, folder.parent):
+        return "packaged"
+    return "option" if (packaged() / folder.name).is_dir() else "recipe"
 
 
 def _is_packaged(leaf: Value) -> bool:
