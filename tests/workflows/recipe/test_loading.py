@@ -301,7 +301,7 @@ def test_an_option_of_the_user_that_lacks_values_is_one_mistake_in_his_file(writ
     assert problem.message.startswith("lacks arrivals, background, bits, c1, c2, camera and 9 more, which steps need")
     write("# Mine.\ndefaults: [small]\nsensor:\n  gain: 0.5 e-/DN\n  read_noise: 2 e-\n", "sensor/imx.yaml")
     recipe = load("first_light", ["sensor=imx"], tmp_path)
-    assert recipe.steps["digital"].params["gain"] == 0.5
+    assert recipe.steps["transfer"].params["gain"] == 0.5
     assert str(recipe.config["sensor.gain"].source) == "sensor/imx.yaml:4:9"
     assert recipe.config["sensor.bits"].value == 16
 
