@@ -32,6 +32,7 @@ from typing import Any, Literal, TypeVar, get_type_hints
 from pydantic import BaseModel, ConfigDict, create_model
 
 from neusee.nodes._error_bound import ErrorBound, TensorStats
+from neusee.nodes.own_modules import import_missing, own_files
 
 Device = Literal["any", "cpu", "gpu"]
 Fn = TypeVar("Fn", bound=Callable[..., Any])
@@ -163,8 +164,11 @@ class Node:
         return f"<node {self.path}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle a node as module and name, so that the process that unpickles the node imports the code."""
-        return _imported, (self.fn.__module__, self.fn.__name__)
+        """Pickle a node as module and name, so that the process that unpickles the node imports the code.
+
+        Files of the user that this process has imported are named too: a result of their nodes may be an input.
+        """
+        return _imported, (self.fn.__module__, self.fn.__name__, own_files())
 
     @functools.cached_property
     def path(self) -> str:
@@ -217,7 +221,8 @@ def _variables(depends: Sequence[str]) -> list[str]:
     return [entry.removeprefix("env:") for entry in depends if entry.startswith("env:")]
 
 
-def _imported(module: str, name: str) -> Node:
+def _imported(module: str, name: str, files: tuple[str, ...] = ()) -> Node:
+    import_missing(files)
     imported: Node = getattr(importlib.import_module(module), name)
     return imported
 

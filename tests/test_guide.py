@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import builtins
 import importlib
 import re
 import shlex
@@ -63,6 +64,9 @@ def folder(tmp_path_factory):
         path = folder / re.match(r"# (my/[\w/]+\.yaml): .*\.\n", text)[1]
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
+    for text in (block for page in PAGES for block in blocks(page, "python")):
+        if named := re.match(r"# (my/\w+\.py)\n", text):
+            (folder / named[1]).write_text(text, encoding="utf-8")
     for level in ("dark", "dim", "half", "bright", "full"):
         (folder / "my" / level).mkdir()
         np.save(folder / "my" / level / "frames.npy", np.ones((2, 4, 4), np.uint16))
@@ -180,8 +184,10 @@ def test_every_python_block_compiles_and_its_names_exist(code):
 
 
 def assigned(tree: ast.Module) -> set[str]:
-    """Return the names that a block assigns."""
-    return {item.id for item in ast.walk(tree) if isinstance(item, ast.Name) and isinstance(item.ctx, ast.Store)}
+    """Return the names that a block gives values: by assignment, as a function or as an argument, and the built-ins."""
+    names = {item.id for item in ast.walk(tree) if isinstance(item, ast.Name) and isinstance(item.ctx, ast.Store)}
+    names |= {item.name for item in ast.walk(tree) if isinstance(item, ast.FunctionDef)}
+    return names | {item.arg for item in ast.walk(tree) if isinstance(item, ast.arg)} | set(dir(builtins))
 
 
 def test_the_glossary_has_one_whole_line_for_each_term():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import re
 from collections.abc import Iterator
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
 
 import typer
 
-from neusee.workflows.cli.command_frame import failing, say
+from neusee.workflows.cli.command_frame import failing, refusing, say
 from neusee.workflows.cli.command_options import Debug
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.recipe.paper_readings import READINGS, SETTLED
@@ -21,6 +20,7 @@ from neusee.workflows.report.text_table import columns
 
 if TYPE_CHECKING:
     from neusee.nodes import Node
+    from neusee.workflows.recipe.node_families import Own
 
 #: how the help on a node describes a type of `neusee.nodes.units`
 _UNITS_IN_WORDS = {
@@ -45,6 +45,7 @@ def recipes() -> None:
 
 def nodes(
     name: Annotated[str | None, typer.Argument(help="One node, such as optics.psf; `reading`, or `glossary`.")] = None,
+    recipe: Annotated[str | None, typer.Option("--recipe", help="Include the nodes that this recipe names.")] = None,
     debug: Debug = False,
 ) -> None:
     """List the nodes, or explain one node.
@@ -52,17 +53,30 @@ def nodes(
     For one node: its physics, source, error, inputs and parameters, and the recipes that use it. `reading` lists how
     the paper is read where it contradicts itself. `glossary` lists the terms of the field, one a line.
     """
+    own = _own(recipe)
     with failing(LookupError):
-        say(node_lines(name) if name else nodes_lines())
+        say(node_lines(name, own) if name else nodes_lines(own))
 
 
-def schema() -> None:
+def schema(
+    recipe: Annotated[str | None, typer.Argument(help="Include the nodes that this recipe names.")] = None,
+) -> None:
     """Print the JSON schema of recipes for editors."""
     import json
 
     from neusee.workflows.recipe import json_schema
 
-    say([json.dumps(json_schema.schema(), indent=1)])
+    say([json.dumps(json_schema.schema(_own(recipe)), indent=1)])
+
+
+def _own(recipe: str | None) -> Own:
+    """Return the modules of the families of nodes that a recipe names, by family."""
+    if recipe is None:
+        return {}
+    from neusee.workflows.recipe.loading import families_of
+
+    with refusing():
+        return families_of(recipe)
 
 
 # --- what the commands print ------------------------------------------------------------------------------------------
@@ -77,29 +91,30 @@ def recipe_lines() -> list[str]:
     return [*titles, "", "groups, as in `neusee run laser=six`", *groups]
 
 
-def nodes_lines() -> list[str]:
+def nodes_lines(own: Own) -> list[str]:
     """Return a line for each node, sorted by family, with the first sentence of its docstring."""
-    from neusee.workflows.recipe.step_declarations import all_nodes
+    from neusee.workflows.recipe.node_families import all_nodes, broken_families, family_title
 
-    nodes = dict(all_nodes())
+    nodes = dict(all_nodes(own))
     width = max(map(len, nodes), default=0)
     lines: list[str] = []
     for family, paths in groupby(nodes, lambda path: path.partition(".")[0]):
-        lines += ["", _first(importlib.import_module(f"neusee.nodes.{family}").__doc__)]
+        lines += ["", _first(family_title(family, own))]
         lines += [f"{path:<{width}}  {_first(nodes[path].__doc__)}" for path in paths]
-    return lines[1:]
+    broken = broken_families().values()
+    return [*lines[1:], *([""] if broken else []), *broken]
 
 
-def node_lines(name: str) -> list[str]:
+def node_lines(name: str, own: Own) -> list[str]:
     """Return the help on one node; for `reading` the interpretations of the paper, for `glossary` the field's terms."""
-    from neusee.workflows.recipe.step_declarations import all_nodes
+    from neusee.workflows.recipe.node_families import all_nodes
 
     if name == "glossary":
         return glossary_lines()
     if name == "reading":
         settled = [line for row in SETTLED for line in (f"{row.number}: {row.matter}", f"  no key: {row.why}", "")]
         return [line for row in READINGS for line in (*_reading(row.path), "")] + settled
-    nodes = dict(all_nodes())
+    nodes = dict(all_nodes(own))
     if name not in nodes:
         raise LookupError(f"there is no node {name}: {nearest(name, nodes)}")
     node, uses = nodes[name], list(_uses(name))

@@ -38,6 +38,7 @@ COMMANDS = {
 }
 _OPTIONS = {
     "--version": "Show the version and exit.",
+    "--no-code": "Refuse recipes that name code; also after a command.",
     "--install-completion": "Install completion for the current shell.",
     "--show-completion": "Show completion for the current shell, to copy it or customize the installation.",
     "-h, --help": "Show this message and exit.",

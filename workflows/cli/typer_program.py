@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Collection
 from typing import Annotated
 
@@ -11,6 +12,8 @@ import typer
 from neusee import __version__
 from neusee.workflows.cli.command_frame import say
 from neusee.workflows.cli.command_list import COMMANDS, DONE, EXIT_CODES, SUMMARY
+
+NO_CODE = "--no-code"
 
 
 def _print_version(wanted: bool) -> None:
@@ -22,6 +25,9 @@ def _print_version(wanted: bool) -> None:
 def _options(
     version: Annotated[
         bool, typer.Option("--version", help="Show the version and exit.", callback=_print_version, is_eager=True)
+    ] = False,
+    no_code: Annotated[
+        bool, typer.Option(NO_CODE, help="Refuse recipes that name code; also after a command.")
     ] = False,
 ) -> None:
     pass
@@ -60,6 +66,9 @@ def run_program(arguments: list[str], completes: bool) -> int:
 
     ``completes`` is True if a shell asks for completions, which need the options of all commands.
     """
+    if NO_CODE in arguments:
+        os.environ["NEUSEE_NO_CODE"] = "1"
+        arguments = [argument for argument in arguments if argument != NO_CODE]
     try:
         return program(COMMANDS if completes else arguments)(arguments, standalone_mode=False, prog_name="neusee") or 0
     except typer.Abort:

@@ -24,7 +24,7 @@ from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, is_private
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.seal import Unsigned, check_signature, secrets, signature
-from neusee.workflows.recipe.step_declarations import all_nodes
+from neusee.workflows.recipe.node_families import all_nodes
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in

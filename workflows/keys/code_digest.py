@@ -33,7 +33,8 @@ from neusee.workflows.keys.process_settings import settings, workflows_digest
 from neusee.workflows.keys.reachable_code import reached
 from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
 
-_LEFT_OUT = frozenset({"neusee", ROOT, f"{ROOT}._node", f"{ROOT}.import_times"})  #: modules that decide no result
+#: modules that decide no result
+_LEFT_OUT = frozenset({"neusee", ROOT, f"{ROOT}._node", f"{ROOT}.import_times", f"{ROOT}.own_modules"})
 _WORKFLOWS = "neusee.workflows"
 _THIS_PROCESS = os.urandom(8).hex()
 _PYTHON = "Python {}.{}".format(*sys.version_info)

@@ -6,19 +6,18 @@ and files are checked for each point.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import neusee.nodes
 from neusee.workflows.graph.recipe_graph import Wire
+from neusee.workflows.recipe.node_families import Own, nodes_of
 from neusee.workflows.recipe.step_declarations import Declared
 from neusee.workflows.recipe.text.yaml_values import Value
 
 Names = tuple[tuple[str, tuple[str, ...] | None], ...]  #: name and items of each block; None for a block without items
 
 _MOST = 16  #: largest number of graphs in the cache
-_graphs: dict[tuple[Value | None, Names], CachedGraph] = {}  #: by ``steps`` and the names of the items
+_graphs: dict[tuple[Value | None, Value | None, Names], CachedGraph] = {}  #: by `_key`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,10 +29,13 @@ class CachedGraph:
     wires: Mapping[str, Mapping[str, Wire]]  #: by step, for the steps whose wires are not references
 
 
-def cached_graph(root: Value) -> CachedGraph | None:
-    """Return the cached step graph of a recipe, or None if the cache has no valid graph of the recipe."""
-    graph = _graphs.get((root.items.get("steps"), _names(root)))
-    return graph if graph is not None and all(map(_current, graph.steps.values())) else None
+def cached_graph(root: Value, own: Own) -> CachedGraph | None:
+    """Return the cached step graph of a recipe, or None if the cache has no valid graph of the recipe.
+
+    ``own`` has the families of nodes that the recipe names.
+    """
+    graph = _graphs.get(_key(root))
+    return graph if graph is not None and all(_is_current(step, own) for step in graph.steps.values()) else None
 
 
 def cache_graph(
@@ -44,7 +46,7 @@ def cache_graph(
         return
     fixed = [name for step in steps.values() if not _refers(step.value.items.get("from")) for name in step.instances]
     graph = CachedGraph(steps, absent, {name: wires[name] for name in fixed})
-    key = root.items["steps"], _names(root)
+    key = _key(root)
     while len(_graphs) >= _MOST:
         _graphs.pop(next(iter(_graphs), key), None)
     _graphs[key] = graph
@@ -59,10 +61,18 @@ def _items(block: dict[str | int, Value]) -> tuple[str, ...] | None:
     return tuple(map(str, block)) if all(isinstance(item.data, dict) for item in block.values()) else None
 
 
-def _current(step: Declared) -> bool:
+def _key(root: Value) -> tuple[Value | None, Value | None, Names]:
+    """Return what decides a graph: the steps, the user's own nodes, and the names of the items."""
+    return root.items.get("steps"), root.items.get("nodes"), _names(root)
+
+
+def _is_current(step: Declared, own: Own) -> bool:
     """Return True if the node of a cached step has not been replaced by another node of the same name."""
     family, _, name = str(step.value.items["node"].data).partition(".")
-    return getattr(sys.modules.get(f"{neusee.nodes.__name__}.{family}"), name, None) is step.node
+    try:
+        return nodes_of(family, own).get(name) is step.node
+    except LookupError:
+        return False
 
 
 def _refers(value: Value | None) -> bool:

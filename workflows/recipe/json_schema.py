@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
@@ -18,7 +19,7 @@ from neusee.nodes import Node, units
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.distributions.scalar import KINDS
 from neusee.workflows.recipe.loading import groups
-from neusee.workflows.recipe.step_declarations import all_nodes
+from neusee.workflows.recipe.node_families import Own, all_nodes
 from neusee.workflows.recipe.wiring import takes_many
 
 Schema = dict[str, Any]
@@ -28,20 +29,26 @@ REFERENCE: Schema = {"type": "string", "pattern": rf"\$\{{.+\}}|^({'|'.join(KIND
 _WIRE: Schema = {"type": ["string", "null"], "pattern": r"^[^\[\]\s]+(\[[^\[\]]+\])?$|\$\{"}
 _DEVICE: Schema = {"type": ["string", "null"], "pattern": r"^(any|cpu|gpu|mps|cuda(:\d+)?)$|\$\{"}
 _ANY: Schema = {}
+_FAMILY: Schema = {"type": "object", "additionalProperties": {"type": "string"}, "maxProperties": 1}
+_NODES: Schema = {"anyOf": [{"type": "string"}, _FAMILY]}
 #: types of values that a reference may replace
 _REFERABLE = {"float", "int", "bool", "literal", "tuple", "list", "dict", "function-before"}
 _NUMBER = r"(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 
 
-def schema() -> Schema:
-    """Return the JSON schema of recipe files, which is also valid for the option files of groups."""
-    nodes = dict(all_nodes())
+def schema(own: Own = MappingProxyType({})) -> Schema:
+    """Return the JSON schema of recipe files, which is also valid for the option files of groups.
+
+    ``own`` has the modules of the user's families of nodes, by family.
+    """
+    nodes = dict(all_nodes(own))
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "neusee recipe",
         "type": "object",
         "properties": {
             "defaults": {"type": "array", "items": _defaults(), "description": "Groups that come first, in order."},
+            "nodes": {"type": "array", "items": _NODES, "description": "Files and modules with your own nodes."},
             "steps": {"type": "object", "additionalProperties": {"$ref": "#/$defs/step"}},
             "seed": {"anyOf": [{"type": "integer", "minimum": 0}, REFERENCE]},
             "tolerance": {"anyOf": [{"type": "number", "minimum": 0}, REFERENCE]},

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.final_values import Config, Setting
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
 from neusee.workflows.recipe.blocks.train_block import KEY as TRAINING
@@ -21,6 +21,8 @@ from neusee.workflows.recipe.expected_numbers import unaffected_expectations
 from neusee.workflows.recipe.global_settings import expectations, outputs_of, seed_and_tolerance
 from neusee.workflows.recipe.graph_cache import CachedGraph, cache_graph, cached_graph
 from neusee.workflows.recipe.known_before_run import CheckedStep, check_steps, refuse_indices
+from neusee.workflows.recipe.node_families import Own
+from neusee.workflows.recipe.own_families import KEY, read_own_families
 from neusee.workflows.recipe.parameters import Checker
 from neusee.workflows.recipe.step_declarations import Declared, declare, device_of
 from neusee.workflows.recipe.text.composition import Composed, compose
@@ -75,7 +77,7 @@ def _as_written(name: str, folder: Path) -> Recipe | None:
     The result is cached while the files and nodes of the recipe are unchanged.
     """
     composed = compose(name, (), folder)
-    graph = cached_graph(composed.root)
+    graph = cached_graph(composed.root, read_own_families(composed.root, []).modules)
     try:
         return check(composed) if graph is None else _checked(composed, graph)
     except RecipeError:
@@ -96,10 +98,11 @@ def check(composed: Composed) -> Recipe:
     composed, uncertain = settle(composed)
     diagnostics = list(composed.diagnostics)
     root, references = composed.root, References(composed.root, diagnostics, dict(composed.replaced))
-    graph = cached_graph(root)
-    steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, diagnostics)
-    wiring, checker = Wiring(root, steps, absent, references, diagnostics), Checker([])
-    checked: list[CheckedStep] = []
+    own, checker = read_own_families(root, diagnostics), Checker([])
+    checker.files[(KEY,)] = own.places
+    graph = cached_graph(root, own.modules)
+    steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, diagnostics, own)
+    wiring, checked = Wiring(root, steps, absent, references, diagnostics), list[CheckedStep]()
     bound = {step.name: step for step in _bind(wiring, checker, graph.wires if graph else {}, checked)}
     loops = list(cycles(bound, {name: step.value.key for name, step in steps.items()}))
     diagnostics += loops
@@ -116,7 +119,7 @@ def check(composed: Composed) -> Recipe:
         cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
     config = Config(_final_values(wiring, bound, checker, uncertain) | dict(_settings(blocks, checker)))
     nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
-    notes = (*composed.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
+    notes = (*composed.notes, *own.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
     parts = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
     return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting)
 
@@ -182,6 +185,18 @@ def _defaults(step: Declared, bound: dict[str, Step]) -> Iterator[tuple[str, Set
         if first and name not in first.param_marks:
             path = (*step.value.path, "with", name)
             yield ".".join(map(str, path)), Setting(value, f"default of {first.node.path}", path, True)
+
+
+def families_of(name: str, folder: Path | None = None) -> Own:
+    """Return the modules of the families of nodes that a recipe names, by family, without a check of the recipe.
+
+    Raises `RecipeError` if a family cannot be read.
+    """
+    diagnostics: list[Diagnostic] = []
+    own = read_own_families(compose(name, (), (folder or Path.cwd()).absolute()).root, diagnostics)
+    if diagnostics:
+        raise RecipeError(diagnostics)
+    return own.modules
 
 
 # --- lists of recipes and groups ------------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ class Checker:
     diagnostics: list[Diagnostic]
     notes: dict[str, None] = field(default_factory=dict)
     #: full path of a file, or of several files, by the path of the value in the recipe
-    files: dict[tuple[str | int, ...], str | list[str]] = field(default_factory=dict)
+    files: dict[tuple[str | int, ...], Any] = field(default_factory=dict)
 
     def read(self, node: Node, given: Value, step: Location) -> dict[str, Any] | None:
         """Return the validated parameters of a step with the defaults of its node, or None if a parameter is wrong."""

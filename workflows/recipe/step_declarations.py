@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import functools
-import importlib.util
 import itertools
 import math
-import pkgutil
 import re
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
-import neusee.nodes
 from neusee.nodes import Node
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError, nearest
+from neusee.workflows.recipe.node_families import find_node, is_known
+from neusee.workflows.recipe.own_families import OwnFamilies
 from neusee.workflows.recipe.text.references import References, Scope, broken
-from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
 _MOST = 20_000  #: steps of a recipe, at most, with all copies
@@ -54,10 +51,11 @@ class Declared:
 
 
 def declare(
-    root: Value, references: References, diagnostics: list[Diagnostic]
+    root: Value, references: References, diagnostics: list[Diagnostic], own: OwnFamilies
 ) -> tuple[dict[str, Declared], dict[str, Value]]:
     """Return the declared steps of a recipe and the steps that are null; report mistakes in the declarations.
 
+    ``own`` has the families of nodes that the recipe names.
     Raises `RecipeError` for more steps than the limit, before the copies are made.
     """
     given = root.items.get("steps")
@@ -67,11 +65,11 @@ def declare(
         return {}, {}
     absent = {str(name): value for name, value in given.data.items() if value.data is None}
     steps, total = dict[str, Declared](), 0
-    find = functools.cache(find_node)
+    find = functools.cache(functools.partial(find_node, own=own.modules))
     for name, value in ((str(name), value) for name, value in given.data.items() if value.data is not None):
         steps[name] = Declared(name, value, None, (), ())
         if _well_formed(name, value, diagnostics):
-            node, dims = _node(value, find, references, diagnostics), _dims(value, root, diagnostics)
+            node, dims = _node(value, find, references, diagnostics, own), _dims(value, root, diagnostics)
             copies = math.prod(len(root.items[dim].items) for dim in dims or ())
             total += copies
             if total > _MOST:
@@ -106,7 +104,11 @@ def _well_formed(name: str, value: Value, diagnostics: list[Diagnostic]) -> bool
 
 
 def _node(
-    step: Value, find: Callable[[str], Node], references: References, diagnostics: list[Diagnostic]
+    step: Value,
+    find: Callable[[str], Node],
+    references: References,
+    diagnostics: list[Diagnostic],
+    own: OwnFamilies,
 ) -> Node | None:
     """Return the node that a step names, or None if the name is wrong; ``find`` returns a node by name."""
     given = step.items.get("node")
@@ -119,7 +121,8 @@ def _node(
     try:
         return find(str(given.plain))
     except LookupError as error:
-        diagnostics.append(Diagnostic(given.mark, f"{step.name}.node", str(error.args[0])))
+        if own.is_whole or is_known(str(given.plain).partition(".")[0]):  # else a family may be one that failed
+            diagnostics.append(Diagnostic(given.mark, f"{step.name}.node", str(error.args[0])))
         return None
 
 
@@ -168,48 +171,3 @@ def device_of(step: Declared, references: References, scope: Scope, diagnostics:
 def _is_item_list(block: Value) -> bool:
     """Return True if a block of a recipe is a list of items such as ``lasers``, which is a mapping of mappings."""
     return isinstance(block.data, dict) and all(isinstance(item.data, dict) for item in block.data.values())
-
-
-# --- nodes ----------------------------------------------------------------------------------------------------------
-
-
-def find_node(name: str) -> Node:
-    """Return the node with a name such as ``sensor.digitize``; raise `LookupError` with the most similar name."""
-    family, _, attribute = name.partition(".")
-    module = f"{neusee.nodes.__name__}.{family}"
-    exists = family.isidentifier() and (module in sys.modules or importlib.util.find_spec(module) is not None)
-    nodes = nodes_of(family) if exists else {}
-    if attribute not in nodes and (now := instead(name)):
-        raise LookupError(f"{name} {now}")
-    if not nodes:
-        raise LookupError(f"no family of nodes {family}; {_elsewhere(attribute) or nearest(family, families())}")
-    if attribute not in nodes:
-        hint = nearest(attribute, nodes).replace("did you mean ", f"did you mean {family}.")
-        raise LookupError(f"no node {name}; {_elsewhere(attribute) or hint}")
-    return nodes[attribute]
-
-
-def _elsewhere(attribute: str) -> str:
-    """Return a hint with the nodes of other families that have the name of an unknown node."""
-    names = [f"{family}.{attribute}" for family in families() if attribute in nodes_of(family)]
-    return f"did you mean {' or '.join(names)}?" if names else ""
-
-
-def families() -> list[str]:
-    """Return the names of the families of nodes, such as ``optics``, without importing a family."""
-    packages = {info.name for info in pkgutil.iter_modules(neusee.nodes.__path__) if info.ispkg}
-    loaded = (re.fullmatch(rf"{neusee.nodes.__name__}\.([a-z]\w*)", module) for module in list(sys.modules))
-    return sorted(packages | {match[1] for match in loaded if match and nodes_of(match[1])})
-
-
-def nodes_of(family: str) -> dict[str, Node]:
-    """Return the nodes of a family such as ``optics`` by name."""
-    module = importlib.import_module(f"{neusee.nodes.__name__}.{family}")
-    return {name: value for name, value in vars(module).items() if isinstance(value, Node)}
-
-
-def all_nodes() -> Iterator[tuple[str, Node]]:
-    """Yield each node of all families with the name that recipes use, such as ``sensor.digitize``."""
-    for family in families():
-        for name, node in nodes_of(family).items():
-            yield f"{family}.{name}", node

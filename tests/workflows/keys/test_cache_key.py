@@ -175,7 +175,7 @@ def test_an_edit_of_the_rule_for_a_shape_computes_nothing_again(trial):
 
 
 def test_no_rule_for_a_shape_is_in_the_digest_of_a_shipped_node(tmp_path):
-    from neusee.workflows.recipe.step_declarations import all_nodes
+    from neusee.workflows.recipe.node_families import all_nodes
 
     code = Code(tmp_path / "code.json")
     for _, each in all_nodes():

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neusee.workflows.graph.diagnostics import Location, RecipeError
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.recipe.loading import groups, load, recipes
 from neusee.workflows.recipe.text.yaml_values import parse
@@ -290,29 +290,6 @@ def test_the_packaged_recipes_have_titles_and_the_groups_options():
 def test_one_own_groups_are_listed_beside_the_packaged(write, tmp_path):
     write("# Mine.\na: 1\n", "doe/mine.yaml")
     assert "mine" in [o.name for o in groups(tmp_path)["doe"]]
-
-
-def test_an_option_of_the_user_that_lacks_values_is_one_mistake_in_his_file(write, tmp_path):
-    write("# Mine.\nsensor:\n  gain: 0.5 e-/DN\n  read_noise: 2 e-\n", "sensor/imx.yaml")
-    with pytest.raises(RecipeError) as caught:
-        load("first_light", ["sensor=imx"], tmp_path)
-    [problem] = caught.value.diagnostics
-    assert str(problem.mark) == "sensor/imx.yaml:2:1"
-    assert problem.message.startswith("lacks arrivals, background, bits, c1, c2, camera and 9 more, which steps need")
-    write("# Mine.\ndefaults: [small]\nsensor:\n  gain: 0.5 e-/DN\n  read_noise: 2 e-\n", "sensor/imx.yaml")
-    recipe = load("first_light", ["sensor=imx"], tmp_path)
-    assert recipe.steps["transfer"].params["gain"] == 0.5
-    assert str(recipe.config["sensor.gain"].source) == "sensor/imx.yaml:4:9"
-    assert recipe.config["sensor.bits"].value == 16
-
-
-def test_a_block_of_a_recipe_that_lacks_values_is_one_mistake(read):
-    given = CAMERA.replace("sensor: {gain: 0.37, read_noise: 10.5 e-, bits: 12, rounding: nearest}", "sensor: {}")
-    with pytest.raises(RecipeError) as caught:
-        read(given)
-    [problem] = caught.value.diagnostics
-    assert str(problem.mark) == "mine.yaml:2:1"
-    assert problem.message.startswith("lacks bits, gain, read_noise, rounding, which steps need: give them, or name")
 
 
 def test_an_override_of_a_value_is_parsed_as_yaml():

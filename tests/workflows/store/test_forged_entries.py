@@ -20,7 +20,7 @@ from neusee.nodes.values import Psf, Stop
 from neusee.workflows.cli import cache_commands
 from neusee.workflows.engine.cost_model import Costs
 from neusee.workflows.keys.seal import seal_record, unseal_record
-from neusee.workflows.recipe.step_declarations import all_nodes, find_node
+from neusee.workflows.recipe.node_families import all_nodes, find_node
 from neusee.workflows.store import garbage_files
 from neusee.workflows.store.band_files import Stacked
 from neusee.workflows.store.remote_store import RemoteStore
@@ -151,7 +151,7 @@ def test_a_check_of_all_results_needs_no_type_of_theirs(tmp_path):
     code = f"""
 import sys
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.recipe.step_declarations import find_node
+from neusee.workflows.recipe.node_families import find_node
 assert [entry.problem for entry in Store(sys.argv[1]).check()] == [""]
 assert "neusee.nodes.metrics" not in sys.modules, "a node was imported"
 find_node("metrics.quality")

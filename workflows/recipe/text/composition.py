@@ -93,8 +93,12 @@ def _hiding(path: Path, recipe: str | Path) -> list[str]:
 def merge(below: Value, above: Value) -> Value:
     """Merge the recipe value ``above`` into the recipe value ``below``, and return the result.
 
-    Mappings are merged key by key; a list, a scalar or a step with ``node`` replaces the value in ``below``.
+    Mappings are merged key by key; a list, a scalar or a step with ``node`` replaces the value in ``below``. The lists
+    ``nodes`` are joined, because each file names the code of its own steps.
     """
+    if above.path == ("nodes",) and isinstance(below.data, list) and isinstance(above.data, list):
+        joined = [*below.data, *above.data]
+        return replace(above, data=[replace(part, path=("nodes", i)) for i, part in enumerate(joined)])
     if not isinstance(below.data, dict) or not isinstance(above.data, dict) or _new_step(above):
         return above
     data = dict(below.data)

@@ -13,7 +13,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step, in_order
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, digest, key_of
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.recipe.step_declarations import find_node
+from neusee.workflows.recipe.node_families import find_node
 from neusee.workflows.studies.stability.extreme_cases import Case, Size
 
 _COMPARES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {  # by node: nodes for the same inputs

@@ -10,7 +10,7 @@ import pytest
 from neusee import recipes
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.recipe.step_declarations import families
+from neusee.workflows.recipe.node_families import families
 from neusee.workflows.recipe.text.renamed_keys import instead, new_name, old_names
 
 RECIPES = ("first_light", "calibrate", "calibrate_camera")

@@ -12,7 +12,7 @@ from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.recipe.step_declarations import find_node
+from neusee.workflows.recipe.node_families import find_node
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.stability import case_result, extreme_cases, stability_study
 from neusee.workflows.studies.stability.case_recipe import CaseRecipe, unchanged_steps

@@ -1,0 +1,93 @@
+"""Import of files and folders with nodes of a user, under the names that the files have.
+
+Such a module is an ordinary module of the process: its folder is searched by ``import``, so that it can import helpers
+beside it. A process that receives one of its nodes imports the same file.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import importlib.util
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+_files: dict[str, Path] = {}  #: file of each module that was imported here, by name
+
+
+def import_file(path: Path) -> ModuleType:
+    """Import a file such as ``bloom.py``, or a package folder with ``__init__.py``, and return the module.
+
+    Raises `ImportError` if there is no such file, if another module has its name or the name of a helper beside it, and
+    whatever the code raises.
+    """
+    file = path / "__init__.py" if path.is_dir() else path
+    name = path.name if path.is_dir() else path.stem
+    if not file.is_file():
+        raise ImportError(f"{path} has no __init__.py" if path.is_dir() else f"there is no file {path}")
+    if not name.isidentifier():
+        raise ImportError(f"{name} is not the name of a module: use letters, digits and _")
+    _refuse_taken(name, file)
+    folder = str(path.parent)
+    if folder not in sys.path:
+        sys.path.append(folder)
+    importlib.invalidate_caches()
+    known = set(sys.modules)
+    try:
+        module = importlib.import_module(name)
+    except BaseException:
+        for added in [module for module in sys.modules if module not in known and f"{module}.".startswith(f"{name}.")]:
+            del sys.modules[added]
+        raise
+    for helper, beside in _helpers(file, path.parent):
+        _refuse_taken(helper, beside)
+    _files[name] = path.absolute()
+    return module
+
+
+def own_files() -> tuple[str, ...]:
+    """Return the files and folders that this process has imported as modules of nodes."""
+    return tuple(map(str, _files.values()))
+
+
+def import_missing(files: tuple[str, ...]) -> None:
+    """Import the modules of another process that this process lacks; raise `ImportError` for a missing file."""
+    for file in map(Path, files):
+        if _files.get(file.stem) != file:
+            import_file(file)
+
+
+def _refuse_taken(name: str, file: Path) -> None:
+    """Raise `ImportError` if ``import name`` does not mean ``file``."""
+    loaded = sys.modules.get(name)
+    taken = getattr(loaded, "__file__", None) if loaded is not None else _found(name)
+    if loaded is not None and taken is None:
+        raise ImportError(f"the name {name} is that of a module of Python: rename {file}")
+    if taken is not None and Path(taken).resolve() != file.resolve():
+        raise ImportError(f"the name {name} is that of {taken}: rename {file}")
+
+
+def _found(name: str) -> str | None:
+    """Return the file that ``import name`` would load, or None."""
+    try:
+        spec = importlib.util.find_spec(name)
+    except (ImportError, ValueError):
+        return None
+    if spec is None:
+        return None
+    return spec.origin if spec.has_location or spec.origin else None
+
+
+def _helpers(file: Path, folder: Path) -> Iterator[tuple[str, Path]]:
+    """Yield name and file of each module beside ``file`` that ``file`` imports."""
+    for item in ast.walk(ast.parse(file.read_bytes())):
+        names = [alias.name for alias in item.names] if isinstance(item, ast.Import) else []
+        if isinstance(item, ast.ImportFrom) and item.module and not item.level:
+            names = [item.module]
+        for top in {name.partition(".")[0] for name in names}:
+            for beside in (folder / f"{top}.py", folder / top / "__init__.py"):
+                if beside.is_file():
+                    yield top, beside
+                    break

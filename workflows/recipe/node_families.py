@@ -1,0 +1,194 @@
+"""Families of nodes, such as ``optics``: those of neusee, of installed packages, and of files that a recipe names.
+
+A package installs a family by an entry point of the group ``neusee.nodes``. A family of a package is imported when a
+recipe uses it or when all are listed, so that a broken package breaks no other recipe.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import importlib.util
+import pkgutil
+import re
+import sys
+import traceback
+from collections.abc import Iterator, Mapping
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+
+import neusee.nodes
+from neusee.nodes import Node
+from neusee.nodes.own_modules import import_file
+from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.recipe.text.renamed_keys import instead
+
+GROUP = "neusee.nodes"  #: group of the entry points by which packages install families of nodes
+
+Own = Mapping[str, ModuleType]  #: modules of the families that a recipe names, by family
+_NO_OWN: Own = {}
+_family_of: dict[str, str] = {}  #: family of each module of a user, because a node has one name in a process
+
+
+def find_node(name: str, own: Own = _NO_OWN) -> Node:
+    """Return the node with a name such as ``sensor.digitize``; raise `LookupError` with the most similar name."""
+    family, _, attribute = name.partition(".")
+    nodes = nodes_of(family, own) if _exists(family, own) else {}
+    if attribute not in nodes and (now := instead(name)):
+        raise LookupError(f"{name} {now}")
+    if not nodes:
+        hint = _elsewhere(attribute, own) or nearest(family, families(own))
+        raise LookupError(f"no family of nodes {family}; {hint}")
+    if attribute not in nodes:
+        hint = nearest(attribute, nodes).replace("did you mean ", f"did you mean {family}.")
+        raise LookupError(f"no node {name}; {_elsewhere(attribute, own) or hint}")
+    return nodes[attribute]
+
+
+def families(own: Own = _NO_OWN) -> list[str]:
+    """Return the names of the families of nodes, such as ``optics``, without importing a family."""
+    packages = {info.name for info in pkgutil.iter_modules(neusee.nodes.__path__) if info.ispkg}
+    loaded = (re.fullmatch(rf"{neusee.nodes.__name__}\.([a-z]\w*)", module) for module in list(sys.modules))
+    return sorted({*packages, *(match[1] for match in loaded if match and _ours(match[1])), *_installed(), *own})
+
+
+def nodes_of(family: str, own: Own = _NO_OWN) -> dict[str, Node]:
+    """Return the nodes of a family such as ``optics`` by name; raise `LookupError` for an installed one that fails."""
+    if family in own:
+        return own_nodes(family, own[family])
+    return _ours(family) if _is_ours(family) else own_nodes(family, _load(family))
+
+
+def all_nodes(own: Own = _NO_OWN) -> Iterator[tuple[str, Node]]:
+    """Yield each node of all families that work with the name that recipes use, such as ``sensor.digitize``."""
+    for family in families(own):
+        try:
+            nodes = nodes_of(family, own)
+        except LookupError:
+            continue
+        for name, node in nodes.items():
+            yield f"{family}.{name}", node
+
+
+def broken_families() -> dict[str, str]:
+    """Return why each installed family cannot be used, by family."""
+    broken = dict[str, str]()
+    for family in _installed():
+        try:
+            nodes_of(family)
+        except LookupError as error:
+            broken[family] = str(error.args[0])
+    return broken
+
+
+def is_known(family: str) -> bool:
+    """Return True if neusee or an installed package has a family of this name."""
+    return _is_ours(family) or family in _installed()
+
+
+def family_title(family: str, own: Own = _NO_OWN) -> str:
+    """Return the first line of the docstring of a family's module; raise `LookupError` as `nodes_of` does."""
+    if family in own:
+        module = own[family]
+    elif _is_ours(family):
+        module = importlib.import_module(f"{neusee.nodes.__name__}.{family}")
+    else:
+        module = _load(family)
+    return (module.__doc__ or "").strip().partition("\n")[0]
+
+
+def own_nodes(family: str, module: ModuleType) -> dict[str, Node]:
+    """Return the nodes that a module or package of a user defines, each named after the family.
+
+    Raises `LookupError` if the module defines no node, or belongs to a family of another name.
+    """
+    name = module.__name__
+    found = {
+        key: value
+        for key, value in vars(module).items()
+        if isinstance(value, Node) and f"{value.fn.__module__}.".startswith(f"{name}.")
+    }
+    if not found:
+        raise LookupError(f"{name} defines no node: decorate a function with @node() of neusee.nodes")
+    if _family_of.setdefault(name, family) != family:
+        raise LookupError(f"{name} is the family {_family_of[name]} in this process: use that name, or a new process")
+    for key, node in found.items():
+        node.path = f"{family}.{key}"
+    return found
+
+
+def import_own(where: str, folder: Path) -> ModuleType:
+    """Import a module that a recipe names: a file or folder relative to ``folder``, or the name of a module.
+
+    Raises `LookupError` with place and cause.
+    """
+    is_path = where.endswith(".py") or "/" in where or "\\" in where or where in (".", "..")
+    path = Path(folder, where).expanduser()
+    try:
+        if is_path:
+            return import_file(path.absolute() if where not in (".", "..") else path.resolve())
+        return importlib.import_module(where)
+    except ModuleNotFoundError as error:
+        if not is_path and error.name and f"{where}.".startswith(f"{error.name}."):
+            beside = f"; write ./{where} for the folder" if path.is_dir() else ""
+            raise LookupError(f"no module {where} is installed{beside}") from None
+        raise LookupError(_failure(where, error)) from None
+    except Exception as error:
+        raise LookupError(_failure(where, error)) from None
+
+
+def _failure(where: str, error: BaseException) -> str:
+    """Return why the import of a module failed, with the last line of the user's code that ran."""
+    lines = [frame for frame in traceback.extract_tb(error.__traceback__) if "importlib" not in frame.filename]
+    inner = [frame for frame in lines if not frame.filename.startswith(str(Path(neusee.nodes.__file__).parents[1]))]
+    line = f"{Path(inner[-1].filename).name}:{inner[-1].lineno}: " if inner else ""
+    if isinstance(error, SyntaxError) and error.filename:
+        line = f"{Path(error.filename).name}:{error.lineno}: "
+    kind = "" if type(error) is ImportError and not inner else f"{type(error).__name__}: "
+    text = error.msg if isinstance(error, SyntaxError) else str(error)
+    return f"{where} cannot be imported: {line}{kind}{text}".rstrip()
+
+
+def _exists(family: str, own: Own) -> bool:
+    return family in own or is_known(family)
+
+
+def _is_ours(family: str) -> bool:
+    """Return True if neusee has a family of this name."""
+    module = f"{neusee.nodes.__name__}.{family}"
+    return family.isidentifier() and (module in sys.modules or importlib.util.find_spec(module) is not None)
+
+
+def _ours(family: str) -> dict[str, Node]:
+    module = importlib.import_module(f"{neusee.nodes.__name__}.{family}")
+    return {name: value for name, value in vars(module).items() if isinstance(value, Node)}
+
+
+@functools.cache
+def _installed() -> dict[str, tuple[EntryPoint, ...]]:
+    """Return the entry points of each family of an installed package; a name of a family of neusee does not count."""
+    found = dict[str, tuple[EntryPoint, ...]]()
+    for point in entry_points(group=GROUP):
+        if not _is_ours(point.name):
+            found[point.name] = (*found.get(point.name, ()), point)
+    return found
+
+
+def _load(family: str) -> ModuleType:
+    """Import an installed family; raise `LookupError` with the distribution and the cause if that fails."""
+    points = _installed()[family]
+    if len(points) > 1:
+        names = " and ".join(sorted({point.dist.name if point.dist else point.value for point in points}))
+        raise LookupError(f"{names} both install a family of nodes {family}: uninstall one")
+    module, place = points[0].value, points[0].dist.name if points[0].dist else points[0].value
+    try:
+        return importlib.import_module(module)
+    except Exception as error:
+        raise LookupError(f"{family} of the installed package {place} fails: {_failure(module, error)}") from None
+
+
+def _elsewhere(attribute: str, own: Own) -> str:
+    """Return a hint with the nodes of other families that have the name of an unknown node."""
+    names = [name for name, _ in all_nodes(own) if name.partition(".")[2] == attribute]
+    return f"did you mean {' or '.join(names)}?" if names else ""
