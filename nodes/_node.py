@@ -14,6 +14,7 @@ generator for a parameter named ``rng``.
     @digitize.check            # checks that the result is plausible
     @digitize.shape            # shape and type of the result, before anything runs
     @digitize.work             # memory and number of operations beside what the shapes say
+    @digitize.example          # the arguments of one small call, on which `neusee check` tries the node
 
 ``digitize.hooks`` has each attached function under the name of its decorator.
 """
@@ -92,6 +93,8 @@ class Hooks:
     #: tensors on the device ``meta``, which have a shape and a type but no values; a tensor of few numbers may have
     #: values. A rule that fails, such as one that needs an unknown input, leaves the result unknown
     shape: Callable[..., Any] | None = None
+    #: (): the arguments of one small call by name, on which `neusee check` tries the node
+    example: Callable[[], Mapping[str, Any]] | None = None
     #: (result, *inputs, **parameters), all as for ``shape``: bytes of memory during the run beside inputs and result,
     #: and number of operations, both up to a constant factor, which is measured
     work: Callable[..., tuple[float, float]] | None = None
@@ -203,7 +206,7 @@ class Node:
     skip_bound, skip_scale, zero_bound = _attaches("skip_bound"), _attaches("skip_scale"), _attaches("zero_bound")
     propagate_error, approximation_error = _attaches("propagate_error"), _attaches("approximation_error")
     band_invariant = _attaches("band_invariant")
-    shape, work = _attaches("shape"), _attaches("work")
+    shape, work, example = _attaches("shape"), _attaches("work"), _attaches("example")
 
     @property
     def preflight_inputs(self) -> tuple[str, ...]:

@@ -32,6 +32,8 @@ COMMANDS = {
     "evaluate": ("evaluate_command", "Compare masks and restorers on the same scenes and lasers."),
     "recipes": ("catalogue", "List the recipes and the groups of options."),
     "nodes": ("catalogue", "List the nodes, or explain one node."),
+    "new": ("new_command", "Write the start of a node, mask, recipe or sensor of your own."),
+    "check": ("check_command", "Check whether nodes keep what the nodes of neusee keep."),
     "schema": ("catalogue", "Print the JSON schema of recipes for editors."),
     "study": ("study_commands", "Study how accurate, stable and certain a recipe's numbers are."),
     "cache": ("cache_commands", "List, check, remove and keep stored results."),

@@ -29,7 +29,7 @@ from neusee.workflows.keys.reachable_code import read_names, written_only
 from neusee.workflows.keys.source_summary import Summary
 
 _SKIPPED = re.compile(r"__\w+__|_abc_\w*|model_\w+|__pydantic\w*")  #: names of a class that its source decides
-_FORETELLING = frozenset({"shape", "work"})  #: hooks that only tell the size and the cost of a result before the run
+_FORETELLING = frozenset({"shape", "work", "example"})  #: hooks that decide no result: size, cost, and a call to try
 _KINDS: tuple[tuple[str, tuple[type, ...]], ...] = (
     ("text", (str, PurePath)),
     ("object", (Enum,)),

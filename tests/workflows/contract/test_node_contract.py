@@ -1,0 +1,153 @@
+"""The contract of a node finds what is wrong with a node of a user, and the nodes of neusee keep it."""
+
+import json
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from neusee.nodes import own_modules
+from neusee.workflows.cli.app import app
+from neusee.workflows.contract.node_contract import check_node, check_values
+from neusee.workflows.contract.value_rules import Call
+from neusee.workflows.recipe import node_families
+from neusee.workflows.recipe.node_families import all_nodes, import_own, own_nodes
+
+START = (files("neusee.workflows.cli") / "starts" / "node.py.txt").read_text(encoding="utf-8").replace("NAME", "bloom")
+
+
+@pytest.fixture
+def made(tmp_path):
+    """Write a node to a file of its own name, import it, and give what the contract finds, by rule."""
+    names = []
+
+    def made(name, *changes):
+        text = START
+        for old, new in changes:
+            assert text.count(old) >= 1, old
+            text = text.replace(old, new)
+        (tmp_path / f"{name}.py").write_text(text)
+        names.append(name)
+        node = own_nodes(name, import_own(f"{name}.py", tmp_path))["bloom"]
+        return {finding.rule: finding for finding in check_node(node)}
+
+    path = list(sys.path)
+    yield made
+    sys.path[:] = path
+    for name in names:
+        sys.modules.pop(name, None)
+        own_modules._files.pop(name, None)
+        node_families._family_of.pop(name, None)
+
+
+def test_the_start_keeps_every_rule(made):
+    found = made("contract_a")
+    assert [rule for rule, finding in found.items() if finding.ok is not True] == []
+    assert {"reference", "gradient", "skip bound", "key", "docstring", "same twice"} <= set(found)
+
+
+STRAIGHT = """
+class Wrong(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x):
+        return x * 1.0
+
+    @staticmethod
+    def backward(ctx, slope):
+        return 2 * slope
+
+
+@node("""
+FAULTS = {
+    "reference": [("(over[i - 1] + over[(i + 1) % count]) / 2", "over[i - 1]")],
+    "gradient": [("\n@node(", STRAIGHT), ("return charge - excess", "return Wrong.apply(charge) - excess")],
+    "inputs": [("    return charge - excess", "    charge.mul_(1.001)\n    return charge - excess")],
+    "docstring": [("    Units:  electrons.\n", "")],
+    "skip bound": [("2 * spill * max", "0.1 * spill * max")],
+    "same twice": [("return charge - excess", "return charge * (1 + 1e-3 * torch.rand(())) - excess")],
+    "type": [("return charge - excess + 0.5 *", "return 1.0 if spill else charge - excess + 0.5 *")],
+    "finite": [("return charge - excess", "return charge / 0 - excess")],
+    "hooks": [("def _(charge: Any, *, full_well: float,", "def _(charge: Any, *, full_wel: float,")],
+    "signature": [('spill: float = 0.5) -> Tensor:\n    "', 'spill: float = 0.5):\n    "')],
+    "key": [("    excess = ", "    full_well = full_well + len(open('gain.txt').read()) * 0\n    excess = ")],
+    "example": [('"full_well": "25500 e-"', '"full_well": 25500.0')],
+}
+
+
+@pytest.mark.parametrize("rule", FAULTS)
+def test_a_planted_fault_breaks_its_rule(made, rule):
+    found = made(f"fault_{rule.replace(' ', '_')}", *FAULTS[rule])
+    assert found[rule].ok is False, found[rule].text
+
+
+def test_a_node_without_a_reference_or_an_example_is_told_how_to_attach_one(made):
+    found = made("contract_b", ("@bloom.reference", "@staticmethod"))
+    assert found["reference"].ok is None
+    assert "@bloom.reference" in found["reference"].text
+    found = made("contract_c", ("@bloom.example", "@staticmethod"))
+    assert found["example"].ok is False
+    assert "@bloom.example" in found["example"].text
+    assert "gradient" not in found
+
+
+def test_the_command_says_each_rule_and_ends_with_three_where_one_is_broken(tmp_path, monkeypatch, made):
+    made("contract_d")
+    monkeypatch.chdir(tmp_path)
+    good = CliRunner().invoke(app, ["check", "contract_d.py"])
+    assert good.exit_code == 0
+    assert "contract_d.bloom\n  ok    docstring" in good.output
+    assert good.output.endswith("1 node: every rule holds\n")
+    bad = CliRunner().invoke(app, ["check", "sensor.digitize", "--json"])
+    assert bad.exit_code == 3
+    assert {key: value for key, value in json.loads(bad.output)["sensor.digitize"][-1].items() if key != "text"} == {
+        "rule": "example",
+        "ok": False,
+    }
+
+
+# --- the nodes of neusee ----------------------------------------------------------------------------------------------
+
+#: rules that a node of neusee breaks on its case; a rule that comes to hold must leave the table
+EXCEPTIONS = {
+    # a changed count of light or of exposures leaves no dark frames, and frames without spread have no statistics
+    "calibrate.camera": ["gradient"],
+    "calibrate.density": ["gradient"],
+    "calibrate.least_squares": ["finite", "gradient"],
+    "calibrate.levels": ["gradient"],
+    "calibrate.sufficient": ["gradient"],
+    # rounding passes slopes on as if there were none, on purpose
+    "doe.fabricate": ["gradient"],
+    "sensor.digitize": ["gradient"],
+    # the height stays float32 in the pupil, and the PSF reads no other: tests of their own compare these slopes
+    "optics.pupil": ["gradient", "shape"],
+    "optics.psf": ["gradient"],
+    "metrics.spectral_error": ["gradient"],
+    # a wavelength passes through tables; metamers have no slope where a spectrum reaches 0
+    "restore.colour_matrix": ["gradient"],
+    "spectra.metamers": ["gradient"],
+    # an unknown bound of the largest value is infinite
+    "optics.image_channels": ["finite"],
+    # factors of a cube: the reference gives other factors of the same cube, and the rule leaves out the smallest
+    "spectra.compress": ["reference", "shape"],
+    "spectra.lift_lmmse_mixture": ["reference", "shape"],
+    "spectra.lift_mallett_mixture": ["reference", "shape"],
+}
+
+
+@pytest.mark.slow
+def test_the_nodes_of_neusee_keep_the_rules_on_values(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "nodes"))
+    from torch_func_cases import CASES
+
+    broken = {}
+    for name, node in all_nodes():
+        if name in CASES:
+            case = CASES[name]
+            inputs = [*case.inputs, *[None] * (len(node.inputs) - len(case.inputs))]
+            defaults = {p.name: p.default for p in node._keyword_only if p.default is not p.empty}
+            findings = check_values(Call(node, inputs, {**defaults, **case.params}))
+            if failed := sorted(finding.rule for finding in findings if finding.ok is False):
+                broken[name] = failed
+    assert broken == EXCEPTIONS

@@ -1,0 +1,62 @@
+"""The command ``neusee check``: does a node keep what nodes promise?"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from neusee.workflows.cli.command_frame import failing, say
+from neusee.workflows.cli.command_list import DONE, MISSED
+from neusee.workflows.cli.command_options import AsJson, Debug
+
+if TYPE_CHECKING:
+    from neusee.nodes import Node
+
+_MARKS = {True: "ok", False: "FAIL", None: "-"}
+
+
+def check(
+    place: Annotated[str, typer.Argument(help="A file, a folder or a module with nodes, or a node: optics.psf.")],
+    as_json: AsJson = False,
+    debug: Debug = False,
+) -> None:
+    """Check whether nodes keep what the nodes of neusee keep.
+
+    Docstring, annotations, hooks, what a cache key covers; on the example of each node: the reference, gradients
+    against finite differences, bands, bounds and shapes. The exit code is 3 if a rule fails. Runs the code.
+    """
+    from neusee.workflows.contract.node_contract import check_node
+
+    with failing(LookupError):
+        found = {name: check_node(node) for name, node in _nodes(place).items()}
+    if as_json:
+        say([json.dumps({name: [asdict(f) for f in findings] for name, findings in found.items()}, indent=1)])
+    for name, findings in found.items() if not as_json else ():
+        say([name, *(f"  {_MARKS[f.ok]:<4}  {f.rule:<11}  {f.text}" for f in findings), ""])
+    failed = sum(f.ok is False for findings in found.values() for f in findings)
+    if not as_json:
+        say(
+            [
+                f"{len(found)} node{'s' * (len(found) != 1)}: "
+                + (f"{failed} rules fail" if failed else "every rule holds")
+            ]
+        )
+    raise typer.Exit(MISSED if failed else DONE)
+
+
+def _nodes(place: str) -> dict[str, Node]:
+    """Return the nodes at a place by name; raise `LookupError` if there are none."""
+    from neusee.workflows.recipe.node_families import find_node, import_own, is_known, nodes_of, own_nodes
+
+    family = place.partition(".")[0]
+    if not place.endswith(".py") and "/" not in place and is_known(family):
+        if place != family:
+            return {place: find_node(place)}
+        return {f"{family}.{name}": node for name, node in nodes_of(family).items()}
+    module = import_own(place, Path.cwd())
+    name = module.__name__.rpartition(".")[2]
+    return {f"{name}.{key}": node for key, node in own_nodes(name, module).items()}

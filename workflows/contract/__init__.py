@@ -1,0 +1,6 @@
+"""Does a node keep what a node promises: documents, types, reference, gradient, bounds and key?
+
+The nodes of neusee pass the same rules in the tests.
+Nothing here reads a recipe or a cache.
+Offers: `node_contract.check_node`, `finding.Finding`.
+"""
