@@ -112,7 +112,7 @@ def _wrong(wavelengths: Numbers, values: Numbers) -> str:
 
 def _npz(file: Path) -> tuple[Numbers, Numbers]:
     with np.load(file, allow_pickle=False) as arrays:
-        return np.asarray(arrays["wavelengths"], np.float64), np.asarray(arrays["reflectances"], np.float64)
+        return _real(arrays["wavelengths"]), _real(arrays["reflectances"])
 
 
 def _mat(file: Path) -> tuple[Numbers, Numbers]:
@@ -123,5 +123,12 @@ def _mat(file: Path) -> tuple[Numbers, Numbers]:
     except Exception as why:  # scipy raises many kinds of errors for foreign bytes
         raise ValueError(f"the file is not a .mat file of version 7 or older: {why}") from None
     name = next(name.removeprefix("sur_") for name in [*variables, "sur_"] if name.startswith("sur_"))
-    start, step, count = np.asarray(variables[f"S_{name}"], np.float64).ravel()
-    return start + step * np.arange(int(count)), np.asarray(variables[f"sur_{name}"], np.float64).T
+    start, step, count = _real(variables[f"S_{name}"]).ravel()
+    return start + step * np.arange(int(count)), _real(variables[f"sur_{name}"]).T
+
+
+def _real(values: Any) -> Numbers:
+    """Return the values as float64; raise ValueError for complex values, whose imaginary part would be lost."""
+    if np.iscomplexobj(values):
+        raise ValueError("its values are complex: save real numbers")
+    return np.asarray(values, np.float64)
