@@ -5,7 +5,8 @@ import pytest
 from neusee.workflows import Store, load
 
 SMALL = ["optics.samples=128", "optics.pitch=63.11 um", "optics.window=[128, 128]", "optics.bands=7",
-         "scene.shape=[128, 128]", "sensor.shape=[112, 112]", "outputs=[developed_quality, restored_quality]"]  # fmt: skip
+         "scene.shape=[128, 128]", "sensor.shape=[112, 112]",
+         "outputs=[developed_quality, restored_quality]"]  # fmt: skip
 
 
 def gains(words, folder):
