@@ -149,6 +149,94 @@ MUTANTS = (
         within("nodes/optics", "psf_independent.py"),
     ),
     Mutant(
+        "nodes/optics/_transform/_pupil_field.py",
+        "turns.copy_(self.screens.height[rows, columns]).mul_(unit * self.view.turns_height)",
+        "torch.mul(self.screens.height[rows, columns], unit * self.view.turns_height, out=turns)",
+        within("nodes/optics", "psf_independent.py::test_the_error_is_as_stated_from_the_height_map_to_the_intensity"),
+    ),
+    Mutant(
+        "nodes/optics/_phase_steps.py",
+        "    height, path = ((b - a)[inside] for a, b in zip(one[:2], other[:2], strict=True))",
+        "    height, path = (((b * 2e6 - a * 2e6) / 2e6)[inside] for a, b in zip(one[:2], other[:2], strict=True))",
+        within("nodes/optics", "pupil.py::test_phase_steps_on_a_thick_plate_are_exact"),
+    ),
+    Mutant(
+        "nodes/metrics/_psf_contrast.py",
+        "torch.fft.rfft2(kernel.double())",
+        "torch.fft.rfft2(kernel.float()).to(torch.complex128)",
+        within("nodes", "double_precision.py::test_the_error_in_float64"),
+    ),
+    Mutant(
+        "nodes/metrics/_suppression_ratios.py",
+        "1.0 - inside / through.where(~dark, 1.0)",
+        "1.0 - inside",
+        within("nodes/metrics", "background_share.py::test_the_light_outside_is_what_passes_and_misses_the_window"),
+    ),
+    Mutant(
+        "nodes/metrics/_spectral_error.py",
+        "(weights[:, 1:] + weights[:, :-1]) / 2], 1) / 2",
+        "(weights[:, 1:] + weights[:, :-1]) / 2], 1) / 4",
+        within("nodes/metrics", "spectral_error.py::test_a_white_point"),
+    ),
+    Mutant(
+        "nodes/spectra/_channel_responses.py",
+        "    if not len(unseen):",
+        "    if len(unseen):",
+        within("workflows/cli", "found_before_run.py::test_a_laser_that_no_channel_sees_is_noted_with_the_response"),
+    ),
+    Mutant(
+        "nodes/scene/_exr_picture.py",
+        '(["R", "G", "B"], ["X", "Y", "Z"], ["Y"])',
+        '(["R", "G", "B"], ["Y"])',
+        within("nodes/scene", "exr_picture.py::test_channels_x_y_and_z_are_cie_xyz"),
+    ),
+    Mutant(
+        "nodes/scene/_exr_picture.py",
+        "opened.channels(number)",
+        "opened.channels(0)",
+        within("nodes/scene", "exr_picture.py::test_the_part_with_the_picture_is_found_or_chosen_by_name"),
+    ),
+    Mutant(
+        "nodes/scene/_cube_files.py",
+        "    if np.iscomplexobj(values):",
+        "    if False:",
+        within(
+            "nodes/scene", "hyperspectral.py::test_a_complex_cube_of_matlab_is_refused_although_its_header_says_double"
+        ),
+    ),
+    Mutant(
+        "workflows/training/training_pictures.py",
+        '"precision": "double"',
+        '"precision": "single"',
+        within("workflows/training", "training_precision.py::test_the_loss_in_float64_has_no_step_of_single_precision"),
+    ),
+    Mutant(
+        "workflows/training/training_iteration.py",
+        "largest = math.inf if self.settings.clip is None else self.settings.clip",
+        "largest = 10.0",
+        within(
+            "workflows/training", "training_precision.py::test_the_gradient_of_each_module_has_at_most_the_norm_clip"
+        ),
+    ),
+    Mutant(
+        "workflows/training/lift/lift_iteration.py",
+        "largest = math.inf if self.settings.clip is None else self.settings.clip",
+        "largest = 10.0",
+        within("workflows/training/lift", "lift_run.py::test_the_gradient_of_all_weights_has_at_most_the_norm_clip"),
+    ),
+    Mutant(
+        "recipes/hdr_night.yaml",
+        "  - restore: richardson_lucy ",
+        "  - restore: wiener ",
+        within("workflows/simulation", "hdr_night.py::test_a_small_picture_gains_from_the_restoration_of_the_recipe"),
+    ),
+    Mutant(
+        "recipes/reading/as_printed.yaml",
+        "  c1: 0.2 ",
+        "  c1: 0 ",
+        within("workflows/recipe", "paper_as_printed.py::test_the_noise_is_that_of_the_printed_formulas"),
+    ),
+    Mutant(
         "nodes/spectra/_illuminant.py",
         "- bands.widths / 2",
         "- bands.widths",

@@ -74,6 +74,7 @@ def folder(tmp_path_factory):
     shutil.copy(folder / "my" / "dark" / "frames.npy", folder / "my" / "set" / "dark.npy")
     (folder / "my" / "set" / "EMVA1288_descriptor.txt").write_text("v 4.0\nn 12 4 4\nd 1000 0\n" + 2 * "i dark.npy\n")
     shutil.copy(ROOT / "recipes" / "samples" / "camera_levels.csv", folder / "my.csv")
+    (folder / "camera.csv").write_text("wavelength,red,green,blue\n400,0,0,1\n550,0,1,0\n700,1,0,0\n")
     save_file(NAFNet(width=16).state_dict(), folder / "net.safetensors")
     np.save(folder / "mask.npy", np.zeros((540, 540)))
     return folder

@@ -22,7 +22,7 @@ def _quantize(height: Tensor, step: float, levels: int, cyclic: bool) -> Tensor:
         level = (height / step).round()
         level = level.remainder(levels) if cyclic else level.clamp(0, levels - 1)
         change = level * step - height
-    return height + change
+    return height + change.detach()  # without a tangent too
 
 
 def _refuse(material: Material, wrap_at: float | None, levels: int | None, max_height: float | None) -> None:

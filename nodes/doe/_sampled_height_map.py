@@ -39,19 +39,27 @@ def _shape_in(file: Path) -> tuple[int, ...]:
         import numpy as np
 
         head = np.load(file, mmap_mode="r", allow_pickle=False)
-        if head.dtype.kind not in "fiu":
-            text = f"{file.name} holds values of type {head.dtype}: save the heights as real numbers, in m"
-            raise ParameterError("file", text)
+        _refuse_other_than_numbers(file, str(head.dtype), head.dtype.kind in "fiu")
         return tuple(head.shape)
     if file.suffix == ".safetensors":
         from safetensors import safe_open
 
         with safe_open(file, framework="pt") as tensors:
-            return tuple(tensors.get_slice(_name(file, list(tensors.keys()))).get_shape())
+            heights = tensors.get_slice(_name(file, list(tensors.keys())))
+            kind = str(heights.get_dtype())
+            _refuse_other_than_numbers(file, kind, kind.startswith(("F", "BF", "I", "U")))
+            return tuple(heights.get_shape())
     if file.suffix == ".png":
         with _levels(file) as picture:
             return picture.height, picture.width
     raise ParameterError("file", f"{file.name}: a height map is read from .npy, .safetensors or grey .png")
+
+
+def _refuse_other_than_numbers(file: Path, kind: str, real: bool) -> None:
+    """Raise ParameterError for values that are not real numbers, such as complex ones, before their part is dropped."""
+    if not real:
+        text = f"{file.name} holds values of type {kind}: save the heights as real numbers, in m"
+        raise ParameterError("file", text)
 
 
 def _levels(file: Path) -> "Image":

@@ -51,8 +51,9 @@ def psf(
 
     Shapes: pupil (v, u), direction (2,) rad -> intensity (band, y, x), clear_peak (band,).
     Units: metres -> share of the clear pupil's light per pixel, not normalised to a sum of one.
-    Error: single, 2e-6 of the brightest pixel; in a tail at 1e-8 of the brightest pixel, 1e-4 of the value at the
-        median and 1.5e-3 at most; double, 1e-11; integrated, a further 1e-5 of the clear peak.
+    Error: single, 2e-6 of the brightest pixel, and where the share s of the clear peak is below 1e-6, 5e-9 / sqrt(s) of
+        the value at the median and 2e-7 / sqrt(s) at most; double, 1e-11 of the brightest pixel; integrated, a further
+        1e-5 of the clear peak.
     Raises: ParameterError before the run, or ValueError, where the window reaches beyond half the alias-free field,
         lambda f / (2 pitch), from the spot; ParameterError for an angle of 1 rad or more; ValueError for a closed
         aperture, for heights or paths that are not finite or above 1e9 turns, and for a pupil in half precision.

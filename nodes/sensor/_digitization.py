@@ -11,6 +11,7 @@ from torch import Generator, Tensor
 from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Well
+from neusee.nodes.torch_func import transformed
 from neusee.nodes.units import Gain, Shape
 
 Rounding = Literal["nearest", "dithered_floor"]
@@ -82,7 +83,7 @@ def digitize(
         raise ValueError("rounding dithered_floor needs random numbers: give rng=torch.Generator()")
     electrons = single(electrons)
     whole = _whole_numbers(electrons.detach(), gain, 2**bits - 1, rng if rounding == "dithered_floor" else None)
-    if not electrons.requires_grad:
+    if not (electrons.requires_grad or transformed()):
         return whole
     ideal = (electrons * gain).clamp(0, 2**bits - 1)
     return ideal + (whole - ideal).detach()  # the sum is exact: the difference is a multiple of the last bit of `ideal`

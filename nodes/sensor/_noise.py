@@ -12,6 +12,7 @@ from torch import Generator, Tensor
 from neusee.nodes import Check, ErrorBound, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Efficiency, Well
+from neusee.nodes.torch_func import transformed
 from neusee.nodes.units import Electrons, Fraction
 
 Distribution = Literal["gaussian", "poisson"]
@@ -93,7 +94,7 @@ def _(
 
 def _gaussian(counts: Tensor, rng: Generator) -> Tensor:
     lit = ~(counts <= _DARK)  # True for NaN, so that NaN reaches the result
-    if not counts.requires_grad:
+    if not (counts.requires_grad or transformed()):
         return normal(counts, rng).mul_(counts.where(lit, 0.0).sqrt_())
     sigma = counts.where(lit, 1.0).sqrt().where(lit, 0.0)  # at 0, the square root has no finite gradient
     return sigma * normal(counts, rng)

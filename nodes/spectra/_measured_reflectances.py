@@ -8,21 +8,18 @@ from zipfile import BadZipFile
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.input_files import csv_rows
 from neusee.nodes.spectra._linear_lift import inside_charts
 from neusee.nodes.spectra._spectral_tables import Table, gamut_samples, paints, require_range
+from neusee.nodes.spectra._spectrum_tables import Numbers, csv_spectra, wrong_wavelengths
 from neusee.nodes.units import DataFiles
 from neusee.nodes.values import Bands
 
 Set = Literal["charts", "CIE 2017", "CQS"]
 _MOST = 1.5  #: largest reflectance; a file with larger values is probably in percent
 _FILES = "give .csv (first column wavelength in nm), .npz (wavelengths, reflectances) or .mat (S_name, sur_name)"
-
-Numbers = NDArray[np.float64]
 
 
 @node(rtol=1e-12)
@@ -89,7 +86,7 @@ def _read(file: Path) -> Table:
 @functools.lru_cache(maxsize=32)
 def _known(file: Path, stamp: int) -> Table:
     """Read the spectra of a file, or return them from memory while the modification time ``stamp`` is unchanged."""
-    reader = {".csv": _csv, ".npz": _npz, ".mat": _mat}.get(file.suffix.lower())
+    reader = {".csv": csv_spectra, ".npz": _npz, ".mat": _mat}.get(file.suffix.lower())
     if reader is None:
         raise ParameterError("files", f"{file.name} holds no reflectances: {_FILES}")
     try:
@@ -106,35 +103,16 @@ def _wrong(wavelengths: Numbers, values: Numbers) -> str:
     """Return the reason why arrays from a file cannot be wavelengths and reflectances, or an empty text if they can."""
     if wavelengths.ndim != 1 or values.ndim != 2 or values.shape[1] != len(wavelengths) or values.size == 0:
         return f"{wavelengths.shape} wavelengths and {values.shape} reflectances: write (spectrum, wavelength)"
-    if not (np.isfinite(wavelengths).all() and np.isfinite(values).all()):
-        return "some wavelengths or reflectances are NaN or infinite"
-    if len(wavelengths) < 2 or not (np.diff(wavelengths) > 0).all() or wavelengths[0] < 100:
-        return "the file needs at least two wavelengths in nm, in rising order"
+    if wrong := wrong_wavelengths(wavelengths, values):
+        return wrong
     if values.max() > _MOST or values.min() < -0.1:
         return f"values from {values.min():.3g} to {values.max():.3g} are not reflectances: write 1 for white, not 100"
     return ""
 
 
-def _csv(file: Path) -> tuple[Numbers, Numbers]:
-    rows = [[_number(cell, file, line) for cell in row] for line, row in list(csv_rows(file))[1:]]
-    if len({len(row) for row in rows}) > 1:
-        raise ValueError("the lines have different numbers of cells")
-    numbers = np.array(rows, np.float64)
-    if numbers.ndim != 2 or numbers.shape[1] < 2:
-        raise ValueError("the file has no columns of numbers below a header")
-    return numbers[:, 0].copy(), numbers[:, 1:].T
-
-
-def _number(cell: str, file: Path, line: int) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        raise ValueError(f"{file.name}:{line}: {cell!r} is not a number") from None
-
-
 def _npz(file: Path) -> tuple[Numbers, Numbers]:
     with np.load(file, allow_pickle=False) as arrays:
-        return np.asarray(arrays["wavelengths"], np.float64), np.asarray(arrays["reflectances"], np.float64)
+        return _real(arrays["wavelengths"]), _real(arrays["reflectances"])
 
 
 def _mat(file: Path) -> tuple[Numbers, Numbers]:
@@ -145,5 +123,12 @@ def _mat(file: Path) -> tuple[Numbers, Numbers]:
     except Exception as why:  # scipy raises many kinds of errors for foreign bytes
         raise ValueError(f"the file is not a .mat file of version 7 or older: {why}") from None
     name = next(name.removeprefix("sur_") for name in [*variables, "sur_"] if name.startswith("sur_"))
-    start, step, count = np.asarray(variables[f"S_{name}"], np.float64).ravel()
-    return start + step * np.arange(int(count)), np.asarray(variables[f"sur_{name}"], np.float64).T
+    start, step, count = _real(variables[f"S_{name}"]).ravel()
+    return start + step * np.arange(int(count)), _real(variables[f"sur_{name}"]).T
+
+
+def _real(values: Any) -> Numbers:
+    """Return the values as float64; raise ValueError for complex values, whose imaginary part would be lost."""
+    if np.iscomplexobj(values):
+        raise ValueError("its values are complex: save real numbers")
+    return np.asarray(values, np.float64)

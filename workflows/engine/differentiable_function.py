@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch._C._functorch import peek_interpreter_stack
 
 from neusee.nodes import TensorStats
 from neusee.workflows.engine.node_call import call, place
@@ -17,12 +18,26 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.engine.step_job import gathered
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step, in_order, needed, unknown_step
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import settle
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_budget import ErrorBudget
 
 Theta = Mapping[str, Any]
+
+#: words by which torch says that a function does not pass one of its transforms
+_MARKS = {
+    "vmap": ("vmap", "Batching rule", "batching rule"),
+    "jvp": ("jvp", "forward mode", "forward AD", "second derivative"),
+    "vjp": ("setup_context", "functorch", "second derivative"),
+}
+_OTHERWISE = {
+    "vmap": ", or take dataclasses.replace(recipe, exact=True), where no step is left out for its values",
+    "jvp": ", or torch.func.vjp",
+    "vjp": ", which differentiates more nodes",
+}
+_PAGE = "recipes/guide/torch_func.md lists the nodes"
 
 
 def as_function(
@@ -36,7 +51,11 @@ def as_function(
 ) -> _Function:
     """Return the recipe as a differentiable function ``theta -> {output: value}``.
 
-    Every value equals the value of `run` bit for bit.
+    Every value equals the value of `run` bit for bit. `torch.func.vjp` and `jvp` follow all outputs of the packaged
+    recipes, networks excepted. `torch.func.vmap` needs ``randomness="same"`` and passes PSFs and what is measured of
+    them (`lsr`, `bsr`, `outside`, `peak`); with ``dataclasses.replace(recipe, exact=True)`` it passes the raw and the
+    developed picture too, but no restoration. A node that does not pass raises RunError with its place and the
+    transform; ``recipes/guide/torch_func.md`` lists every node.
 
     Args: free: parameters such as ``"spot.strength"``, or steps such as ``"height"``, whose result the caller
     provides. Steps that do not depend on ``free`` are computed once, here, or read from the store. Noise is the
@@ -114,6 +133,17 @@ class _Function:
 
     def _evaluate(self, step: Step, values: dict[str, Any], theta: Theta, ledger: ErrorBudget, seed: int) -> Any:
         params = {**step.params, **{p: theta[full] for p, full in self.tuned.get(step.name, {}).items()}}
+        inputs = [gathered(step.wires.get(name), values.__getitem__) for name in step.node.inputs]
+        try:
+            return self._result(step, inputs, params, values, ledger, seed)
+        except (RuntimeError, NotImplementedError, ValueError) as error:
+            raise _told(error, step, inputs, self.recipe.exact) from error
+
+    def _result(
+        self, step: Step, inputs: list[Any], params: dict[str, Any], values: dict[str, Any], ledger: ErrorBudget,
+        seed: int,
+    ) -> Any:  # fmt: skip
+        """Return the result of a step, or that of a cheaper step where the tolerance of the recipe allows it."""
         if step.node.hooks.skip_bound is not None:
             with torch.no_grad():
                 verdict = ledger.verdict(step, params, lambda name: self._facts_of(name, values))
@@ -121,7 +151,6 @@ class _Function:
                 return values[verdict.instead]
         else:
             ledger.pass_on(step)
-        inputs = [gathered(step.wires.get(name), values.__getitem__) for name in step.node.inputs]
         return self.caller(step, inputs, params, seed, place(step, self.device))
 
     def _facts_of(self, name: str, values: dict[str, Any]) -> Any:
@@ -131,6 +160,22 @@ class _Function:
         if name not in self._facts:
             self._facts[name] = TensorStats.of(self.fixed[name])
         return self._facts[name]
+
+
+def _told(error: Exception, step: Step, inputs: list[Any], exact: bool) -> Exception:
+    """Return an error that names the step and the transform of `torch.func` that it does not pass, or ``error``."""
+    interpreter = peek_interpreter_stack()
+    if interpreter is None:
+        return error
+    cause = error.cause if isinstance(error, RunError) else error
+    said = " ".join(str(cause).split())
+    name = {"Vmap": "vmap", "Jvp": "jvp", "Grad": "vjp"}.get(interpreter.key().name, "")
+    if not name or not any(mark in said for mark in _MARKS[name]):
+        return error
+    way = "call the function for one tensor after another" if name == "vmap" else "use torch.autograd"
+    other = "" if exact and name == "vmap" else _OTHERWISE[name]
+    text = f"torch.func.{name} does not pass {step.node.path} ({said[:120]} ...): {way}{other}; {_PAGE}"
+    return RunError(step, inputs, NotImplementedError(text))
 
 
 class _Ends:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
@@ -81,7 +81,8 @@ class Checker:
     def _plain(self, node: Node, name: str, value: Value) -> Any:
         """Return a parameter value as plain data, with a file path relative to the folder of its YAML file."""
         parts = value.data if isinstance(value.data, list) else [value]
-        if not _is_file(node.hints.get(name)) or not all(isinstance(part.data, str) for part in parts):
+        hint = node.hints.get(name)
+        if not _is_file(hint) or not all(isinstance(part.data, str) for part in parts) or value.plain in _texts(hint):
             return value.plain
         paths = [os.path.normpath(Path(part.mark.folder) / Path(part.data).expanduser()) for part in parts]
         full = [os.path.abspath(path) for path in paths]
@@ -93,6 +94,13 @@ def _is_file(hint: Any) -> bool:
     """Return True if a parameter's type annotation contains `IsFile` at any depth, so that the parameter is a path."""
     extras = getattr(hint, "__metadata__", ())
     return any(isinstance(extra, IsFile) for extra in extras) or any(map(_is_file, get_args(hint)))
+
+
+def _texts(hint: Any) -> list[Any]:
+    """Return the texts that a parameter takes beside a path, such as the names of known cameras."""
+    if get_origin(hint) is Literal:
+        return list(get_args(hint))
+    return [text for part in get_args(hint) for text in _texts(part)]
 
 
 def _problems(
@@ -119,7 +127,9 @@ def _problems(
             wrong.setdefault((value.mark, _said(value)), []).append(_message(e) + _in_si(e, value))
     yield from gone.values()  # parameters that moved to the same node share one message
     for (mark, path), messages in wrong.items():
-        yield Diagnostic(mark, path, ", or ".join(dict.fromkeys(messages)))
+        absent = [message for message in dict.fromkeys(messages) if message.startswith("no such file")]
+        others = [message for message in dict.fromkeys(messages) if message not in absent]
+        yield Diagnostic(mark, path, "; ".join([*absent, *([", or ".join(others)] if others else [])]))
 
 
 def _deepest(value: Value, path: tuple[int | str, ...]) -> Value:
@@ -150,7 +160,7 @@ def _message(error: ErrorDetails) -> str:
     text = re.sub(r"must be a number, unable to parse .*", "must be a number", text)
     if error["type"] == "literal_error":
         options = re.findall(r"'([^']*)'", error.get("ctx", {}).get("expected", ""))
-        hint = nearest(str(error["input"]), options)
+        hint = nearest(os.path.basename(str(error["input"])), options)
         text += f"; {hint}" if hint.startswith("did you mean") else ""
     return text[:1].lower() + text[1:]
 

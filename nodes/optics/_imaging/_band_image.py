@@ -9,6 +9,7 @@ from torch.nn.functional import conv2d, pad
 
 from neusee.nodes import Check, node
 from neusee.nodes.optics._transform._chirp_transform import smooth
+from neusee.nodes.torch_func import one_by_one
 from neusee.nodes.values import Psf
 
 Border = Literal["zero", "reflect"]
@@ -136,6 +137,7 @@ class _Product(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         """Save the inputs for the backward pass outside of `forward`, as `torch.func` requires."""
         ctx.save_for_backward(*inputs[:2])
+        ctx.save_for_forward(*inputs[:2])
         ctx.how = inputs[2:]
 
     @staticmethod
@@ -148,6 +150,18 @@ class _Product(torch.autograd.Function):
             first, second, here, there = (a, grad, at_a, at) if conjugate else (grad, a, at, at_a)
             of_b = _Product.apply(first, second, here, there, at_b, tuple(b.shape[1:]), True, length)  # type: ignore[no-untyped-call]
         return of_a, of_b, *(None for _ in ctx.how)
+
+    @staticmethod
+    def jvp(ctx: Any, a: Tensor | None, b: Tensor | None, *_: None) -> Any:
+        """Return the change of a product: that by the first factor, and that by the second."""
+        first, second = ctx.saved_tensors
+        pairs = [(x, y) for x, y in ((a, second), (first, b)) if x is not None and y is not None]
+        changes = [_Product.apply(x, y, *ctx.how) for x, y in pairs]  # type: ignore[no-untyped-call]
+        return sum(changes[1:], changes[0])
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
+        return one_by_one(_Product.apply, info.batch_size, (*in_dims[:2], *(None for _ in given[2:])), given)
 
 
 class _Plane:

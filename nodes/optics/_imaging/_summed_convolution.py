@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from neusee.nodes.torch_func import one_by_one
+
 Corner = tuple[int, int]
 
 _COLUMNS = 16  #: columns of each spectrum at a time; on a GPU all columns
@@ -52,6 +54,7 @@ class Summed(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         """Save the inputs for the backward pass outside of `forward`, as `torch.func` requires."""
         ctx.save_for_backward(*inputs[:2])
+        ctx.save_for_forward(*inputs[:2])
         ctx.how = inputs[2:]
 
     @staticmethod
@@ -70,6 +73,18 @@ class Summed(torch.autograd.Function):
             else:
                 of_b = summed(grad, a, Mix(y, u, mix.x), back._replace(at_a=where.at, at_b=where.at_a))
         return of_a, of_b, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, a: Tensor | None, b: Tensor | None, *_: None) -> Any:
+        """Return the change of a product: that by the first factor, and that by the second."""
+        first, second = ctx.saved_tensors
+        pairs = [(x, y) for x, y in ((a, second), (first, b)) if x is not None and y is not None]
+        changes = [Summed.apply(x, y, *ctx.how) for x, y in pairs]  # type: ignore[no-untyped-call]
+        return sum(changes[1:], changes[0])
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
+        return one_by_one(Summed.apply, info.batch_size, (*in_dims[:2], None, None), given)
 
 
 def summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:

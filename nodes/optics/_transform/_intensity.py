@@ -12,6 +12,7 @@ from neusee.nodes.optics._transform._pupil_field import Field, Screens, View, re
 from neusee.nodes.optics._transform._sample_axis import patch_of
 from neusee.nodes.optics._transform._scaled_transform import Method, propagate
 from neusee.nodes.optics._transform._workspace import Workspace, borrowed
+from neusee.nodes.torch_func import one_by_one, transformed
 
 _ONCE = "the PSF has no second derivative here: differentiate without create_graph=True"
 KEPT_FIELD_BYTES = 1 << 30  #: bytes; focal fields up to this size are kept for back-propagation
@@ -28,7 +29,7 @@ class Sampling:
 
 def intensity_of(amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
     """Return the intensity of the PSF, differentiable by back-propagation and by the transforms of `torch.func`."""
-    form = _Transformed if torch._C._are_functorch_transforms_active() else PupilIntensity
+    form = _Transformed if transformed() else PupilIntensity
     result: Tensor = form.apply(amplitude, height, path, sampling)  # type: ignore[no-untyped-call]
     return result
 
@@ -62,20 +63,26 @@ class _Transformed(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         ctx.save_for_backward(*inputs[:3])
+        ctx.save_for_forward(*inputs[:3])
         ctx.sampling = inputs[3]
 
     @staticmethod
     def backward(ctx: Any, weight: Tensor) -> tuple[Tensor | None, ...]:
         return (*_Gradient.apply(weight, *ctx.saved_tensors, ctx.sampling), None)  # type: ignore[no-untyped-call]
 
-
-class _Gradient(torch.autograd.Function):
-    """The gradients of the PSF intensity for amplitude, height and path; a second derivative raises an error."""
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Any:
+        saved = ctx.saved_tensors
+        given = [torch.zeros_like(x) if t is None else t for x, t in zip(saved, tangents, strict=False)]
+        return _Tangent.apply(*saved, *given, ctx.sampling)  # type: ignore[no-untyped-call]
 
     @staticmethod
-    def forward(weight: Tensor, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Any:
-        fields = [None] * len(sampling.views)
-        return tuple(_adjoint(weight, Screens.of(amplitude, height, path), sampling, fields, (True, True, True)))
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
+        return one_by_one(_Transformed.apply, info.batch_size, in_dims, given)
+
+
+class _Once(torch.autograd.Function):
+    """A first derivative for `torch.func`, of which a further derivative raises an error."""
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -84,6 +91,35 @@ class _Gradient(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
         raise RuntimeError(_ONCE)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Any:
+        raise RuntimeError(_ONCE)
+
+
+class _Tangent(_Once):
+    """The change of the PSF intensity for small changes of amplitude, height and path (forward mode)."""
+
+    @staticmethod
+    def forward(*given: Any) -> Tensor:
+        return _pushed(Screens.of(*given[:3]), given[3:6], given[6])
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
+        return one_by_one(_Tangent.apply, info.batch_size, in_dims, given)
+
+
+class _Gradient(_Once):
+    """The gradients of the PSF intensity for amplitude, height and path (reverse mode)."""
+
+    @staticmethod
+    def forward(weight: Tensor, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Any:
+        fields = [None] * len(sampling.views)
+        return tuple(_adjoint(weight, Screens.of(amplitude, height, path), sampling, fields, (True, True, True)))
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
+        return one_by_one(_Gradient.apply, info.batch_size, in_dims, given)
 
 
 def _computed(screens: Screens, sampling: Sampling, keep: bool) -> tuple[Tensor, list[Tensor | None]]:
@@ -121,6 +157,40 @@ def _adjoint(
             planes = kept if kept is not None else _focal(field, sampling, work)
             _add_gradient(field, planes, weight[view.band], grads, sampling.method, work)
     return grads
+
+
+def _pushed(screens: Screens, tangents: Sequence[Tensor], sampling: Sampling) -> Tensor:
+    """Return the change of the PSF intensity, 2 Re(U* dU), for changes ``tangents`` of amplitude, height and path."""
+    views, shape = sampling.views, (sampling.views[0].rows.n_out, sampling.views[0].columns.n_out)
+    change = torch.zeros(views[-1].band + 1, *shape, dtype=sampling.dtype, device=screens.height.device)
+    with borrowed(sampling.dtype, change.device) as work:
+        for view in views:
+            field = Field(screens, view, sampling.dtype)
+            planes = _focal(field, sampling, work)
+            _add_change(field, tangents, planes, change[view.band], sampling.method, work)
+    return change
+
+
+def _add_change(
+    field: Field, tangents: Sequence[Tensor], planes: Tensor, change: Tensor, method: Method, work: Workspace
+) -> None:
+    """Add the change of the weighted intensity of one view to ``change``, given the focal field ``planes``."""
+
+    def source(start: int, stop: int, out: Tensor) -> None:
+        rows, everywhere = slice(start, stop), slice(0, out.shape[2])
+        unit = work.take("unit", *out.shape)
+        field.phasor(rows, everywhere, unit, work)
+        amplitude, height, path = (x[rows].to(out.dtype) for x in tangents)
+        turning = field.view.turns_height * height + field.view.turns_path * path
+        turning = turning.mul_(2 * math.pi).mul_(field.screens.amplitude[rows])
+        torch.mul(unit[0], amplitude, out=out[0]).addcmul_(unit[1], turning, value=-1)
+        torch.mul(unit[1], amplitude, out=out[1]).addcmul_(unit[0], turning)
+
+    def sink(rows: slice, columns: slice, patch: Tensor) -> None:
+        focal = patch_of(planes.transpose(1, 2), rows, columns, patch)
+        patch_of(change, rows, columns, patch).add_(_scaled(field.view, (2 * focal * patch).sum(0), rows, columns))
+
+    propagate(field.view.rows, field.view.columns, source, sink, work, method)
 
 
 def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:

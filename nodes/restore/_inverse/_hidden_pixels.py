@@ -11,21 +11,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 from torch.nn.functional import avg_pool2d, pad
 
 from neusee.nodes.restore._inverse._conjugate_gradients import descend, inner, pieces
 from neusee.nodes.restore._inverse._fft_grid import halvings
 from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, mixed, narrowed, variance, widened
+from neusee.nodes.torch_func import transformed
 
 STEPS = 20  #: the most steps on the finest grid; each coarser grid may take four times as many, up to MOST
 MOST = 100
 ENOUGH = 1e-5  #: squared distance for each seen pixel, in units of the posterior, at which the iteration ends. The
 #: residual underestimates this distance by a factor of 10 to 30, because it underestimates the slowest modes
+_ONCE = "the deconvolution has no second derivative: differentiate without create_graph=True"
 CAREFUL = 8.0  #: factor by which the tolerance falls with each coarser grid, whose steps are cheap
 
 
@@ -35,32 +36,77 @@ def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH) -> Te
         return _exact(seen)
     tensors = (seen.picture, seen.weight, seen.transfer, *seen.glare)
     with torch.no_grad():
-        x = _nested(seen, steps, enough * float((seen.weight > 0).sum()))
-    if not (torch.is_grad_enabled() and any(t.requires_grad for t in tensors)):
+        x = _nested(_fixed(seen), steps, enough * float((seen.weight > 0).sum()))
+    followed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+    if not (followed or transformed()):
         return x
     rest = torch.fft.irfft2(seen.slope(x), s=seen.torus)
-    pixels: Tensor = _Followed.apply(torch.fft.irfft2(x, s=seen.torus), rest, seen, steps)  # type: ignore[no-untyped-call]
+    frame, fixed = _Frame(seen.torus, seen.grey, steps), (seen.weight, seen.transfer, seen.power, *seen.glare)
+    pixels: Tensor = _Followed.apply(torch.fft.irfft2(x, s=seen.torus), rest, frame, *map(Tensor.detach, fixed))  # type: ignore[no-untyped-call]
     spectrum: Tensor = torch.fft.rfft2(pixels)
     return spectrum
 
 
+def _fixed(seen: Blurred) -> Blurred:
+    """Return the problem without gradients and tangents."""
+    parts = {name: getattr(seen, name).detach() for name in ("picture", "weight", "transfer", "power")}
+    return replace(seen, **parts, glare=tuple(pattern.detach() for pattern in seen.glare))
+
+
+class _Frame(NamedTuple):
+    """The numbers of a deconvolution problem that are no tensors."""
+
+    torus: Size
+    grey: float
+    steps: int
+
+
 class _Followed(torch.autograd.Function):
-    """An autograd function of the deconvolved picture, which passes gradients to the residual of the linear problem."""
+    """The deconvolved picture as a function of the residual of the linear problem, which carries all derivatives."""
 
     @staticmethod
-    def forward(ctx: Any, answer: Tensor, rest: Tensor, seen: Blurred, steps: int) -> Tensor:
-        ctx.seen, ctx.steps = seen, steps
+    def forward(answer: Tensor, rest: Tensor, frame: _Frame, *fixed: Tensor) -> Tensor:
         return answer.clone()
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor, None, None]:
-        """Solve the linear problem of the forward pass with the incoming gradient in place of the picture."""
-        pull = torch.fft.rfft2(grad)
-        seen = replace(ctx.seen, picture=torch.zeros_like(ctx.seen.picture), pull=pull)
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        _, _, ctx.frame, *fixed = inputs
+        ctx.save_for_backward(*fixed)
+        ctx.save_for_forward(*fixed)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        fixed = ctx.saved_tensors
+        return None, _Solved.apply(grad, ctx.frame, *fixed), None, *(None for _ in fixed)  # type: ignore[no-untyped-call]
+
+    @staticmethod
+    def jvp(ctx: Any, answer: Tensor | None, rest: Tensor, *_: None) -> Any:
+        return _Solved.apply(rest, ctx.frame, *ctx.saved_tensors)  # type: ignore[no-untyped-call]
+
+
+class _Solved(torch.autograd.Function):
+    """The solution of the linear problem for a given right side, with which forward and reverse mode differentiate."""
+
+    @staticmethod
+    def forward(right: Tensor, frame: _Frame, *fixed: Tensor) -> Tensor:
+        weight, transfer, power, *glare = fixed
+        pull, nothing = torch.fft.rfft2(right), torch.zeros_like(weight)
+        seen = Blurred(nothing, weight, transfer, power, frame.torus, frame.grey, tuple(glare), pull)
         enough = 1e-10 * float(inner(pull, _spread(seen, pull), seen.torus))
-        slope = _nested(seen, ctx.steps, enough)
-        return None, torch.fft.irfft2(slope, s=seen.torus), None, None
+        solution: Tensor = torch.fft.irfft2(_nested(seen, frame.steps, enough), s=seen.torus)
+        return solution
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        raise RuntimeError(_ONCE)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Any:
+        raise RuntimeError(_ONCE)
 
 
 def _nested(seen: Blurred, steps: int, enough: float) -> Tensor:

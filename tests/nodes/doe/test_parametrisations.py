@@ -30,6 +30,19 @@ def suppression(height):
     return intensity.pow(8).sum().pow(1 / 8)
 
 
+@pytest.mark.parametrize("suffix", [".npy", ".safetensors"])
+def test_a_height_that_is_complex_is_refused_before_the_run_and_in_it(tmp_path, suffix):
+    file, height = tmp_path / f"mask{suffix}", torch.full((64, 64), 1e-6 + 1e-6j, dtype=torch.complex64)
+    if suffix == ".npy":
+        np.save(file, height.numpy())
+    else:
+        save_file({"height": height}, file)
+    with pytest.raises(ParameterError, match=rf"mask{suffix} holds values of type .*64: save the heights as real num"):
+        doe.pixelwise.hooks.preflight(stop=STOP, file=file)
+    with pytest.raises(ParameterError, match="save the heights as real numbers, in m"):
+        doe.pixelwise(STOP, file=file, rng=seeded())
+
+
 @pytest.mark.parametrize("name", ["pixelwise", "unet"])
 def test_start_is_seeded_bounded_and_far_from_flat(name):
     node, params = getattr(doe, name), {} if name == "pixelwise" else {"width": 8, "grid": 32}

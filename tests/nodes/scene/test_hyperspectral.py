@@ -93,6 +93,14 @@ def test_refusals_before_the_run(tmp_path):
         hyperspectral.hooks.preflight(file=npy(tmp_path, np.ones((2, 2, 3), complex)), start=400 * NM, stop=700 * NM)
 
 
+def test_a_complex_cube_of_matlab_is_refused_although_its_header_says_double(tmp_path):
+    from scipy.io import savemat
+
+    savemat(tmp_path / "a.mat", {"cube": np.full((2, 2, 3), 0.5 + 0.25j)})
+    with pytest.raises(ParameterError, match=r"a\.mat holds complex values: save the cube as real numbers of light"):
+        hyperspectral.hooks.preflight(file=tmp_path / "a.mat", start=400 * NM, stop=700 * NM)
+
+
 def test_values_that_are_not_finite_are_refused(tmp_path):
     path = npy(tmp_path, np.full((2, 2, 3), np.nan))
     with pytest.raises(ValueError, match="12 values"):

@@ -206,6 +206,19 @@ def test_a_file_of_another_kind_is_refused(tmp_path, name, text):
         reflectances.hooks.preflight(files=(path,))
 
 
+@pytest.mark.parametrize("kind", ["npz", "mat"])
+def test_complex_reflectances_are_refused_and_no_part_of_them_is_dropped(tmp_path, kind):
+    from scipy.io import savemat
+
+    path, values = tmp_path / f"mine.{kind}", np.full((2, 31), 0.5 + 0.2j)
+    if kind == "npz":
+        np.savez(path, wavelengths=np.linspace(400, 700, 31), reflectances=values)
+    else:
+        savemat(path, {"S_mine": [[400.0, 10.0, 31.0]], "sur_mine": values.T})
+    with pytest.raises(ParameterError, match=rf"mine\.{kind} cannot be read as reflectances \(its values are complex"):
+        reflectances.hooks.preflight(sets=(), files=(path,))
+
+
 def test_bands_beyond_a_file_and_nothing_at_all_are_refused(tmp_path):
     path = written(tmp_path, "csv", [450.0, 550.0, 700.0], [[0.5, 0.6, 0.7]])
     with pytest.raises(ValueError, match="holds 450 to 700 nm"):

@@ -251,18 +251,75 @@ def test_torch_func_follows_a_parameter(store):
     torch.testing.assert_close(torch.func.grad(loss)(gain), torch.autograd.grad(loss(leaf), leaf)[0])
 
 
-@pytest.mark.parametrize("output", ["lsr[mask]", "raw[mask]"])
-def test_torch_func_follows_the_camera(output, store):
-    recipe = load("laser_free", SMALL, doe="axicon")
+WIDE = [*SMALL[:-1], "sensor.shape=[48, 48]", "scene.shape=[56, 56]"]  # too wide for an exact restoration
+
+
+def camera_and_height(store, output, exact=False):
+    """``first_light`` as a function of the height of its mask, and that height."""
+    recipe = load("first_light", WIDE if output == "restored" else SMALL, doe="axicon")
+    recipe = replace(recipe, exact=exact)
     function = as_function(recipe, "fabricated", outputs=[output], store=store)
-    height = run(recipe, store, ["fabricated"])["fabricated"]
+    return lambda height: function({"fabricated": height})[output], run(recipe, store, ["fabricated"])["fabricated"]
 
-    def result(height):
-        return function({"fabricated": height})[output]
 
+@pytest.mark.filterwarnings("ignore:`torch.jit.script`", "ignore:There is a performance drop")  # of torch
+@pytest.mark.parametrize("output", ["lsr[mask]", "raw[mask]", "restored"])
+def test_torch_func_follows_the_camera_backwards_and_forwards(output, store):
+    result, height = camera_and_height(store, output)
+    rng = torch.Generator().manual_seed(1)
     found, pull = torch.func.vjp(result, height)
-    weight = torch.rand(found.shape, dtype=found.dtype, generator=torch.Generator().manual_seed(1))
+    weight, push = torch.rand(found.shape, dtype=found.dtype, generator=rng), 1e-9 * torch.rand(96, 96, generator=rng)
     leaf = height.clone().requires_grad_()
     expected = result(leaf)
     assert torch.equal(found, expected.detach())
-    torch.testing.assert_close(pull(weight)[0], torch.autograd.grad(expected, leaf, weight)[0])
+    (slope,) = torch.autograd.grad(expected, leaf, weight)
+    torch.testing.assert_close(pull(weight)[0], slope)
+    value, change = torch.func.jvp(result, (height,), (push,))
+    assert torch.equal(value, found)
+    terms = (slope * push).double(), (change * weight).double()
+    off = abs(float(terms[0].sum() - terms[1].sum()))
+    assert off < 1e-3 * float(terms[1].abs().sum())
+    assert off < 1e-2 * abs(float(terms[1].sum()))
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script`", "ignore:There is a performance drop")  # of torch
+@pytest.mark.parametrize("output", ["lsr[mask]", "raw[mask]"])
+def test_torch_func_follows_the_exact_camera_for_several_masks(output, store):
+    result, height = camera_and_height(store, output, exact=True)
+    masks = torch.stack([height, 1.1 * height, 0 * height])
+    found = torch.func.vmap(result, randomness="same")(masks)
+    assert not torch.equal(found[0], found[1])
+    torch.testing.assert_close(found, torch.stack([result(mask) for mask in masks]), rtol=1e-6, atol=0)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script`", "ignore:There is a performance drop")  # of torch
+def test_a_psf_has_no_second_derivative_in_any_mode(store):
+    result, height = camera_and_height(store, "lsr[mask]")
+    push = torch.ones_like(height)
+    slope = torch.func.grad(lambda x: result(x).sum())
+    with pytest.raises(RuntimeError, match="no second derivative"):
+        torch.func.jvp(slope, (height,), (push,))
+    with pytest.raises(RuntimeError, match="no second derivative"):
+        torch.func.grad(lambda x: torch.func.jvp(result, (x,), (push,))[1].sum())(height)
+    with pytest.raises(RuntimeError, match="no second derivative"):
+        torch.func.grad(lambda x: slope(x).sum())(height)
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script`", "ignore:There is a performance drop")  # of torch
+@pytest.mark.parametrize(
+    ("output", "exact", "step", "way"),
+    [
+        ("raw[mask]", False, r"image\[mask\]", "or take dataclasses.replace"),
+        ("restored", True, "deconvolved", "call the function for one tensor after another; recipes/guide"),
+    ],
+)
+def test_what_does_not_pass_a_transform_is_told_with_its_place_and_a_way(output, exact, step, way, store):
+    result, height = camera_and_height(store, output, exact)
+    with pytest.raises(RunError, match=rf"\.yaml:\d+:\d+   {step}.*torch\.func\.vmap does not pass .*{way}"):
+        torch.func.vmap(result, randomness="same")(torch.stack([height, height]))
+
+
+def test_a_mistake_under_a_transform_stays_what_it_is(store):
+    function = as_function(camera(), "height", outputs=["loss"], store=store)
+    with pytest.raises(RunError, match=r"(?s)^(?!.*does not pass).*inputs: scene \(64,\) float64, psf \(63,\) float64"):
+        torch.func.vjp(lambda x: function({"height": x})["loss"], torch.ones(63, dtype=torch.float64))

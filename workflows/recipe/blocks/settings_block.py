@@ -16,6 +16,7 @@ Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Beta = Annotated[float, Field(ge=0, lt=1)]
 Number = Annotated[int, Field(ge=1)]
+GradientNorm = Annotated[float, Field(gt=0, allow_inf_nan=False)] | None  #: None: no limit
 
 
 class SettingsBlock(BaseModel):

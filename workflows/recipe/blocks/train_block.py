@@ -10,7 +10,15 @@ from pydantic import Field, model_validator
 
 from neusee.workflows.graph.diagnostics import Diagnostic
 from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings, MaskTraining
-from neusee.workflows.recipe.blocks.settings_block import Beta, Number, SettingsBlock, Share, Weight, read_block
+from neusee.workflows.recipe.blocks.settings_block import (
+    Beta,
+    GradientNorm,
+    Number,
+    SettingsBlock,
+    Share,
+    Weight,
+    read_block,
+)
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.yaml_values import Value
 
@@ -99,7 +107,7 @@ class Training(SettingsBlock):
     precision: Literal["float32", "bfloat16", "float64"] = "float32"
     logarithm: bool = True
     reduction: Literal["mean", "sum"] = "mean"  #: of the reconstruction loss over pixels and frequencies
-    clip: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = 10.0  #: largest gradient norm of a module
+    clip: GradientNorm = 10.0  #: largest gradient norm of a module
     mask: MaskSettings = MaskSettings()  #: settings of the mask design without images, which replaces stage 1
     stages: dict[Annotated[int, Field(ge=1, le=2)], Stage]
     keep: Number = 100

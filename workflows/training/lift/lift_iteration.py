@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,8 +19,6 @@ from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.loop.resumable_loop import Losses, averaged, require_finite
 from neusee.workflows.training.training_pictures import require_steps
-
-_LARGEST_GRADIENT = 10.0  #: norm above which the gradient is clipped
 
 
 class Pairs:
@@ -86,7 +85,8 @@ class LiftLearner:
         estimate = lift_pictures(self.net, picture)
         loss = losses.mrae(estimate, cube, floor=self.settings.floor)
         loss.backward()
-        slope = float(nn.utils.clip_grad_norm_(self.net.parameters(), _LARGEST_GRADIENT))
+        largest = math.inf if self.settings.clip is None else self.settings.clip
+        slope = float(nn.utils.clip_grad_norm_(self.net.parameters(), largest))
         errors = {"MRAE": float(loss.detach()), "RMSE": _rmse(estimate.detach(), cube), "slope": slope, "rate": rate}
         require_finite(errors)
         self.optimiser.step()

@@ -58,7 +58,9 @@ def _key(recipe: Recipe, settings: LiftTraining) -> str:
         ]
         for name in needed(recipe, [settings.measured, settings.picture, settings.cube])
     }
-    block = settings.model_copy(update={"keep": 1, "show": 1, "validation_batches": 1}).model_dump(mode="json")
+    usual = {"clip"} if settings.clip == 10.0 else set()  # so that older trainings continue
+    fixed = settings.model_copy(update={"keep": 1, "show": 1, "validation_batches": 1})
+    block = fixed.model_dump(mode="json", exclude=usual)
     return digest("lift", recipe.seed, steps, {_OLD_NAMES.get(name, name): value for name, value in block.items()})[:8]
 
 

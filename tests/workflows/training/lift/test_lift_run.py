@@ -14,6 +14,7 @@ from safetensors.torch import load_file
 
 from neusee.nodes.spectra import bands, lift_mst_plus_plus, render
 from neusee.workflows import RecipeError, Store, load
+from neusee.workflows.training.lift import lift_run
 from neusee.workflows.training.lift.lift_iteration import LiftLearner, Pairs
 from neusee.workflows.training.lift.lift_run import train_lift
 
@@ -127,6 +128,36 @@ def test_a_few_iterations_lower_the_error(tmp_path, start):
     assert errors[-1] < 0.9 * errors[0]
     if start == "linear":
         assert errors[0] < 0.3
+
+
+@pytest.mark.parametrize("clip", [10.0, 0.5, None])
+def test_the_gradient_of_all_weights_has_at_most_the_norm_clip(tmp_path, clip):
+    words = ["train_lift.start=random", *([] if clip == 10.0 else [f"train_lift.clip={clip or 'null'}"])]
+    recipe = load("train_lift", [*TINY, *words])
+    assert recipe.lifting.clip == clip
+    learner = LiftLearner(recipe.lifting, Pairs(recipe, recipe.lifting, Store(tmp_path), "cpu"), recipe.seed, "cpu")
+    with torch.no_grad():
+        for weight in learner.net.parameters():
+            weight.mul_(2)  # so that the gradient is long
+    norm = learner.iterate(0)["slope"]
+    assert norm > 10
+    kept = float(torch.cat([p.grad.flatten() for p in learner.net.parameters()]).double().norm())
+    assert kept == pytest.approx(clip or norm, rel=1e-4)
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "none"])
+def test_a_limit_of_the_gradient_that_is_not_positive_is_refused(value):
+    with pytest.raises(RecipeError, match=r"train_lift\.clip"):
+        load("train_lift", [f"train_lift.clip={value}"])
+
+
+def test_the_usual_limit_leaves_the_folder_of_a_training_that_was_begun_before_the_setting(monkeypatch):
+    blocks = []
+    monkeypatch.setattr(lift_run, "digest", lambda *parts: blocks.append(parts[-1]) or "00000000")
+    for clip in ("10", "0.5", "null"):
+        recipe = load("train_lift", [*TINY, f"train_lift.clip={clip}"])
+        lift_run._key(recipe, recipe.lifting)
+    assert [block.get("clip", "absent") for block in blocks] == ["absent", 0.5, None]
 
 
 def test_what_is_not_a_number_stops_and_is_kept(tmp_path, monkeypatch):

@@ -1,0 +1,25 @@
+"""Helpers of nodes under `torch.func`: whether one of its transforms is at work, and `vmap` by repeated calls."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+
+
+def transformed() -> bool:
+    """Return True inside a transform of `torch.func`, which follows tensors whose `requires_grad` is False."""
+    return torch._C._are_functorch_transforms_active()
+
+
+def one_by_one(call: Callable[..., Any], count: int, in_dims: Sequence[int | None], given: Sequence[Any]) -> Any:
+    """Call a function ``count`` times with parts of the batched inputs; return the stacked results and their dimension.
+
+    ``in_dims`` has the batched dimension of each input, or None for an input that is the same in every call.
+    """
+    results = []
+    for i in range(count):
+        parts = [x if dim is None else x.select(dim, i) for x, dim in zip(given, in_dims, strict=True)]
+        results.append(call(*parts))
+    if isinstance(results[0], tuple):
+        return tuple(torch.stack(parts) for parts in zip(*results, strict=True)), (0,) * len(results[0])
+    return torch.stack(results), 0
