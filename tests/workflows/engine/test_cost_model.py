@@ -72,6 +72,15 @@ def test_a_damaged_size_in_the_journal_is_passed_over():
     assert not Costs(rows, {"a": SMALL}).of(step("a"), ["cpu"]).known
 
 
+def test_a_peak_that_this_machine_cannot_have_is_passed_over():
+    """Such as in a line of the journal that somebody wrote: it would make the step too large for ever."""
+    right = row("a", 1.0, peak=3e8, of=SMALL)
+    forged = [row("a", 1.0, peak=1e15, of=SMALL)] * 5
+    for sizes in ({"a": SMALL}, {"a": LARGE}, {}):
+        assert Costs([right, *forged], sizes).of(step("a"), ["cpu"]) == Costs([right], sizes).of(step("a"), ["cpu"])
+    assert Costs([], {"a": SMALL}).of(step("a"), ["cpu"], forged[0]) == Costs([], {"a": SMALL}).of(step("a"), ["cpu"])
+
+
 def test_only_the_newest_count():
     rows = [*(row("a", 100.0, of=SMALL) for _ in range(50)), *(row("a", 1.0, of=SMALL) for _ in range(5))]
     assert Costs(rows, {"a": SMALL}).of(step("a"), ["cpu"]).seconds["cpu"] == 1.0
