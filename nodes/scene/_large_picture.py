@@ -23,9 +23,14 @@ def linear_light(codes: NDArray[Any], linear: Linear, shape: Shape | None) -> Te
 
     For a large picture the result equals that of `framed` within the round-off of float32.
     """
-    if codes.shape[0] * codes.shape[1] > _LARGE:
+    if is_large(codes.shape[0] * codes.shape[1]):
         return _in_bands(codes, linear, shape)
     return framed(linear(codes), shape)
+
+
+def is_large(pixels: float) -> bool:
+    """Return True for a picture that is converted and scaled in bands of rows."""
+    return pixels > _LARGE
 
 
 def _in_bands(codes: NDArray[Any], linear: Linear, shape: Shape | None) -> Tensor:
