@@ -211,7 +211,7 @@ MUTANTS = (
         "nodes/input_files.py",
         "count > VALUES",
         "count > VALUES + 1",
-        within("workflows/cli", "limits.py::test_a_file_at_the_limit_is_read_and_a_larger_one_is_refused"),
+        within("workflows/cli", "limits.py::test_arrays_and_tables_at_the_shipped_limits"),
     ),
     Mutant(
         "nodes/scene/_large_picture.py",

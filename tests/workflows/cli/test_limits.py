@@ -1,5 +1,7 @@
 """Each named limit of input files and recipes: just below it a recipe is valid, just above it is refused with it."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -130,16 +132,16 @@ def test_arrays_and_tables_at_the_shipped_limits(tmp_path):
     from neusee.nodes import ParameterError
     from neusee.nodes.scene._cube_files import size_and_type
 
-    def cube(n):
+    def cube(*shape):
         with (tmp_path / "a.npy").open("wb") as file:
-            head = {"descr": "|u1", "fortran_order": False, "shape": (1000, 1000, n)}
+            head = {"descr": "|u1", "fortran_order": False, "shape": shape}
             np.lib.format.write_array_header_1_0(file, head)
-            file.truncate(file.tell() + 1_000_000 * n)
+            file.truncate(file.tell() + math.prod(shape))
         return tmp_path / "a.npy"
 
-    assert size_and_type(cube(1000), None)[0] == (1000, 1000, 1000)
-    with pytest.raises(ParameterError, match=r"1000 x 1000 x 1001 values, more than the limit of 1000 million"):
-        size_and_type(cube(1001), None)
+    assert size_and_type(cube(1000, 1000, 1000), None)[0] == (1000, 1000, 1000)
+    with pytest.raises(ParameterError, match=r"1 x 1 x 1000000001 values, more than the limit of 1000 million"):
+        size_and_type(cube(1, 1, 10**9 + 1), None)
     (tmp_path / "a.csv").write_bytes(b"a\n" + b"1\n" * 1_000_000)
     assert sum(1 for _ in input_files.csv_rows(tmp_path / "a.csv")) == 1_000_001
     with (tmp_path / "a.csv").open("ab") as file:
