@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from neusee.nodes import ParameterError
+from neusee.nodes.input_files import once_per_version
 
 Net = TypeVar("Net", bound=nn.Module)
 OPTIONS = "neusee.options"  #: metadata key of the options of a network, which the tensors may not show
@@ -36,7 +37,7 @@ def file_metadata(net: nn.Module) -> dict[str, str]:
 
 
 def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> None:
-    """Raise ParameterError unless a weights file has the tensor names, shapes and options that a network requires."""
+    """Raise ParameterError unless a weights file fits a network: names, shapes, options, and finite numbers."""
     from safetensors import SafetensorError, safe_open
 
     net = empty(make)
@@ -48,11 +49,40 @@ def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> Non
     except SafetensorError as error:
         raise ParameterError("weights", f"{weights.name} is not a safetensors file: {error}") from error
     if options is not None:
-        _same_options(json.loads(options), getattr(net, "options", {}), weights)
+        _same_options(_options(options, weights), getattr(net, "options", {}), weights)
     for name in sorted(shapes | stored):
         if shapes.get(name) != stored.get(name):
             text = f"{weights.name}: {name} is {stored.get(name)}, this network (width {width}) has {shapes.get(name)}"
             raise ParameterError("weights", text)
+    if problem := _not_finite(weights):
+        raise ParameterError("weights", problem)
+
+
+@once_per_version
+def _not_finite(weights: Path) -> str:
+    """Return a message for the first tensor in a weights file with values that are not finite, or an empty text."""
+    from safetensors import safe_open
+
+    with safe_open(weights, framework="pt") as tensors:
+        found = (wrong_weights(weights, name, tensors.get_tensor(name)) for name in tensors.keys())  # noqa: SIM118
+        return next(filter(None, found), "")
+
+
+def wrong_weights(weights: Path, name: str, tensor: Tensor) -> str:
+    """Return a message for a tensor of network weights with values that are not finite, or an empty text."""
+    count = int((~torch.isfinite(tensor)).sum())
+    fix = "train the network again, or give an earlier file"
+    return f"{weights.name}: {name} holds {count} values that are not finite (NaN or infinity): {fix}" if count else ""
+
+
+def _options(text: str, weights: Path) -> Mapping[str, Any]:
+    try:
+        options = json.loads(text)
+    except ValueError:
+        options = None
+    if not isinstance(options, dict):
+        raise ParameterError("weights", f"{weights.name} has damaged options ({text[:40]!r}): copy the file again")
+    return options
 
 
 def _same_options(trained: Mapping[str, Any], options: Mapping[str, Any], weights: Path) -> None:

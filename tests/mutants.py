@@ -289,6 +289,30 @@ MUTANTS = (
         "(waves + rounded_up)",
         within("nodes", "bounds.py::test_what_is_left_out_changes_no_more_than_stated[fabricate-30]"),
     ),
+    Mutant(
+        "nodes/input_files.py",
+        "rows * columns > PIXELS",
+        "rows * columns >= PIXELS",
+        within("workflows/cli", "limits.py::test_a_file_at_the_limit_is_read_and_a_larger_one_is_refused"),
+    ),
+    Mutant(
+        "nodes/input_files.py",
+        "count > VALUES",
+        "count > VALUES + 1",
+        within("workflows/cli", "limits.py::test_arrays_and_tables_at_the_shipped_limits"),
+    ),
+    Mutant(
+        "nodes/scene/_large_picture.py",
+        "(old / new) - 0.5)",
+        "(old / new))",
+        within("nodes/scene", "large_picture.py::test_bands_of_rows_give_the_light_of_the_whole_picture"),
+    ),
+    Mutant(
+        "nodes/calibrate/_frames/_damaged_frames.py",
+        "end > (size := file.stat().st_size)",
+        "end > (size := file.stat().st_size) + 4000",
+        within("workflows/cli", "limits.py::test_fits_frames_are_opened_before_the_run"),
+    ),
     # The engine, and what is built on it.
     Mutant(
         "workflows/keys/cache_key.py",
@@ -328,6 +352,12 @@ MUTANTS = (
             "workflows/tolerance",
             "error_propagation.py::test_of_the_tolerance_of_a_recipe_with_economies_half_is_theirs",
         ),
+    ),
+    Mutant(
+        "workflows/engine/cost_model.py",
+        'fits = _kind(row) != "cpu" or',
+        'fits = _kind(row) == "cpu" or',
+        within("workflows/engine", "cost_model.py::test_a_peak_that_this_machine_cannot_have_is_passed_over"),
     ),
     Mutant(
         "workflows/engine/cost_model.py",

@@ -1,5 +1,7 @@
 """Scene-linear OpenEXR pictures, converted to linear sRGB."""
 
+import math
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,7 +13,8 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.input_files import not_finite, once_per_version, refuse_large_picture
-from neusee.nodes.scene._crop_to_frame import enlarged, framed
+from neusee.nodes.scene._crop_to_frame import enlarged
+from neusee.nodes.scene._large_picture import Linear, bands_of, linear_light
 from neusee.nodes.scene._spectral_exr import PartHeader, exr_parts, part_headers
 from neusee.nodes.units import DataFile, Shape
 
@@ -41,7 +44,7 @@ def exr(
             damaged file, for values that are not finite, and for more than 64 million pixels.
     Source: OpenEXR technical introduction (chromaticities, adoptedNeutral); matrices of colour-science.
     """
-    scene = framed(_linear(file, part), shape) / (white or 1.0)
+    scene = linear_light(*_linear_pixels(file, part), shape) / (white or 1.0)
     return scene.clamp_min(0) if negatives == "clip" else scene
 
 
@@ -60,10 +63,14 @@ def _(*, file: Path, shape: Shape | None = None, part: str | None = None, **para
 
 @exr.check
 def _(result: Tensor, *, file: Path, part: str | None = None, **params: Any) -> list[Check]:
-    linear = _linear(file, part)
-    below, least = int((linear < 0).sum()), float(linear.min())
+    pixels, linear = _linear_pixels(file, part)
+    below, least = 0, math.inf
+    for rows in bands_of(pixels.shape[:2]):
+        light = linear(pixels[rows])
+        below, least = below + int((light < 0).sum()), min(least, float(light.min()))
     text = f"peak {float(result.max()):.4g}, mean {float(result.mean()):.3g}"
-    return [Check(text + (f"; {below} of {linear.numel()} values were negative, down to {least:.2g}" if below else ""))]
+    values = 3 * pixels.shape[0] * pixels.shape[1]
+    return [Check(text + (f"; {below} of {values} values were negative, down to {least:.2g}" if below else ""))]
 
 
 def picture_size(file: Path, part: str | None) -> tuple[int, int]:
@@ -114,16 +121,25 @@ def _pixels(file: Path, part: str | None) -> tuple[dict[str, Any], list[str], ND
         return header, names, np.stack([np.asarray(channels[name].pixels, dtype=np.float32) for name in names])
 
 
-def _linear(file: Path, part: str | None = None) -> Tensor:
-    """Read all pixels of an OpenEXR file as linear sRGB, (3, y, x) float32."""
+def _linear_pixels(file: Path, part: str | None) -> tuple[NDArray[np.float32], Linear]:
+    """Read the values (y, x, channel) of an OpenEXR file; return them and their conversion to linear sRGB (3, y, x)."""
     header, names, pixels = _pixels(file, part)
     if problem := not_finite(file, int((~np.isfinite(pixels)).sum())):
         raise ValueError(problem)
     if names == ["Y"]:
-        return torch.from_numpy(pixels).expand(3, -1, -1).clone()
-    to_srgb = _xyz_to_srgb(header) if names == ["X", "Y", "Z"] else _to_srgb(header)
-    matrix = torch.from_numpy(to_srgb).to(torch.float32)
-    return (matrix @ torch.from_numpy(pixels).flatten(1)).reshape(pixels.shape)
+        matrix = None
+    else:
+        to_srgb = _xyz_to_srgb(header) if names == ["X", "Y", "Z"] else _to_srgb(header)
+        matrix = torch.from_numpy(to_srgb).to(torch.float32)
+    return pixels.transpose(1, 2, 0), partial(_converted, matrix)
+
+
+def _converted(matrix: Tensor | None, values: NDArray[Any]) -> Tensor:
+    """Return linear sRGB (3, y, x) of the values (y, x, channel) of a picture, or of its one channel for no matrix."""
+    planes = torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))
+    if matrix is None:
+        return planes.expand(3, -1, -1).clone()
+    return (matrix @ planes.flatten(1)).reshape(planes.shape)
 
 
 def _xyz_to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:

@@ -3,12 +3,15 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.input_files import once_per_version, refuse_large_picture
 from neusee.nodes.scene._crop_to_frame import enlarged, framed
+from neusee.nodes.scene._large_picture import linear_light
 from neusee.nodes.units import DataFile, Shape
 
 _MODES = ("RGB", "L", "P", "1", "I", "I;16", "I;16B")
@@ -30,14 +33,12 @@ def photograph(*, file: DataFile, shape: Shape | None = None) -> Tensor:
             and for more than 64 million pixels.
     Source: IEC 61966-2-1:1999 (sRGB); EXIF 2.3, tag Orientation.
     """
-    from kornia.color import rgb_to_linear_rgb
-
-    return framed(rgb_to_linear_rgb(_codes(file)), shape)
+    return linear_light(_codes(file), _linear, shape)
 
 
 @photograph.reference
 def _(*, file: Path, shape: Shape | None = None) -> Tensor:
-    codes = _codes(file).double()
+    codes = _scaled(_codes(file)).double()
     return framed(torch.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4), shape)
 
 
@@ -131,24 +132,36 @@ def _profile(image: Any) -> str:
     return "" if "srgb" in name.lower() else name
 
 
-def _codes(file: Path) -> Tensor:
-    """Read the sRGB code values of a photograph, turned upright and scaled to [0, 1]: (3, y, x) float32.
+def _linear(codes: NDArray[Any]) -> Tensor:
+    """Decode sRGB code values (y, x, 3) to linear light (3, y, x) float32."""
+    from kornia.color import rgb_to_linear_rgb
+
+    light: Tensor = rgb_to_linear_rgb(_scaled(codes))
+    return light
+
+
+def _scaled(codes: NDArray[Any]) -> Tensor:
+    """Return code values (y, x, 3) as (3, y, x) float32 in [0, 1]."""
+    scale = 255.0 if codes.dtype == np.uint8 else 65535.0
+    return torch.from_numpy(np.ascontiguousarray(codes.transpose(2, 0, 1), dtype=np.float32)) / scale
+
+
+def _codes(file: Path) -> NDArray[Any]:
+    """Read the sRGB code values (y, x, 3) of a photograph, turned upright.
 
     Kornia_rs reads 16-bit colour, of which Pillow would keep 8 bits.
     """
-    import numpy as np
     from PIL import Image, ImageOps
 
     with Image.open(file) as image:
         _refuse(file, image)
+        turned = image.getexif().get(_ORIENTATION, 1)
         if image.mode == "RGB" and _depth(file) == 16:
-            values = _words(file, image.getexif().get(_ORIENTATION, 1))
-        else:
-            upright = ImageOps.exif_transpose(image)
-            values = np.asarray(upright if upright.mode.startswith("I") else upright.convert("RGB"))
-    scale = 255.0 if values.dtype == np.uint8 else 65535.0
-    grey = values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2)
-    return torch.from_numpy(np.ascontiguousarray(grey.transpose(2, 0, 1), dtype=np.float32)) / scale
+            return _words(file, turned)
+        upright = ImageOps.exif_transpose(image) if turned != 1 else image  # a copy
+        plain = upright.mode.startswith("I") or upright.mode == "RGB"
+        values = np.asarray(upright if plain else upright.convert("RGB"))
+    return values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2)
 
 
 def _depth(file: Path) -> int:
@@ -157,9 +170,8 @@ def _depth(file: Path) -> int:
     return head[24] if head.startswith(b"\x89PNG") else 8
 
 
-def _words(file: Path, turned: int) -> Any:
+def _words(file: Path, turned: int) -> NDArray[Any]:
     """Read a 16-bit RGB PNG file, and turn the picture upright by the EXIF orientation ``turned``."""
-    import numpy as np
     from kornia_rs.io import read_image_png_u16
 
     values = np.asarray(read_image_png_u16(str(file), "rgb"))

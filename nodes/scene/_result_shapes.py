@@ -8,6 +8,7 @@ from torch import Tensor
 from neusee.nodes.scene._cube_files import Layout
 from neusee.nodes.scene._exr_picture import exr, picture_size
 from neusee.nodes.scene._hyperspectral import hyperspectral, rows_and_columns
+from neusee.nodes.scene._large_picture import is_large
 from neusee.nodes.scene._photograph import photograph, read_header
 from neusee.nodes.scene._test_targets import targets
 from neusee.nodes.shape_rules import blank
@@ -54,5 +55,14 @@ def _picture(result: Tensor, *inputs: Any, file: Path, **params: Any) -> tuple[f
     return 12.0 * y * x, float(3 * y * x + 3 * result.numel())
 
 
-photograph.work(_picture)
+@photograph.work
+def _(result: Tensor, *inputs: Any, file: Path, **params: Any) -> tuple[float, float]:
+    """Return the memory of the decoded picture, which is less for each pixel of a large one, and the operations."""
+    held, operations = _picture(result, *inputs, file=file, **params)
+    pixels = held / 12
+    if result.numel() == 3 * pixels:  # not scaled: the law counts the result 2.76 times
+        return (0.0 if is_large(pixels) else 16.0 * pixels), operations
+    return (10.0 if is_large(pixels) else 60.0) * pixels, operations
+
+
 exr.work(_picture)

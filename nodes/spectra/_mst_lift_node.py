@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.network_weights import empty
+from neusee.nodes.network_weights import empty, wrong_weights
 from neusee.nodes.spectra._linear_lift import lift_checks, needs_rgb
 from neusee.nodes.spectra._mst_plus_plus import BANDS, MSTPlusPlus
 from neusee.nodes.units import DataFile
@@ -131,7 +131,7 @@ def _untrained(untrained: str, rng: torch.Generator) -> MSTPlusPlus:
 
 
 def _fitting(weights: Path) -> dict[str, Tensor]:
-    """Read the tensors of a checkpoint file, and raise ParameterError unless names and shapes fit the network MST++."""
+    """Read the tensors of a checkpoint file, and raise ParameterError unless they fit MST++ and are finite."""
     found = {name.removeprefix("module."): tensor for name, tensor in _read(weights).items()}
     network = _empty().state_dict()
     wrong = [name for name in network if name not in found or found[name].shape != network[name].shape]
@@ -139,6 +139,8 @@ def _fitting(weights: Path) -> dict[str, Tensor]:
     if wrong:
         text = f"{weights} holds {len(found)} tensors, and {len(wrong)} tensors do not fit MST++, such as {wrong[0]}"
         raise ParameterError("weights", text)
+    if problem := next(filter(None, (wrong_weights(weights, name, each) for name, each in found.items())), ""):
+        raise ParameterError("weights", problem)
     return {name: tensor.float() for name, tensor in found.items()}
 
 

@@ -17,6 +17,7 @@ from typing import Any
 from neusee.workflows.engine.cost_laws import GUESS, Law, Size, shipped
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import device_kind
+from neusee.workflows.recipe.known_before_run import machine_memory
 
 _FASTER = 10.0  #: speed of another kind of device relative to the CPU, until both are measured
 _NEWEST = 5  #: number of earlier results that are used
@@ -136,7 +137,9 @@ class Costs:
 
 
 def _is_measured(row: Row) -> bool:
-    return row.get("seconds") is not None and row.get("bytes") is not None
+    """Return True for a journal line with a time, a size and a peak of memory that this machine can have."""
+    fits = _kind(row) != "cpu" or (row.get("peak") or 0) <= machine_memory()
+    return fits and row.get("seconds") is not None and row.get("bytes") is not None
 
 
 def _scales(law: Law, rows: Sequence[Row], faster: Any) -> tuple[float, float]:

@@ -1,5 +1,7 @@
-"""The check of a file of raw frames before the run, without decoding its pixels."""
+"""The check of a file of raw frames before the run, which reads no pixels but those that are fractions."""
 
+import math
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -7,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from neusee.nodes import ParameterError
-from neusee.nodes.calibrate._frames._image_files import refuse_page
+from neusee.nodes.calibrate._frames._image_files import FITS, fits_image, read, refuse_page
 from neusee.nodes.input_files import VALUES, once_per_version
 
 _STRIP_STARTS, _STRIP_LENGTHS = 273, 279  #: TIFF tags
@@ -49,8 +51,36 @@ def _numpy(file: Path) -> str:
     head = np.load(file, mmap_mode="r", allow_pickle=False)
     if head.dtype.kind not in "uif":
         return f"{file} holds values of type {head.dtype}: save raw frames as whole numbers"
-    if head.size > VALUES:
-        return f"{file} has {head.size} values, more than the limit of {VALUES}: divide the frames among several files"
+    return _too_large(file, head.shape) or _wrong_numbers(file, head.shape, head.dtype.kind == "f")
+
+
+def _fits(file: Path) -> str:
+    """Return a message for a FITS file without an image, cut short, too large, or with other than whole numbers."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # astropy warns of a file that is cut short, which is refused here
+        shape, fractions, end = fits_image(file)
+    if end > (size := file.stat().st_size):
+        return f"{file} is damaged (its image ends at byte {end}, after its end at {size}): copy the file again"
+    return _too_large(file, shape) or _wrong_numbers(file, shape, fractions)
+
+
+def _too_large(file: Path, shape: tuple[int, ...]) -> str:
+    count = math.prod(map(int, shape))
+    if count <= VALUES:
+        return ""
+    return f"{file} has {count} values, more than the limit of {VALUES}: divide the frames among several files"
+
+
+def _wrong_numbers(file: Path, shape: tuple[int, ...], fractions: bool) -> str:
+    """Return a message for an array that is no stack of frames, or holds no digital numbers, else an empty text.
+
+    Numbers of a type without fractions are not read before the run.
+    """
+    if fractions or len(shape) not in (2, 3) or not math.prod(shape):
+        try:
+            read(file)
+        except ValueError as error:
+            return str(error)
     return ""
 
 
@@ -58,10 +88,12 @@ def _exr(file: Path) -> str:
     from neusee.nodes.scene._spectral_exr import exr_header
 
     try:
-        _, names, _ = exr_header(file)
+        _, names, size = exr_header(file)
     except ParameterError as error:
         return str(error)
-    return f"{file} has the channels {', '.join(names)}: save one channel alone" if len(names) != 1 else ""
+    if len(names) != 1:
+        return f"{file} has the channels {', '.join(names)}: save one channel alone"
+    return _wrong_numbers(file, size, True)
 
 
 _CHECKS: dict[str, Callable[[Path], str]] = {
@@ -70,4 +102,5 @@ _CHECKS: dict[str, Callable[[Path], str]] = {
     ".tiff": _picture,
     ".npy": _numpy,
     ".exr": _exr,
+    **dict.fromkeys(FITS, _fits),
 }

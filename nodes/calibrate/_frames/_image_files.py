@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _GREY = ("L", "I", "I;16", "I;16B", "I;16L", "F")  #: pixel modes that Pillow reads without conversion
-_FITS = (".fits", ".fit", ".fts")
+FITS = (".fits", ".fit", ".fts")  #: suffixes
 _TOP = 1 << 24  #: DN; above any converter
 
 
@@ -34,7 +35,7 @@ def read(file: Path) -> NDArray[np.int32]:
 def readable(file: Path) -> Callable[[Path], NDArray[Any]]:
     """Return the function that reads files of this suffix; raise ValueError for an unknown suffix."""
     suffix = file.suffix.lower()
-    if suffix in _FITS and importlib.util.find_spec("astropy") is None:
+    if suffix in FITS and importlib.util.find_spec("astropy") is None:
         raise ValueError(f"{file.name} needs astropy: pip install 'neusee[fits]'")
     if suffix not in _READERS:
         raise ValueError(
@@ -84,10 +85,31 @@ def _fits(file: Path) -> NDArray[Any]:
     from astropy.io import fits
 
     with fits.open(file) as opened:
-        for part in opened:
-            if part.data is not None and getattr(part, "is_image", False):
-                return np.array(part.data)
-    raise ValueError(f"{file} holds no image: give a FITS file with an image")
+        return np.array(_first_image(file, opened).data)
+
+
+def fits_image(file: Path) -> tuple[tuple[int, ...], bool, int]:
+    """Return the shape of the first image of a FITS file, True if its numbers may be fractions, and its last byte.
+
+    Only headers are read. Raises ValueError for a file without an image.
+    """
+    from astropy.io import fits
+
+    with fits.open(file) as opened:
+        image = _first_image(file, opened)
+        header, about = image.header, image.fileinfo()
+        scaled = float(header.get("BSCALE", 1)) != 1 or float(header.get("BZERO", 0)) % 1 != 0 or "BLANK" in header
+        fractions = scaled or int(header["BITPIX"]) < 0
+        packed = isinstance(image, fits.CompImageHDU)  # its blocks of 2880 bytes, of which the last one may be short
+        size = about["datSpan"] - 2879 if packed else math.prod(image.shape) * abs(int(header["BITPIX"])) // 8
+        return tuple(image.shape), fractions, int(about["datLoc"] + size)
+
+
+def _first_image(file: Path, opened: Any) -> Any:
+    image = next((part for part in opened if getattr(part, "is_image", False) and part.shape), None)
+    if image is None:
+        raise ValueError(f"{file} holds no image: give a FITS file with an image")
+    return image
 
 
 _READERS: dict[str, Callable[[Path], NDArray[Any]]] = {
@@ -96,5 +118,5 @@ _READERS: dict[str, Callable[[Path], NDArray[Any]]] = {
     ".tiff": _picture,
     ".exr": _exr,
     ".npy": partial(np.load, allow_pickle=False),
-    **dict.fromkeys(_FITS, _fits),
+    **dict.fromkeys(FITS, _fits),
 }

@@ -72,6 +72,15 @@ def test_a_damaged_size_in_the_journal_is_passed_over():
     assert not Costs(rows, {"a": SMALL}).of(step("a"), ["cpu"]).known
 
 
+def test_a_peak_that_this_machine_cannot_have_is_passed_over():
+    """Such as in a line of the journal that somebody wrote: it would make the step too large for ever."""
+    right = row("a", 1.0, peak=3e8, of=SMALL)
+    forged = [row("a", 1.0, peak=1e15, of=SMALL)] * 5
+    for sizes in ({"a": SMALL}, {"a": LARGE}, {}):
+        assert Costs([right, *forged], sizes).of(step("a"), ["cpu"]) == Costs([right], sizes).of(step("a"), ["cpu"])
+    assert Costs([], {"a": SMALL}).of(step("a"), ["cpu"], forged[0]) == Costs([], {"a": SMALL}).of(step("a"), ["cpu"])
+
+
 def test_only_the_newest_count():
     rows = [*(row("a", 100.0, of=SMALL) for _ in range(50)), *(row("a", 1.0, of=SMALL) for _ in range(5))]
     assert Costs(rows, {"a": SMALL}).of(step("a"), ["cpu"]).seconds["cpu"] == 1.0
@@ -102,6 +111,25 @@ def test_another_kind_of_device_is_priced_by_the_steps_that_ran_on_both():
 def test_a_law_gives_at_least_the_bytes_of_the_result():
     assert Law((0.0, 0.0, 0.5, 0.0), (0.0, 0.0)).peak(SMALL) == SMALL.result
     assert Law((7.0, 1.0, 2.0, 3.0), (0.0, 0.0)).peak(Size(10.0, 100.0, 1000.0, 0.0)) == 7 + 10 + 200 + 3000
+
+
+@pytest.mark.parametrize(
+    ("size", "shape", "measured"),
+    [
+        ((7000, 9000), (8, 8), 615e6), ((7000, 9000), None, 1020e6), ((1990, 2000), (500, 500), 263e6),
+        ((1990, 2000), None, 215e6), ((427, 640), (768, 768), 33e6), ((427, 640), (3000, 3000), 335e6),
+    ],
+)  # fmt: skip
+def test_the_memory_of_a_photograph_follows_its_own_pixels(tmp_path, monkeypatch, size, shape, measured):
+    """Peaks measured in a process of their own; 37 MB were predicted for a scene of 8 x 8 of 63 million pixels."""
+    from neusee.nodes.scene import _result_shapes, photograph
+
+    monkeypatch.setattr(_result_shapes, "read_header", lambda file: ("", 1, size))
+    (tmp_path / "a.png").write_bytes(b"")
+    params = {"file": tmp_path / "a.png", "shape": shape}
+    found = size_of(photograph, [], params, photograph.hooks.shape(**params))
+    peak = shipped()["scene.photograph"].peak(found)
+    assert 0.9 * measured < peak < 2.2 * measured
 
 
 def test_the_size_of_a_step_is_that_of_its_tensors():

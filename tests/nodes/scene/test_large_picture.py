@@ -1,0 +1,79 @@
+"""Large pictures: the same light as in one piece, in bands of rows, and within the memory that is stated."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from neusee.nodes import ParameterError, input_files
+from neusee.nodes.scene import _large_picture, exr, photograph
+from neusee.nodes.scene._crop_to_frame import framed
+
+SIZES = [
+    ((101, 67), (8, 8)), ((101, 67), (30, 50)), ((67, 101), (67, 100)), ((50, 60), (75, 75)), ((50, 60), (50, 60)),
+    ((50, 60), None), ((64, 1), (8, 1)), ((1, 64), (1, 5)), ((333, 222), (7, 3)), ((40, 41), (39, 40)),
+]  # fmt: skip
+
+
+def light(codes):
+    return torch.from_numpy(np.ascontiguousarray(codes.transpose(2, 0, 1)))
+
+
+@pytest.mark.parametrize(("size", "shape"), SIZES)
+@pytest.mark.parametrize("band", [1, 500])
+def test_bands_of_rows_give_the_light_of_the_whole_picture(monkeypatch, size, shape, band):
+    """Kornia resamples the whole picture in float64; a band of one row is the smallest there is."""
+    monkeypatch.setattr(_large_picture, "_LARGE", 0)
+    monkeypatch.setattr(_large_picture, "_BAND", band)
+    codes = np.random.default_rng(0).random((*size, 3), dtype=np.float32)
+    result = _large_picture.linear_light(codes, light, shape)
+    assert result.dtype == torch.float32
+    torch.testing.assert_close(result.double(), framed(light(codes).double(), shape), rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize(("node", "name"), [(photograph, "a.png"), (exr, "a.exr"), (exr, "grey.exr")])
+def test_a_file_gives_the_same_light_in_bands(monkeypatch, tmp_path, node, name):
+    values = np.random.default_rng(0).random((40, 60, 3), dtype=np.float32) - 0.1 * (node is exr)
+    if node is exr:
+        import OpenEXR
+
+        channels = {c: values[..., i].copy() for i, c in enumerate("RGB" if name == "a.exr" else "Y")}
+        OpenEXR.File({}, channels).write(str(tmp_path / name))
+    else:
+        Image.fromarray((255 * values).astype(np.uint8)).save(tmp_path / name)
+    whole = [node(file=tmp_path / name, shape=shape) for shape in (None, (16, 20))]
+    told = node.hooks.check(whole[0], file=tmp_path / name)
+    monkeypatch.setattr(_large_picture, "_LARGE", 0)
+    monkeypatch.setattr(_large_picture, "_BAND", 300)
+    for one, shape in zip(whole, (None, (16, 20)), strict=True):
+        torch.testing.assert_close(node(file=tmp_path / name, shape=shape), one, rtol=0, atol=2e-6)
+    assert node.hooks.check(whole[0], file=tmp_path / name) == told
+    assert node is photograph or "values were negative" in told[0].text
+
+
+@pytest.mark.slow
+def test_a_picture_at_the_limit_takes_less_than_one_and_a_half_gigabytes(tmp_path):
+    """64 million pixels, at the size of the file and for a scene of 8 x 8 pixels: 3.4 GB and minutes before."""
+    side = 8000
+    assert side * side == input_files.PIXELS
+    Image.new("RGB", (side, side), (90, 120, 200)).save(tmp_path / "a.png", compress_level=1)
+    code = """
+import resource, sys
+from pathlib import Path
+from neusee.nodes.scene import photograph
+file = Path(sys.argv[1])
+assert photograph.hooks.preflight(file=file, shape=(8, 8)) == []
+small, whole = photograph(file=file, shape=(8, 8)), photograph(file=file)
+assert whole.shape == (3, 8000, 8000)
+assert float((small - whole[:, :8, :8]).abs().max()) < 1e-6
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+"""
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "a.png"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) < 1.5e9
+    Image.new("RGB", (side + 1, side), (90, 120, 200)).save(tmp_path / "b.png", compress_level=1)
+    with pytest.raises(ParameterError, match=r"b\.png has 8001 x 8000 pixels, more than the limit of 64 million"):
+        photograph.hooks.preflight(file=tmp_path / "b.png")
