@@ -19,6 +19,7 @@ _BINS = 24
 _APART = 0.1  #: inches around each diagram, so that a title does not touch the numbers above it
 _SLIGHT = 1e-6  #: share of a curve's largest element; no ratio to a smaller median is drawn
 _ALONG = 200  #: signals of a photon-transfer curve
+_CLIPPED = 0.7  #: share of the predicted standard deviation below which flat fields are clipped, and not drawn
 
 
 @drawn
@@ -73,11 +74,22 @@ def bands(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], axi
 
 @drawn
 def transfer(draws: FloatArray) -> Any:
-    """Draw bands of photon-transfer curves in DN from ``draws`` (draw, level, signal | variance | predicted)."""
+    """Draw bands of photon-transfer curves in DN from ``draws`` (draw, level, signal | variance | predicted).
+
+    Where the full well or the converter clips flat fields, their noise collapses; there, a grey area takes their place.
+    """
     figure, axes = canvas(6.6, 5.8, 2, 1, sharex=True, height_ratios=[2, 1])
     ax, below = axes[:, 0]
-    for column, colour, name in ((2, BLUE, "predicted"), (1, ORANGE, "flat fields")):
-        _band(ax, below, *_at_one_signal(draws, column), colour, f"{name}: middle 90 %")
+    signal, predicted = _at_one_signal(draws, 2)
+    flat = _at_one_signal(draws, 1)[1]
+    whole = np.quantile(flat, 0.05, axis=0) > _CLIPPED * np.median(predicted, axis=0)
+    _band(ax, below, signal, predicted, BLUE, "predicted: middle 90 %")
+    if whole.any():
+        _band(ax, below, signal[whole], flat[:, whole], ORANGE, "flat fields: middle 90 %")
+    if not whole.all():
+        ax.axvspan(
+            signal[~whole].min(), signal.max(), color=_GREY, alpha=0.15, linewidth=0, label="clipped flat fields"
+        )
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.set_title("photon-transfer curve: middle 90 % of the draws")
