@@ -86,7 +86,7 @@ def _section(anchor: str, section: Section) -> dict[str, Any]:
         "anchor": anchor,
         "heading": section.heading,
         "text": _paragraphs(section.text),
-        "alt": " ".join([f"Figure: {section.heading}.", *_paragraphs(section.text)[:1]]),
+        "alt": _alternative(section),
         "picture": base64.b64encode(section.picture).decode() if section.picture else "",
         "columns": section.columns,
         "numeric": numeric,
@@ -95,6 +95,12 @@ def _section(anchor: str, section: Section) -> dict[str, Any]:
             for r, row in enumerate(section.rows)
         ],
     }
+
+
+def _alternative(section: Section) -> str:
+    """Return the alternative text of the picture of a section: the heading, and the first sentence of the text."""
+    sentences = [re.split(r"(?<=[.!?]) ", paragraph)[0] for paragraph in _paragraphs(section.text)[:1]]
+    return " ".join([f"Figure: {section.heading}.", *sentences])
 
 
 def _refuse_stray_marks(section: Section) -> None:

@@ -16,6 +16,7 @@ from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
 from neusee.workflows.report import result_numbers, run_folder, run_page, run_pictures, run_timing
+from neusee.workflows.report.console import closing
 from neusee.workflows.report.figures import gantt
 from neusee.workflows.report.run_folder import find_run, new_run
 from neusee.workflows.simulation.simulate_recipe import simulate
@@ -210,6 +211,13 @@ def test_a_mask_that_gains_nothing_is_not_praised():
     (same, _) = result_numbers.balance({"plain lens": GAIN, "with mask": GAIN})
     assert same.startswith("The mask does not change")
     assert result_numbers.balance({"plain lens": GAIN}) == []
+
+
+def test_the_terminal_says_what_a_mask_is_for_and_what_it_costs(done):
+    said = result_numbers.balance({"plain lens": GAIN, "with mask": PRICE})
+    doc = {**done.document, "table": {**done.document["table"], "balance": said}}
+    lines = closing(doc, "report.html", [])
+    assert [line.strip() for line in lines if line.strip() in said] == said
 
 
 def test_a_gain_is_not_called_a_price_and_an_equal_number_is_not_said():

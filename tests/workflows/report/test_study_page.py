@@ -105,7 +105,7 @@ def test_a_dash_stands_below_the_numbers_of_its_column():
 
 
 def test_a_figure_has_a_text_that_says_what_it_shows():
-    section = Section("Curves", "The middle 90 % of the draws.\n\nMore.", picture=b"PNG")
+    section = Section("Curves", "The middle 90 % of the draws. Less.\n\nMore.", picture=b"PNG")
     assert '<img alt="Figure: Curves. The middle 90 % of the draws."' in page("a", "b", [section], {})
 
 
