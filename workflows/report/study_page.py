@@ -6,6 +6,7 @@ The page has a light mode, a dark mode and a print mode. A sign in each coloured
 from __future__ import annotations
 
 import base64
+import math
 import numbers
 import re
 from collections.abc import Mapping, Sequence
@@ -77,6 +78,16 @@ def said(value: Any) -> str:
     if isinstance(value, numbers.Real) and not isinstance(value, numbers.Integral):
         return f"{float(value):.3g}"
     return str(value)
+
+
+def with_uncertainty(mean: float, sd: float) -> str:
+    """Return mean ± standard deviation as text, rounded to two significant digits of the standard deviation."""
+    if not 0 < sd < math.inf:
+        return f"{mean:.6g} ± {sd:g}"
+    digits = 1 - math.floor(math.log10(sd))
+    if not -5 <= digits <= 12:
+        return f"{mean:.5g} ± {sd:.2g}"
+    return " ± ".join(f"{round(value, digits):.{max(digits, 0)}f}" for value in (mean, sd))
 
 
 def _section(anchor: str, section: Section) -> dict[str, Any]:

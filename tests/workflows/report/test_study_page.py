@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from neusee.workflows.report.study_page import Section, page, said
+from neusee.workflows.report.study_page import Section, page, said, with_uncertainty
 
 PNG = b"\x89PNG\r\n\x1a\n and what follows"
 
@@ -139,3 +139,20 @@ def test_a_long_name_may_go_on_in_a_new_line_and_a_number_may_not():
 def test_a_mapping_inside_a_mapping_has_brackets():
     text = page("a", "b", [], {"settings": {"weights": {"lsr": 2, "bsr": 1}, "at": "", "slopes": [4, 48]}})
     assert "weights (lsr 2, bsr 1), at –, slopes (4, 48)" in text
+
+
+@pytest.mark.parametrize(
+    ("mean", "sd", "said"),
+    [
+        (10.4961, 0.0203, "10.496 ± 0.020"),
+        (390.05, 0.59, "390.05 ± 0.59"),
+        (25502.3, 39.4, "25502 ± 39"),
+        (1132.96, 394.0, "1130 ± 390"),
+        (0.76956, 0.00226, "0.7696 ± 0.0023"),
+        (1.0, 0.0, "1 ± 0"),
+        (float("nan"), float("inf"), "nan ± inf"),
+        (3e9, 2.1e8, "3e+09 ± 2.1e+08"),
+    ],
+)
+def test_digits_stand_beside_their_deviation(mean, sd, said):
+    assert with_uncertainty(mean, sd) == said

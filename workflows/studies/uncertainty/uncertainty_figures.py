@@ -9,6 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from neusee.workflows.report.figures.camera_overview import high
+from neusee.workflows.report.figures.point_labels import plain_ticks
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, encoded, picture
 from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray
 
@@ -16,10 +17,11 @@ _GREY = "#777777"
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE)
 _WIDE = 30.0  #: ratio of the largest to the least value of curves above which their axis is logarithmic
 _BINS = 24
+_TICKS = 4  #: numbers below a diagram of a number, at most; each may have seven characters
 _APART = 0.1  #: inches around each diagram, so that a title does not touch the numbers above it
 _SLIGHT = 1e-6  #: share of a curve's largest element; no ratio to a smaller median is drawn
 _ALONG = 200  #: signals of a photon-transfer curve
-_CLIPPED = 0.7  #: share of the predicted standard deviation below which flat fields are clipped, and not drawn
+_CLIPPED = 0.9  #: share of the predicted standard deviation below which flat fields are clipped, and not drawn
 
 
 @drawn
@@ -48,7 +50,7 @@ def _bars(ax: Any, bars: Sequence[tuple[str, float, float]], middle: float) -> N
     ax.axvline(middle, color=BLACK, linewidth=0.9)
     ax.set_yticks(range(len(bars)), [bar[0] for bar in bars])
     ax.ticklabel_format(axis="x", useOffset=False)
-    ax.tick_params(axis="x", rotation=20)
+    ax.locator_params(axis="x", nbins=_TICKS)
     ax.grid(False, axis="y")
 
 
@@ -82,7 +84,7 @@ def transfer(draws: FloatArray) -> Any:
     ax, below = axes[:, 0]
     signal, predicted = _at_one_signal(draws, 2)
     flat = _at_one_signal(draws, 1)[1]
-    whole = np.quantile(flat, 0.05, axis=0) > _CLIPPED * np.median(predicted, axis=0)
+    whole = np.median(flat / predicted, axis=0) > _CLIPPED
     _band(ax, below, signal, predicted, BLUE, "predicted: middle 90 %")
     if whole.any():
         _band(ax, below, signal[whole], flat[:, whole], ORANGE, "flat fields: middle 90 %")
@@ -92,6 +94,7 @@ def transfer(draws: FloatArray) -> Any:
         )
     ax.set_xscale("log")
     ax.set_yscale("log")
+    plain_ticks(ax.yaxis)
     ax.set_title("photon-transfer curve: middle 90 % of the draws")
     ax.set_ylabel("standard deviation (DN)")
     below.set_xlabel("mean above dark (DN)")
@@ -134,7 +137,8 @@ def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) ->
         ax.axvline(middles[name], color=VERMILION, linewidth=1.2, label="value with every input at its median")
         ax.set_title(name)
         ax.ticklabel_format(axis="x", useOffset=False)
-        ax.tick_params(axis="x", rotation=20)
+        ax.locator_params(axis="x", nbins=_TICKS)
+        ax.locator_params(axis="y", integer=True)
         ax.grid(False)
     for ax in list(axes.flat)[len(draws) :]:
         ax.set_axis_off()
