@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from collections import Counter
 from typing import Any
@@ -102,14 +101,12 @@ def _tick_labels(axis: Any) -> list[Any]:
 def _overlapping(texts: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
     """Return the pairs of texts whose boxes overlap; the box of an oblique text says too little."""
     upright = [(text, box) for text, box in texts if text.get_rotation() % 90 == 0]
-    pairs = itertools.combinations(upright, 2)
-    return [(a[0], b[0]) for a, b in pairs if _overlap(a[1], b[1]) and a[0].get_text() != b[0].get_text()]
-
-
-def _overlap(a: Any, b: Any) -> bool:
-    across = min(a.x1, b.x1) - max(a.x0, b.x0)
-    along = min(a.y1, b.y1) - max(a.y0, b.y0)
-    return across > TOUCH and along > TOUCH
+    x0, y0, x1, y1 = np.array([box.extents for _, box in upright]).reshape(-1, 4).T
+    across = np.minimum.outer(x1, x1) - np.maximum.outer(x0, x0)
+    along = np.minimum.outer(y1, y1) - np.maximum.outer(y0, y0)
+    pairs = np.argwhere(np.triu((across > TOUCH) & (along > TOUCH), 1))
+    both = [(upright[i][0], upright[j][0]) for i, j in pairs]
+    return [(a, b) for a, b in both if a.get_text() != b.get_text()]
 
 
 def _same_looks(figure: Any, axes: list[Any]) -> list[str]:
