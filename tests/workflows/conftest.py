@@ -57,3 +57,20 @@ def one_thread():
 
     with one_thread():
         yield
+
+
+@pytest.fixture(autouse=True)
+def no_fault_in_any_figure(monkeypatch):
+    """Every figure that the program draws in a test has panels with content, and texts that can be read."""
+    from neusee.workflows.report.figures import style
+    from tests.figure_faults import watched
+
+    save, found = style.png_of, []
+
+    def saved(figure):
+        watched(figure, found)
+        return save(figure)
+
+    monkeypatch.setattr(style, "png_of", saved)
+    yield
+    assert found == []

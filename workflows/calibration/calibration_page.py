@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,7 @@ from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import IntervalEstimate, ModelSpread
 from neusee.workflows.calibration.posterior_checks import Check, count_failures
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
-from neusee.workflows.report.study_page import Mark, Section
+from neusee.workflows.report.study_page import Mark, Section, with_uncertainty
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -88,14 +87,6 @@ class CalibrationResult:
         below, unit = float((draws < nominal).mean()), unit_of(name, self.params)
         mean, sd = float(draws.mean()), float(draws.std())
         return ParameterEstimate(name, unit, kind, mean, sd, low, high, nominal, below, narrower)
-
-
-def with_uncertainty(mean: float, sd: float) -> str:
-    """Return mean ± standard deviation as text, rounded to two significant digits of the standard deviation."""
-    if not sd > 0:
-        return f"{mean:.6g} ± {sd:g}"
-    digits = 1 - math.floor(math.log10(sd))
-    return f"{mean:.{digits}f} ± {sd:.{digits}f}" if 0 <= digits <= 12 else f"{mean:.5g} ± {sd:.2g}"
 
 
 def unit_of(name: str, params: Mapping[str, Any]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -62,7 +62,8 @@ def _broken(name: str) -> str:
 def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
     """Draw the L1 error of every mask and restorer with its 95 % interval over the laser strength.
 
-    The left plot is for pictures of full size, the right plot for reduced pictures.
+    The left plot is for pictures of full size, the right plot for reduced pictures. Intervals of few scenes are much
+    wider than the means are apart; they do not stretch the axis.
     """
     figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
     looks = _looks(list(tables))
@@ -74,7 +75,7 @@ def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
         ax.set_xlabel("laser strength (multiples of saturation)")
         values = next(iter(tables.values())).strengths
         ax.set_xticks(_places(values), ["none" if k == 0 else _power(k) for k in values])
-        ax.set_ylim(bottom=0)
+        ax.set_ylim(0, _top(tables.values(), metric))
     axes[0, 0].set_ylabel("L1 (sRGB, 0 to 1)")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(3, len(labels)))
@@ -87,6 +88,13 @@ def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], nam
     ax.plot(at, [x.mean for x in intervals], marker="o", markersize=4, linewidth=1.4, label=name, **look)
     low, up = [x.low for x in intervals], [x.high for x in intervals]
     ax.fill_between(at, low, up, color=look["color"], alpha=0.15, linewidth=0)
+
+
+def _top(tables: Iterable[MetricTable], metric: str) -> float:
+    """Return the end of an axis that shows every mean, and intervals up to three times the largest mean."""
+    found = [mean(table.at(metric, i)) for table in tables for i in range(len(table.strengths))]
+    largest = max(x.mean for x in found)
+    return 1.05 * max(largest, min(3 * largest, max([x.high for x in found if x.high > 0], default=0.0))) or 1.0
 
 
 def _places(values: Sequence[float]) -> list[float]:

@@ -77,7 +77,8 @@ def sections(result: EvaluationResult, shown: Mapping[str, bytes]) -> list[Secti
     """Return all sections of the report page of an evaluation."""
     parts = [_crossed(result), _numbers(result), _compared(result)]
     text = """Mean over scenes and its 95 % interval. A scene without a laser counts only at the strength none, so
-        that every scene of the other points has a laser."""
+        that every scene of the other points has a laser. The axis ends at most at three times the largest mean; an
+        interval of few scenes may reach beyond."""
     parts.append(Section("Error over strength", text, picture=shown["strengths"]))
     text = """The first scene with each laser of the protocol and without a laser, all with the same scale. The rows are
         the truth, the picture of the plain lens without restoration, and every pipeline."""

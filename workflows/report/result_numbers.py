@@ -59,7 +59,7 @@ def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, An
     columns = [column for column in _COLUMNS if any(column in cells for cells in numbers.values())]
     rows = [{"name": name, "cells": [_text(cells, c) for c in columns]} for name, cells in numbers.items() if cells]
     legend = [text.format(band=where) for column, text in _LEGEND.items() if column in columns]
-    return {"columns": columns, "rows": rows, "legend": legend, "balance": balance(numbers)}
+    return {"columns": columns, "rows": rows, "legend": legend, "balance": balance(numbers, bool(_lines(recipe, keys)))}
 
 
 def _field(found: Any, field: str) -> Tensor | None:
@@ -73,14 +73,17 @@ def _text(cells: Mapping[str, float], column: str) -> str:
     return _COLUMNS[column][3].format(cells[column]) if column in cells else ""
 
 
-def balance(numbers: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Return what the mask gains and what the mask costs in a run as sentences, from the rows of the result table."""
+def balance(numbers: Mapping[str, Mapping[str, float]], laser: bool = True) -> list[str]:
+    """Return what the mask gains and what the mask costs in a run as sentences, from the rows of the result table.
+
+    ``laser`` says whether a laser shines in this run.
+    """
     plain, mask, restored = (numbers.get(name, {}) for name in ("plain lens", "with mask", "restored"))
-    gain = _gain(plain, mask)
+    gain = _gain(plain, mask, laser)
     return [*gain, *_price(plain, mask, restored)] if gain else []
 
 
-def _gain(plain: Mapping[str, float], mask: Mapping[str, float]) -> list[str]:
+def _gain(plain: Mapping[str, float], mask: Mapping[str, float], laser: bool) -> list[str]:
     """Return a sentence with the ratio of the irradiance of the brightest pixel without and with the mask."""
     peak = "peak/I_sat"
     if not (plain.get(peak, 0.0) > 0 and mask.get(peak, 0.0) > 0):
@@ -90,32 +93,45 @@ def _gain(plain: Mapping[str, float], mask: Mapping[str, float]) -> list[str]:
     if 0.99 < less < 1.01:
         return [f"The mask does not change the light of the brightest pixel ({ends})."]
     if less < 1:
-        return [f"The mask does not protect the sensor here: the brightest pixel receives {1 / less:.3g} times more "
-                f"light than behind the plain lens ({ends})."]  # fmt: skip
-    return [f"What the mask is for: the brightest pixel receives {less:.3g} times less light than behind the plain "
-            f"lens ({ends}), which protects the sensor from damage by a strong laser."]  # fmt: skip
+        return [f"The mask does not protect the sensor here: the brightest pixel receives {_times(1 / less)} times "
+                f"more light than behind the plain lens ({ends})."]  # fmt: skip
+    lower = f"the brightest pixel receives {_times(less)} times less light than behind the plain lens ({ends})"
+    if not laser:
+        return [f"No laser shines in this run, from which the mask could protect the sensor: {lower}."]
+    return [f"What the mask is for: {lower}, which protects the sensor from damage by a strong laser."]
+
+
+def _times(ratio: float) -> str:
+    """Return a ratio as text with three digits or, from 1000 on, as a whole number with commas."""
+    return f"{ratio:.3g}" if ratio < 999.5 else f"{ratio:,.0f}"
 
 
 def _price(plain: Mapping[str, float], mask: Mapping[str, float], restored: Mapping[str, float]) -> list[str]:
     """Return a sentence with the picture quality and the saturated pixels without and with the mask."""
-    quality, lost, parts = "PSNR (dB)", "saturated px", list[str]()
+    quality, lost, text = "PSNR (dB)", "saturated px", ""
+    worse = mask.get(quality, 0.0) < plain.get(quality, 0.0)
     if quality in plain and quality in mask:
         after = f" ({_text(restored, quality)} dB after restoration)" if quality in restored else ""
-        parts.append(f"a PSNR of {_text(mask, quality)} dB{after} in place of {_text(plain, quality)} dB")
-    if lost in plain and lost in mask:
-        parts.append(f"{_text(mask, lost)} saturated pixels in place of {_text(plain, lost)}")
-    worse = mask.get(quality, 0.0) < plain.get(quality, 0.0)
-    return [f"{'The price' if worse else 'The picture'} with the mask: {', and '.join(parts)}."] if parts else []
+        text = f"a PSNR of {_text(mask, quality)} dB{after} in place of {_text(plain, quality)} dB"
+    if lost in plain and lost in mask and plain[lost] != mask[lost]:
+        joint = (", but " if worse and mask[lost] < plain[lost] else ", and ") if text else ""
+        text += f"{joint}{_text(mask, lost)} saturated pixels in place of {_text(plain, lost)}"
+    return [f"{'The price' if worse else 'The picture'} with the mask: {text}."] if text else []
 
 
 def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, str]:
     """Return index and name of the spectral band nearest to the first laser, or to 550 nm if there is no laser."""
     if BANDS not in keys:
         return 0, "the first band"
-    prefix = LINES.removesuffix("*]")
-    lines = [name for name in recipe.steps if name.startswith(prefix) and name in keys]
+    lines = _lines(recipe, keys)
     wavelength = mean_wavelength(value(lines[0])) if lines else _DESIGN_WAVELENGTH
     return nearest(value(BANDS).centres, wavelength)
+
+
+def _lines(recipe: Recipe, keys: Container[str]) -> list[str]:
+    """Return the steps among ``keys`` that give the spectral line of a laser."""
+    prefix = LINES.removesuffix("*]")
+    return [name for name in recipe.steps if name.startswith(prefix) and name in keys]
 
 
 def metrics(recipe: Recipe, keys: Mapping[str, str], value: Value) -> list[list[Any]]:

@@ -233,9 +233,14 @@ def _readings(recipe: Recipe) -> list[dict[str, str]]:
         return []
     texts = ("path", "number", "matter", "reason")
     return [
-        {name: str(getattr(row, name)) for name in texts} | {"value": str(values[row.path]), "state": state}
+        {name: str(getattr(row, name)) for name in texts} | {"value": _written(values[row.path]), "state": state}
         for row, state in in_force(values)
     ]
+
+
+def _written(value: Any) -> str:
+    """Return a value as a recipe writes the value: ``true`` in place of Python's ``True``."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _figures(missing: Mapping[str, str], ran: bool) -> list[dict[str, str]]:
@@ -249,12 +254,13 @@ def _facts(result: Result) -> list[list[str]]:
     """Return a table of the software versions, the machine and the settings of a run."""
     import torch
 
-    cores, threads = f"{os.cpu_count()} cores", f"{torch.get_num_threads()} threads"
+    counts = {"core": os.cpu_count() or 1, "thread": torch.get_num_threads()}
+    machine = ", ".join(f"{count} {name}{'s' * (count > 1)}" for name, count in counts.items())
     rows = [
         ["neusee", version_of("neusee")],
         ["Python", platform.python_version()],
         *[[name, version_of(name)] for name in _LIBRARIES],
-        ["machine", f"{platform.system()} {platform.machine()}, {cores}, {threads}"],
+        ["machine", f"{platform.system()} {platform.machine()}, {machine}"],
         ["device", result.device],
         ["recipe seed", str(result.recipe.seed)],
         ["tolerance", f"{result.recipe.tolerance:g}"],

@@ -82,7 +82,8 @@ def timeline(result: Result) -> bytes | None:
     known = [done for done in ran if done.predicted is not None]
     plan = result.schedule or Schedule((), 0.0, {}, 0.0)
     slots = {slot.task: slot for slot in plan.slots}
-    whole = all(done.step in slots for done in known)
+    # where the time of a step is only a guess, the gap that it leaves in the schedule is no plan to compare with
+    whole = len(known) == len(ran) and all(done.step in slots for done in known)
     planned = tuple(slots[done.step] for done in known) if whole else _in_turn(known)
     return _function("report.figures.gantt:timeline")(schedule=replace(plan, slots=planned), rows=rows)
 

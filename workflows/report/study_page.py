@@ -6,7 +6,7 @@ The page has a light mode, a dark mode and a print mode. A sign in each coloured
 from __future__ import annotations
 
 import base64
-import json
+import math
 import numbers
 import re
 from collections.abc import Mapping, Sequence
@@ -14,6 +14,9 @@ from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from typing import Any, Literal
+
+_SHORT = 16  #: characters of the longest text that a table does not break at a hyphen
+_BREAK = re.compile(r"(?<=[_,/.])(?=[a-z])|(?=\[)")  #: where a long word may go on in a new line
 
 Mark = Literal["pass", "warn", "fail"]
 
@@ -41,7 +44,7 @@ def page(title: str, lead: str, sections: Sequence[Section], provenance: Mapping
         banner=banner,
         lead=_paragraphs(lead),
         sections=[_section(f"s{i}", s) for i, s in enumerate(sections)],
-        provenance=[(name, _plain(value)) for name, value in provenance.items()],
+        provenance=[(name, text) for name, value in provenance.items() if (text := _plain(value))],
     )
 
 
@@ -52,12 +55,18 @@ def filled(template: str, **values: Any) -> str:
     text = (Path(__file__).parent / "templates" / template).read_text(encoding="utf-8")
     environment = Environment(autoescape=True, undefined=StrictUndefined)
     environment.filters["code"] = _with_code
+    environment.filters["breaks"] = _with_breaks
     return environment.from_string(text).render(**values)
 
 
 def _with_code(text: str) -> str:
     """Return text as HTML, with each part between backticks as code."""
     return re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))
+
+
+def _with_breaks(text: str) -> str:
+    """Return text as HTML in which a long word such as ``developed_quality[mask]`` may go on in a new line."""
+    return " ".join(_BREAK.sub("<wbr>", escape(w)) if len(w) > _SHORT else escape(w) for w in text.split(" "))
 
 
 def said(value: Any) -> str:
@@ -71,6 +80,16 @@ def said(value: Any) -> str:
     return str(value)
 
 
+def with_uncertainty(mean: float, sd: float) -> str:
+    """Return mean ± standard deviation as text, rounded to two significant digits of the standard deviation."""
+    if not 0 < sd < math.inf:
+        return f"{mean:.6g} ± {sd:g}"
+    digits = 1 - math.floor(math.log10(sd))
+    if not -5 <= digits <= 12:
+        return f"{mean:.5g} ± {sd:.2g}"
+    return " ± ".join(f"{round(value, digits):.{max(digits, 0)}f}" for value in (mean, sd))
+
+
 def _section(anchor: str, section: Section) -> dict[str, Any]:
     _refuse_stray_marks(section)
     numeric = {i for i in range(len(section.columns)) if _holds_numbers([row[i] for row in section.rows])}
@@ -78,6 +97,7 @@ def _section(anchor: str, section: Section) -> dict[str, Any]:
         "anchor": anchor,
         "heading": section.heading,
         "text": _paragraphs(section.text),
+        "alt": _alternative(section),
         "picture": base64.b64encode(section.picture).decode() if section.picture else "",
         "columns": section.columns,
         "numeric": numeric,
@@ -86,6 +106,12 @@ def _section(anchor: str, section: Section) -> dict[str, Any]:
             for r, row in enumerate(section.rows)
         ],
     }
+
+
+def _alternative(section: Section) -> str:
+    """Return the alternative text of the picture of a section: the heading, and the first sentence of the text."""
+    sentences = [re.split(r"(?<=[.!?]) ", paragraph)[0] for paragraph in _paragraphs(section.text)[:1]]
+    return " ".join([f"Figure: {section.heading}.", *sentences])
 
 
 def _refuse_stray_marks(section: Section) -> None:
@@ -99,8 +125,14 @@ def _refuse_stray_marks(section: Section) -> None:
 
 
 def _cell(value: Any, mark: Mark | None, numeric: bool) -> dict[str, str]:
-    right = "n" if numeric or _is_number(value) else ""
-    return {"text": said(value), "kind": " ".join(filter(None, (right, mark)))}
+    text = said(value)
+    align = "n" if numeric or _is_number(value) else "one" if _is_short_word(text) else ""
+    return {"text": text, "kind": " ".join(filter(None, (align, mark)))}
+
+
+def _is_short_word(text: str) -> bool:
+    """Return True for a short text without a space, such as 2.6e-05, which must not break at its hyphen."""
+    return len(text) <= _SHORT and "-" in text and not any(map(str.isspace, text))
 
 
 def _is_number(value: Any) -> bool:
@@ -118,4 +150,12 @@ def _paragraphs(text: str) -> list[str]:
 
 
 def _plain(value: Any) -> str:
-    return said(value) if not isinstance(value, Mapping | list | tuple) else json.dumps(value, default=str)
+    """Return a value as text: a list with commas, and a mapping as names and values; inner ones stand in brackets."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_inner(item)}" for name, item in value.items())
+    return ", ".join(map(_inner, value)) if isinstance(value, list | tuple) else said(value)
+
+
+def _inner(value: Any) -> str:
+    text = _plain(value)
+    return f"({text})" if isinstance(value, Mapping | list | tuple) else text or "–"

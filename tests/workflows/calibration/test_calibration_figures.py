@@ -35,3 +35,24 @@ def test_the_axes_of_chains_are_read_without_adding_an_offset():
     figure = calibration_figures.traces.__wrapped__(draws, ["offset, DN"])
     figure.canvas.draw()
     assert figure.axes[0].yaxis.get_offset_text().get_text() == ""
+
+
+def test_numbers_of_many_pairs_can_be_read_at_the_width_of_the_page():
+    for count in (2, 9):
+        names = [f"parameter {i}\ne-" for i in range(count)]
+        draws = np.random.default_rng(0).normal(1.0, 0.1, (400, count))
+        figure = calibration_figures.corners.__wrapped__(draws, names, [1.0] * count)
+        shrunk = min(1.0, 1140 / (100 * figure.get_size_inches()[0]))
+        axis = figure.axes[-1].xaxis
+        assert min(text.get_fontsize() for text in (axis.label, *axis.get_ticklabels())) * shrunk >= 8.9
+
+
+def test_a_single_draw_does_not_squeeze_a_panel_of_pairs():
+    draws = np.random.default_rng(0).normal(1.0, 0.1, (2000, 2))
+    draws[0] = 50.0
+    figure = calibration_figures.corners.__wrapped__(draws, ["gain", "offset"], [1.0, 1.45])
+    for ax in (figure.axes[0], figure.axes[3]):
+        low, high = ax.get_xlim()
+        assert low < 0.8
+        assert 1.2 < high < 2.0
+    assert figure.axes[3].get_xlim()[1] >= 1.45

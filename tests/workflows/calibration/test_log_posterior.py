@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from neusee.workflows.calibration import emcee_sampler
-from neusee.workflows.calibration.calibration_page import with_uncertainty
 from neusee.workflows.calibration.identifiability import identify
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_checks import checks, importance_samples
@@ -183,19 +182,6 @@ def test_draws_too_narrow_fail_where_importance_sampling_can_tell(drawn, monkeyp
     narrow = replace(chains, draws=chains.flat.mean(0) + 0.8 * (chains.draws - chains.flat.mean(0)))
     found = {check.name: check.mark for check in checks(p, best, told, narrow, law)}
     assert found["importance sampling agrees with the chains"] == "fail"
-
-
-@pytest.mark.parametrize(
-    ("mean", "sd", "said"),
-    [
-        (10.4961, 0.0203, "10.496 ± 0.020"),
-        (390.05, 0.59, "390.05 ± 0.59"),
-        (25502.3, 39.4, "25502 ± 39"),
-        (1.0, 0.0, "1 ± 0"),
-    ],
-)
-def test_digits_stand_beside_their_deviation(mean, sd, said):
-    assert with_uncertainty(mean, sd) == said
 
 
 @pytest.fixture

@@ -289,6 +289,12 @@ def test_a_line_with_a_count_says_what_is_left(capsys):
     ]
 
 
+def test_a_calibration_says_what_is_left(capsys):
+    steps = "{} of about 2000 steps of 4 x 64 walkers: tau 9.0, effective sample size 100"
+    found = lines_of(capsys, (10, steps.format(500)), (10, steps.format(750)))
+    assert found[1].endswith("; about 50 s left")
+
+
 def test_a_study_that_goes_on_takes_the_rate_of_now(capsys):
     found = lines_of(capsys, (1, "[40/50] a"), (10, "[41/50] b"), (10, "[43/50] c"))
     assert found == ["[40/50] a", "[41/50] b; about 1 min 30 s left", "[43/50] c; about 47 s left"]

@@ -102,3 +102,10 @@ def test_it_is_a_picture_of_a_fair_size_and_always_the_same():
     width, height = struct.unpack(">II", one[16:24])
     assert 900 < width < 1500
     assert 1200 < height < 2500
+
+
+def test_a_plan_of_some_steps_is_not_taken_for_the_whole(drawn):
+    schedule = planned(9)
+    rows = [*ran(schedule), ("unknown", "cpu", 0.8, 0.2)]
+    _, lanes, _ = drawn(schedule, rows)
+    assert lanes.get_title(loc="left") == "planned 700 ms for 9 of 10 steps, took 1 s"

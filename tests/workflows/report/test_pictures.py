@@ -226,6 +226,15 @@ def test_a_lamp_darkens_neither_the_scene_nor_the_points_of_the_spectra():
     assert float(ax.images[0].get_array()[:, 20:].max()) > 0.9
 
 
+@pytest.mark.parametrize(("at", "rings"), [((12, 30), 2), ((0, 30), 0), ((12, N - 1), 0), ((N - 1, N - 1), 0)])
+def test_a_ring_marks_a_laser_only_inside_the_picture(at, rings):
+    light = torch.zeros(3, N, N)
+    light[:, *at] = 1.0
+    ax = camera_overview.canvas(4, 4)[1][0, 0]
+    camera_overview._ring(ax, {"green": light}, scene())
+    assert len(ax.patches) == rings
+
+
 def test_without_bsr_there_is_one_panel(light):
     arguments = dict(lsr=light.lsr, bands=bands(), psf=light.mask)
     assert len(optics.suppression.__wrapped__(**arguments).axes) == 1

@@ -16,6 +16,7 @@ from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
 from neusee.workflows.report import result_numbers, run_folder, run_page, run_pictures, run_timing
+from neusee.workflows.report.console import closing
 from neusee.workflows.report.figures import gantt
 from neusee.workflows.report.run_folder import find_run, new_run
 from neusee.workflows.simulation.simulate_recipe import simulate
@@ -107,7 +108,7 @@ def done(tmp_path):
 class Reader(HTMLParser):
     """Checks that every tag is closed, and collects what the page would fetch."""
 
-    VOID = frozenset({"meta", "img", "br", "link", "input"})
+    VOID = frozenset({"meta", "img", "br", "link", "input", "wbr"})
 
     def __init__(self) -> None:
         super().__init__()
@@ -212,6 +213,62 @@ def test_a_mask_that_gains_nothing_is_not_praised():
     assert result_numbers.balance({"plain lens": GAIN}) == []
 
 
+def test_the_terminal_says_what_a_mask_is_for_and_what_it_costs(done):
+    said = result_numbers.balance({"plain lens": GAIN, "with mask": PRICE})
+    doc = {**done.document, "table": {**done.document["table"], "balance": said}}
+    lines = closing(doc, "report.html", [])
+    assert [line.strip() for line in lines if line.strip() in said] == said
+
+
+def test_a_gain_is_not_called_a_price_and_an_equal_number_is_not_said():
+    (_, price) = result_numbers.balance({"plain lens": GAIN, "with mask": PRICE | {"saturated px": 0.0}})
+    assert price == (
+        "The price with the mask: a PSNR of 14.59 dB in place of 27.07 dB, but 0 saturated pixels in place of 244."
+    )
+    (_, price) = result_numbers.balance({"plain lens": GAIN, "with mask": PRICE | {"saturated px": 244.0}})
+    assert price == "The price with the mask: a PSNR of 14.59 dB in place of 27.07 dB."
+
+
+def test_a_large_ratio_has_no_exponent():
+    (gain, _) = result_numbers.balance({"plain lens": GAIN | {"peak/I_sat": 9.095e5}, "with mask": PRICE})
+    assert "receives 235,195 times less light" in gain
+
+
+def test_without_a_laser_the_mask_is_not_said_to_protect():
+    (gain, _) = result_numbers.balance({"plain lens": GAIN, "with mask": PRICE}, laser=False)
+    assert gain.startswith("No laser shines in this run")
+    assert "which protects" not in gain
+
+
+def test_a_section_without_a_figure_is_left_out_and_its_reason_is_a_note(done):
+    text = done.page.read_text()
+    headings = re.findall(r'<h2 id="([a-z-]+)">', text)
+    assert headings == ["results", "notes", "left-out", "graph", "time", "steps", "provenance", "again"]
+    assert re.findall(r'<a href="#([a-z-]+)">', text) == headings
+    (line,) = re.findall(r"<li>Not drawn: (.*)</li>", text)
+    assert "Point-spread functions (the recipe has no step" in line
+    assert "raw_mask.png" not in line
+
+
+def test_a_reason_and_a_check_share_a_column_that_wraps(done):
+    step = {**done.document["steps"][0], "state": "left out", "why": "changes at most 0", "checks": [{"text": "a < b",
+            "ok": True}]}  # fmt: skip
+    text = run_page.page({**done.document, "steps": [step]}, {})
+    assert '<td class="check"><span class="soft">changes at most 0</span>; <span>a &lt; b</span></td>' in text
+    assert "nowrap" not in re.search(r"td\.check \{(.*?)\}", text)[1]
+
+
+def test_a_short_time_is_not_shown_as_none(done):
+    steps = [{**done.document["steps"][0], "made_in": seconds} for seconds in (0.0004, 0.0006, 0.0)]
+    text = run_page.page({**done.document, "steps": steps}, {})
+    cells = re.findall(r"</td><td class=\"n\">(&lt; 0.001|[\d.]+)(?:<br>.*?)?</td><td>2 DN", text)
+    assert cells == ["&lt; 0.001", "0.001", "0.000"]
+
+
+def test_a_truth_value_is_written_as_a_recipe_writes_it():
+    assert [run_page._written(value) for value in (True, False, "once", 0.1)] == ["true", "false", "once", "0.1"]
+
+
 def _luminance(colour: str) -> float:
     channels = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
     linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
@@ -276,7 +333,7 @@ def test_a_missed_number_and_a_failed_check_stand_first(tmp_path):
     assert done.document["failed"] == ["number: not negative"]
     text = done.page.read_text()
     assert 'class="verdict bad"' in text
-    assert text.index("twice &amp; more") < text.index('id="overview"')
+    assert text.index("twice &amp; more") < text.index('id="results"')
 
 
 def test_the_page_can_be_written_again_from_what_is_stored(done):
@@ -431,3 +488,16 @@ def test_only_what_was_known_is_drawn_as_the_plan(tmp_path, monkeypatch):
     ]
     run_pictures.timeline(replace(result, schedule=None))
     assert seen["schedule"].slots == ()
+
+
+def test_a_guess_leaves_no_gap_in_the_plan_that_is_drawn(tmp_path, monkeypatch):
+    result = recipe().run(Store(tmp_path / "cache"))
+    told = {
+        "number": replace(result.done["number"], predicted=None, began=5.0, seconds=2.0, lane="cpu"),
+        "truth": replace(result.done["truth"], predicted=1.0, began=7.0, seconds=1.0, lane="cpu"),
+    }
+    plan = Schedule((Slot("number", "cpu", 0.0, 99.0), Slot("truth", "cpu", 99.0, 100.0)), 100.0, {"cpu": 0.0}, 0.0)
+    seen = {}
+    monkeypatch.setattr(gantt, "timeline", lambda **given: seen.update(given) or b"png")
+    run_pictures.timeline(replace(result, done=told, schedule=plan))
+    assert [(s.task, s.start, s.end) for s in seen["schedule"].slots] == [("truth", 0.0, 1.0)]

@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from neusee.workflows.report.study_page import Section, page, said
+from neusee.workflows.report.study_page import Section, page, said, with_uncertainty
 
 PNG = b"\x89PNG\r\n\x1a\n and what follows"
 
@@ -40,7 +40,7 @@ def made(**how):
 def test_cells_hold_numbers_to_three_digits_and_marks_as_classes():
     found = Cells(made(marks={(0, 1): "fail", (1, 0): "pass"})).cells
     assert found[:4] == [("dark", ""), ("0.000123", "n fail"), ("<one>", "pass"), ("–", "n")]
-    assert ("[1, 2]", "key") in found
+    assert ("1, 2", "key") in found
 
 
 def test_a_mark_where_there_is_no_cell_is_refused():
@@ -102,3 +102,57 @@ def test_every_table_scrolls_within_its_box():
 def test_a_dash_stands_below_the_numbers_of_its_column():
     text = page("t", "", [Section("s", "", ("a", "b"), [(1.0, "x"), (None, None)])], {})
     assert '<tr><td class="n">–</td><td>–</td></tr>' in text
+
+
+def test_a_figure_has_a_text_that_says_what_it_shows():
+    section = Section("Curves", "The middle 90 % of the draws. Less.\n\nMore.", picture=b"PNG")
+    assert '<img alt="Figure: Curves. The middle 90 % of the draws."' in page("a", "b", [section], {})
+
+
+def test_provenance_is_text_without_braces_and_without_empty_rows():
+    text = page("a", "b", [], {"versions": {"python": "3.12", "torch": 2.5}, "command": "", "seeds": [1, 2]})
+    assert re.findall(r"<th>(\w+)</th><td class=\"key\">(.*?)</td>", text) == [
+        ("versions", "python 3.12, torch 2.5"),
+        ("seeds", "1, 2"),
+    ]
+
+
+def test_a_long_heading_of_a_column_of_numbers_wraps():
+    style = page("a", "b", [], {}).partition("</style>")[0]
+    assert not re.search(r"th\.n[^{}]*\{[^}]*nowrap", style)
+
+
+def test_a_number_does_not_break_at_its_hyphen():
+    rows = [["2.62099e-05", "-0.01", "a sentence with e-05", "2026-11-23_first_light_3d8a5701"]]
+    text = page("a", "b", [Section("h", "", tuple("wxyz"), rows)], {})
+    assert re.findall(r"<td( class=\"one\")?>", text) == [' class="one"', ' class="one"', "", ""]
+    assert "td.one { white-space: nowrap; }" in text
+
+
+def test_a_long_name_may_go_on_in_a_new_line_and_a_number_may_not():
+    rows = [["developed_quality[mask]", "raw[plain]", "a < b_c", "-1.2345678901234567e-05"]]
+    text = page("a", "b", [Section("h", "", tuple("wxyz"), rows)], {})
+    assert "<td>developed_<wbr>quality<wbr>[mask]</td><td>raw[plain]</td><td>a &lt; b_c</td>" in text
+    assert text.count("<wbr>") == 2
+
+
+def test_a_mapping_inside_a_mapping_has_brackets():
+    text = page("a", "b", [], {"settings": {"weights": {"lsr": 2, "bsr": 1}, "at": "", "slopes": [4, 48]}})
+    assert "weights (lsr 2, bsr 1), at –, slopes (4, 48)" in text
+
+
+@pytest.mark.parametrize(
+    ("mean", "sd", "said"),
+    [
+        (10.4961, 0.0203, "10.496 ± 0.020"),
+        (390.05, 0.59, "390.05 ± 0.59"),
+        (25502.3, 39.4, "25502 ± 39"),
+        (1132.96, 394.0, "1130 ± 390"),
+        (0.76956, 0.00226, "0.7696 ± 0.0023"),
+        (1.0, 0.0, "1 ± 0"),
+        (float("nan"), float("inf"), "nan ± inf"),
+        (3e9, 2.1e8, "3e+09 ± 2.1e+08"),
+    ],
+)
+def test_digits_stand_beside_their_deviation(mean, sd, said):
+    assert with_uncertainty(mean, sd) == said

@@ -46,11 +46,13 @@ def centre(image: Tensor, like: Tensor) -> Tensor:
 
 
 def _ring(ax: Any, spots: Mapping[str, Tensor], like: Tensor) -> None:
-    """Draw a ring around the brightest pixel of each laser."""
+    """Draw a ring around the brightest pixel of each laser, unless this pixel is on the rim: that laser is outside."""
     from matplotlib.patches import Circle
 
     radius = max(like.shape[-1] / 14, 3.0)
     images = [centre(spot, like) for spot in spots.values()]
     for y, x in {divmod(int(image.sum(0).argmax()), image.shape[-1]) for image in images}:
+        if not (0 < y < like.shape[-2] - 1 and 0 < x < like.shape[-1] - 1):
+            continue
         for width, colour in ((3.0, "black"), (1.4, ORANGE)):
             ax.add_patch(Circle((x, y), radius, fill=False, color=colour, linewidth=width))

@@ -89,15 +89,20 @@ def _rows(ax: Any, names: Sequence[str]) -> None:
     ax.spines["left"].set_visible(False)
     ax.grid(False, axis="y")
     ax.set_axisbelow(True)
+    if not names:
+        ax.text(0.5, 0.5, "no step", transform=ax.transAxes, ha="center", va="center")
 
 
 def _title(plan: Spans, ran: Spans) -> str:
     ends = {
-        word: max(start + took for _, start, took in spans.values())
+        word: _time(max(start + took for _, start, took in spans.values()))
         for word, spans in (("planned", plan), ("took", ran))
         if spans
     }
-    return ", ".join(f"{word} {_time(end)}" for word, end in ends.items()) or "nothing to run"
+    known = sum(step in plan for step in ran)
+    if plan and known < len(ran):
+        ends["planned"] += f" for {known} of {len(ran)} steps"
+    return ", ".join(f"{word} {end}" for word, end in ends.items()) or "nothing to run"
 
 
 def _unit(seconds: float) -> tuple[float, str]:

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.values import Psf, Pupil
-from neusee.workflows.report.figures.style import BLUE, GREEN, canvas, drawn
+from neusee.workflows.report.figures.point_labels import PointLabel, place_labels, plain_ticks
+from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, canvas, drawn
 
 STRENGTHS = (0.0, 1.0, 1e3, 1e6)  #: peak of the laser divided by the white of the scene
 METHODS = ("shifted PSF, added", "scene and laser\nin one convolution")
@@ -26,13 +27,12 @@ def error_time(*, step: Callable[..., Any], pupil: Pupil) -> Any:
     for precision, colour, mark in (("single", BLUE, "o"), ("double", GREEN, "s")):
         mine = [row for row in rows if row[0] == precision]
         ax.loglog([r[2] * 1e3 for r in mine], [r[3] for r in mine], mark, color=colour, label=f"{precision} precision")
-        for _, window, seconds, error in mine:
-            text, at = f"{window}²", (seconds * 1e3, error)
-            ax.annotate(text, at, (0, 7), textcoords="offset points", ha="center", fontsize=9)
     ax.margins(x=0.25, y=0.35)
+    plain_ticks(ax.xaxis)
     xlabel = "run time (ms), fastest of three; labels: window in pixels"
     ax.set(title="PSF of one band: error against run time", xlabel=xlabel, ylabel="largest error / peak")
     ax.legend(loc="center left")
+    place_labels(figure, {ax: [PointLabel(1e3 * seconds, e, f"{window}²", BLACK) for _, window, seconds, e in rows]})
     return figure
 
 

@@ -52,12 +52,16 @@ def drawn(draw: Callable[P, Any]) -> Callable[P, bytes]:
         import matplotlib
 
         with matplotlib.rc_context(dict(_RC)):
-            out = io.BytesIO()
-            figure = draw(*args, **kwargs)
-            figure.savefig(out, format="png", bbox_inches="tight", pad_inches=0.08, metadata={"Software": "neusee"})
-        return out.getvalue()
+            return png_of(draw(*args, **kwargs))
 
     return inner
+
+
+def png_of(figure: Any) -> bytes:
+    """Return a matplotlib figure as the bytes of a PNG file, cut to what is drawn."""
+    out = io.BytesIO()
+    figure.savefig(out, format="png", bbox_inches="tight", pad_inches=0.08, metadata={"Software": "neusee"})
+    return out.getvalue()
 
 
 def picture(axes: Any, image: Any, title: str, **options: Any) -> Any:

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import cycle
 from typing import Any
 
 import numpy as np
 
+from neusee.workflows.report.figures.point_labels import PointLabel, place_labels, plain_ticks
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn
 
 EXACT = 1e-9  #: the level at which smaller errors are drawn, because a logarithmic axis has no 0
 _STEP_EXACT = 1e-17  #: the same level in the diagrams of single steps, some of which are in double precision
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, "#CC79A7", "#56B4E9", "#8B7500", "#555555")
-_STYLES = tuple(zip(_COLOURS, "osD^vP*X", strict=True))
-_LABEL_OFFSETS = ((6, 4), (6, -12), (-6, 4), (-6, -12), (0, 9), (0, -17), (16, 13), (-16, 13), (16, -21), (-16, -21))
+_MARKERS = "osD^vP*X"
 _GREY = "#777777"
 
 
@@ -116,7 +116,10 @@ def promises(asked: Sequence[float], measured: Mapping[str, Sequence[float]], pr
 
 
 def _styles(names: Iterable[str]) -> Styles:
-    return dict(zip(dict.fromkeys(names), cycle(_STYLES), strict=False))
+    """Return colour and marker of each line; when all colours are used, each begins again with the next marker."""
+    count = len(_COLOURS)
+    looks = ((_COLOURS[i % count], _MARKERS[(i + i // count) % count]) for i in itertools.count())
+    return dict(zip(dict.fromkeys(names), looks, strict=False))
 
 
 def _draw_diagram(diagram: Diagram, errors: Sequence[float] = (), seconds: Sequence[float] = ()) -> None:
@@ -131,7 +134,7 @@ def _draw_diagram(diagram: Diagram, errors: Sequence[float] = (), seconds: Seque
     ax.set_ylim(*_axis_limits([*y, *errors], 100.0, 4.0))
     for line in lines:
         _draw(ax, line, *styles[line.name], exact)
-    _tick_seconds(ax)
+    plain_ticks(ax.xaxis)
     _draw_exact_level(ax, [d.error for d in dots], exact)
 
 
@@ -159,16 +162,6 @@ def _ring_own_setting(ax: Any, lines: Sequence[Line]) -> None:
         ax.plot(*at, **ring, markeredgewidth=1.6, label="the recipe's own settings", zorder=4)
 
 
-def _tick_seconds(ax: Any) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    low, high = ax.get_xlim()
-    many = math.log10(high / low) > 2.5
-    ax.xaxis.set_major_locator(LogLocator(subs=(1.0,) if many else (1.0, 2.0, 5.0), numticks=20))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    ax.xaxis.set_minor_formatter(NullFormatter())
-
-
 def _draw_exact_level(ax: Any, errors: Iterable[float], exact: float) -> None:
     if any(e < exact for e in errors):
         ax.axhline(exact, color=_GREY, linewidth=0.8, linestyle=":")
@@ -177,32 +170,13 @@ def _draw_exact_level(ax: Any, errors: Iterable[float], exact: float) -> None:
 
 
 def _place_labels(figure: Any, diagrams: Sequence[Diagram]) -> None:
-    """Write the label of each point where the label covers no marker or other label; omit labels without free space."""
-    from matplotlib.transforms import Bbox
-
-    figure.canvas.draw()
-    for ax, lines, styles, exact in diagrams:
-        dots = [(replace(d, error=max(d.error, exact)), styles[line.name][0]) for line in lines for d in line.dots]
-        marks = (ax.transData.transform((d.seconds, d.error)) for d, _ in dots)
-        taken = [Bbox.from_bounds(x - 6, y - 6, 12, 12) for x, y in marks]
-        for dot, colour in dots:
-            if dot.label:
-                _label(figure, ax, dot, colour, taken)
-
-
-def _label(figure: Any, ax: Any, dot: Dot, colour: str, taken: list[Any]) -> None:
-    """Write a label at the first offset at which it overlaps no box in ``taken``, and append its box to ``taken``."""
-    from matplotlib.patheffects import withStroke
-
-    inside, at = ax.get_window_extent(), (dot.seconds, dot.error)
-    style = {"color": colour, "path_effects": [withStroke(linewidth=2.5, foreground="white")], "zorder": 5}
-    for x, y in _LABEL_OFFSETS:
-        side = "left" if x > 0 else "right" if x < 0 else "center"
-        text = ax.annotate(dot.label, at, (x, y), textcoords="offset points", ha=side, fontsize=9, **style)
-        text.set_in_layout(False)
-        box = text.get_window_extent(figure.canvas.get_renderer())
-        whole = inside.x0 <= box.x0 and box.x1 <= inside.x1 and inside.y0 <= box.y0 and box.y1 <= inside.y1
-        if whole and not any(box.overlaps(other) for other in taken):
-            taken.append(box)
-            return
-        text.remove()
+    """Write the label of each point of the diagrams where the label covers no marker, no note and no other label."""
+    points = {
+        ax: [
+            PointLabel(d.seconds, max(d.error, exact), d.label, styles[line.name][0])
+            for line in lines
+            for d in line.dots
+        ]
+        for ax, lines, styles, exact in diagrams
+    }
+    place_labels(figure, points)

@@ -21,6 +21,7 @@ TOLERANCE, KEEP_ALL = "tolerance", "everything kept"
 HEADER = ("part", "line", "setting", "output", "seed", "error", "seconds", "computing", "proved", "refused")
 _BUSY = 1.5  #: processes for each core, above which times are not reliable
 _NO_WORSE = 2.0  #: factor on the error of the full computation, which is one draw of its rounding error
+_ABREAST = 6  #: outputs side by side in a table
 _FACTOR = 2.0  #: the largest accepted ratio of the chosen run time to the cheapest
 
 _REFERENCE = """The reference is the recipe at its own sampling (bands, pupil samples, window), without omissions,
@@ -146,7 +147,7 @@ def sections(result: AccuracyResult, drawn: Mapping[str, bytes]) -> list[Section
     return [
         _all_points(once, f"{_REFERENCE}\n\n{_TIME}\n\n{seeds}", drawn.get("work_precision")),
         _chosen(result.points),
-        _outputs(once, drawn.get("promises")),
+        *_outputs(once, drawn.get("promises")),
         _steps(result.steps, drawn.get("steps")),
         _not_varied(result),
     ]
@@ -183,15 +184,26 @@ def _chosen(points: Points) -> Section:
     return Section("Chosen against cheapest", text, columns, rows, None, marks)
 
 
-def _outputs(points: Points, picture: bytes | None) -> Section:
+def _outputs(points: Points, picture: bytes | None) -> list[Section]:
+    """Return the errors of all outputs in tables of a few columns each, which fit the page."""
     names = list(dict.fromkeys(name for p in points for name in p.found.errors))
-    rows = [
+    groups = [names[i : i + _ABREAST] for i in range(0, len(names), _ABREAST)] or [[]]
+    text = "The largest error of each output over the seeds; a dash where the setting changes the output's shape."
+    parts = []
+    for number, group in enumerate(groups):
+        heading = "Every output" + (f", part {number + 1} of {len(groups)}" if number else "")
+        columns = ("parameter", "setting", *group)
+        parts.append(Section(heading, "" if number else text, columns, _errors(points, group), picture))
+        picture = None
+    return parts
+
+
+def _errors(points: Points, names: Sequence[str]) -> list[tuple[Any, ...]]:
+    return [
         (p.trial.line, p.trial.label, *(max(p.found.errors[n]) if n in p.found.errors else None for n in names))
         for p in points
         if p.sound
     ]
-    text = "The largest error of each output over the seeds; a dash where the setting changes the output's shape."
-    return Section("Every output", text, ("parameter", "setting", *names), rows, picture)
 
 
 def _steps(tried: Sequence[StepTried], picture: bytes | None) -> Section:

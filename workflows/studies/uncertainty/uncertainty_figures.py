@@ -9,6 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from neusee.workflows.report.figures.camera_overview import high
+from neusee.workflows.report.figures.point_labels import plain_ticks
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, encoded, picture
 from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray
 
@@ -16,9 +17,11 @@ _GREY = "#777777"
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE)
 _WIDE = 30.0  #: ratio of the largest to the least value of curves above which their axis is logarithmic
 _BINS = 24
+_TICKS = 4  #: numbers below a diagram of a number, at most; each may have seven characters
 _APART = 0.1  #: inches around each diagram, so that a title does not touch the numbers above it
 _SLIGHT = 1e-6  #: share of a curve's largest element; no ratio to a smaller median is drawn
 _ALONG = 200  #: signals of a photon-transfer curve
+_CLIPPED = 0.9  #: share of the predicted standard deviation below which flat fields are clipped, and not drawn
 
 
 @drawn
@@ -47,7 +50,7 @@ def _bars(ax: Any, bars: Sequence[tuple[str, float, float]], middle: float) -> N
     ax.axvline(middle, color=BLACK, linewidth=0.9)
     ax.set_yticks(range(len(bars)), [bar[0] for bar in bars])
     ax.ticklabel_format(axis="x", useOffset=False)
-    ax.tick_params(axis="x", rotation=20)
+    ax.locator_params(axis="x", nbins=_TICKS)
     ax.grid(False, axis="y")
 
 
@@ -73,13 +76,25 @@ def bands(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], axi
 
 @drawn
 def transfer(draws: FloatArray) -> Any:
-    """Draw bands of photon-transfer curves in DN from ``draws`` (draw, level, signal | variance | predicted)."""
+    """Draw bands of photon-transfer curves in DN from ``draws`` (draw, level, signal | variance | predicted).
+
+    Where the full well or the converter clips flat fields, their noise collapses; there, a grey area takes their place.
+    """
     figure, axes = canvas(6.6, 5.8, 2, 1, sharex=True, height_ratios=[2, 1])
     ax, below = axes[:, 0]
-    for column, colour, name in ((2, BLUE, "predicted"), (1, ORANGE, "flat fields")):
-        _band(ax, below, *_at_one_signal(draws, column), colour, f"{name}: middle 90 %")
+    signal, predicted = _at_one_signal(draws, 2)
+    flat = _at_one_signal(draws, 1)[1]
+    whole = np.median(flat / predicted, axis=0) > _CLIPPED
+    _band(ax, below, signal, predicted, BLUE, "predicted: middle 90 %")
+    if whole.any():
+        _band(ax, below, signal[whole], flat[:, whole], ORANGE, "flat fields: middle 90 %")
+    if not whole.all():
+        ax.axvspan(
+            signal[~whole].min(), signal.max(), color=_GREY, alpha=0.15, linewidth=0, label="clipped flat fields"
+        )
     ax.set_xscale("log")
     ax.set_yscale("log")
+    plain_ticks(ax.yaxis)
     ax.set_title("photon-transfer curve: middle 90 % of the draws")
     ax.set_ylabel("standard deviation (DN)")
     below.set_xlabel("mean above dark (DN)")
@@ -122,7 +137,8 @@ def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) ->
         ax.axvline(middles[name], color=VERMILION, linewidth=1.2, label="value with every input at its median")
         ax.set_title(name)
         ax.ticklabel_format(axis="x", useOffset=False)
-        ax.tick_params(axis="x", rotation=20)
+        ax.locator_params(axis="x", nbins=_TICKS)
+        ax.locator_params(axis="y", integer=True)
         ax.grid(False)
     for ax in list(axes.flat)[len(draws) :]:
         ax.set_axis_off()

@@ -12,7 +12,7 @@ from torch import Tensor
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.distributions.uncertain_inputs import InputDraws, Inputs
 from neusee.workflows.report.contents import BANDS
-from neusee.workflows.report.study_page import Mark, Section
+from neusee.workflows.report.study_page import Mark, Section, with_uncertainty
 from neusee.workflows.studies.uncertainty import uncertainty_figures as figures
 from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray, Scatter, worst_known
 from neusee.workflows.studies.uncertainty.sobol_indices import EXPLAINED, SobolIndices
@@ -132,7 +132,7 @@ def lead(result: UncertaintyResult) -> str:
         known = f"the standard deviation of {result.worst} is known to {result.error:.1%} only"
         known += f"; {result.wanted:.1%} was requested"
     numbers = {name: result.scatter[name] for name in result.numbers[:_MOST]}
-    values = [f"{name} {float(s.mean[0]):.5g} ± {float(s.sd[0]):.2g}" for name, s in numbers.items()]
+    values = [f"{name} {with_uncertainty(float(s.mean[0]), float(s.sd[0]))}" for name, s in numbers.items()]
     strange = f" NaN or infinite in some draw: {', '.join(result.strange)}." if result.strange else ""
     return f"{count} {kind} of {', '.join(result.inputs.names)}: {known}.{strange}\n\n{'; '.join(values)}."
 

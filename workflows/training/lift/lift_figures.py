@@ -7,11 +7,12 @@ from typing import Any
 
 from torch import Tensor
 
+from neusee.workflows.report.figures.point_labels import PointLabel, place_labels
 from neusee.workflows.report.figures.style import BLACK, BLUE, ORANGE, canvas, drawn, encoded, picture
 from neusee.workflows.training.training_figures import running_median
 
 _SHOWN = ("MRAE", "RMSE", "rate")
-_COLOURS = {"mst_plus_plus": BLUE, "linear": ORANGE}
+_LOOKS = {"mst_plus_plus": {"color": BLUE}, "linear": {"color": ORANGE, "linestyle": "--"}}
 
 
 @drawn
@@ -40,9 +41,11 @@ def lifted_spectra(shown: Tensor, truth: Tensor, estimates: Mapping[str, Tensor]
     for number, (ax, (row, column)) in enumerate(zip(axes[0, 1:], at, strict=True), 1):
         ax.plot(nm, truth[:, row, column].cpu().numpy(), color=BLACK, linewidth=1.5, label="truth")
         for name, cube in estimates.items():
-            ax.plot(nm, cube[:, row, column].cpu().numpy(), color=_COLOURS[name], linewidth=1.2, label=name)
+            ax.plot(nm, cube[:, row, column].cpu().numpy(), linewidth=1.2, label=name, **_LOOKS[name])
         ax.set_title(f"pixel {number}")
         ax.set_ylim(bottom=0)
-    axes[0, 1].legend()
+    axes[0, 1].set_ylabel("reflectance")
+    figure.legend(*axes[0, 1].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     figure.supxlabel("wavelength (nm)")
+    place_labels(figure, {axes[0, 0]: [PointLabel(c, r, str(i), BLACK) for i, (r, c) in enumerate(at, 1)]})
     return figure

@@ -7,6 +7,7 @@ figures of merit of the mask are computed on every band and at the full sampling
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -135,7 +136,7 @@ class DesignedMask:
         provenance = {
             "stage": "mask",
             "recipe": recipe.name,
-            **({"command": " ".join(command)} if command else {}),
+            **({"command": shlex.join(command)} if command else {}),
             "date": timestamp(),
             "settings": settings.model_dump(mode="json"),
             "versions": versions(),

@@ -14,8 +14,8 @@ import torch
 from neusee.workflows import load
 from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.accuracy_figures import EXACT, Dot, Line, steps, work_precision
-from neusee.workflows.studies.accuracy.accuracy_report import count_missed, lead
+from neusee.workflows.studies.accuracy.accuracy_figures import EXACT, Dot, Line, promises, steps, work_precision
+from neusee.workflows.studies.accuracy.accuracy_report import AccuracyResult, count_missed, lead, sections
 from neusee.workflows.studies.accuracy.accuracy_study import study, trials
 from neusee.workflows.studies.accuracy.pareto_line import ToleranceChoice, cheapest, median_ratio, pareto_front
 from neusee.workflows.studies.accuracy.recipe_knobs import finest, knobs
@@ -319,6 +319,24 @@ def test_a_tolerance_finer_than_the_arithmetic_is_told_from_one_that_was_missed(
     off = WorkPrecisionPoint(replace(fine.trial, value=1e-9), replace(fine.found, errors={"raw": [1e-3]}))
     assert "cannot be tested" not in lead(recipe, [*points, off])
     assert (count_missed([*points, fine]), count_missed([*points, off])) == (0, 1)
+
+
+def test_a_table_of_many_outputs_is_cut_to_the_width_of_the_page(recipe, store):
+    point = PointCache(finest(recipe), store, seeds=1).point(Trial("samples", "10", recipe))
+    names = [f"output[{i}]" for i in range(15)]
+    many = WorkPrecisionPoint(point.trial, replace(point.found, errors={name: [1e-3] for name in names}))
+    result = AccuracyResult(load("laser_free"), (many,), (), (), 1)
+    parts = [s for s in sections(result, {"promises": b"PNG"}) if s.heading.startswith("Every output")]
+    assert [s.heading for s in parts] == ["Every output", "Every output, part 2 of 3", "Every output, part 3 of 3"]
+    assert [bool(s.picture) for s in parts] == [True, False, False]
+    assert [name for s in parts for name in s.columns[2:]] == names
+    assert max(len(s.columns) for s in parts) <= 8
+    assert {len(row) for s in parts for row in s.rows} == {8, 5}
+
+
+def test_many_outputs_can_be_told_apart():
+    outputs = {f"output {i}": [1e-3, 1e-4] for i in range(20)}
+    promises([1e-2, 1e-3], outputs, [None, None])  # the legend is checked wherever a figure is drawn
 
 
 def test_a_study_without_seeds_is_refused(recipe, store, tmp_path):
