@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-from neusee.workflows.keys.code_digest import parts_file, source_file
+from neusee.workflows.keys.code_digest import source_file
+from neusee.workflows.keys.code_memo import read_parts
 
-Parts = dict[str, dict[str, str]]  #: digests of definitions, by module, and of all other dependencies
 _STATE, _SETTINGS = "state of ", "settings"
 _OTHER = frozenset({"Python", _SETTINGS, "closure", "neusee.workflows"})
 
 
 def edits(root: Path, old: str, new: str) -> list[str]:
     """Return one text clause for each definition that differs between two versions of code; [] if no record exists."""
-    before, after = _parts(root, old), _parts(root, new)
+    before, after = read_parts(root, old), read_parts(root, new)
     if not before or not after:
         return []
     names = [name for name in after if name in before and _is_module(name)]
@@ -77,13 +76,3 @@ def _file(module: str) -> str:
     path = source_file(module)
     package = path is not None and path.name == "__init__.py"
     return module.replace(".", "/") + ("/__init__.py" if package else ".py")
-
-
-def _parts(root: Path, found: str) -> Parts:
-    """Return the digest of each definition in a version of the code; {} if its record is missing or damaged."""
-    try:
-        parts = json.loads(parts_file(root, found).read_bytes())
-        whole = all(isinstance(found, str) for inside in parts.values() for found in inside.values())
-        return dict(parts) if whole else {}
-    except (OSError, ValueError, TypeError, AttributeError):
-        return {}

@@ -13,7 +13,6 @@ use them to name the changed function.
 from __future__ import annotations
 
 import functools
-import json
 import os
 import sys
 from collections.abc import Callable
@@ -22,7 +21,7 @@ from typing import Any, NamedTuple
 
 from neusee.nodes import Node
 from neusee.workflows.keys.cache_key import PRIVATE, digest, is_private
-from neusee.workflows.keys.code_memo import EDITION, read_memo, write_file, write_memo
+from neusee.workflows.keys.code_memo import EDITION, Parts, read_memo, write_memo, write_parts
 from neusee.workflows.keys.code_objects import PYTHON
 from neusee.workflows.keys.declared_dependencies import FREE, refusal, resolve, uncovered
 from neusee.workflows.keys.followed_imports import Imports
@@ -38,7 +37,6 @@ _WORKFLOWS = "neusee.workflows"
 _THIS_PROCESS = os.urandom(8).hex()
 _PYTHON = "Python {}.{}".format(*sys.version_info)
 
-Parts = dict[str, dict[str, str]]  #: digests of definitions, versions or contents, by module or other dependency
 Names = dict[str, set[str]]  #: names that are used of each module; an empty name stands for all of them
 
 
@@ -96,9 +94,7 @@ class Code:
             self._new = False
             write_memo(self._memo, self._summaries)
         for code, parts in self._parts.items():
-            path = parts_file(self._memo.parent, code)
-            if not os.path.exists(path):
-                write_file(path, json.dumps(parts).encode(), self._memo.parent / "tmp")
+            write_parts(self._memo.parent, code, parts)
         self._parts = {}
 
     def _of(self, node: Node) -> str:
@@ -260,11 +256,6 @@ _summarised = functools.lru_cache(1000)(summarise)  #: several stores in one pro
 def _decides_nothing(module: str) -> bool:
     """Return True for a module that decides no result, such as the rules for the shapes of a family of nodes."""
     return module in _LEFT_OUT or (module.startswith(f"{ROOT}.") and module.endswith("._result_shapes"))
-
-
-def parts_file(root: Path, code: str) -> Path:
-    """Return the path of the file that stores the digest of each definition that the digest ``code`` covers."""
-    return root / "code" / f"{code}.json"
 
 
 def source_file(module: str) -> Path | None:
