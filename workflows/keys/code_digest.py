@@ -21,13 +21,13 @@ from typing import Any, NamedTuple
 
 from neusee.nodes import Node
 from neusee.workflows.keys.cache_key import PRIVATE, digest, is_private
-from neusee.workflows.keys.code_memo import EDITION, Parts, read_memo, write_memo, write_parts
+from neusee.workflows.keys.code_memo import EDITION, Parts, is_complete, read_memo, write_memo, write_parts
 from neusee.workflows.keys.code_objects import PYTHON
 from neusee.workflows.keys.declared_dependencies import FREE, refusal, resolve, uncovered
 from neusee.workflows.keys.followed_imports import Imports
 from neusee.workflows.keys.loaded_source import compiled_as_written, edited_since, imported, say_once, source_of
 from neusee.workflows.keys.loaded_state import LoadedState, counted_values
-from neusee.workflows.keys.module_origin import Origin, module_path, origin_of
+from neusee.workflows.keys.module_origin import Origin, look_again, module_path, origin_of
 from neusee.workflows.keys.process_settings import settings, workflows_digest
 from neusee.workflows.keys.reachable_code import reached
 from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
@@ -63,11 +63,13 @@ class Code:
     """Digests of the source code of nodes, which stay the same during one run."""
 
     def __init__(self, memo: Path) -> None:
+        look_again()
         self._memo = memo
         self._summaries: dict[str, Summary] = read_memo(memo)
         self._new = False
         self._wholes: dict[str, Whole] = {}
         self._looks: dict[tuple[str, frozenset[str], bool], Look | None] = {}
+        self._followed: dict[frozenset[str], Callable[[str], bool]] = {}
         self._origins: dict[tuple[str, frozenset[str]], Origin] = {}
         self._codes: dict[int, tuple[Node, str]] = {}  # digest of each node, by id
         self._parts: dict[str, Parts] = {}  # by digest
@@ -90,7 +92,7 @@ class Code:
 
     def save(self) -> None:
         """Save the new digests of source files and of their functions; do nothing if the folder cannot be written."""
-        if self._new:
+        if self._new or not is_complete(self._memo):
             self._new = False
             write_memo(self._memo, self._summaries)
         for code, parts in self._parts.items():
@@ -219,11 +221,14 @@ class Code:
 
     def _follows(self, packages: frozenset[str]) -> Callable[[str], bool]:
         """Return the function that tells whether the source of a module is followed."""
-        return functools.cache(lambda name: self._followed(name, packages))
+        if packages not in self._followed:
+            self._followed[packages] = functools.cache(lambda name: self._is_followed(name, packages))
+        return self._followed[packages]
 
-    def _followed(self, module: str, packages: frozenset[str]) -> bool:
+    def _is_followed(self, module: str, packages: frozenset[str]) -> bool:
         outside = _decides_nothing(module) or f"{module}.".startswith(f"{_WORKFLOWS}.")
-        return not outside and self._origin(module, packages).kind == "source"
+        nowhere = module.startswith("namedtuple_") and module not in sys.modules  # the module of the methods of a tuple
+        return not outside and not nowhere and self._origin(module, packages).kind == "source"
 
     def _origin(self, module: str, packages: frozenset[str]) -> Origin:
         key = (module, packages)

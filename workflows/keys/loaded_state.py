@@ -53,10 +53,15 @@ _KINDS: tuple[tuple[str, tuple[type, ...]], ...] = (
 )  #: how values of a type are described; any other value is an object
 
 
-@functools.cache
-def _how(kind: type) -> str:
-    """Return how values of a type are described."""
-    return next((how for how, kinds in _KINDS if issubclass(kind, kinds)), "object")
+class _Hows(dict[type, str]):
+    """How values of a type are described, by type."""
+
+    def __missing__(self, kind: type) -> str:
+        self[kind] = next((how for how, kinds in _KINDS if issubclass(kind, kinds)), "object")
+        return self[kind]
+
+
+_HOW = _Hows()
 
 
 class LoadedState:
@@ -78,8 +83,10 @@ class LoadedState:
 
     def _of(self, value: Any) -> Any:
         """Return a value as text and tuples that are the same in each process; a repeated object is its number."""
+        if value is None:
+            return _NOTHING
         kind: Any = type(value)
-        how = _how(kind)
+        how = _HOW[kind]
         if how == "plain":
             return kind.__name__, repr(value)
         if how == "text":
@@ -88,11 +95,12 @@ class LoadedState:
             return kind.__name__, value.__qualname__
         if how == "module":
             return kind.__name__, self._noted(value.__name__)
-        if id(value) in self._seen:
-            return "again", self._seen[id(value)]
-        self._seen[id(value)] = len(self._seen)
+        seen, name = self._seen, id(value)
+        if name in seen:
+            return "again", seen[name]
+        seen[name] = len(seen)
         self._kept.append(value)
-        return getattr(self, f"_{how}")(value)
+        return _DESCRIBED[how](self, value)
 
     def _array(self, value: Any) -> Any:
         return type(value).__name__, *_array(value)
@@ -135,8 +143,9 @@ class LoadedState:
     def _function(self, function: FunctionType) -> Any:
         """Return a function by module and name, with its defaults and closure if it is local."""
         home, code = str(function.__globals__.get("__name__")), function.__code__
-        self._noted(home, function.__qualname__)
         own = home == self._name and code.co_filename == self._file
+        if home != self._name:
+            self._noted(home, function.__qualname__)
         if own and self._functions and function_code(code) not in self._functions:
             self.replaced.append(function.__qualname__)
         local = own or not _found(home, function)
@@ -167,6 +176,14 @@ class LoadedState:
     def _placed(self, text: str) -> str:
         """Return a text without the folder of the module, so that it is the same for each place of installation."""
         return text.replace(self._folder, "<folder>") if self._folder in text else text
+
+
+_NOTHING = ("NoneType", "None")
+_ATOMS = ("plain", "text", "builtin", "module")
+#: the method that describes a value, by the kind of its type
+_DESCRIBED: dict[str, Callable[[LoadedState, Any], Any]] = {
+    how: getattr(LoadedState, f"_{how}") for how in ("object", *(how for how, _ in _KINDS)) if how not in _ATOMS
+}
 
 
 def counted_values(module: ModuleType, summary: Summary, free: Collection[str], root: bool) -> dict[str, Any]:
