@@ -56,7 +56,7 @@ class DerivedFiles:
             "file": path.name,
             "file_bytes": len(content),
         }
-        self.store.put(key, torch.cat([_digest(path, how) for how in ("sha256", _FAST)]), about)
+        self.store.put(key, _digest(path, "sha256" if secrets() else _FAST), about)
         return path
 
     def _path(self, key: str, suffix: str) -> Path:
@@ -76,12 +76,9 @@ class DerivedFiles:
 
 
 def _is_right(path: Path, kept: Tensor) -> bool:
-    """Return True if a file has the SHA-256 that was stored, or without a secret the checksum (xxh3), which is faster.
-
-    The signature of the store covers both.
-    """
-    sha256, checksum = kept.split([_SHA256, len(kept) - _SHA256]) if len(kept) > _SHA256 else (kept, kept)
-    return torch.equal(sha256, _digest(path, "sha256")) if secrets() else torch.equal(checksum, _digest(path, _FAST))
+    """Return True if a file has the digest that was stored: SHA-256, or the faster xxh3 where nothing is signed."""
+    signed = len(kept) == _SHA256
+    return (signed or not secrets()) and torch.equal(kept, _digest(path, "sha256" if signed else _FAST))
 
 
 def _digest(path: Path, how: Any) -> Tensor:
