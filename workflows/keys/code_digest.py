@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,13 +23,13 @@ from neusee.nodes import Node
 from neusee.workflows.keys.cache_key import PRIVATE, digest, is_private
 from neusee.workflows.keys.code_memo import EDITION, Parts, is_complete, read_memo, write_memo, write_parts
 from neusee.workflows.keys.code_objects import PYTHON
-from neusee.workflows.keys.declared_dependencies import FREE, refusal, resolve, uncovered
+from neusee.workflows.keys.declared_dependencies import FREE, changing_refusal, refusal, resolve, uncovered
 from neusee.workflows.keys.followed_imports import Imports
 from neusee.workflows.keys.loaded_source import compiled_as_written, edited_since, imported, say_once, source_of
 from neusee.workflows.keys.loaded_state import LoadedState, counted_values
 from neusee.workflows.keys.module_origin import Origin, look_again, module_path, origin_of
 from neusee.workflows.keys.process_settings import settings, workflows_digest
-from neusee.workflows.keys.reachable_code import reached
+from neusee.workflows.keys.reachable_code import reached, read_names
 from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
 
 _LEFT_OUT = frozenset({"neusee", ROOT, f"{ROOT}._node", f"{ROOT}.import_times"})  #: modules that decide no result
@@ -48,6 +48,7 @@ class Look(NamedTuple):
     summary: Summary | None = None  #: None for a module that counts by its version
     path: Path | None = None
     state: str = ""
+    changing: Mapping[str, str] = {}  #: types of loaded objects that no digest covers, such as generators, by name
     private: bool = False  #: True if the loaded code is not that of the file
 
 
@@ -118,6 +119,8 @@ class Code:
         if not plain:
             state = LoadedState(sys.modules[module], (), self._follows(_packages(module)))
             parts["closure"] = {node.path: state.digest({"function": node.fn})}
+            if state.changing and f"{FREE}function" not in node.depends:
+                raise LookupError(changing_refusal("function", state.changing["function"], source))
             inner = [self._whole(name).code for name in sorted(state.modules.keys() - whole.looks.keys())]
             parts["closure"].update({f"module {n}": each for n, each in enumerate(inner)})
             private = private or any(map(is_private, inner))
@@ -159,12 +162,17 @@ class Code:
         """Raise `LookupError` for the first construct that is not followed and not declared."""
         own = {node.fn.__name__, "_"}
         for name, look in whole.looks.items():
-            if look.summary is None or look.path is None or not look.summary.constructs:
+            if look.summary is None or look.path is None or not (look.summary.constructs or look.changing):
                 continue
             used = own if name == module else whole.names.get(name) or {""}
+            free = [*look.summary.depends, *node.depends]
+            read = read_names(look.summary.statements, set() if used & {"", "*"} else used) if look.changing else set()
+            for held, kind in look.changing.items():
+                if held in read and f"{FREE}{held}" not in free:
+                    raise LookupError(changing_refusal(held, kind, look.path))
             lines = [r for r in reached(look.summary.statements, None if "" in used else used)]
             found = [item for item in look.summary.constructs if any(item.line in r for r in lines)]
-            left = uncovered(found, [*look.summary.depends, *node.depends])
+            left = uncovered(found, free)
             if left is not None:
                 raise LookupError(refusal(left, look.path))
 
@@ -200,10 +208,11 @@ class Code:
         free = {entry.removeprefix(FREE) for entry in summary.depends if entry.startswith(FREE)}
         imports = {name: used for name, used in inner.names(summary).items() if name.partition(".")[0] not in free}
         state, private, parts = "", edited_since(module), {module: summary.definitions}
+        changing: Mapping[str, str] = {}
         if known:
             loaded = LoadedState(sys.modules[module], summary.functions if compiled_as_written(module) else (), follows)
             state = loaded.digest(counted_values(sys.modules[module], summary, free, root))
-            parts[f"state of {module}"] = {"values": state}
+            parts[f"state of {module}"], changing = {"values": state}, loaded.changing
             for name in sorted(loaded.modules):
                 imports.setdefault(name, set()).update(loaded.modules[name])
             if loaded.replaced and not private:
@@ -217,7 +226,7 @@ class Code:
             if declared.changed:
                 private = True
                 say_once(module, f"{path.parent / declared.changed[0]} was changed after the import of {path}: restart")
-        return Look(parts, imports, summary, path, state, private)
+        return Look(parts, imports, summary, path, state, changing, private)
 
     def _follows(self, packages: frozenset[str]) -> Callable[[str], bool]:
         """Return the function that tells whether the source of a module is followed."""

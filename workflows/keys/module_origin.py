@@ -63,9 +63,8 @@ def module_path(module: str) -> str | None:
     parent, _, name = module.rpartition(".")
     if not parent:
         spec = _spec(module)
-        return spec.origin if spec is not None and spec.has_location else None
-    folders = getattr(sys.modules[parent], "__path__", ()) if parent in sys.modules else _folders(parent)
-    return next(filter(None, (_file_in(folder, name) for folder in folders)), None)
+        return spec.origin if spec is not None and spec.has_location and os.path.isfile(spec.origin or "") else None
+    return next(filter(None, (_file_in(folder, name) for folder in _folders_above(module))), None)
 
 
 def module_file(folder: str | Path, names: Sequence[str]) -> Path | None:
@@ -143,14 +142,22 @@ def _text(folder: str, name: str) -> bytes:
 def _without_file(module: str, top: str, packages: frozenset[str]) -> Origin:
     """Return the origin of a module without a file: a folder of modules, a built-in part, or a missing module."""
     if module in sys.modules:
-        if getattr(sys.modules[module], "__path__", None) is not None:
+        inside = vars(sys.modules[module])
+        if inside.get("__path__") is not None and not inside.get("__file__"):
             return Origin("folder")
         installed = "" if top in packages or module == top else version_of(top)
         return Origin("distribution", None, installed) if installed else Origin("nowhere")
     if "." not in module:
         spec = _spec(module)
-        return Origin("absent" if spec is None else "folder")
-    return Origin("absent")
+        return Origin("absent" if spec is None else "nowhere" if spec.has_location else "folder")
+    found = any(not os.path.isdir(folder) for folder in _folders_above(module))
+    return Origin("nowhere" if found else "absent")
+
+
+def _folders_above(module: str) -> list[str]:
+    """Return the folders of the package that a module is in."""
+    parent = module.rpartition(".")[0]
+    return list(vars(sys.modules[parent]).get("__path__", ())) if parent in sys.modules else _folders(parent)
 
 
 def _folders(package: str) -> list[str]:
@@ -159,8 +166,7 @@ def _folders(package: str) -> list[str]:
     if not parent:
         spec = _spec(package)
         return list(spec.submodule_search_locations or ()) if spec is not None else []
-    above = getattr(sys.modules[parent], "__path__", ()) if parent in sys.modules else _folders(parent)
-    return [path for folder in above if os.path.isdir(path := os.path.join(folder, name))]
+    return [path for folder in _folders_above(package) if os.path.isdir(path := os.path.join(folder, name))]
 
 
 def _spec(top: str) -> importlib.machinery.ModuleSpec | None:

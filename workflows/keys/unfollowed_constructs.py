@@ -21,15 +21,24 @@ _BY_NAME = "a module is imported by a name that only a run knows"
 _VARIABLE = "an environment variable is read"
 _FILE = "a file is read that is no parameter"
 
+_SETTING = "a setting of the process decides"
+_DRAWING = (
+    *("os.urandom", "secrets", "random", "torch.initial_seed", "torch.seed", "torch.get_rng_state"),
+    *("torch.random.get_rng_state", "numpy.random.get_state"),
+)
+_TIMES = ("time", "perf_counter", "monotonic", "process_time", "thread_time")
+
 _LEGACY = ("rand", "randn", "randint", "random", "normal", "uniform", "choice", "permutation", "shuffle", "poisson")
 
 #: What the names of Python and of libraries do, by their first parts.
 _NAMES: Mapping[str, tuple[str, str]] = {
-    **dict.fromkeys(("os.environ", "os.environb", "os.getenv", "os.getenvb"), ("env", _VARIABLE)),
+    **dict.fromkeys(("os.environ", "os.environb", "os.getenv", "os.getenvb", "os.path.expandvars"), ("env", _VARIABLE)),
     **dict.fromkeys(("importlib.import_module", "__import__", "importlib.__import__", "runpy"), ("import", _BY_NAME)),
     **dict.fromkeys(("sys.modules", "importlib.util", "importlib.machinery"), ("import", _BY_NAME)),
     **dict.fromkeys(("pkgutil.iter_modules", "pkgutil.walk_packages", "importlib.metadata"), ("import", _BY_NAME)),
     **dict.fromkeys(("exec", "eval", "compile", "ctypes.CDLL", "ctypes.cdll", "types.FunctionType"), ("run", _RUN)),
+    **dict.fromkeys(("ctypes.PyDLL", "ctypes.pydll", "ctypes.pythonapi", "ctypes.util.find_library"), ("run", _RUN)),
+    **dict.fromkeys(("numpy.ctypeslib.load_library",), ("run", _RUN)),
     **dict.fromkeys(("subprocess", "os.system", "os.popen", "multiprocessing", "types.CodeType"), ("run", _RUN)),
     **dict.fromkeys(
         ("pickle.load", "pickle.loads", "marshal.loads", "cffi", "torch.utils.cpp_extension"), ("run", _RUN)
@@ -41,13 +50,16 @@ _NAMES: Mapping[str, tuple[str, str]] = {
     **dict.fromkeys(("os.getcwd", "pathlib.Path.cwd"), ("file", _FILE)),
     **dict.fromkeys(("pathlib.Path.home", "os.path.expanduser", "sys.path", "sys.argv"), ("state", _CLOCK)),
     **dict.fromkeys(("os.cpu_count", "os.getpid", "os.uname", "platform", "getpass", "uuid"), ("state", _CLOCK)),
-    **dict.fromkeys(("time.time", "time.time_ns", "time.localtime", "time.gmtime", "time.strftime"), ("state", _CLOCK)),
-    **dict.fromkeys(("datetime.datetime.now", "datetime.datetime.today", "datetime.date.today"), ("state", _CLOCK)),
+    **{f"time.{name}{unit}": ("state", _CLOCK) for name in _TIMES for unit in ("", "_ns")},
+    **{f"time.{name}": ("state", _CLOCK) for name in ("localtime", "gmtime", "strftime", "ctime", "asctime")},
+    **{f"datetime.datetime.{name}": ("state", _CLOCK) for name in ("now", "utcnow", "today")},
+    **dict.fromkeys(("datetime.date.today", "threading.get_ident", "resource", "tracemalloc"), ("state", _CLOCK)),
+    **dict.fromkeys(("locale", "decimal", "numpy.geterr", "numpy.get_printoptions"), ("state", _SETTING)),
     **dict.fromkeys(("torch.get_num_threads", "torch.get_num_interop_threads", "psutil"), ("state", _CLOCK)),
     **dict.fromkeys(
         ("torch.cuda.is_available", "torch.cuda.device_count", "torch.cuda.get_device_name"), ("state", _CLOCK)
     ),
-    **dict.fromkeys(("os.urandom", "secrets", "torch.initial_seed", "torch.seed", "random"), ("state", _DRAWN)),
+    **dict.fromkeys(_DRAWING, ("state", _DRAWN)),
     **{
         f"numpy.random.{name}": ("state", _DRAWN)
         for name in ("rand", "randn", "randint", "random", "normal", "uniform")
@@ -55,9 +67,12 @@ _NAMES: Mapping[str, tuple[str, str]] = {
     **{f"numpy.random.{name}": ("state", _DRAWN) for name in _LEGACY},
 }
 _BUILTINS = frozenset({"exec", "eval", "compile", "__import__", "__file__", "__spec__", "__loader__"})
-_METHODS = frozenset({"open", "read_text", "read_bytes", "iterdir", "glob", "rglob"})  #: of a path
+_METHODS = frozenset(
+    {"open", "read_text", "read_bytes", "iterdir", "glob", "rglob", "exists", "is_file", "is_dir", "stat", "lstat"}
+)  #: of a path
 _READERS = re.compile(  #: functions of libraries that read a file
-    r"(open|io\.open|codecs\.open|os\.open|glob\.i?glob|os\.(listdir|scandir|walk)|"
+    r"(open|io\.open|codecs\.open|os\.open|glob\.i?glob|os\.(listdir|scandir|walk|stat|lstat|access|readlink)|"
+    r"os\.path\.(exists|lexists|isfile|isdir|islink|getsize|getmtime|getctime|samefile)|"
     r"(numpy|torch)\.(load|loadtxt|genfromtxt|fromfile|memmap|from_file)|"
     r"PIL\.Image\.open|safetensors\.safe_open|safetensors\.\w+\.(load_file|safe_open)|h5py\.File|scipy\.io\.loadmat|"
     r"pandas\.read_\w+|.*\.imread|.*\.imopen|gzip\.open|bz2\.open|lzma\.open|zipfile\.ZipFile|tarfile\.open|"
