@@ -58,6 +58,7 @@ class Whole(NamedTuple):
     code: str
     looks: dict[str, Look]
     names: Names
+    parts: Parts
 
 
 class Code:
@@ -124,7 +125,7 @@ class Code:
             inner = [self._whole(name).code for name in sorted(state.modules.keys() - whole.looks.keys())]
             parts["closure"].update({f"module {n}": each for n, each in enumerate(inner)})
             private = private or any(map(is_private, inner))
-        return self._named(digest(code, parts), {**_parts(whole.looks), **parts}, private)
+        return self._named(digest(code, parts), {**whole.parts, **parts}, private)
 
     def _whole(self, module: str) -> Whole:
         """Return the digest of a module with the modules that it leads to."""
@@ -148,7 +149,7 @@ class Code:
         code = digest(_PYTHON, settings(), state)
         parts = {"Python": {"version": _PYTHON}, "settings": settings(), **_parts(looks)}
         code = self._named(code, parts, any(look.private for look in looks.values()))
-        self._wholes[module] = Whole(code, looks, names)
+        self._wholes[module] = Whole(code, looks, names, parts)
         return self._wholes[module]
 
     def _named(self, code: str, parts: Parts, private: bool) -> str:

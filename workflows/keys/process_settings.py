@@ -14,7 +14,8 @@ import torch
 
 from neusee.nodes.exact_convolution import tf32_setting
 
-_USUAL = {
+#: settings of a new process
+USUAL = {
     "default dtype": "torch.float32",
     "default device": "cpu",
     "matmul precision": "highest",
@@ -41,7 +42,7 @@ def settings() -> dict[str, str]:
         "numbers below 1e-308": "kept" if _SMALLEST * _HALF else "0",
         "assert statements": f"left out by -{'O' * sys.flags.optimize}" if sys.flags.optimize else "run",
     }
-    return {name: value for name, value in now.items() if value != _USUAL[name]}
+    return {name: value for name, value in now.items() if value != USUAL[name]}
 
 
 @functools.cache
