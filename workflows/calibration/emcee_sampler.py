@@ -1,13 +1,13 @@
 """Sampling of a sensor's posterior with emcee: four ensembles of walkers, until the chains are long enough.
 
-Only this file and `ensembles` import emcee. After each round all draws are written in emcee's HDF5 format. A killed run
-continues from the last round and gives the same draws, to the last bit, as a run that never stopped.
+Only this file and `ensembles` import emcee. After each round all draws are written in emcee's HDF5 format, behind a
+seal in the first bytes, which HDF5 leaves to its users. A killed run continues from the last round and gives the same
+draws, to the last bit, as a run that never stopped. Chains whose file has no right seal start anew.
 """
 
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +20,7 @@ import numpy as np
 from neusee.workflows.calibration.ensembles import Walk, walk_until
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
+from neusee.workflows.keys.seal import seal_file, unseal_file
 from neusee.workflows.report.study_folder import Progress, silent
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ _FIRST, _GROWTH, _LONGEST = 250, 1.25, 32_000  #: steps of the first round; grow
 _TAUS, _CHANGE = 50.0, 0.01  #: least length of a chain in tau, and the largest change of tau in its last round
 _SURELY = 100.0  #: length of a chain in tau at which any change of tau is allowed
 _BESIDE = 5.0  #: nats for each parameter by which a starting point may lie below the mode
+_SEAL = 512  #: bytes of the seal in front of the draws
 _BURN = 10.0  #: autocorrelation times that are discarded
 _MOVES = {"de": emcee.moves.DEMove, "stretch": emcee.moves.StretchMove}
 
@@ -170,19 +172,27 @@ def _gathered(runs: Sequence[Walk], tau: float, steps: int, long: bool) -> Chain
 
 
 def _read(file: Path, index: int) -> Any:
-    """Read the draws of an ensemble into a backend in memory; return None if the file cannot be read."""
+    """Read the draws of an ensemble into a backend in memory; return None if the file cannot be read or trusted."""
     try:
-        if not file.is_file():
-            return None
+        with open(file, "rb") as raw:
+            unseal_file(file.stem, raw.read(_SEAL).rstrip(b"\0"), raw.read())
         kept = emcee.backends.HDFBackend(str(file), name=f"ensemble{index}", read_only=True)
         memory = emcee.backends.Backend()
         memory.reset(*kept.shape)
         memory.chain, memory.log_prob = kept.get_chain(), kept.get_log_prob()
         memory.accepted, memory.iteration = kept.accepted, kept.iteration
         memory.random_state = kept.random_state
-    except (OSError, KeyError, AttributeError):
+        np.random.RandomState().set_state(memory.random_state)
+    except (OSError, LookupError, AttributeError, ValueError, TypeError, RuntimeError):
         return None
-    return memory
+    return memory if _is_whole(memory) else None
+
+
+def _is_whole(memory: Any) -> bool:
+    """Return True if draws and log densities of every step are there and are numbers."""
+    steps = memory.iteration
+    shapes = memory.chain.shape == (steps, *memory.shape) and memory.log_prob.shape == (steps, memory.shape[0])
+    return steps > 0 and shapes and bool(np.isfinite(memory.chain).all() and np.isfinite(memory.log_prob).all())
 
 
 def _keep(file: Path, backends: Sequence[Any], progress: Progress) -> bool:
@@ -206,8 +216,10 @@ def _write(file: Path, backends: Sequence[Any]) -> None:
         with TemporaryDirectory(prefix="neusee-") as folder:
             whole = Path(folder) / "draws.h5"
             _write_draws(whole, backends)
-            shutil.copyfile(whole, part)
-        with open(part, "rb") as written:
+            content = whole.read_bytes()[_SEAL:]
+        with open(part, "wb") as written:
+            written.write(seal_file(file.stem, content).ljust(_SEAL, b"\0") + content)
+            written.flush()
             os.fsync(written.fileno())
         os.replace(part, file)
     finally:
@@ -215,6 +227,11 @@ def _write(file: Path, backends: Sequence[Any]) -> None:
 
 
 def _write_draws(path: Path, backends: Sequence[Any]) -> None:
+    """Write the draws of all ensembles to an HDF5 file whose first bytes are free for the seal."""
+    import h5py
+
+    with h5py.File(path, "w", userblock_size=_SEAL):
+        pass
     for index, memory in enumerate(backends):
         kept = emcee.backends.HDFBackend(str(path), name=f"ensemble{index}")
         kept.reset(*memory.shape)

@@ -15,7 +15,7 @@ from neusee.workflows.engine.resolve_keys import Resolved
 from neusee.workflows.explain.change_wording import Wording
 from neusee.workflows.explain.code_changes import edits
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.keys.cache_key import Key, is_private
 from neusee.workflows.store.result_store import Store
 
 Origin = Mapping[str, Any]  #: the parts of a key: node, code, params, inputs, stream
@@ -91,7 +91,12 @@ class Comparison:
             return [f"{old['node']} -> {new['node']}{where}"]
         found = self.wording.params(label, old["params"], new["params"])
         if old["code"] != new["code"]:
-            found += self._edited(old["code"], new["code"]) or [f"the code of {new['node']} changed"]
+            private = [f"the loaded code of {new['node']} is not that of its file any more: restart Python"]
+            found += (
+                private
+                if is_private(new["code"])
+                else self._edited(old["code"], new["code"]) or [f"the code of {new['node']} changed"]
+            )
         return found + self._stream(old.get("stream"), new.get("stream"))
 
     def origin(self, key: Key) -> Origin | None:

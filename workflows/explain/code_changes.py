@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-from neusee.workflows.keys.code_digest import parts_file, source_file
+from neusee.workflows.keys.code_digest import source_file
+from neusee.workflows.keys.code_memo import read_parts
+from neusee.workflows.keys.process_settings import USUAL
 
-Parts = dict[str, dict[str, str]]  #: digests of definitions, by module, and of all other dependencies
 _STATE, _SETTINGS = "state of ", "settings"
-_OTHER = frozenset({"Python", _SETTINGS, "closure", "neusee.workflows"})
+_PROGRAM = "neusee.workflows"
+_OTHER = frozenset({"Python", _SETTINGS, "closure", _PROGRAM})
 
 
 def edits(root: Path, old: str, new: str) -> list[str]:
     """Return one text clause for each definition that differs between two versions of code; [] if no record exists."""
-    before, after = _parts(root, old), _parts(root, new)
+    before, after = read_parts(root, old), read_parts(root, new)
     if not before or not after:
         return []
     names = [name for name in after if name in before and _is_module(name)]
@@ -29,7 +30,8 @@ def edits(root: Path, old: str, new: str) -> list[str]:
         for text in _beside(name, before.get(name, {}), after.get(name, {}))
     ]
     return source + beside or [
-        f"values in {_file(name.removeprefix(_STATE))} changed: a table, a constant, a default or a function"
+        f"a value that {_file(name.removeprefix(_STATE))} holds was changed while the program ran: a constant, "
+        "a table, a default or a function"
         for name in after
         if name.startswith(_STATE) and before.get(name, after[name]) != after[name]
     ]
@@ -44,16 +46,20 @@ def _beside(name: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
     labels = [label for label in dict.fromkeys([*new, *old]) if old.get(label) != new.get(label)]
     if not labels:
         return []
-    if name in ("Python", _SETTINGS) or name.startswith("package "):
-        usual = "the usual one" if name == _SETTINGS else "none"
-        what = {_SETTINGS: "", "Python": "Python: "}.get(name, f"{name}: ")
-        return [
-            f"{what}{label + ': ' if name == _SETTINGS else ''}{old.get(label, usual)} -> {new.get(label, usual)}"
-            for label in labels
-        ]
+    if name == _SETTINGS:
+        values = [(label, old.get(label, USUAL.get(label)), new.get(label, USUAL.get(label))) for label in labels]
+        return [f"{label} {before} -> {after}, a setting of this process" for label, before, after in values]
+    if name == "Python" or name.startswith("package "):
+        before, after = old.get("version"), new.get("version")
+        if not before or not after:
+            return [f"{name} is {'used now' if after else 'no longer used'}"]
+        return [f"{before} -> {after}{', an installed package' if name != 'Python' else ''}"]
     if name == "closure":
-        return ["the values that the function of the node holds changed"]
-    return [f"{name} changed" if old and new else f"{name} is declared {'now' if new else 'no more'}"]
+        return ["a value that the function of the node holds from the function around it changed"]
+    if name == _PROGRAM:
+        return ["the program itself changed, which the node imports (neusee/workflows)"]
+    what = f"declared {name}" if name.startswith("file ") else name
+    return [f"{what} changed" if old and new else f"{name} is declared {'now' if new else 'no more'}"]
 
 
 def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
@@ -77,13 +83,3 @@ def _file(module: str) -> str:
     path = source_file(module)
     package = path is not None and path.name == "__init__.py"
     return module.replace(".", "/") + ("/__init__.py" if package else ".py")
-
-
-def _parts(root: Path, found: str) -> Parts:
-    """Return the digest of each definition in a version of the code; {} if its record is missing or damaged."""
-    try:
-        parts = json.loads(parts_file(root, found).read_bytes())
-        whole = all(isinstance(found, str) for inside in parts.values() for found in inside.values())
-        return dict(parts) if whole else {}
-    except (OSError, ValueError, TypeError, AttributeError):
-        return {}

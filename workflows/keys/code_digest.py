@@ -13,24 +13,23 @@ use them to name the changed function.
 from __future__ import annotations
 
 import functools
-import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from neusee.nodes import Node
 from neusee.workflows.keys.cache_key import PRIVATE, digest, is_private
-from neusee.workflows.keys.code_memo import EDITION, read_memo, write_file, write_memo
+from neusee.workflows.keys.code_memo import EDITION, Parts, is_complete, read_memo, write_memo, write_parts
 from neusee.workflows.keys.code_objects import PYTHON
-from neusee.workflows.keys.declared_dependencies import FREE, refusal, resolve, uncovered
+from neusee.workflows.keys.declared_dependencies import FREE, changing_refusal, refusal, resolve, uncovered
 from neusee.workflows.keys.followed_imports import Imports
 from neusee.workflows.keys.loaded_source import compiled_as_written, edited_since, imported, say_once, source_of
 from neusee.workflows.keys.loaded_state import LoadedState, counted_values
-from neusee.workflows.keys.module_origin import Origin, module_path, origin_of
+from neusee.workflows.keys.module_origin import Origin, look_again, module_path, origin_of
 from neusee.workflows.keys.process_settings import settings, workflows_digest
-from neusee.workflows.keys.reachable_code import reached
+from neusee.workflows.keys.reachable_code import reached, read_names
 from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
 
 #: modules that decide no result
@@ -39,7 +38,6 @@ _WORKFLOWS = "neusee.workflows"
 _THIS_PROCESS = os.urandom(8).hex()
 _PYTHON = "Python {}.{}".format(*sys.version_info)
 
-Parts = dict[str, dict[str, str]]  #: digests of definitions, versions or contents, by module or other dependency
 Names = dict[str, set[str]]  #: names that are used of each module; an empty name stands for all of them
 
 
@@ -51,6 +49,7 @@ class Look(NamedTuple):
     summary: Summary | None = None  #: None for a module that counts by its version
     path: Path | None = None
     state: str = ""
+    changing: Mapping[str, str] = {}  #: types of loaded objects that no digest covers, such as generators, by name
     private: bool = False  #: True if the loaded code is not that of the file
 
 
@@ -60,17 +59,20 @@ class Whole(NamedTuple):
     code: str
     looks: dict[str, Look]
     names: Names
+    parts: Parts
 
 
 class Code:
     """Digests of the source code of nodes, which stay the same during one run."""
 
     def __init__(self, memo: Path) -> None:
+        look_again()
         self._memo = memo
         self._summaries: dict[str, Summary] = read_memo(memo)
         self._new = False
         self._wholes: dict[str, Whole] = {}
         self._looks: dict[tuple[str, frozenset[str], bool], Look | None] = {}
+        self._followed: dict[frozenset[str], Callable[[str], bool]] = {}
         self._origins: dict[tuple[str, frozenset[str]], Origin] = {}
         self._codes: dict[int, tuple[Node, str]] = {}  # digest of each node, by id
         self._parts: dict[str, Parts] = {}  # by digest
@@ -93,13 +95,11 @@ class Code:
 
     def save(self) -> None:
         """Save the new digests of source files and of their functions; do nothing if the folder cannot be written."""
-        if self._new:
+        if self._new or not is_complete(self._memo):
             self._new = False
             write_memo(self._memo, self._summaries)
         for code, parts in self._parts.items():
-            path = parts_file(self._memo.parent, code)
-            if not os.path.exists(path):
-                write_file(path, json.dumps(parts).encode(), self._memo.parent / "tmp")
+            write_parts(self._memo.parent, code, parts)
         self._parts = {}
 
     def _of(self, node: Node) -> str:
@@ -121,10 +121,12 @@ class Code:
         if not plain:
             state = LoadedState(sys.modules[module], (), self._follows(_packages(module)))
             parts["closure"] = {node.path: state.digest({"function": node.fn})}
+            if state.changing and f"{FREE}function" not in node.depends:
+                raise LookupError(changing_refusal("function", state.changing["function"], source))
             inner = [self._whole(name).code for name in sorted(state.modules.keys() - whole.looks.keys())]
             parts["closure"].update({f"module {n}": each for n, each in enumerate(inner)})
             private = private or any(map(is_private, inner))
-        return self._named(digest(code, parts), {**_parts(whole.looks), **parts}, private)
+        return self._named(digest(code, parts), {**whole.parts, **parts}, private)
 
     def _whole(self, module: str) -> Whole:
         """Return the digest of a module with the modules that it leads to."""
@@ -148,7 +150,7 @@ class Code:
         code = digest(_PYTHON, settings(), state)
         parts = {"Python": {"version": _PYTHON}, "settings": settings(), **_parts(looks)}
         code = self._named(code, parts, any(look.private for look in looks.values()))
-        self._wholes[module] = Whole(code, looks, names)
+        self._wholes[module] = Whole(code, looks, names, parts)
         return self._wholes[module]
 
     def _named(self, code: str, parts: Parts, private: bool) -> str:
@@ -162,12 +164,17 @@ class Code:
         """Raise `LookupError` for the first construct that is not followed and not declared."""
         own = {node.fn.__name__, "_"}
         for name, look in whole.looks.items():
-            if look.summary is None or look.path is None or not look.summary.constructs:
+            if look.summary is None or look.path is None or not (look.summary.constructs or look.changing):
                 continue
             used = own if name == module else whole.names.get(name) or {""}
+            free = [*look.summary.depends, *node.depends]
+            read = read_names(look.summary.statements, set() if used & {"", "*"} else used) if look.changing else set()
+            for held, kind in look.changing.items():
+                if held in read and f"{FREE}{held}" not in free:
+                    raise LookupError(changing_refusal(held, kind, look.path))
             lines = [r for r in reached(look.summary.statements, None if "" in used else used)]
             found = [item for item in look.summary.constructs if any(item.line in r for r in lines)]
-            left = uncovered(found, [*look.summary.depends, *node.depends])
+            left = uncovered(found, free)
             if left is not None:
                 raise LookupError(refusal(left, look.path))
 
@@ -203,10 +210,11 @@ class Code:
         free = {entry.removeprefix(FREE) for entry in summary.depends if entry.startswith(FREE)}
         imports = {name: used for name, used in inner.names(summary).items() if name.partition(".")[0] not in free}
         state, private, parts = "", edited_since(module), {module: summary.definitions}
+        changing: Mapping[str, str] = {}
         if known:
             loaded = LoadedState(sys.modules[module], summary.functions if compiled_as_written(module) else (), follows)
             state = loaded.digest(counted_values(sys.modules[module], summary, free, root))
-            parts[f"state of {module}"] = {"values": state}
+            parts[f"state of {module}"], changing = {"values": state}, loaded.changing
             for name in sorted(loaded.modules):
                 imports.setdefault(name, set()).update(loaded.modules[name])
             if loaded.replaced and not private:
@@ -220,15 +228,18 @@ class Code:
             if declared.changed:
                 private = True
                 say_once(module, f"{path.parent / declared.changed[0]} was changed after the import of {path}: restart")
-        return Look(parts, imports, summary, path, state, private)
+        return Look(parts, imports, summary, path, state, changing, private)
 
     def _follows(self, packages: frozenset[str]) -> Callable[[str], bool]:
         """Return the function that tells whether the source of a module is followed."""
-        return functools.cache(lambda name: self._followed(name, packages))
+        if packages not in self._followed:
+            self._followed[packages] = functools.cache(lambda name: self._is_followed(name, packages))
+        return self._followed[packages]
 
-    def _followed(self, module: str, packages: frozenset[str]) -> bool:
+    def _is_followed(self, module: str, packages: frozenset[str]) -> bool:
         outside = _decides_nothing(module) or f"{module}.".startswith(f"{_WORKFLOWS}.")
-        return not outside and self._origin(module, packages).kind == "source"
+        nowhere = module.startswith("namedtuple_") and module not in sys.modules  # the module of the methods of a tuple
+        return not outside and not nowhere and self._origin(module, packages).kind == "source"
 
     def _origin(self, module: str, packages: frozenset[str]) -> Origin:
         key = (module, packages)
@@ -261,11 +272,6 @@ _summarised = functools.lru_cache(1000)(summarise)  #: several stores in one pro
 def _decides_nothing(module: str) -> bool:
     """Return True for a module that decides no result, such as the rules for the shapes of a family of nodes."""
     return module in _LEFT_OUT or (module.startswith(f"{ROOT}.") and module.endswith("._result_shapes"))
-
-
-def parts_file(root: Path, code: str) -> Path:
-    """Return the path of the file that stores the digest of each definition that the digest ``code`` covers."""
-    return root / "code" / f"{code}.json"
 
 
 def source_file(module: str) -> Path | None:

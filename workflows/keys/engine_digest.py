@@ -6,13 +6,16 @@ result. `code_digest.Code` computes the digests of nodes.
 
 from __future__ import annotations
 
-import ast
 import functools
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import xxhash
+
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.source_summary import module_file, syntax_digest
+from neusee.workflows.keys.code_memo import EDITION, Outline, outlines
+from neusee.workflows.keys.code_objects import PYTHON
+from neusee.workflows.keys.source_summary import module_file, syntax_outline
 
 _HERE = Path(__file__).parents[1]
 _ROOT = "neusee.workflows"
@@ -34,28 +37,29 @@ def engine(*modules: str) -> str:
         path = _source(name)
         if path is None:
             raise LookupError(f"{_ROOT}.{name} has no source file below {_HERE}, so its results have no cache key")
-        seen[name], imports = _parsed(path.read_bytes())
+        seen[name], imports = outline(path.read_bytes())
         todo += imported(imports)
     return digest(seen)
 
 
-@functools.cache
-def _parsed(source: bytes) -> tuple[str, list[ast.stmt]]:
-    """Return the digest of a source file and the import statements at its top level."""
-    imports: list[ast.stmt] = [item for item in ast.parse(source).body if isinstance(item, ast.Import | ast.ImportFrom)]
-    return syntax_digest(source), imports
+def outline(source: bytes) -> Outline:
+    """Return the digest of a source file and the import statements at its top level; an equal source is parsed once."""
+    name = f"{PYTHON}:{EDITION}:{xxhash.xxh3_128_hexdigest(source)}"
+    if name not in outlines:
+        outlines[name] = Outline(*syntax_outline(source))
+    return outlines[name]
 
 
-def imported(statements: Iterable[ast.stmt]) -> Iterator[str]:
+def imported(statements: Iterable[tuple[str, list[str]]]) -> Iterator[str]:
     """Yield the name of each module of neusee.workflows in import statements, such as ``engine.runner``."""
-    for item in statements:
-        if isinstance(item, ast.Import):
-            yield from (_below(alias.name) for alias in item.names if alias.name.startswith(f"{_ROOT}."))
-        elif isinstance(item, ast.ImportFrom) and f"{item.module}.".startswith(f"{_ROOT}."):
-            base = _below(item.module or "")
-            for alias in item.names:
-                module = f"{base}.{alias.name}".lstrip(".")
-                yield module if _source(module) is not None or not base else base
+    for base, names in statements:
+        if not base:
+            yield from (_below(name) for name in names if name.startswith(f"{_ROOT}."))
+        elif f"{base}.".startswith(f"{_ROOT}."):
+            below = _below(base)
+            for name in names:
+                module = f"{below}.{name}".lstrip(".")
+                yield module if _source(module) is not None or not below else below
 
 
 def _below(module: str) -> str:

@@ -64,7 +64,7 @@ class Imports:
         if module == ROOT:
             return True
         inside = package == ROOT or self._kind_of(package) in ("source", "folder")
-        if package in sys.modules and not hasattr(sys.modules[package], "__path__"):
+        if package in sys.modules and "__path__" not in vars(sys.modules[package]):
             return False
         return inside and module_path(module) is not None
 

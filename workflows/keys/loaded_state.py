@@ -8,7 +8,9 @@ Values of classes of other packages count by their type alone.
 from __future__ import annotations
 
 import functools
+import io
 import operator
+import random
 import re
 import sys
 from collections import deque
@@ -28,6 +30,9 @@ from neusee.workflows.keys.code_objects import function_code
 from neusee.workflows.keys.reachable_code import read_names, written_only
 from neusee.workflows.keys.source_summary import Summary
 
+_DISPATCH = getattr(
+    functools.singledispatch(str), "__code__", None
+)  #: of a function that a type chooses, whose closure holds a cache
 _SKIPPED = re.compile(r"__\w+__|_abc_\w*|model_\w+|__pydantic\w*")  #: names of a class that its source decides
 _FORETELLING = frozenset({"shape", "work", "example"})  #: hooks that decide no result: size, cost, and a call to try
 _KINDS: tuple[tuple[str, tuple[type, ...]], ...] = (
@@ -41,6 +46,7 @@ _KINDS: tuple[tuple[str, tuple[type, ...]], ...] = (
     ("function", (FunctionType,)),
     ("class", (type,)),
     ("array", (torch.Tensor, np.ndarray)),
+    ("changing", (torch.Generator, np.random.Generator, np.random.RandomState, random.Random, io.IOBase)),
     ("table", (Mapping,)),
     ("list", (list, tuple, deque)),
     ("set", (set, frozenset)),
@@ -53,10 +59,16 @@ _KINDS: tuple[tuple[str, tuple[type, ...]], ...] = (
 )  #: how values of a type are described; any other value is an object
 
 
-@functools.cache
-def _how(kind: type) -> str:
-    """Return how values of a type are described."""
-    return next((how for how, kinds in _KINDS if issubclass(kind, kinds)), "object")
+class _Hows(dict[type, str]):
+    """How values of a type are described, by type."""
+
+    def __missing__(self, kind: type) -> str:
+        other = "changing" if hasattr(kind, "__next__") else "object"
+        self[kind] = next((how for how, kinds in _KINDS if issubclass(kind, kinds)), other)
+        return self[kind]
+
+
+_HOW = _Hows()
 
 
 class LoadedState:
@@ -65,6 +77,9 @@ class LoadedState:
     def __init__(self, module: ModuleType, functions: Collection[str], followed: Callable[[str], bool]) -> None:
         self.modules: dict[str, set[str]] = {}  #: names of functions and classes that the module holds, by module
         self.replaced: list[str] = []  #: functions of the module's own file whose code is not that of the file
+        self.changing: dict[str, str] = {}  #: types of objects such as generators, by the name that is or holds them
+        self._changes: list[str] = []
+        self._holds: dict[int, list[str]] = {}  # changes in repeated objects, by id
         self._name, self._file = module.__name__, getattr(module, "__file__", "") or ""
         self._folder = self._file.rpartition("/")[0] or "."
         self._functions, self._followed = frozenset(functions), followed
@@ -73,13 +88,21 @@ class LoadedState:
 
     def digest(self, values: Mapping[str, Any]) -> str:
         """Return the digest of named values of the module; names such as ``__file__`` do not count."""
-        state = [(name, self._of(value)) for name, value in sorted(values.items()) if not name.startswith("__")]
+        state: list[Any] = []
+        for name in sorted(values):
+            if name == "__getattr__" or not (name.startswith("__") and name.endswith("__")):
+                state.append((name, self._of(values[name])))
+                if self._changes:
+                    self.changing[name] = self._changes[0]
+                    self._changes = []
         return xxhash.xxh3_128_hexdigest(repr(state).encode(errors="surrogatepass"))
 
     def _of(self, value: Any) -> Any:
         """Return a value as text and tuples that are the same in each process; a repeated object is its number."""
+        if value is None:
+            return _NOTHING
         kind: Any = type(value)
-        how = _how(kind)
+        how = _HOW[kind]
         if how == "plain":
             return kind.__name__, repr(value)
         if how == "text":
@@ -88,14 +111,24 @@ class LoadedState:
             return kind.__name__, value.__qualname__
         if how == "module":
             return kind.__name__, self._noted(value.__name__)
-        if id(value) in self._seen:
-            return "again", self._seen[id(value)]
-        self._seen[id(value)] = len(self._seen)
+        seen, name = self._seen, id(value)
+        if name in seen:
+            self._changes += self._holds.get(name, ())
+            return "again", seen[name]
+        seen[name], before = len(seen), len(self._changes)
         self._kept.append(value)
-        return getattr(self, f"_{how}")(value)
+        told = _DESCRIBED[how](self, value)
+        if len(self._changes) > before:
+            self._holds[name] = self._changes[before:]
+        return told
 
     def _array(self, value: Any) -> Any:
         return type(value).__name__, *_array(value)
+
+    def _changing(self, value: Any) -> Any:
+        """Note an object that changes while a process runs, such as a generator or a file, and return its type."""
+        self._changes.append(type(value).__name__)
+        return self._typed(value)
 
     def _table(self, value: Any) -> Any:
         return self._typed(value), [(self._of(key), self._of(part)) for key, part in list(value.items())]
@@ -135,14 +168,19 @@ class LoadedState:
     def _function(self, function: FunctionType) -> Any:
         """Return a function by module and name, with its defaults and closure if it is local."""
         home, code = str(function.__globals__.get("__name__")), function.__code__
-        self._noted(home, function.__qualname__)
+        if code is _DISPATCH:
+            kinds: Mapping[type, Any] = function.registry  # type: ignore[attr-defined]
+            parts = sorted(kinds.items(), key=lambda item: f"{item[0].__module__}.{item[0].__qualname__}")
+            return "singledispatch", [(self._of(kind), self._of(part)) for kind, part in parts]
         own = home == self._name and code.co_filename == self._file
+        if home != self._name:
+            self._noted(home, function.__qualname__)
         if own and self._functions and function_code(code) not in self._functions:
             self.replaced.append(function.__qualname__)
         local = own or not _found(home, function)
-        parts = (function.__defaults__, function.__kwdefaults__, function.__closure__) if local else ()
+        held = (function.__defaults__, function.__kwdefaults__, function.__closure__) if local else ()
         exact = function_code(code) if local and not own and self._followed(home) else ""
-        return "function", home, code.co_qualname, exact, [part and self._of(part) for part in parts]
+        return "function", home, code.co_qualname, exact, [part and self._of(part) for part in held]
 
     def _class(self, kind: type) -> Any:
         name = ("class", self._noted(kind.__module__, kind.__qualname__), kind.__qualname__)
@@ -167,6 +205,14 @@ class LoadedState:
     def _placed(self, text: str) -> str:
         """Return a text without the folder of the module, so that it is the same for each place of installation."""
         return text.replace(self._folder, "<folder>") if self._folder in text else text
+
+
+_NOTHING = ("NoneType", "None")
+_ATOMS = ("plain", "text", "builtin", "module")
+#: the method that describes a value, by the kind of its type
+_DESCRIBED: dict[str, Callable[[LoadedState, Any], Any]] = {
+    how: getattr(LoadedState, f"_{how}") for how in ("object", *(how for how, _ in _KINDS)) if how not in _ATOMS
+}
 
 
 def counted_values(module: ModuleType, summary: Summary, free: Collection[str], root: bool) -> dict[str, Any]:

@@ -13,8 +13,7 @@ import os
 import re
 import sys
 import sysconfig
-from collections.abc import Sequence
-from importlib import metadata
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -22,6 +21,8 @@ Kind = Literal["python", "distribution", "source", "binary", "folder", "absent",
 _STANDARD = tuple({sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")})
 _INSTALLED = frozenset({"site-packages", "dist-packages"})
 _fixed: dict[str, Origin] = {}  #: origins of packages that do not change while a process runs
+_listed: dict[str, frozenset[str]] = {}  #: names in the folders of packages, as they were at the last `look_again`
+_ENDS = (".py", *importlib.machinery.EXTENSION_SUFFIXES)
 distributions_of: dict[str, list[str]] = {}  #: names of distributions by module, where both names differ
 _BUILD_IN_VERSION = frozenset({"torch"})  #: its version ends with its build, such as ``+cu124``, which is a device
 
@@ -62,9 +63,8 @@ def module_path(module: str) -> str | None:
     parent, _, name = module.rpartition(".")
     if not parent:
         spec = _spec(module)
-        return spec.origin if spec is not None and spec.has_location else None
-    folders = getattr(sys.modules[parent], "__path__", ()) if parent in sys.modules else _folders(parent)
-    return next(filter(None, (_file_in(folder, name) for folder in folders)), None)
+        return spec.origin if spec is not None and spec.has_location and os.path.isfile(spec.origin or "") else None
+    return next(filter(None, (_file_in(folder, name) for folder in _folders_above(module))), None)
 
 
 def module_file(folder: str | Path, names: Sequence[str]) -> Path | None:
@@ -82,7 +82,7 @@ def version_of(top: str) -> str:
     found = _released(top)
     if not found:
         if top not in distributions_of or not all(map(_released, distributions_of[top])):
-            distributions_of[top] = sorted(set(_distributions().get(top, ())))
+            distributions_of[top] = _distributions(top)
         found = ", ".join(map(_released, distributions_of[top]))
     return found
 
@@ -101,31 +101,63 @@ def _plain(name: str) -> str:
 def _releases() -> dict[str, str]:
     """Return the version of each installed distribution, read from the names of the folders of its metadata."""
     found: dict[str, str] = {}
-    for folder in filter(os.path.isdir, sys.path):
-        if not _INSTALLED.isdisjoint(Path(folder).parts):
-            for entry in os.listdir(folder):
-                name, _, version = entry.removesuffix(".dist-info").partition("-")
-                if entry.endswith(".dist-info"):
-                    found.setdefault(_plain(name), version)
+    for folder in _metadata():
+        name, _, version = os.path.basename(folder).removesuffix(".dist-info").partition("-")
+        found.setdefault(_plain(name), version)
     return found
 
 
-@functools.cache
-def _distributions() -> dict[str, list[str]]:
-    return dict(metadata.packages_distributions())
+def _metadata() -> Iterator[str]:
+    """Yield the folder with the metadata of each installed distribution."""
+    for folder in filter(os.path.isdir, sys.path):
+        if not _INSTALLED.isdisjoint(Path(folder).parts):
+            yield from (os.path.join(folder, name) for name in os.listdir(folder) if name.endswith(".dist-info"))
+
+
+def _distributions(top: str) -> list[str]:
+    """Return the names of the distributions that contain a top-level module."""
+    inside = re.compile(rb'^"?%s(/|\.py,|\.[^/,]*(so|pyd),)' % re.escape(top.encode()), re.MULTILINE)
+    found = [folder for folder in _metadata() if _contains(folder, top, inside)]
+    names = (
+        re.search(r"^Name: *(.*?)\s*$", _text(folder, "METADATA").decode(errors="replace"), re.MULTILINE)
+        for folder in found
+    )
+    return sorted({name[1] for name in names if name})
+
+
+def _contains(folder: str, top: str, inside: re.Pattern[bytes]) -> bool:
+    """Return True if a distribution names a top-level module, or if a file of it is in this module."""
+    names = _text(folder, "top_level.txt").decode(errors="replace").split()
+    return top in names if names else inside.search(_text(folder, "RECORD")) is not None
+
+
+def _text(folder: str, name: str) -> bytes:
+    try:
+        with open(os.path.join(folder, name), "rb") as file:
+            return file.read()
+    except OSError:
+        return b""
 
 
 def _without_file(module: str, top: str, packages: frozenset[str]) -> Origin:
     """Return the origin of a module without a file: a folder of modules, a built-in part, or a missing module."""
     if module in sys.modules:
-        if getattr(sys.modules[module], "__path__", None) is not None:
+        inside = vars(sys.modules[module])
+        if inside.get("__path__") is not None and not inside.get("__file__"):
             return Origin("folder")
         installed = "" if top in packages or module == top else version_of(top)
         return Origin("distribution", None, installed) if installed else Origin("nowhere")
     if "." not in module:
         spec = _spec(module)
-        return Origin("absent" if spec is None else "folder")
-    return Origin("absent")
+        return Origin("absent" if spec is None else "nowhere" if spec.has_location else "folder")
+    found = any(not os.path.isdir(folder) for folder in _folders_above(module))
+    return Origin("nowhere" if found else "absent")
+
+
+def _folders_above(module: str) -> list[str]:
+    """Return the folders of the package that a module is in."""
+    parent = module.rpartition(".")[0]
+    return list(vars(sys.modules[parent]).get("__path__", ())) if parent in sys.modules else _folders(parent)
 
 
 def _folders(package: str) -> list[str]:
@@ -134,8 +166,7 @@ def _folders(package: str) -> list[str]:
     if not parent:
         spec = _spec(package)
         return list(spec.submodule_search_locations or ()) if spec is not None else []
-    above = getattr(sys.modules[parent], "__path__", ()) if parent in sys.modules else _folders(parent)
-    return [path for folder in above if os.path.isdir(path := os.path.join(folder, name))]
+    return [path for folder in _folders_above(package) if os.path.isdir(path := os.path.join(folder, name))]
 
 
 def _spec(top: str) -> importlib.machinery.ModuleSpec | None:
@@ -146,11 +177,19 @@ def _spec(top: str) -> importlib.machinery.ModuleSpec | None:
 
 
 def _file_in(folder: str, name: str) -> str | None:
-    found = module_file(folder, [name])
-    if found is not None:
-        return str(found)
-    files = (os.path.join(folder, f"{name}{suffix}") for suffix in importlib.machinery.EXTENSION_SUFFIXES)
-    return next((file for file in files if os.path.isfile(file)), None)
+    """Return the file of a module in a folder, or None."""
+    if folder not in _listed:
+        _listed[folder] = frozenset(os.listdir(folder) if os.path.isdir(folder) else ())
+    if name in _listed[folder]:
+        found = module_file(folder, [name])
+        if found is not None:
+            return str(found)
+    return next((os.path.join(folder, name + end) for end in _ENDS if name + end in _listed[folder]), None)
+
+
+def look_again() -> None:
+    """Forget which files are in which folders, because a file may be new."""
+    _listed.clear()
 
 
 def _shadowed(top: str) -> bool:

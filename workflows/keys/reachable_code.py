@@ -6,6 +6,8 @@ import ast
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
+from neusee.workflows.keys.syntax_pass import Block, Kinds, each
+
 _QUIET = ("node", "pytest", "hypothesis", "functools", "staticmethod", "dataclass", "torch.no_grad")
 _WRITERS = frozenset({"append", "add", "extend", "update", "insert", "appendleft", "clear"})
 _DEFINITION = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
@@ -21,9 +23,9 @@ class Statement(NamedTuple):
     writes: list[str]  #: names whose object it changes, as in ``log.append(x)``
 
 
-def statements(tree: ast.Module) -> list[Statement]:
+def statements(blocks: Iterable[Block]) -> list[Statement]:
     """Return the statements at the top level of a module."""
-    return [_statement(item) for item in tree.body]
+    return [_statement(block.item, block.kinds) for block in blocks]
 
 
 def reached(parts: Sequence[Statement], names: Collection[str] | None) -> Iterator[range]:
@@ -58,22 +60,23 @@ def written_only(parts: Sequence[Statement]) -> set[str]:
     return {name for part in parts for name in part.writes} - {name for part in parts for name in part.refers}
 
 
-def _statement(item: ast.stmt) -> Statement:
+def _statement(item: ast.stmt, kinds: Kinds) -> Statement:
     marks = item.decorator_list if isinstance(item, _DEFINITION) else []
     first = min([item.lineno, *(mark.lineno for mark in marks)])
-    written = {id(part) for inner in ast.walk(item) for part in _noted(inner)}
-    loads = [part for part in ast.walk(item) if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Load)]
+    written = {id(part) for part in _noted(kinds)}
+    loads = [part for part in each(kinds, ast.Name) if isinstance(part.ctx, ast.Load)]
     refers = {part.id for part in loads if id(part) not in written}
     writes = {part.id for part in loads if id(part) in written}
     return Statement(first, item.end_lineno or item.lineno, sorted(_binds(item)), sorted(refers), sorted(writes))
 
 
-def _noted(item: ast.AST) -> Iterator[ast.AST]:
+def _noted(kinds: Kinds) -> Iterator[ast.AST]:
     """Yield the name in ``name.append(x)`` and ``name[i] = x``, which write to an object and do not read it."""
-    if isinstance(item, ast.Expr) and isinstance(item.value, ast.Call) and isinstance(item.value.func, ast.Attribute):
-        if item.value.func.attr in _WRITERS:
-            yield item.value.func.value
-    elif isinstance(item, ast.Assign):
+    for item in each(kinds, ast.Expr):
+        called = item.value.func if isinstance(item.value, ast.Call) else None
+        if isinstance(called, ast.Attribute) and called.attr in _WRITERS:
+            yield called.value
+    for item in each(kinds, ast.Assign):
         yield from (target.value for target in item.targets if isinstance(target, ast.Subscript))
 
 

@@ -3,7 +3,7 @@
 A record is a dict that is written as one line of JSON. `seal_record` adds the fields ``format``, ``seal`` (xxh3 of all
 bytes before it) and ``sign`` (HMAC-SHA256 of format, key and SHA-256 of these bytes). The checksum finds damage; only
 the signature finds a forgery. ``NEUSEE_CACHE_SECRET`` holds the secret, or several separated by commas: the first one
-signs, and each one is accepted.
+signs, and each one is accepted. A file of another kind begins with such a record, which holds the SHA-256 of the rest.
 """
 
 from __future__ import annotations
@@ -90,6 +90,21 @@ def unseal_record(raw: bytes) -> dict[str, Any]:
     if secrets():
         check_signature(sign, str(record.get("key", "")), hashlib.sha256(body).digest())
     return record
+
+
+def seal_file(name: str, content: bytes) -> bytes:
+    """Return the record that `unseal_file` compares with a content; the signature covers the name and the content."""
+    return seal_record({"key": name, "sha256": hashlib.sha256(content).hexdigest()})
+
+
+def unseal_file(name: str, seal: bytes, content: bytes) -> bytes:
+    """Return the content of a file whose seal is right.
+
+    Raises `NotRead` for another format version or a missing signature, and `ValueError` for any other content or name.
+    """
+    if unseal_record(seal) != {"key": name, "sha256": hashlib.sha256(content).hexdigest()}:
+        raise ValueError(f"the content of {name} is not what was sealed")
+    return content
 
 
 def checked_body(raw: bytes) -> tuple[bytes, str]:

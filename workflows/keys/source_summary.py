@@ -13,12 +13,14 @@ from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_objects import functions_of
 from neusee.workflows.keys.module_origin import module_file
 from neusee.workflows.keys.reachable_code import Statement, statements
+from neusee.workflows.keys.syntax_pass import Kinds, Syntax, each
 from neusee.workflows.keys.unfollowed_constructs import Construct, constructs, literal_import
 
-__all__ = ["ROOT", "Import", "Summary", "Use", "module_file", "summarise", "syntax_digest"]
+__all__ = ["ROOT", "Import", "Summary", "Use", "module_file", "summarise", "syntax_outline"]
 
 ROOT = "neusee.nodes"
 _parsing = threading.Lock()  #: lock of the parser of Python 3.11, which miscounts the depth in two threads
+_READS = ("__doc__", "getdoc", "cleandoc", "getcomments")  #: names by which code reads docstrings
 _SHORT = 16  #: digits of the digest of a definition
 _LARGE = frozenset({"torch", "numpy", "scipy", *sys.stdlib_module_names})  #: packages of which no chain is noted
 
@@ -45,88 +47,81 @@ class Summary(NamedTuple):
 def summarise(source: bytes) -> Summary:
     """Return the summary of a source file; comments, layout and docstrings do not affect the digests."""
     with _parsing:
-        tree = ast.parse(source)
+        parsed = ast.parse(source)
         functions = functions_of(source)
-    whole, documents = digest(ast.dump(tree)), any(_reads_docstrings(item) for item in ast.walk(tree))
-    _without_docstrings(tree)
-    text, definitions = digest(ast.dump(tree)), _definitions(tree)
-    depends = [entry for item in tree.body for entry in _declared(item)]
-    tree = _as_run(tree)
-    imports, bound = _imports(tree)
+    tree = Syntax(parsed)
+    text = _digest_of(tree)
+    depends = [entry for item, _ in tree.texts for entry in _declared(item)]
+    imports, bound = _imports(tree.all)
     binds = sorted(name for name, ways in bound.items() if any(way[2] for way in ways))
     names = {
         name: ".".join(filter(None, way[1:])) for name, ways in bound.items() for way in sorted(ways) if not way[0]
     }
-    imports += [way for call in ast.walk(tree) if (way := _by_literal(call, names)) is not None]
-    uses = _uses(tree, {name: {way for way in ways if _chained(way)} for name, ways in bound.items()})
-    found = constructs(tree, names)
-    parts = statements(tree)
-    return Summary(text, whole, documents, imports, binds, uses, definitions, functions, found, parts, depends)
+    imports += [way for call in each(tree.all, ast.Call) if (way := _by_literal(call, names)) is not None]
+    return Summary(
+        text,
+        digest(text, tree.documents),
+        any(map(_reads_docstrings, (tree.all, tree.not_run))),
+        imports,
+        binds,
+        _uses(tree.all, {name: {way for way in ways if _chained(way)} for name, ways in bound.items()}),
+        _definitions(tree.texts),
+        functions,
+        constructs(tree, names),
+        statements(tree.blocks),
+        depends,
+    )
 
 
-def syntax_digest(source: bytes) -> str:
-    """Return the digest of the syntax tree of a source file, which no comment, layout or docstring affects."""
+def syntax_outline(source: bytes) -> tuple[str, list[tuple[str, list[str]]]]:
+    """Return the digest of the syntax tree of a source file, and the import statements at its top level.
+
+    No comment, layout or docstring affects the digest. An import statement is the module in ``from a import b, c`` with
+    the names, or an empty text with the modules of ``import a, b``.
+    """
     with _parsing:
         tree = ast.parse(source)
-    _without_docstrings(tree)
-    return digest(ast.dump(tree))
+    found = [item for item in tree.body if isinstance(item, ast.Import | ast.ImportFrom)]
+    imports = [(getattr(item, "module", "") or "", [alias.name for alias in item.names]) for item in found]
+    return _digest_of(Syntax(tree)), imports
 
 
-def _without_docstrings(tree: ast.Module) -> None:
-    for item in ast.walk(tree):
-        documented = isinstance(item, ast.Module | ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)
-        if documented and ast.get_docstring(item, clean=False) is not None:  # type: ignore[arg-type]
-            item.body = item.body[1:]  # type: ignore[attr-defined]
+def _digest_of(tree: Syntax) -> str:
+    return digest([text for _, text in tree.texts])
 
 
-def _imports(tree: ast.Module) -> tuple[list[Import], dict[str, set[Import]]]:
+def _imports(kinds: Kinds) -> tuple[list[Import], dict[str, set[Import]]]:
     """Return the imports of a module, and the import of each name that an import binds."""
     imports: list[Import] = []
     bound: dict[str, set[Import]] = defaultdict(set)
-    for item in ast.walk(tree):
-        if isinstance(item, ast.Import):
-            imports += [(0, alias.name, "") for alias in item.names]
-            for alias in item.names:
-                bound[alias.asname or _top(alias.name)].add((0, alias.name if alias.asname else _top(alias.name), ""))
-        elif isinstance(item, ast.ImportFrom):
-            ways = [(item.level, item.module or "", alias.name) for alias in item.names]
-            imports += ways
-            for alias, way in zip(item.names, ways, strict=True):
-                bound[alias.asname or alias.name].add(way)
+    for item in each(kinds, ast.Import):
+        imports += [(0, alias.name, "") for alias in item.names]
+        for alias in item.names:
+            bound[alias.asname or _top(alias.name)].add((0, alias.name if alias.asname else _top(alias.name), ""))
+    for item in each(kinds, ast.ImportFrom):
+        ways = [(item.level, item.module or "", alias.name) for alias in item.names]
+        imports += ways
+        for alias, way in zip(item.names, ways, strict=True):
+            bound[alias.asname or alias.name].add(way)
     return list(dict.fromkeys(imports)), bound
 
 
-def _by_literal(call: ast.AST, names: Mapping[str, str]) -> Import | None:
-    """Return the import in a call such as ``import_module("a.b")``, or None for anything else."""
-    module = literal_import(call, names) if isinstance(call, ast.expr) else None
+def _by_literal(call: ast.Call, names: Mapping[str, str]) -> Import | None:
+    """Return the import in a call such as ``import_module("a.b")``, or None for any other call."""
+    module = literal_import(call, names)
     return (module and (len(module) - len(module.lstrip(".")), module.lstrip("."), "")) or None
 
 
-def _as_run(tree: ast.Module) -> ast.Module:
-    """Return a module without the blocks that a process does not run: for types alone, and for a program."""
-    return _Run().visit(tree)  # type: ignore[no-any-return]
-
-
-class _Run(ast.NodeTransformer):
-    """A transformer that removes the branches for type checkers and for a program that is run by its file."""
-
-    def visit_If(self, item: ast.If) -> list[ast.stmt] | ast.AST:
-        test = ast.unparse(item.test)
-        if test in ("TYPE_CHECKING", "typing.TYPE_CHECKING", "__name__ == '__main__'"):
-            return [self.visit(part) for part in item.orelse] or ast.copy_location(ast.Pass(), item)
-        return self.generic_visit(item)
-
-
-def _reads_docstrings(item: ast.AST) -> bool:
-    """Return True for an expression that reads a docstring as data."""
-    attribute = isinstance(item, ast.Attribute) and item.attr in ("__doc__", "getdoc", "cleandoc", "getcomments")
-    name = isinstance(item, ast.Name) and item.id in ("__doc__", "getdoc") and isinstance(item.ctx, ast.Load)
-    return attribute or name or (isinstance(item, ast.Constant) and item.value == "__doc__")
+def _reads_docstrings(kinds: Kinds) -> bool:
+    """Return True for code that reads a docstring as data."""
+    by_attribute = any(item.attr in _READS for item in each(kinds, ast.Attribute))
+    by_name = any(item.id in _READS[:2] and isinstance(item.ctx, ast.Load) for item in each(kinds, ast.Name))
+    return by_attribute or by_name or any(item.value == "__doc__" for item in each(kinds, ast.Constant))
 
 
 def _declared(item: ast.stmt) -> list[str]:
     """Return the entries of ``__depends__ = ("table.csv", "env:NAME")``."""
-    if not isinstance(item, ast.Assign) or "__depends__" not in [ast.unparse(target) for target in item.targets]:
+    if not isinstance(item, ast.Assign) or "__depends__" not in [getattr(name, "id", "") for name in item.targets]:
         return []
     try:
         entries = ast.literal_eval(item.value)
@@ -148,21 +143,22 @@ def _top(module: str) -> str:
     return module.partition(".")[0]
 
 
-def _uses(tree: ast.Module, bound: dict[str, set[Import]]) -> list[Use]:
+def _uses(kinds: Kinds, bound: dict[str, set[Import]]) -> list[Use]:
     """Return each use of an imported name in an expression such as ``a.b.c``, and each use of a whole package."""
     lines: dict[tuple[int, str, str, str], int] = {}
-    for name, attributes, line in _chains(tree):
+    for name, attributes, line in _chains(kinds):
         for way in bound.get(name, ()):
             if attributes or ".".join(filter(None, way[1:])) in ("neusee", ROOT, "nodes"):
-                lines.setdefault((*way, ".".join(attributes)), line)
+                use = (*way, ".".join(attributes))
+                lines[use] = min(line, lines.get(use, line))
     return sorted((*use, line) for use, line in lines.items())
 
 
-def _chains(tree: ast.Module) -> Iterator[tuple[str, list[str], int]]:
+def _chains(kinds: Kinds) -> Iterator[tuple[str, list[str], int]]:
     """Yield the first name, the attributes and the line number of each expression such as ``a.b.c`` in a module."""
-    inner: set[int] = set()  # parts of earlier expressions, because the walk yields an expression before its parts
-    for item in ast.walk(tree):
-        if id(item) in inner or not isinstance(item, ast.Attribute | ast.Name):
+    inner: set[int] = set()  # parts of earlier expressions, because an expression comes before its parts
+    for item in each(kinds, ast.Attribute, ast.Name):
+        if id(item) in inner:
             continue
         here: ast.expr = item
         attributes: list[str] = []
@@ -174,17 +170,16 @@ def _chains(tree: ast.Module) -> Iterator[tuple[str, list[str], int]]:
             yield here.id, attributes[::-1], item.lineno
 
 
-def _definitions(tree: ast.Module) -> dict[str, str]:
+def _definitions(texts: Iterable[tuple[ast.stmt, str]]) -> dict[str, str]:
     """Return the digest of each top-level definition of a module, by labels such as ``psf()`` or ``class Psf``.
 
     Definitions with the same label share one digest.
     """
-    dumps: dict[str, list[str]] = defaultdict(list)
-    for item in tree.body:
-        dump = ast.dump(item)
+    found: dict[str, list[str]] = defaultdict(list)
+    for item, text in texts:
         for label in _labels(item):
-            dumps[label].append(dump)
-    return {label: digest(parts)[:_SHORT] for label, parts in dumps.items()}
+            found[label].append(text)
+    return {label: digest(parts)[:_SHORT] for label, parts in found.items()}
 
 
 def _labels(item: ast.stmt) -> Iterable[str]:

@@ -12,6 +12,8 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
+from neusee.workflows.keys.syntax_pass import Kinds, Scope, Syntax, each
+
 _CLOCK = "a clock, a process or a machine decides"
 _DRAWN = "random numbers without a seed: draw them from a parameter rng"
 _RUN = "code that no import names is run"
@@ -19,15 +21,24 @@ _BY_NAME = "a module is imported by a name that only a run knows"
 _VARIABLE = "an environment variable is read"
 _FILE = "a file is read that is no parameter"
 
+_SETTING = "a setting of the process decides"
+_DRAWING = (
+    *("os.urandom", "secrets", "random", "torch.initial_seed", "torch.seed", "torch.get_rng_state"),
+    *("torch.random.get_rng_state", "numpy.random.get_state"),
+)
+_TIMES = ("time", "perf_counter", "monotonic", "process_time", "thread_time")
+
 _LEGACY = ("rand", "randn", "randint", "random", "normal", "uniform", "choice", "permutation", "shuffle", "poisson")
 
 #: What the names of Python and of libraries do, by their first parts.
 _NAMES: Mapping[str, tuple[str, str]] = {
-    **dict.fromkeys(("os.environ", "os.environb", "os.getenv", "os.getenvb"), ("env", _VARIABLE)),
+    **dict.fromkeys(("os.environ", "os.environb", "os.getenv", "os.getenvb", "os.path.expandvars"), ("env", _VARIABLE)),
     **dict.fromkeys(("importlib.import_module", "__import__", "importlib.__import__", "runpy"), ("import", _BY_NAME)),
     **dict.fromkeys(("sys.modules", "importlib.util", "importlib.machinery"), ("import", _BY_NAME)),
     **dict.fromkeys(("pkgutil.iter_modules", "pkgutil.walk_packages", "importlib.metadata"), ("import", _BY_NAME)),
     **dict.fromkeys(("exec", "eval", "compile", "ctypes.CDLL", "ctypes.cdll", "types.FunctionType"), ("run", _RUN)),
+    **dict.fromkeys(("ctypes.PyDLL", "ctypes.pydll", "ctypes.pythonapi", "ctypes.util.find_library"), ("run", _RUN)),
+    **dict.fromkeys(("numpy.ctypeslib.load_library",), ("run", _RUN)),
     **dict.fromkeys(("subprocess", "os.system", "os.popen", "multiprocessing", "types.CodeType"), ("run", _RUN)),
     **dict.fromkeys(
         ("pickle.load", "pickle.loads", "marshal.loads", "cffi", "torch.utils.cpp_extension"), ("run", _RUN)
@@ -39,13 +50,16 @@ _NAMES: Mapping[str, tuple[str, str]] = {
     **dict.fromkeys(("os.getcwd", "pathlib.Path.cwd"), ("file", _FILE)),
     **dict.fromkeys(("pathlib.Path.home", "os.path.expanduser", "sys.path", "sys.argv"), ("state", _CLOCK)),
     **dict.fromkeys(("os.cpu_count", "os.getpid", "os.uname", "platform", "getpass", "uuid"), ("state", _CLOCK)),
-    **dict.fromkeys(("time.time", "time.time_ns", "time.localtime", "time.gmtime", "time.strftime"), ("state", _CLOCK)),
-    **dict.fromkeys(("datetime.datetime.now", "datetime.datetime.today", "datetime.date.today"), ("state", _CLOCK)),
+    **{f"time.{name}{unit}": ("state", _CLOCK) for name in _TIMES for unit in ("", "_ns")},
+    **{f"time.{name}": ("state", _CLOCK) for name in ("localtime", "gmtime", "strftime", "ctime", "asctime")},
+    **{f"datetime.datetime.{name}": ("state", _CLOCK) for name in ("now", "utcnow", "today")},
+    **dict.fromkeys(("datetime.date.today", "threading.get_ident", "resource", "tracemalloc"), ("state", _CLOCK)),
+    **dict.fromkeys(("locale", "decimal", "numpy.geterr", "numpy.get_printoptions"), ("state", _SETTING)),
     **dict.fromkeys(("torch.get_num_threads", "torch.get_num_interop_threads", "psutil"), ("state", _CLOCK)),
     **dict.fromkeys(
         ("torch.cuda.is_available", "torch.cuda.device_count", "torch.cuda.get_device_name"), ("state", _CLOCK)
     ),
-    **dict.fromkeys(("os.urandom", "secrets", "torch.initial_seed", "torch.seed", "random"), ("state", _DRAWN)),
+    **dict.fromkeys(_DRAWING, ("state", _DRAWN)),
     **{
         f"numpy.random.{name}": ("state", _DRAWN)
         for name in ("rand", "randn", "randint", "random", "normal", "uniform")
@@ -53,9 +67,12 @@ _NAMES: Mapping[str, tuple[str, str]] = {
     **{f"numpy.random.{name}": ("state", _DRAWN) for name in _LEGACY},
 }
 _BUILTINS = frozenset({"exec", "eval", "compile", "__import__", "__file__", "__spec__", "__loader__"})
-_METHODS = frozenset({"open", "read_text", "read_bytes", "iterdir", "glob", "rglob"})  #: of a path
+_METHODS = frozenset(
+    {"open", "read_text", "read_bytes", "iterdir", "glob", "rglob", "exists", "is_file", "is_dir", "stat", "lstat"}
+)  #: of a path
 _READERS = re.compile(  #: functions of libraries that read a file
-    r"(open|io\.open|codecs\.open|os\.open|glob\.i?glob|os\.(listdir|scandir|walk)|"
+    r"(open|io\.open|codecs\.open|os\.open|glob\.i?glob|os\.(listdir|scandir|walk|stat|lstat|access|readlink)|"
+    r"os\.path\.(exists|lexists|isfile|isdir|islink|getsize|getmtime|getctime|samefile)|"
     r"(numpy|torch)\.(load|loadtxt|genfromtxt|fromfile|memmap|from_file)|"
     r"PIL\.Image\.open|safetensors\.safe_open|safetensors\.\w+\.(load_file|safe_open)|h5py\.File|scipy\.io\.loadmat|"
     r"pandas\.read_\w+|.*\.imread|.*\.imopen|gzip\.open|bz2\.open|lzma\.open|zipfile\.ZipFile|tarfile\.open|"
@@ -79,10 +96,10 @@ class Construct(NamedTuple):
     line: int
 
 
-def constructs(tree: ast.Module, bound: Mapping[str, str]) -> list[Construct]:
+def constructs(tree: Syntax, bound: Mapping[str, str]) -> list[Construct]:
     """Return each construct of a module that is not followed; ``bound`` has the full name of each imported name."""
-    own = {name for item in ast.walk(tree) for name in _bound_here(item)}
-    found = [*_named(tree, bound, own), *_read(tree, bound, own), *_file_names(tree)]
+    own = _bound_here(tree.all)
+    found = [*_named(tree.all, bound, own), *_read(tree.calls, bound, own), *_file_names(tree.all)]
     return sorted(set(found), key=lambda item: (item.line, item))
 
 
@@ -108,30 +125,25 @@ def literal_import(call: ast.expr, bound: Mapping[str, str]) -> str | None:
 _IMPORTERS = ("importlib.import_module", "importlib.__import__", "__import__", "importlib.util.find_spec")
 
 
-def _bound_here(item: ast.AST) -> Iterator[str]:
-    """Yield the names that a statement or an argument binds, so that they hide a builtin of the same name."""
-    if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-        yield item.name
-    elif isinstance(item, ast.arg):
-        yield item.arg
-    elif isinstance(item, ast.Name) and not isinstance(item.ctx, ast.Load):
-        yield item.id
+def _bound_here(kinds: Kinds) -> set[str]:
+    """Return the names that statements and arguments bind, so that they hide a builtin of the same name."""
+    found = {item.name for item in each(kinds, ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)}
+    found |= {item.arg for item in each(kinds, ast.arg)}
+    return found | {item.id for item in each(kinds, ast.Name) if not isinstance(item.ctx, ast.Load)}
 
 
-def _named(tree: ast.Module, bound: Mapping[str, str], own: set[str]) -> Iterator[Construct]:
+def _named(kinds: Kinds, bound: Mapping[str, str], own: set[str]) -> Iterator[Construct]:
     """Yield each use of a name that reads what no import shows, such as ``os.environ``."""
-    known = {id(call.func) for call in ast.walk(tree) if isinstance(call, ast.Call) and literal_import(call, bound)}
-    known |= {id(part) for use in ast.walk(tree) if isinstance(use, ast.Attribute) for part in [use.value]}
-    names = {id(use): name for use, name in _variables(tree, bound)}
-    for item in ast.walk(tree):
-        if not isinstance(item, ast.Attribute | ast.Name) or id(item) in known or not isinstance(item.ctx, ast.Load):
+    known = {id(call.func) for call in each(kinds, ast.Call) if literal_import(call, bound)}
+    known |= {id(use.value) for use in each(kinds, ast.Attribute)}
+    names = {id(use): name for use, name in _variables(kinds, bound)}
+    for item in each(kinds, ast.Attribute, ast.Name):
+        if id(item) in known or not isinstance(item.ctx, ast.Load):
+            continue
+        base = _first_name(item)
+        if base not in bound and (base in own or base not in _BUILTINS):
             continue
         full = dotted(item, bound)
-        first = full.partition(".")[0]
-        if isinstance(item, ast.Name) and item.id in own and item.id not in bound:
-            continue
-        if first not in _BUILTINS and _first_name(item) not in bound:
-            continue
         if entry := _entry(full):
             yield Construct(entry[0], names.get(id(_environ(item)), ""), full, entry[1], item.lineno)
 
@@ -152,31 +164,22 @@ def _environ(item: ast.expr) -> ast.expr:
     return item.value if isinstance(item, ast.Attribute) and item.attr in ("get", "__getitem__", "pop") else item
 
 
-def _variables(tree: ast.Module, bound: Mapping[str, str]) -> Iterator[tuple[ast.expr, str]]:
+def _variables(kinds: Kinds, bound: Mapping[str, str]) -> Iterator[tuple[ast.expr, str]]:
     """Yield the expression and the variable of each ``os.environ["X"]``, ``os.environ.get("X")`` and so on."""
-    for item in ast.walk(tree):
-        key: ast.expr | None = None
-        if isinstance(item, ast.Subscript):
-            use, key = item.value, item.slice
-        elif isinstance(item, ast.Call) and item.args:
-            use, key = _environ(item.func), item.args[0]
-        if (
-            isinstance(key, ast.Constant)
-            and isinstance(key.value, str)
-            and (_entry(dotted(use, bound)) or " ")[0] == "env"
-        ):
-            yield use, key.value
+    pairs = [(item.value, item.slice) for item in each(kinds, ast.Subscript)]
+    pairs += [(_environ(item.func), item.args[0]) for item in each(kinds, ast.Call) if item.args]
+    for use, key in pairs:
+        if (name := _literal(key)) and (_entry(dotted(use, bound)) or " ")[0] == "env":
+            yield use, name
 
 
-def _read(tree: ast.Module, bound: Mapping[str, str], own: set[str]) -> Iterator[Construct]:
+def _read(calls: Iterable[tuple[Scope, ast.Call]], bound: Mapping[str, str], own: set[str]) -> Iterator[Construct]:
     """Yield each call that reads a file whose path does not come from an argument of the function around it."""
-    for scope, item in _with_scope(tree, ()):
-        if not isinstance(item, ast.Call):
-            continue
+    for scope, item in calls:
         full = dotted(item.func, bound)
         method = isinstance(item.func, ast.Attribute) and item.func.attr in _METHODS
-        called = _READERS.fullmatch(full) and (_first_name(item.func) in bound or (full == "open" and full not in own))
-        if called:
+        known = _first_name(item.func) in bound or (full == "open" and full not in own)
+        if known and _READERS.fullmatch(full):
             path = item.args[0] if item.args else next((word.value for word in item.keywords), None)
         elif method and isinstance(item.func, ast.Attribute) and _first_name(item.func) not in bound:
             path = item.func.value
@@ -196,20 +199,6 @@ def _writes(call: ast.Call) -> bool:
 def _literal(path: ast.AST) -> str:
     """Return the text of a literal, or an empty text for anything else."""
     return path.value if isinstance(path, ast.Constant) and isinstance(path.value, str) else ""
-
-
-Scope = tuple[ast.AST, ...]  #: the functions around an expression, the outermost first
-
-
-def _with_scope(item: ast.AST, scope: Scope) -> Iterator[tuple[Scope, ast.AST]]:
-    """Yield each part of a module with the functions around it."""
-    todo: list[tuple[Scope, ast.AST]] = [(scope, item)]
-    while todo:
-        around, part = todo.pop()
-        yield around, part
-        if isinstance(part, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-            around = (*around, part)
-        todo += [(around, child) for child in ast.iter_child_nodes(part)]
 
 
 def _given(path: ast.expr, scope: Scope, seen: frozenset[str]) -> bool:
@@ -253,10 +242,9 @@ def _assigned(function: ast.AST) -> Iterator[tuple[str, ast.expr]]:
                 yield from ((part.id, value) for part in ast.walk(target) if isinstance(part, ast.Name))
 
 
-def _file_names(tree: ast.Module) -> Iterator[Construct]:
+def _file_names(kinds: Kinds) -> Iterator[Construct]:
     """Yield each text that is the name of a file of data, where it may become a path: in a call or as a constant."""
-    said = [item for item in ast.walk(tree) if isinstance(item, ast.Raise | ast.JoinedStr)]
-    spoken = {id(part) for item in said for part in ast.walk(item)}
-    for item in ast.walk(tree):
-        if isinstance(item, ast.Constant) and id(item) not in spoken and _FILE_NAME.fullmatch(text := _literal(item)):
+    spoken = {id(part) for item in each(kinds, ast.Raise, ast.JoinedStr) for part in ast.walk(item)}
+    for item in each(kinds, ast.Constant):
+        if _FILE_NAME.fullmatch(text := _literal(item)) and id(item) not in spoken:
             yield Construct("file", text, repr(text), _FILE, item.lineno)

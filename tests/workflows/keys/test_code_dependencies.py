@@ -10,6 +10,7 @@ import os
 import shutil
 import sys
 import types
+import zipfile
 
 import pytest
 import torch
@@ -255,6 +256,43 @@ EDITS = {
         {ONE: source("part * k", "from neusee.nodes.kinds._two import *"), TWO: "part = 2.0\n"},
         (TWO, "2.0", "3.0"),
     ),
+    "single dispatch, registered elsewhere": (
+        {
+            ONE: source("part(k)", "from neusee.nodes.kinds import _fill\nfrom neusee.nodes.kinds._two import part\n"),
+            TWO: "from functools import singledispatch\n\n\n@singledispatch\ndef part(x):\n    return x\n",
+            "kinds/_fill.py": "from neusee.nodes.kinds._two import part\n\n\n@part.register\ndef _(x: float):\n"
+            "    return 2.0 * x\n",
+        },
+        ("kinds/_fill.py", "2.0", "3.0"),
+    ),
+    "match on an enumeration of another file": (
+        {
+            ONE: source(
+                "pick(Kind.A)",
+                "from neusee.nodes.kinds._two import Kind\n\n\ndef pick(kind):\n    match kind:\n        case Kind.B:\n"
+                "            return 3.0\n        case _:\n            return 2.0\n",
+            ),
+            TWO: "from enum import Enum\n\n\nclass Kind(Enum):\n    A = 1\n    B = 2\n",
+        },
+        (TWO, "B = 2", "B = 1"),
+    ),
+    "attribute that a metaclass of another file sets": (
+        {
+            ONE: source("part.s", FROM),
+            TWO: "from neusee.nodes.kinds._meta import Base\n\n\nclass part(Base):\n    pass\n",
+            "kinds/_meta.py": "class Meta(type):\n    @property\n    def s(cls):\n        return 2.0\n\n\n"
+            "class Base(metaclass=Meta):\n    pass\n",
+        },
+        ("kinds/_meta.py", "2.0", "3.0"),
+    ),
+    "module with its own getattr": (
+        {
+            ONE: source("part", FROM),
+            TWO: "def __getattr__(name):\n    if name != 'part':\n        raise AttributeError(name)\n"
+            "    return 2.0\n",
+        },
+        (TWO, "2.0", "3.0"),
+    ),
     "lambda in a list": (
         {ONE: source("part[0](k)", FROM), TWO: "part = [lambda x: 2.0 * x]\n"},
         (TWO, "2.0", "3.0"),
@@ -309,11 +347,75 @@ REFUSED = {
     "clock": ({ONE: source("time.time()", "import time")}, "time.time: a clock"),
     "threads": ({ONE: source("torch.get_num_threads()")}, "torch.get_num_threads: "),
     "device": ({ONE: source("torch.cuda.is_available()")}, "torch.cuda.is_available: "),
+    "library of C by numpy": (
+        {ONE: source("np.ctypeslib.load_library('x', '.')", "import numpy as np")},
+        "numpy.ctypeslib.load_library: code that no import names",
+    ),
+    "functions of Python by ctypes": ({ONE: source("ctypes.pythonapi", "import ctypes")}, "ctypes.pythonapi: code"),
+    "locale": ({ONE: source("locale.atof('2,5')", "import locale")}, "locale.atof: a setting of the process"),
+    "timer": ({ONE: source("time.perf_counter()", "import time")}, "time.perf_counter: a clock"),
+    "context of decimal numbers": (
+        {ONE: source("float(Decimal(1) / 3)", "from decimal import Decimal")},
+        "decimal.Decimal: a setting of the process",
+    ),
+    "setting of numpy": ({ONE: source("len(np.geterr()['over'])", "import numpy as np")}, "numpy.geterr: a setting"),
+    "existence of a file": (
+        {ONE: source("2.0 if Path('/tmp/flag').exists() else 3.0", "from pathlib import Path")},
+        r"Path\('/tmp/flag'\)\.exists\(\): a file is read",
+    ),
+    "size of a file": (
+        {ONE: source("os.path.getsize('/tmp/flag')", "import os")},
+        r"os.path.getsize\('/tmp/flag'\): a file is read",
+    ),
+    "variables in a path": (
+        {ONE: source("len(os.path.expandvars('$HOME'))", "import os")},
+        "os.path.expandvars: an environment variable",
+    ),
+    "generator of the module": (
+        {ONE: source("next(part)", "part = (float(i) for i in range(9))")},
+        r"__init__\.py: part is or holds a generator, .*depends=\[\"unaffected:part\"\]",
+    ),
+    "counter of a helper": (
+        {ONE: source("next(part)", FROM), TWO: "import itertools\n\npart = itertools.count(2.0)\n"},
+        r"\.py: part is or holds a count, ",
+    ),
+    "random numbers of the module": (
+        {ONE: source("part.random()", "import numpy as np\npart = np.random.default_rng(1)")},
+        r"__init__\.py: part is or holds a Generator, ",
+    ),
+    "random numbers of a class": (
+        {ONE: source("part.rng.seed()", FROM), TWO: "import torch\n\n\nclass part:\n    rng = torch.Generator()\n"},
+        r"_two\.py: part is or holds a Generator, ",
+    ),
     "numbers without a seed": ({ONE: source("np.random.rand()", "import numpy as np")}, "numpy.random.rand: random"),
     "declared file that is missing": ({ONE: source("k", depends="depends=['no.csv']")}, "depends='no.csv' is no file"),
     "declared text that is no list": ({ONE: source("k", "__depends__ = 3")},
         "__depends__ must be a tuple of texts"),
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("inside", ["at the top", "in a function", "as a package"])
+def test_a_helper_in_an_archive_is_refused_by_name(lab, inside, monkeypatch):
+    name = "kinds_packed/__init__.py" if inside == "as a package" else "kinds_packed.py"
+    with zipfile.ZipFile(lab.folder / "lib" / "a.zip", "w") as file:
+        file.writestr(name, "def part(x):\n    return 2.0 * x\n")
+    monkeypatch.syspath_prepend(str(lab.folder / "lib" / "a.zip"))
+    line = "from kinds_packed import part"
+    before = f"def part(x):\n    {line} as f\n    return f(x)\n" if inside == "in a function" else line
+    lab.write(ONE, source("part(k)", before))
+    with pytest.raises(RunError, match=r"kinds_packed has no source file.*save the module as a file"):
+        lab.run()
+
+
+def test_a_name_of_a_changing_object_that_the_node_does_not_reach_is_fine(lab):
+    lab.write(ONE, source("part(k)", FROM))
+    lab.write(TWO, "import itertools\n\nCOUNT = itertools.count()\n\n\ndef part(x):\n    return 2.0 * x\n")
+    assert lab.run()[:2] == (2.0, 2.0)
+    lab.edit(TWO, "def part(x):", "def part(x, count=COUNT):")
+    with pytest.raises(RunError, match=r"(part|COUNT) is or holds a count"):
+        lab.run()
+    lab.edit(TWO, "import itertools", "import itertools\n__depends__ = ('unaffected:COUNT', 'unaffected:part')")
+    assert lab.run()[:2] == (2.0, 2.0)
 
 
 @pytest.mark.parametrize("kind", REFUSED)
@@ -357,10 +459,55 @@ def patched_tensor(lab, monkeypatch):
     sys.modules["neusee.nodes.kinds._two"].TENSOR.fill_(3.0)
 
 
+def three_of_a_number(name):
+    if isinstance(name, str):
+        raise AttributeError(name)
+    return 3.0
+
+
+def late_registration(lab, monkeypatch):
+    sys.modules["neusee.nodes.kinds._two"].scale.register(float, three_times)
+
+
+def late_getattr(lab, monkeypatch):
+    vars(sys.modules["neusee.nodes.kinds._two"])["__getattr__"] = three_of_a_number
+
+
+def private_name(lab, monkeypatch):
+    vars(sys.modules["neusee.nodes.kinds._two"])["__OWN"] = 3.0
+
+
+def metaclass_attribute(lab, monkeypatch):
+    monkeypatch.setattr(type(sys.modules["neusee.nodes.kinds._two"].Part), "s", 3.0)
+
+
 def default_dtype(lab, monkeypatch):
     torch.set_default_dtype(torch.float64)
 
 
+LATE = """import functools
+import sys
+
+__OWN = 1.0
+
+
+class Meta(type):
+    s = 1.0
+
+
+class Part(metaclass=Meta):
+    pass
+
+
+@functools.singledispatch
+def scale(x):
+    return x
+
+
+def part(x):
+    late = sys.intern and globals().get("__getattr__")
+    return scale(x) * __OWN * Part.s * (late(0) if late else 1.0)
+"""
 LOADED = "import torch\nS = 1.0\nTABLE = {'a': 1.0}\nTENSOR = torch.ones(())\n\n\nclass Part:\n    def of(self):\n        return 1.0\n\n\ndef part(x, f=1.0):\n    return x * f * S * TABLE['a'] * TENSOR * Part().of() + 0.5 * (torch.get_default_dtype() == torch.float64)\n"  # noqa: E501
 PATCHES = (
     patched_constant, patched_function, patched_default, patched_table, patched_method, patched_tensor, default_dtype,
@@ -379,6 +526,42 @@ def test_what_changes_in_a_loaded_module_is_computed_again(lab, patch, monkeypat
     assert truth != first
     torch.set_default_dtype(torch.float32)
     monkeypatch.undo()
+
+
+@pytest.mark.parametrize(
+    "patch", [late_registration, late_getattr, private_name, metaclass_attribute], ids=lambda patch: patch.__name__
+)
+def test_what_is_added_to_a_loaded_module_is_computed_again(lab, patch, monkeypatch):
+    lab.write(ONE, source("part(k)", FROM))
+    lab.write(TWO, LATE)
+    first, truth, _ = lab.run()
+    assert first == truth == 1.0
+    patch(lab, monkeypatch)
+    assert lab.run(again=False)[:2] == (3.0, 3.0)
+
+
+def test_an_object_that_changes_is_noticed_under_each_of_its_names(lab):
+    lab.write(ONE, source("next(part[0])", FROM))
+    lab.write(TWO, "import itertools\n\na = [itertools.count(2.0)]\npart = a\n")
+    with pytest.raises(RunError, match=r"part is or holds a count"):
+        lab.run()
+
+
+@pytest.mark.parametrize("setting", ["autocast", "denormal"])
+def test_a_setting_of_torch_that_changes_digits_counts(lab, setting):
+    result = (
+        "(x @ x).double().sum()" if setting == "autocast" else "torch.tensor([1e-310], dtype=torch.float64) * 1e300"
+    )
+    lab.write(ONE, source(result, "x = torch.linspace(0.0, 1.0, 4096).reshape(64, 64)"))
+    first, truth, _ = lab.run()
+    assert first == truth
+    try:
+        with torch.autocast("cpu", enabled=setting == "autocast"):
+            torch.set_flush_denormal(setting == "denormal")
+            assert lab.run(again=False)[0] != first
+    finally:
+        torch.set_flush_denormal(False)
+    assert lab.run(again=False)[2] == "cached"
 
 
 def entries(store):
