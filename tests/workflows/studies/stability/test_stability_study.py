@@ -231,3 +231,35 @@ def test_cancellation_counts_in_each_scalar_of_a_result(picture):
 
     assert judge_step(step_of(exact), [signed], BY_NAME["usual"], 0).mark != "fail"
     assert judge_step(step_of(wrong), [signed], BY_NAME["usual"], 0).mark == "fail"
+
+
+def test_a_result_that_the_rounding_of_its_inputs_changes_as_much_warns_with_that_number(picture):
+    @node(rtol=1e-6)
+    def steep(x: torch.Tensor) -> torch.Tensor:
+        return torch.sin(100 * x)  # exact but for the product, which rounds once more
+
+    cell = judge_step(step_of(steep), [picture], USUAL, 0)
+    assert cell.mark == "warn"
+    assert cell.note.startswith("ill-conditioned: rounding of the inputs alone changes it by ")
+    moved = float(cell.note.rsplit(" ", 1)[1])
+    assert 1e-6 < moved < 6e-6  # half a rounding of 100 x, at x up to 1
+    assert cell.bound == pytest.approx(4 * moved, rel=0.1)
+
+    @node(rtol=1e-6)
+    def wrong(x: torch.Tensor) -> torch.Tensor:
+        return torch.sin(100 * x) + (1e-4 if x.dtype == torch.float32 else 0.0)
+
+    assert judge_step(step_of(wrong), [picture], USUAL, 0).mark == "fail"
+
+
+def test_a_gradient_that_cancels_in_a_large_loss_is_no_failure(picture):
+    @node()
+    def kept(x: torch.Tensor) -> torch.Tensor:
+        return 1e5 * (x / x.norm()).square().sum()  # the gradient is 0
+
+    @node()
+    def wrong(x: torch.Tensor) -> torch.Tensor:
+        return 1e5 * (x / x.norm() ** (1.001 if x.dtype == torch.float32 else 1.0)).square().sum()
+
+    assert judge_step(step_of(kept), [picture], USUAL, 0).mark == "pass"
+    assert judge_step(step_of(wrong), [picture], USUAL, 0).slope > 1e-3
