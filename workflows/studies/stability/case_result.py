@@ -2,10 +2,11 @@
 
 The reference is the node's own reference, or the node's function on the same inputs in float64, with the same random
 numbers. The bound of the result is the node's ``rtol`` times the largest element of the reference. The bound of the
-gradient is 1e-4 of its largest element, or ten times ``rtol`` if that is more. A result that the rounding of the inputs
-alone changes by a quarter of its error or more is ill-conditioned, which is a warning: no computation in single
-precision can be more accurate than this change, and a stable one is not much less accurate (Higham, Accuracy and
-Stability of Numerical Algorithms, 2nd ed., section 1.6).
+gradient is 1e-4 of its largest element, or ten times ``rtol`` if that is more.
+
+A result or a gradient is ill-conditioned, which is a warning, if a change of the inputs by at most four roundings to
+single precision alone changes it by its error or more. A stable computation is the exact one of such inputs (Higham,
+Accuracy and Stability of Numerical Algorithms, 2nd ed., section 1.5).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.report.study_page import Mark
 from neusee.workflows.store.serialization import each_tensor, tensors_in
 from neusee.workflows.studies.stability.extreme_cases import Case, stated_words
-from neusee.workflows.studies.stability.gradient_error import LEAST, cancelled, finite, over, slope_error
+from neusee.workflows.studies.stability.gradient_error import LEAST, cancelled, finite, moved_slopes, over, slope_error
 from neusee.workflows.studies.stability.step_runs import (
     HALVES,
     Refused,
@@ -42,8 +43,7 @@ _STEEPER = 10.0  #: ratio of the bound of a gradient to the bound of the result
 _DIM = 1e-3  #: share of the brightest element below which an element is dim
 _LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.add_photons")  #: nodes that must keep dim parts
 _HUGE = 1e30  #: the large number with which infinity is compared
-_STABLE = 4.0  #: error of a stable computation, at most, as a multiple of what the rounding of its inputs changes
-_ROUNDINGS = 3  #: random roundings of the inputs that are tried
+_ROUNDINGS = 10  #: random roundings of the inputs that are tried
 
 
 @dataclass(frozen=True)
@@ -97,19 +97,20 @@ def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
         return Cell("fail", "not finite") if _fits_single_precision(truth) else overflows
     bound = max([step.node.rtol, ROUNDING, *(HALVES.get(x.dtype, 0.0) for x in tensors_in(value))])
     coarse = max((HALVES.get(x.dtype, 0.0) for x in tensors_in(inputs)), default=0.0)  # of a gradient, as of its input
-    slope_bound, moved = max(SLOPE, _STEEPER * bound, 2 * coarse), 0.0
+    slope_bound, moved = max(SLOPE, _STEEPER * bound, 2 * coarse), [0.0, 0.0]
     dim = case.expect == "dim part" and step.node.path.startswith(_LIGHT)
-    error = _dim_error(value, truth) if dim else _error(value, truth)
+    error, slope = _dim_error(value, truth) if dim else _error(value, truth), slope_error(step, inputs, seed)
     if error > bound and all(x.ndim == 0 for x in tensors_in(truth)):
         scalars = enumerate(zip(tensors_in(value), tensors_in(truth), strict=True))
         error = max(over(a, b, LEAST) * cancelled(step, inputs, b, i, seed) for i, (a, b) in scalars)
-    elif error > bound and not dim:
-        moved = _moved(step, inputs, truth, seed)
-    cell = _marked(error, max(bound, _STABLE * moved), slope_error(step, inputs, seed), slope_bound)
-    if moved and cell.mark != "fail":
-        return replace(
-            cell, mark="warn", note=f"ill-conditioned: rounding of the inputs alone changes it by {moved:.1e}"
-        )
+    elif error > bound and not (dim or coarse):
+        moved[0] = _moved(step, inputs, truth, seed)
+    if slope is not None and slope > slope_bound and not coarse:
+        moved[1] = moved_slopes(step, inputs, seed, _ROUNDINGS)
+    cell = _marked(error, max(bound, moved[0]), slope, max(slope_bound, moved[1]))
+    if any(moved) and cell.mark != "fail":
+        changes = f"the result by {moved[0]:.1e}, the gradient by {moved[1]:.1e}"
+        return replace(cell, mark="warn", note=f"ill-conditioned: four roundings of the inputs alone change {changes}")
     return cell
 
 
@@ -119,9 +120,7 @@ def _truth(step: Step, inputs: list[Any], seed: int) -> Any:
 
 
 def _moved(step: Step, inputs: list[Any], truth: Any, seed: int) -> float:
-    """Return the largest error of the reference that the rounding of the input pictures to single precision makes."""
-    if any(x.dtype in HALVES for x in tensors_in(inputs)):
-        return 0.0
+    """Return the largest error of the reference that random roundings of the input pictures make."""
     with torch.no_grad():
         return max(_error(_truth(step, rounded(inputs, draw), seed), truth) for draw in range(_ROUNDINGS))
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.store.serialization import each_tensor, tensors_in
-from neusee.workflows.studies.stability.step_runs import in_double, is_picture, pictures_in, run
+from neusee.workflows.studies.stability.step_runs import in_double, is_picture, pictures_in, rounded, run
 from neusee.workflows.tolerance.error_norm import largest_error
 
 LEAST = math.sqrt(torch.finfo(torch.float32).tiny)  #: the least scale of an error, far above denormal numbers
@@ -28,6 +28,19 @@ def slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
         if usual is None:
             return None
         truth = true_slopes(step, inputs, seed)
+    return _apart(usual, truth, inputs)
+
+
+def moved_slopes(step: Step, inputs: list[Any], seed: int, draws: int) -> float:
+    """Return the largest change of the reference gradient by random roundings of the inputs."""
+    with torch.enable_grad():
+        truth = true_slopes(step, inputs, seed)
+        each = [true_slopes(step, inputs, seed, draw=draw) for draw in range(draws)]
+    return max((_apart(slopes, truth, inputs) for slopes in each if slopes and finite(slopes)), default=0.0)
+
+
+def _apart(usual: list[Tensor], truth: list[Tensor] | None, inputs: list[Any]) -> float:
+    """Return the largest error of gradients by each picture, or infinity if the reference gradient is not finite."""
     if truth is None or not finite(truth):
         return math.inf
     pictures = pictures_in(inputs)
@@ -43,8 +56,11 @@ def _slight(picture: Tensor) -> float:
     return max(1.0 / (picture.numel() * max(top, LEAST)), torch.finfo(picture.dtype).tiny)
 
 
-def true_slopes(step: Step, inputs: list[Any], seed: int, part: int | None = None) -> list[Tensor] | None:
-    wide = each_tensor(lambda x: x.double() if is_picture(x) else x, inputs)
+def true_slopes(
+    step: Step, inputs: list[Any], seed: int, part: int | None = None, draw: int | None = None
+) -> list[Tensor] | None:
+    """Return the gradients of the reference in float64: of a ``part`` of the result, at inputs rounded by ``draw``."""
+    wide = each_tensor(lambda x: x.double() if is_picture(x) else x, inputs) if draw is None else rounded(inputs, draw)
     leaves = [id(w) for w, x in zip(tensors_in(wide), tensors_in(inputs), strict=True) if is_picture(x)]
     reference = step.node.hooks.reference
     ways = [partial(run, step, reference), partial(in_double, step)] if reference else [partial(in_double, step)]

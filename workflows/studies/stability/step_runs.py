@@ -58,12 +58,12 @@ def in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
 
 
 def rounded(inputs: Sequence[Any], draw: int) -> list[Any]:
-    """Return a step's inputs in float64, each element moved at random by up to half of a rounding in float32."""
+    """Return a step's inputs in float64, each element moved at random by up to four roundings in float32."""
     rng = torch.Generator().manual_seed(draw)
 
     def move(x: Tensor) -> Tensor:
         off = 2 * torch.rand(x.shape, generator=rng, dtype=torch.float64) - 1
-        return x.double() * (1 + 2.0**-24 * off)
+        return x.double() * (1 + 4 * 2.0**-24 * off)
 
     moved: list[Any] = each_tensor(lambda x: move(x) if is_picture(x) else x, list(inputs))
     return moved
