@@ -52,17 +52,16 @@ def _average(samples: int, feature: float) -> Tensor:
 
 @smooth.reference
 def _(height: Tensor, stop: Stop, *, feature: float) -> Tensor:
-    """Compute the average of the height map over the tool's spot, one sample after another."""
+    """Compute the average of the height map over the tool's spot, for the samples of one row after another."""
     samples, pitch, _ = grid_of(stop)
     sigma = feature / pitch / math.sqrt(8 * math.log(2))
     x, index = height.double(), torch.arange(samples, dtype=torch.float64)
-    result = torch.empty_like(x)
+    across = (index[:, None, None] - index).square()  # of each spot, over all columns
+    rows = []
     for v in range(samples):
-        for u in range(samples):
-            square = (index[:, None] - v).square() + (index - u).square()
-            spot = torch.exp(-square / (2 * sigma**2))
-            result[v, u] = (spot * x).sum() / spot.sum()
-    return result
+        spots = torch.exp(-((index[:, None] - v).square() + across) / (2 * sigma**2))
+        rows.append((spots * x).sum((1, 2)) / spots.sum((1, 2)))
+    return torch.stack(rows)
 
 
 @smooth.preflight

@@ -58,4 +58,4 @@ def _(pupil: Pupil, bands: Bands, illuminant: Any = None, responses: Tensor | No
 @spectral_error.work
 def _(result: Tensor, pupil: Pupil, bands: Bands, *others: Any, **params: Any) -> tuple[float, float]:
     values = 2.0 * len(bands.centres) * _SIDE**2
-    return 4.0 * values, values + pupil.height.numel()
+    return 8.0 * values, values + pupil.height.numel()

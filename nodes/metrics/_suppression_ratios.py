@@ -129,7 +129,7 @@ def light_outside(psf: Psf, pupil: Pupil) -> Tensor:
     """
     passed, clear = (x.double().square().sum() for x in (pupil.amplitude, pupil.aperture))
     through = passed / clear
-    inside = single(psf.intensity).sum(-1).sum(-1, dtype=torch.float64)
+    inside = torch.stack([band.sum(dtype=torch.float64) for band in single(psf.intensity)])  # a copy of one band
     dark = through <= _DARK  # false for NaN, so that NaN reaches the result
     outside: Tensor = torch.where(dark, 0.0, 1.0 - inside / through.where(~dark, 1.0))
     return outside

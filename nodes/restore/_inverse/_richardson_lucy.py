@@ -17,9 +17,10 @@ from neusee.nodes.values import Bands, Psf
 
 _UNSEEN = 1e-3  #: share of the light of a scene pixel that reaches known pixels, below which the share counts as this
 _DARK = 1e-6  #: e-, least expected count, because the expectation is a divisor
+_GONE = 1e-30  #: e-, light below which a scene pixel stays dark; its gradient would grow with each step and overflow
 
 
-@node(rtol=1e-4, additive_inputs=[("glare",)])
+@node(rtol=3e-4, additive_inputs=[("glare",)])
 def richardson_lucy(
     electrons: Tensor,
     psf: Psf,
@@ -45,7 +46,8 @@ def richardson_lucy(
     Units:  e-; glare any; the result as behind a perfect lens without losses.
     Error:  a grey scene is assumed. The number of steps decides between blur and noise, and is no convergence: more
             steps restore finer detail and more noise. Without such lamps `restore.wiener` leaves less error.
-            float32: 1e-4 of the brightest pixel after 40 steps.
+            float32: 1e-5 of the brightest pixel after 40 steps, and 3e-4 at pixels of which 1e-3 of the light is seen,
+            where the rounding of a Fourier transform, 1e-7, counts a thousandfold.
     Raises: ValueError where shapes or bands differ, and for pictures and PSFs that are not finite.
     Source: Richardson, J. Opt. Soc. Am. 62, 55 (1972); Lucy, Astron. J. 79, 745 (1974); read noise as in Snyder,
             Hammoud and White, J. Opt. Soc. Am. A 10, 1014 (1993).
@@ -103,6 +105,6 @@ def _climb(
         for strength, pattern in zip(strengths, patterns, strict=True):
             expected = expected + strength * pattern
         ratio = counts / expected.clamp_min(_DARK)
-        scene = scene * (seen_from(ratio) / share).clamp_min(0)
+        scene = torch.where(scene <= _GONE, 0.0, scene * (seen_from(ratio) / share).clamp_min(0))
         strengths = [s * (p * ratio).sum() / (p * known).sum() for s, p in zip(strengths, patterns, strict=True)]
     return scene[..., :y, :x]

@@ -1,11 +1,13 @@
 """The estimated error by the number of bands, against a sum of many bands in the same interval."""
 
+import numpy as np
 import pytest
 import torch
 
 from neusee.nodes import doe, optics, spectra
 from neusee.nodes.metrics import spectral_error
 from neusee.nodes.metrics._spectral_error import _interpolated
+from tests.nodes.optics.independent_psf import window
 
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
 STOP = optics.stop(samples=270, pitch=29.92e-6, diameter=8e-3)
@@ -89,3 +91,51 @@ def test_the_index_between_bands():
     few, more = (spectra.bands(start=400e-9, stop=700e-9, count=n) for n in (31, 61))
     found = _interpolated(few.centres, doe.material(few), more.centres)
     torch.testing.assert_close(found, doe.material(more), rtol=1e-6, atol=0)
+
+
+NARROW = spectra.bands(start=500e-9, stop=501e-9, count=5)
+COARSE = optics.stop(samples=48, pitch=8e-3 / 48, diameter=8e-3)
+SIDE = 113  # the alias-free field of 0.1667 mm samples at 500 nm, in pixels of 2.9 um
+
+
+def narrow(dtype=torch.float32):
+    height = doe.half_rings(COARSE, waves=(3.0,))
+    found = optics.pupil(height, doe.material(NARROW), NARROW, COARSE)
+    screens = {name: getattr(found, name).to(dtype) for name in ("aperture", "amplitude", "height", "path")}
+    return found._replace(**screens)
+
+
+def doubled_rule(pupil, height):
+    """Return the estimate for one channel of equal weights by its definition, with PSFs that share no code."""
+    centres = NARROW.centres.numpy()
+    lengths = np.concatenate([centres, (centres[1:] + centres[:-1]) / 2])
+    index = np.polynomial.Polynomial.fit(centres, pupil.index.numpy(), 4)(lengths)
+    lens = {"pitch": float(pupil.pitch), **LENS, "shape": (SIDE, SIDE)}
+    light = [window(height, pupil.path, pupil.aperture, n, w, **lens) for n, w in zip(index, lengths, strict=True)]
+    coarse = sum(light[:5]) - (light[0] + light[4]) / 2  # by the trapezoidal rule, and with half its step
+    fine = (coarse + sum(light[5:])) / 2
+    return np.linalg.norm(coarse - fine) / np.linalg.norm(sum(light[:5]))
+
+
+def estimate(pupil):
+    one = torch.ones(1, 5, dtype=torch.float64) / (NARROW.centres * NARROW.widths)
+    return spectral_error(pupil, NARROW, torch.ones(5), one, **LENS)[0]
+
+
+def test_bands_of_a_fifth_of_a_nanometre_and_the_gradient_of_their_estimate():
+    """The PSFs of both rules differ by 1e-5 or less, so that float32 would leave two digits of the result."""
+    pupil = narrow()
+    truth = doubled_rule(pupil, pupil.height)
+    assert 1e-7 < truth < 1e-4
+    height = pupil.height.clone().requires_grad_()
+    found = estimate(pupil._replace(height=height))
+    assert float(found.detach()) == pytest.approx(truth, rel=1e-4)
+    found.backward()
+    way = torch.rand(48, 48, generator=torch.Generator().manual_seed(2), dtype=torch.float64).numpy() * 1e-9
+    low, high = (doubled_rule(pupil, pupil.height.double().numpy() + sign * way) for sign in (-1, 1))
+    assert float((height.grad.double() * torch.tensor(way)).sum()) == pytest.approx((high - low) / 2, rel=1e-3)
+
+
+def test_a_pupil_in_half_precision_is_refused():
+    with pytest.raises(ValueError, match="height is float16, which is too coarse"):
+        estimate(narrow()._replace(height=narrow().height.half()))

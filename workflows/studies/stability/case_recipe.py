@@ -88,12 +88,13 @@ class CaseRecipe:
     keys: dict[str, Key] = field(default_factory=dict)
     values: dict[str, Any] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)  #: reasons of steps that gave no value
+    usual: CaseRecipe | None = None  #: the recipe without changes, for results that the case leaves alone
 
     @classmethod
-    def of(cls, recipe: Recipe, case: Case, code: Code) -> CaseRecipe:
+    def of(cls, recipe: Recipe, case: Case, code: Code, usual: CaseRecipe | None = None) -> CaseRecipe:
         """Return the recipe of an extreme case and the store key of each step; changed results have other keys."""
         steps = with_parameters(with_size(with_losses(recipe), case.size), case)
-        chain = cls(recipe, case, steps)
+        chain = cls(recipe, case, steps, usual=usual)
         for name in in_order({n: s.sources for n, s in steps.items()}, steps):
             key, _ = key_of(steps[name], chain.keys, recipe.seed, code)
             chain.keys[name] = digest(key, case.name) if _put(steps[name], case) else key
@@ -117,7 +118,13 @@ class CaseRecipe:
         return self.values[step]
 
     def _compute(self, name: str) -> None:
-        step = self.steps[name]
+        step, usual = self.steps[name], self.usual
+        if usual and usual.keys[name] == self.keys[name]:
+            try:
+                self.values[name] = usual._value(name)
+            except LookupError:
+                self.refused[name] = usual.refused[name]
+            return
         if any(source in self.refused for source in step.sources):
             self.refused[name] = "an earlier step gave no result"
             return

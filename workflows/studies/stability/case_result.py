@@ -3,36 +3,47 @@
 The reference is the node's own reference, or the node's function on the same inputs in float64, with the same random
 numbers. The bound of the result is the node's ``rtol`` times the largest element of the reference. The bound of the
 gradient is 1e-4 of its largest element, or ten times ``rtol`` if that is more.
+
+A result or a gradient is ill-conditioned, which is a warning, if a change of the inputs by at most four roundings to
+single precision alone changes it by its error or more. A stable computation is the exact one of such inputs (Higham,
+Accuracy and Stability of Numerical Algorithms, 2nd ed., section 1.5).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.overrides import TorchFunctionMode
 
 from neusee.workflows.graph.recipe_graph import Step
-from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.report.study_page import Mark
 from neusee.workflows.store.serialization import each_tensor, tensors_in
 from neusee.workflows.studies.stability.extreme_cases import Case, stated_words
+from neusee.workflows.studies.stability.gradient_error import LEAST, cancelled, finite, moved_slopes, over, slope_error
+from neusee.workflows.studies.stability.step_runs import (
+    HALVES,
+    Refused,
+    as_used,
+    in_double,
+    is_picture,
+    pictures_in,
+    rounded,
+    run,
+)
 from neusee.workflows.tolerance.error_norm import largest_error
 
 ROUNDING = 2.0**-23  #: the least bound of a result in single precision
 SLOPE = 1e-4  #: the least bound of a gradient in single precision
 _NEAR = 0.5  #: share of a bound above which the mark is ``warn``
 _STEEPER = 10.0  #: ratio of the bound of a gradient to the bound of the result
-_LEAST = math.sqrt(torch.finfo(torch.float32).tiny)  #: the least scale of an error, far above denormal numbers
 _DIM = 1e-3  #: share of the brightest element below which an element is dim
 _LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.add_photons")  #: nodes that must keep dim parts
 _HUGE = 1e30  #: the large number with which infinity is compared
-_HALVES = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
+_ROUNDINGS = 10  #: random roundings of the inputs that are tried
 
 
 @dataclass(frozen=True)
@@ -47,19 +58,6 @@ class Cell:
     slope_bound: float | None = None
 
 
-class _Refused(Exception):
-    """Error of a step that rejects its inputs with `ValueError`."""
-
-
-class _CountedInSingle(TorchFunctionMode):
-    """A PyTorch function mode that samples float64 Poisson counts with the mean rounded to single precision."""
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func is torch.poisson and args[0].dtype == torch.float64:
-            return func(args[0].float(), *args[1:], **(kwargs or {})).double()
-        return func(*args, **(kwargs or {}))
-
-
 def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell | None:
     """Test a step in an extreme case and return the test result, or None if the case changes no input of the step."""
     given = _changed_inputs(inputs, case)
@@ -67,7 +65,7 @@ def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell
         return None
     try:
         return _seen(step, inputs, given, case, seed) if case.expect == "seen" else _compared(step, given, case, seed)
-    except _Refused as refused:
+    except Refused as refused:
         return Cell("pass", f"refused: {refused}")
     except Exception as error:
         return Cell("fail", f"{type(error).__name__}: {str(error).splitlines()[0]}")
@@ -77,43 +75,15 @@ def _changed_inputs(inputs: Sequence[Any], case: Case) -> list[Any] | None:
     """Return a step's inputs with the pictures changed for an extreme case, or None if no input is a picture."""
     given = list(inputs)
     if case.alike:
-        if len(given) < 2 or not all(isinstance(x, Tensor) and _is_picture(x) for x in given[:2]):
+        if len(given) < 2 or not all(isinstance(x, Tensor) and is_picture(x) for x in given[:2]):
             return None
         given[1] = given[0].clone()
     if case.inputs is not None:
-        if not _pictures(given):
+        if not pictures_in(given):
             return None
         change = case.inputs
-        given = each_tensor(lambda x: change(x) if _is_picture(x) else x, given)
+        given = each_tensor(lambda x: change(x) if is_picture(x) else x, given)
     return given
-
-
-def _is_picture(x: Tensor) -> bool:
-    return (x.is_floating_point() and x.ndim >= 2 and x.dtype != torch.float64) or x.dtype in _HALVES
-
-
-def _pictures(values: Sequence[Any]) -> list[Tensor]:
-    return [x for x in tensors_in(list(values)) if _is_picture(x)]
-
-
-def _run(step: Step, fn: Any, inputs: Sequence[Any], seed: int, **params: Any) -> Any:
-    rng = {"rng": torch.Generator().manual_seed(stream_seed(seed, step.name))} if step.node.random else {}
-    return fn(*inputs, **{**step.params, **params}, **rng)
-
-
-def _as_used(step: Step, inputs: Sequence[Any], seed: int) -> Any:
-    """Compute a step with its own parameters and return its result; raise `_Refused` for a `ValueError`."""
-    try:
-        return _run(step, step.node.fn, inputs, seed)
-    except ValueError as error:
-        raise _Refused(str(error)) from error
-
-
-def _in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
-    wide = each_tensor(lambda x: x.double() if x.is_floating_point() else x, list(inputs))
-    precise = {"precision": "double"} if "precision" in step.params else {}
-    with _CountedInSingle():
-        return _run(step, step.node.fn, wide, seed, **precise)
 
 
 # --- errors of results ------------------------------------------------------------------------------------------------
@@ -121,22 +91,38 @@ def _in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
 
 def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
     with torch.no_grad():
-        value, reference = _as_used(step, inputs, seed), step.node.hooks.reference
-        truth = _run(step, reference, inputs, seed) if reference else _in_double(step, inputs, seed)
-    if not _finite(value):
+        value, truth = as_used(step, inputs, seed), _truth(step, inputs, seed)
+    if not finite(value):
         overflows = Cell("pass", "overflows visibly, as the reference does in single precision")
         return Cell("fail", "not finite") if _fits_single_precision(truth) else overflows
-    bound = max([step.node.rtol, ROUNDING, *(_HALVES.get(x.dtype, 0.0) for x in tensors_in(value))])
+    bound = max([step.node.rtol, ROUNDING, *(HALVES.get(x.dtype, 0.0) for x in tensors_in(value))])
+    coarse = max((HALVES.get(x.dtype, 0.0) for x in tensors_in(inputs)), default=0.0)  # of a gradient, as of its input
+    slope_bound, moved = max(SLOPE, _STEEPER * bound, 2 * coarse), [0.0, 0.0]
     dim = case.expect == "dim part" and step.node.path.startswith(_LIGHT)
-    error = _dim_error(value, truth) if dim else _error(value, truth)
+    error, slope = _dim_error(value, truth) if dim else _error(value, truth), slope_error(step, inputs, seed)
     if error > bound and all(x.ndim == 0 for x in tensors_in(truth)):
         scalars = enumerate(zip(tensors_in(value), tensors_in(truth), strict=True))
-        error = max(_over(a, b, _LEAST) * _cancelled(step, inputs, b, i, seed) for i, (a, b) in scalars)
-    coarse = max(
-        (_HALVES.get(x.dtype, 0.0) for x in tensors_in(inputs)), default=0.0
-    )  # a gradient has the input's type
-    slope_bound = max(SLOPE, _STEEPER * bound, 2 * coarse)
-    return _marked(error, bound, _slope_error(step, inputs, seed), slope_bound)
+        error = max(over(a, b, LEAST) * cancelled(step, inputs, b, i, seed) for i, (a, b) in scalars)
+    elif error > bound and not (dim or coarse):
+        moved[0] = _moved(step, inputs, truth, seed)
+    if slope is not None and slope > slope_bound and not coarse:
+        moved[1] = moved_slopes(step, inputs, seed, _ROUNDINGS)
+    cell = _marked(error, max(bound, moved[0]), slope, max(slope_bound, moved[1]))
+    if any(moved) and cell.mark != "fail":
+        changes = f"the result by {moved[0]:.1e}, the gradient by {moved[1]:.1e}"
+        return replace(cell, mark="warn", note=f"ill-conditioned: four roundings of the inputs alone change {changes}")
+    return cell
+
+
+def _truth(step: Step, inputs: list[Any], seed: int) -> Any:
+    reference = step.node.hooks.reference
+    return run(step, reference, inputs, seed) if reference else in_double(step, inputs, seed)
+
+
+def _moved(step: Step, inputs: list[Any], truth: Any, seed: int) -> float:
+    """Return the largest error of the reference that random roundings of the input pictures make."""
+    with torch.no_grad():
+        return max(_error(_truth(step, rounded(inputs, draw), seed), truth) for draw in range(_ROUNDINGS))
 
 
 def _marked(error: float, bound: float, slope: float | None, steeper: float) -> Cell:
@@ -151,25 +137,7 @@ def _marked(error: float, bound: float, slope: float | None, steeper: float) -> 
 def _error(value: Any, truth: Any) -> float:
     """Return the largest difference of a result from the reference, relative to the reference's largest element."""
     pairs = list(zip(tensors_in(value), tensors_in(truth), strict=True))
-    return max((_over(a, b, _LEAST) for a, b in pairs), default=0.0)
-
-
-def _cancelled(step: Step, inputs: list[Any], truth: Tensor, part: int, seed: int) -> float:
-    """Return the inverse condition number of a scalar result f(x), |f| / sum |x df/dx|, but at most 1.
-
-    ``part`` is the position of ``truth`` among the scalars that the step returns.
-    """
-    with torch.enable_grad():
-        slopes = _true_slopes(step, inputs, seed, part) or []
-    moved = sum(float((x.double() * g).abs().sum()) for x, g in zip(_pictures(inputs), slopes, strict=False))
-    weight = float(_weight(truth))
-    return min(1.0, weight * abs(float(truth)) / moved) if moved > 0 else 1.0
-
-
-def _over(a: Tensor, b: Tensor, floor: float) -> float:
-    """Return the largest difference of ``a`` and ``b``, divided by the larger of the largest ``|b|`` and ``floor``."""
-    error, top = largest_error(a, b), float(b.detach().double().abs().max()) if b.numel() else 0.0
-    return error if top >= floor else error * (top or 1.0) / floor
+    return max((over(a, b, LEAST) for a, b in pairs), default=0.0)
 
 
 def _dim_error(value: Any, truth: Any) -> float:
@@ -182,84 +150,9 @@ def _dim_error(value: Any, truth: Any) -> float:
     return worst
 
 
-def _finite(value: Any) -> bool:
-    return all(bool(x.isfinite().all()) for x in tensors_in(value) if x.is_floating_point())
-
-
 def _fits_single_precision(truth: Any) -> bool:
     top = torch.finfo(torch.float32).max
     return all(bool((x.abs() < top).all()) for x in tensors_in(truth) if x.is_floating_point())
-
-
-# --- gradients --------------------------------------------------------------------------------------------------------
-
-
-def _slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
-    """Return the error of the gradient of a weighted sum of the result, or None if the result has no gradient."""
-    with torch.enable_grad():
-        usual = _slopes(inputs, lambda given: _run(step, step.node.fn, given, seed))
-        if usual is None:
-            return None
-        truth = _true_slopes(step, inputs, seed)
-    if truth is None or not _finite(truth):
-        return math.inf
-    pictures = _pictures(inputs)
-    tops = [torch.finfo(torch.float32 if x.dtype == torch.float64 else x.dtype).max for x in pictures]
-    if any(bool((g.abs() >= top).any()) for g, top in zip(truth, tops, strict=True)):
-        return 0.0  # the gradient exceeds the range of the picture's type
-    return max(_over(a, b, _slight(x)) for a, b, x in zip(usual, truth, pictures, strict=True))
-
-
-def _slight(picture: Tensor) -> float:
-    """Return the least divisor of a gradient error: the gradient of a normalised mean, or the least normal number."""
-    top = float(picture.detach().double().abs().max())
-    return max(1.0 / (picture.numel() * max(top, _LEAST)), torch.finfo(picture.dtype).tiny)
-
-
-def _true_slopes(step: Step, inputs: list[Any], seed: int, part: int | None = None) -> list[Tensor] | None:
-    wide = each_tensor(lambda x: x.double() if _is_picture(x) else x, inputs)
-    leaves = [id(w) for w, x in zip(tensors_in(wide), tensors_in(inputs), strict=True) if _is_picture(x)]
-    reference = step.node.hooks.reference
-    ways = [partial(_run, step, reference), partial(_in_double, step)] if reference else [partial(_in_double, step)]
-
-    def of(way: Any, given: list[Any]) -> Any:
-        value = way(given, seed)
-        return value if part is None else tensors_in(value)[part]
-
-    return next((slopes for way in ways if (slopes := _slopes(wide, partial(of, way), leaves))), None)
-
-
-def _slopes(inputs: list[Any], fn: Any, ids: list[int] | None = None) -> list[Tensor] | None:
-    """Return the gradients of ``fn(inputs)`` with respect to the pictures, or to the tensors with these ``ids``."""
-    leaves: list[Tensor] = []
-
-    def leaf(x: Tensor) -> Tensor:
-        if _is_picture(x) if ids is None else id(x) in ids:
-            leaves.append(x.detach().clone().requires_grad_())
-            return leaves[-1]
-        return x
-
-    total = _weighed(fn(each_tensor(leaf, inputs)))
-    if total is None or not leaves:
-        return None
-    grads = torch.autograd.grad(total, leaves, allow_unused=True)
-    return [torch.zeros_like(x) if g is None else g for x, g in zip(leaves, grads, strict=True)]
-
-
-def _weighed(value: Any) -> Tensor | None:
-    """Return the sum of all differentiable results, each scaled to about 1 and multiplied by fixed random weights."""
-    parts = [(x.double() * _weight(x) / _near(x)).sum() for x in tensors_in(value) if x.requires_grad]
-    return torch.stack(parts).sum() if parts else None
-
-
-def _weight(x: Tensor) -> Tensor:
-    return torch.rand(x.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float32)
-
-
-def _near(x: Tensor) -> float:
-    """Return a power of ten near the largest element of ``x``, or 1 if ``x`` is a scalar or tiny."""
-    top = float(x.detach().double().abs().max()) if x.ndim else 0.0
-    return 10.0 ** round(math.log10(top) + 0.123) if _LEAST < top < math.inf else 1.0
 
 
 # --- NaN and infinity ------------------------------------------------------------------------------------------------
@@ -267,7 +160,7 @@ def _near(x: Tensor) -> float:
 
 def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed: int) -> Cell:
     """Return a test result that fails if a step's result does not show NaN or infinity of an input picture."""
-    notes = [_one_seen(step, _with_one_changed(i, inputs, given), seed) for i in range(len(_pictures(inputs)))]
+    notes = [_one_seen(step, _with_one_changed(i, inputs, given), seed) for i in range(len(pictures_in(inputs)))]
     hidden = [note for note in notes if note.startswith("hidden")]
     stated = stated_words(step.node, case.name)
     if hidden and stated is None:
@@ -279,21 +172,21 @@ def _one_seen(step: Step, given: list[Any], seed: int) -> str:
     """Return how a step treats NaN or infinity in an input: refused, seen in the result, as a large number, hidden."""
     with torch.no_grad():
         try:
-            value = _as_used(step, given, seed)
-        except _Refused as refused:
+            value = as_used(step, given, seed)
+        except Refused as refused:
             return f"refused: {refused}"
-        if not _finite(value):
+        if not finite(value):
             return "seen"
-        bad = next(float(x[~x.isfinite()][0]) for x in _pictures(given) if not _finite(x))
+        bad = next(float(x[~x.isfinite()][0]) for x in pictures_in(given) if not finite(x))
         if math.isnan(bad):
             return "hidden: a finite result in spite of NaN"
         large = each_tensor(lambda x: x.nan_to_num(posinf=_HUGE, neginf=-_HUGE), given)
-        limit = _run(step, step.node.fn, large, seed)
-        same = _finite(limit) and largest_error(value, limit) <= max(step.node.rtol, ROUNDING)
+        limit = run(step, step.node.fn, large, seed)
+        same = finite(limit) and largest_error(value, limit) <= max(step.node.rtol, ROUNDING)
         return "like a large number" if same else "hidden: another result than for a large number"
 
 
 def _with_one_changed(which: int, inputs: Sequence[Any], given: Sequence[Any]) -> list[Any]:
-    swap = {id(_pictures(inputs)[which]): _pictures(given)[which]}
+    swap = {id(pictures_in(inputs)[which]): pictures_in(given)[which]}
     only: list[Any] = each_tensor(lambda x: swap.get(id(x), x), list(inputs))
     return only

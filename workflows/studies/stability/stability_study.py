@@ -77,7 +77,7 @@ def _rows(recipe: Recipe, store: Store, cases: Sequence[Case], progress: Progres
     own = engine("studies.stability.extreme_cases", "studies.stability.case_result")
     usual = CaseRecipe.of(recipe, USUAL, code)
     for number, case in enumerate(cases, 1):
-        chain = usual if case is USUAL else CaseRecipe.of(recipe, case, code)
+        chain = usual if case is USUAL else CaseRecipe.of(recipe, case, code, usual)
         found = list(_row(chain, set(unchanged_steps(chain, usual)), store, own))
         yield from found
         bad = sum(row.cell.mark == "fail" for row in found)

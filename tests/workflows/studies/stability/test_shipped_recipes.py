@@ -6,6 +6,10 @@ from pathlib import Path
 import pytest
 
 from neusee.workflows import Store, load
+from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.studies.stability.case_recipe import CaseRecipe
+from neusee.workflows.studies.stability.case_result import judge_step
+from neusee.workflows.studies.stability.extreme_cases import CASES
 from neusee.workflows.studies.stability.stability_study import study
 
 RECIPES = sorted(path.stem for path in (Path(__file__).parents[4] / "recipes").glob("*.yaml"))
@@ -31,3 +35,22 @@ def failing(recipe, store, folder, **cases):
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_no_cell_of_a_shipped_recipe_fails(recipe, store, tmp_path):
     assert failing(recipe, store, tmp_path) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("recipe", "case", "step", "mark"),
+    [
+        ("hdr_night", "gain / 1e4", "deconvolved", "pass"),  # the gradient overflowed at scene pixels that are dark
+        ("laser_free", "400 nm", "outside[plain]", "pass"),  # the difference of 1 and a sum in float32
+        ("laser_free", "1 pixel", "loss background_loss of bsr[mask]", "pass"),  # a gradient of 0 in a loss of 1e4
+        ("plain_lens", "700 nm", "spectral", "pass"),  # PSFs in float32 that differ by 1e-6
+        ("plain_lens", "huge", "deconvolved", "warn"),  # the rounding of the inputs counts three thousandfold
+        ("axicon", "steps past pi", "level", "warn"),  # the maximum of two elements that rounding makes equal
+        ("train_small", "two levels", "laser_psf[mask,drawn]", "warn"),  # 2.1e-6 in speckle
+    ],
+)
+def test_cells_that_failed_once(recipe, case, step, mark, tmp_path):
+    extreme = next(each for each in CASES if each.name == case)
+    chain = CaseRecipe.of(load(recipe), extreme, Code(tmp_path / "code.json"))
+    assert judge_step(chain.steps[step], chain.inputs(step), extreme, chain.recipe.seed).mark == mark

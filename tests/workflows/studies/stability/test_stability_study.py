@@ -231,3 +231,54 @@ def test_cancellation_counts_in_each_scalar_of_a_result(picture):
 
     assert judge_step(step_of(exact), [signed], BY_NAME["usual"], 0).mark != "fail"
     assert judge_step(step_of(wrong), [signed], BY_NAME["usual"], 0).mark == "fail"
+
+
+def test_a_result_that_the_rounding_of_its_inputs_changes_as_much_warns_with_that_number(picture):
+    @node(rtol=1e-6)
+    def steep(x: torch.Tensor) -> torch.Tensor:
+        return torch.sin(100 * x)  # exact but for the product, which rounds once more
+
+    cell = judge_step(step_of(steep), [picture], USUAL, 0)
+    assert cell.mark == "warn"
+    assert cell.note.startswith("ill-conditioned: four roundings of the inputs alone change the result by ")
+    moved = float(cell.note.split(" by ")[1].split(",")[0])
+    assert 4e-6 < moved < 24e-6  # four roundings of 100 x, at x up to 1
+    assert cell.bound == pytest.approx(moved, rel=0.1)
+
+    @node(rtol=1e-6)
+    def wrong(x: torch.Tensor) -> torch.Tensor:
+        return torch.sin(100 * x) + (1e-4 if x.dtype == torch.float32 else 0.0)
+
+    assert judge_step(step_of(wrong), [picture], USUAL, 0).mark == "fail"
+
+
+def test_a_gradient_that_cancels_in_a_large_loss_is_no_failure(picture):
+    @node()
+    def kept(x: torch.Tensor) -> torch.Tensor:
+        return 1e5 * (x / x.norm()).square().sum()  # the gradient is 0
+
+    @node()
+    def wrong(x: torch.Tensor) -> torch.Tensor:
+        return 1e5 * (x / x.norm() ** (1.001 if x.dtype == torch.float32 else 1.0)).square().sum()
+
+    assert judge_step(step_of(kept), [picture], USUAL, 0).mark == "pass"
+    assert judge_step(step_of(wrong), [picture], USUAL, 0).slope > 1e-3
+
+
+def test_the_gradient_of_a_maximum_that_rounding_decides_is_a_warning(picture):
+    @node()
+    def brightest(x: torch.Tensor) -> torch.Tensor:
+        return (x + 8.0).amax()  # 1 and its neighbour give the same sum in float32
+
+    near = picture / 2
+    near[0, 0], near[3, 3] = 1.0, 1.0 - 2.0**-24
+    cell = judge_step(step_of(brightest), [near], USUAL, 0)
+    assert cell.slope > 0.4
+    assert cell.mark == "warn"
+    assert "the gradient by" in cell.note
+
+    @node()
+    def wrong(x: torch.Tensor) -> torch.Tensor:
+        return (x * (0.7 if x.dtype == torch.float32 else 0.2)).exp().amax() / 2
+
+    assert judge_step(step_of(wrong), [picture], USUAL, 0).mark == "fail"
