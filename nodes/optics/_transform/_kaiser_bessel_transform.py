@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neusee.nodes.optics._transform._banded_matrix import Banded
 from neusee.nodes.optics._transform._chirp_transform import smooth
-from neusee.nodes.optics._transform._sample_axis import Axis, Sink, Source, row_chunks
+from neusee.nodes.optics._transform._sample_axis import Axis, Sink, Source, last_type, row_chunks
 from neusee.nodes.optics._transform._workspace import Workspace
 
 
@@ -48,7 +48,8 @@ class _Kernel(NamedTuple):
 _BLOCK = 16
 _WIDEST = 8  #: the grid divides the input into at least this many parts, however few the window needs
 _COLUMN_BLOCKS = 8
-_SINGLE, _DOUBLE = _Kernel(8, 1.75), _Kernel(18, 2.0)
+_SINGLE, _DOUBLE = _Kernel(9, 1.75), _Kernel(18, 2.0)
+_LAST = 10.0  #: work along the last axis for each independent sample of the result, where a pupil sample has work 1
 
 
 class Plan(NamedTuple):
@@ -73,8 +74,11 @@ class Plan(NamedTuple):
 
 
 @functools.lru_cache(maxsize=64)
-def plan(axis: Axis, dtype: torch.dtype, device: torch.device) -> Plan:
-    """Return the grids and interpolation weights of the transform along one axis, cached for later calls."""
+def plan(axis: Axis, dtype: torch.dtype, device: torch.device, kind: torch.dtype | None = None) -> Plan:
+    """Return the grids and interpolation weights of the transform along one axis, cached for later calls.
+
+    The field is interpolated to the grid of the FFT in the type ``kind``, by default ``dtype``.
+    """
     kernel = _SINGLE if dtype == torch.float32 else _DOUBLE
     pitch = min(1 / (axis.alpha * axis.n_out * kernel.oversampling), max(axis.n_in, _WIDEST) / _WIDEST)
     points = _odd(math.ceil((axis.n_in - 1) / pitch) + kernel.width)
@@ -83,7 +87,7 @@ def plan(axis: Axis, dtype: torch.dtype, device: torch.device) -> Plan:
     while spread.n_columns + 2 * spread.margin > length:
         length = smooth(length + length // 4, even=True)
         spread = _spread(axis, kernel, pitch, length)
-    gather = _gather(axis, kernel, pitch, points, length).to(dtype, device)
+    gather = _gather(axis, kernel, pitch, points, length).to(kind or dtype, device)
     kept = spread.n_columns + 2 * spread.margin
     return Plan(gather, spread.to(dtype, device), points, length, kept, axis.sign)
 
@@ -132,7 +136,8 @@ def kaiser_bessel(rows: Axis, columns: Axis, source: Source, sink: Sink, work: W
     """Compute the scaled Fourier transform by interpolation, a short FFT and interpolation, in chunks that fit in a
     cache.
     """
-    along_x, along_y = (plan(axis, work.dtype, work.device) for axis in (columns, rows))
+    last = last_type(rows.n_in * columns.n_in, _LAST * rows.bandwidth * columns.bandwidth, work.dtype)
+    along_x, along_y = plan(columns, work.dtype, work.device), plan(rows, work.dtype, work.device, last)
     half = _rows_to_frequencies(along_x, along_y.gather.margin, rows.n_in, source, work)
     spectrum = _columns_to_frequencies(along_y, half, work)
     _interpolate(along_x, along_y, (rows.n_out, columns.n_out), spectrum, sink, work)
@@ -172,9 +177,10 @@ def _place(blocks: Tensor, line: Tensor, x: Plan) -> None:
 
 def _columns_to_frequencies(y: Plan, half: Tensor, work: Workspace) -> Tensor:
     """Interpolate all columns to the grid of the FFT, transform the columns, and return the cropped FFT transposed."""
-    wide = half.shape[1]
-    columns = work.take("columns", y.length, wide, dtype=half.dtype)
-    y.gather.left(_flat(half), _flat(columns[y.padded : y.padded + y.gather.n_rows]))
+    wide, kind = half.shape[1], y.gather.weights.dtype.to_complex()
+    given = half if kind == half.dtype else work.take("given", *half.shape, dtype=kind).copy_(half)
+    columns = work.take("columns", y.length, wide, dtype=kind)
+    y.gather.left(_flat(given), _flat(columns[y.padded : y.padded + y.gather.n_rows]))
     columns[: y.padded] = 0
     columns[y.padded + y.points :] = 0
     spectrum = work.take("spectrum", wide, y.kept, dtype=half.dtype)

@@ -73,13 +73,12 @@ class Field:
         """Write the cosine and sine of the pupil phase in one patch, in float64 if the phase exceeds two turns."""
         angle = work.take("angle", *planes.shape[1:])
         turns = angle if self.few else work.take("turns", *planes.shape[1:], dtype=torch.float64)
-        unit = 2 * math.pi if self.few else 1.0
-        turns.copy_(self.screens.height[rows, columns]).mul_(unit * self.view.turns_height)  # cast before the product
+        turns.copy_(self.screens.height[rows, columns])  # cast before the product
+        torch.add(self.tilt_u[columns], turns, alpha=self.view.turns_height, out=turns)
         if self.screens.longest > 0:
-            turns.add_(self.screens.path[rows, columns], alpha=unit * self.view.turns_path)
-        turns.add_(self.tilt_u[columns], alpha=unit).add_(self.tilt_v[rows], alpha=unit)
-        if not self.few:
-            torch.mul(turns.sub_(turns.round()), 2 * math.pi, out=angle)
+            turns.add_(self.screens.path[rows, columns], alpha=self.view.turns_path)
+        turns.add_(self.tilt_v[rows])
+        torch.mul(turns if self.few else turns.frac_(), 2 * math.pi, out=angle)
         torch.cos(angle, out=planes[0])
         torch.sin(angle, out=planes[1])
 

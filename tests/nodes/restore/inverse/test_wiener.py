@@ -11,6 +11,7 @@ from neusee.nodes.optics import image
 from neusee.nodes.restore import wiener
 from neusee.nodes.restore._inverse import _wiener
 from neusee.nodes.restore._inverse._wiener import _strengths, effective_psf
+from neusee.nodes.sensor import crop
 from neusee.nodes.spectra import bands, illuminant, leaves, reflectances, responses
 from neusee.nodes.values import Bands, Psf
 
@@ -164,6 +165,23 @@ def test_gradient_reaches_picture_and_psf():
     run(electrons, Psf(kernel, ONE)).square().mean().backward()
     assert torch.isfinite(electrons.grad).all()
     assert bool(kernel.grad.any())
+
+
+@pytest.mark.parametrize("size", [12, 44, 96])
+def test_value_and_gradients_in_single_precision_are_those_of_double(size):
+    """Of bright pictures, whose signal is far above the noise, with clipped pixels and glare."""
+    kernel, crossing = disc(2, 9).intensity, crossed(size)
+    bright = 1e3 * scene(192)[:, :size, :size] + 4e6 * crop(crossing, shape=(size, size))
+    clipped = bright > bright.quantile(0.7)
+    values = []
+    for dtype in (torch.float32, torch.float64):
+        leaves = [x.to(dtype).requires_grad_() for x in (bright.clone(), kernel.clone(), crossing.clone())]
+        found = run(leaves[0], Psf(leaves[1], ONE), clipped, [leaves[2]])
+        weights = torch.rand(found.shape, generator=torch.Generator().manual_seed(5)).to(found)
+        values.append([found.detach(), *torch.autograd.grad((weights * found).sum(), leaves)])
+    assert values[0][0].dtype == torch.float32
+    for single, double in zip(*values, strict=True):
+        assert float((single - double).abs().max()) <= 3e-7 * float(double.abs().max())
 
 
 def test_shapes_must_agree():
