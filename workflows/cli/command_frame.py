@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import itertools
 import shlex
-import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -95,11 +94,6 @@ def failing(*errors: type[Exception], code: int = BAD, before: str = "") -> Iter
 def say(lines: list[str]) -> None:
     """Print lines to stdout."""
     print(*lines, sep="\n", flush=True)
-
-
-def terminal_width() -> int | None:
-    """Return the number of characters in a line of the terminal, or None if stdout is no terminal."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def fail(message: str, code: int = BAD) -> NoReturn:

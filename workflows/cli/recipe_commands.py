@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, terminal_width, the_store
+from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, the_store
 from neusee.workflows.cli.command_list import FAILED, MISSED
 from neusee.workflows.cli.command_options import (
     AsJson,
@@ -164,8 +164,7 @@ def plan(
         with refusing():
             lines, refused = run_forecast.simulated_lines(recipe, the_store(), devices), False
     else:
-        width = None if as_json else terminal_width()
-        lines, refused = run_forecast.plan_lines(recipe, the_store(), device, memory_limit(memory), width)
+        lines, refused = run_forecast.plan_lines(recipe, the_store(), device, memory_limit(memory))
     if as_json:
         say_json({"command": shlex.join(command), "refused": refused, "lines": lines})
     else:

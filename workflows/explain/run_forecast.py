@@ -18,12 +18,10 @@ from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import Key, device_kind
 from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
 from neusee.workflows.report.contents import steps_of, wanted
-from neusee.workflows.report.text_table import columns_within
+from neusee.workflows.report.text_table import columns
 from neusee.workflows.store.byte_sizes import format_size
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
-
-_SPARE = ("reads", "node")  #: columns that a narrow terminal does without
 
 
 @dataclass(frozen=True)
@@ -96,18 +94,13 @@ def _with_report(plan: Plan, store: Store, costs: Costs, lanes: Mapping[str, Lan
     return replace(plan, refused=f"{why}: give more memory, or choose a smaller picture or number of bands")
 
 
-def plan_lines(
-    recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None, width: int | None = None
-) -> tuple[list[str], bool]:
-    """Return the table of a forecast as lines of at most ``width`` characters, and True if the run would lack memory.
-
-    If the table is wider, the columns with the inputs and the nodes are left out.
-    """
+def plan_lines(recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None) -> tuple[list[str], bool]:
+    """Return the table of a forecast as lines, and True if the run would lack memory."""
     lanes = lanes_of(device.split(","), memory)
     plan = planned(recipe, store, lanes)
     rows = [_row(name, plan, store) for name in plan.order]
     head = ["step", "node", "state", "where", "seconds", "bytes", "memory", "reads"]
-    return [*columns_within([head, *rows], width, _SPARE), *_sums(plan, lanes)], bool(plan.refused)
+    return [*columns([head, *rows]), *_sums(plan, lanes)], bool(plan.refused)
 
 
 def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:

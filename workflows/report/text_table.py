@@ -17,23 +17,6 @@ def columns(rows: Rows, numbers: str = "<", gap: str = "  ") -> list[str]:
     return [gap.join(f"{cell:{form}}" for cell, form in zip(row, forms, strict=True)).rstrip() for row in rows]
 
 
-def columns_within(rows: Rows, width: int | None, spare: Sequence[str]) -> list[str]:
-    """Return the lines of a table that fits ``width`` characters, without as many columns of ``spare`` as needed.
-
-    The first row has the names of the columns. The last line names the columns that are left out. None is no limit.
-    """
-    left_out: list[str] = []
-    lines = columns(rows)
-    for name in spare:
-        if width is None or max(map(len, lines)) <= width:
-            break
-        at = rows[0].index(name)
-        rows = [[*row[:at], *row[at + 1 :]] for row in rows]
-        lines = columns(rows)
-        left_out.append(name)
-    return [*lines, *([f"left out on this narrow terminal: {', '.join(left_out)}"] if left_out else [])]
-
-
 def indented(rows: Rows) -> list[str]:
     """Return an indented line of text for each table row, with numbers aligned right and a dash for an empty cell."""
     full = [[name, *(cell or "–" for cell in cells)] for name, *cells in rows]
