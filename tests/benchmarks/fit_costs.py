@@ -1,71 +1,54 @@
-"""Coefficients of the cost laws: runs of shipped recipes at several sizes, and a fit of seconds and memory by node.
+"""Coefficients of the cost laws: a fit of seconds and memory by node to measured runs of shipped recipes.
 
-    python tests/benchmarks/fit_costs.py            # runs (half an hour on two cores, up to 6 GB), fits and writes
-    python tests/benchmarks/fit_costs.py JOURNALS   # fits to the journals (*.jsonl) in this folder
+    python tests/benchmarks/measured_runs.py FOLDER   # the runs
+    python tests/benchmarks/fit_costs.py FOLDER       # fits to the runs in FIT and writes node_costs.json
+    python tests/benchmarks/fit_costs.py FOLDER show  # compares with all runs, those that were held out apart
 
-Each run has an empty cache and its own process. For each node and size the largest peak and the median time count. The
-fit is least squares of the relative error with coefficients that are not negative (Lawson and Hanson 1974, ch. 23).
+For each node and size the largest peak and the median processor time count. The fit is least squares of the relative
+error with coefficients that are not negative (Lawson and Hanson 1974, ch. 23). The range of a law is that of runs
+about laws that were fitted without their size.
 """
 
 import json
-import os
-import subprocess
 import sys
-import tempfile
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple
 
 import numpy as np
+from measured_runs import FIT, HELD_OUT, file_of
 from scipy.optimize import nnls
 
-from neusee.workflows.engine.cost_laws import sizes_of
+from neusee.nodes import registered_nodes
+from neusee.workflows.engine import cost_laws
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.report.contents import steps_of, wanted
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 TARGET = Path(__file__).parents[2] / "workflows" / "engine" / "node_costs.json"
+LIBRARIES = "colour", "kornia"  #: that take long to load
 SMALLEST = 16e6  #: B; below, memory that earlier steps freed hides what a step needs
 SMALL_PART = 1e6  #: B of the inputs, the result or the work; below, they cannot be what takes the memory
-MEMORY_FLOOR, TIME_FLOOR = 32e6, 5e-3  #: B and s to which an error is relative at least: below is noise
-LARGE, LONG = 32e6, 10e-3  #: B and s from which a run counts for the spread
+MEMORY_FLOOR, TIME_FLOOR = 32e6, 20e-3  #: B and s to which an error is relative at least: below is noise
+LARGE, LONG = 64e6, 0.1  #: B and s from which a step counts for the comparison
+CLOSE = 0.2  #: relative error that counts as met
 
 
-def at(scene, sensor, samples, window):
-    """Changes of a recipe to a scene, sensor, pupil and window of other sizes; the pupil keeps its width."""
-    sizes = {"scene.shape": [scene] * 2, "sensor.shape": [sensor] * 2, "optics.samples": samples}
-    sizes |= {"optics.pitch": f"{8.0784 / samples * 1e3:.4f} um", "optics.window": [window] * 2}
-    return [f"{name}={value}" for name, value in sizes.items()]
+class Seen(NamedTuple):
+    """What a node took at one size."""
+
+    size: tuple
+    loads: bool  #: True if the step also loaded the library of its node
+    peak: float | None  #: B, the largest
+    seconds: float  #: the median
 
 
-SMALL, MIDDLE, LARGER = at(288, 240, 270, 256), [], at(1280, 1024, 1080, 1024)
-RUNS = {
-    "tiny": ["first_light", *at(96, 64, 128, 96)],
-    "small": ["first_light", *SMALL],
-    "middle": ["first_light"],
-    "large": ["first_light", *LARGER],
-    "full": ["first_light", "scene.shape=[512,512]", "sensor.shape=[448,448]", "--exact"],
-    "full2": ["first_light", "scene.shape=[1024,1024]", "--exact"],
-    "dirty": ["dirty_windshield"],
-    "dirty2": ["dirty_windshield", *SMALL],
-    "six": ["six_lasers"],
-    "paper": ["paper_table1"],
-    "network": ["demonstration"],
-    "night": ["hdr_night"],
-    "axicon": ["axicon"],
-    "learnt": ["train_small"],
-    "calibrate": ["calibrate"],
-}
-
-
-def collect(folder):
-    """Run every recipe with an empty cache and keep its journal."""
-    for name, words in RUNS.items():
-        with tempfile.TemporaryDirectory() as place:
-            env = {**os.environ, "NEUSEE_CACHE": f"{place}/cache", "OMP_NUM_THREADS": "1"}
-            command = [sys.executable, "-m", "neusee", "run", *words, "--quiet", "--out", f"{place}/runs"]
-            subprocess.run(command, env=env, check=False)
-            (folder / f"{name}.jsonl").write_text(Path(f"{place}/cache/journal.jsonl").read_text())
+def read(folder, names):
+    """Return the runs of these names that are in the folder."""
+    paths = (Path(folder, file_of(name)) for name in names)
+    return [json.loads(path.read_text()) for path in paths if path.exists()]
 
 
 def sizes_in(words):
@@ -73,23 +56,41 @@ def sizes_in(words):
     name, *changes = [word for word in words if word != "--exact"]
     recipe = replace(load(name, changes), exact="--exact" in words)
     recipe = with_substitutions(recipe, wanted(recipe))
-    return {step: size for step, size in sizes_of(recipe, steps_of(recipe)).items() if size.known}
+    return {step: size for step, size in cost_laws.sizes_of(recipe, steps_of(recipe)).items() if size.known}
 
 
-def grouped(folder):
-    """By node: (size, largest peak, median seconds) of each size that ran."""
+def loaders(runs):
+    """The libraries that each node was seen to load, and their bytes."""
     found = {}
-    for path in sorted(Path(folder).glob("*.jsonl")):
-        here, sizes = {}, sizes_in(RUNS[path.stem])
-        for line in path.read_text().splitlines()[1:]:
-            row = json.loads(line) if line else {}
-            if row.get("step") in sizes and row.get("device") == "cpu":
-                here.setdefault((row["node"], tuple(sizes[row["step"]][:4])), []).append(row)
-        for (node, size), rows in here.items():
-            peaks = [row["peak"] for row in rows if row["peak"] is not None]
-            most = max(max(peaks), size[1]) if peaks else None
-            found.setdefault(node, []).append((size, most, median(row["seconds"] for row in rows)))
-    return found
+    for run in runs:
+        for _, node, grown, new in run["grown"]:
+            loaded = [library for library in LIBRARIES if library in new]
+            if loaded:
+                libraries, sizes = found.setdefault(node, (set(), []))
+                libraries.update(loaded)
+                sizes.append(grown)
+    return {node: (sorted(libraries), median(sizes)) for node, (libraries, sizes) in found.items()}
+
+
+def grouped(runs, loading):
+    """By node: what was seen at each size."""
+    found = {}
+    for run in runs:
+        sizes, there = sizes_in(run["words"]), set()
+        for row in run["steps"]:
+            libraries = set(loading.get(row["node"], ((), 0))[0])
+            first = not libraries <= there
+            there |= libraries
+            if row["step"] in sizes and row["device"] == "cpu":
+                size = tuple(sizes[row["step"]][:4])
+                found.setdefault(row["node"], {}).setdefault((size, first), []).append(row)
+    return {node: [seen(*key, rows) for key, rows in sizes.items()] for node, sizes in found.items()}
+
+
+def seen(size, first, rows):
+    """The largest peak and the median time of the steps of one size."""
+    peaks = [row["peak"] for row in rows if row["peak"] is not None]
+    return Seen(size, first, max(max(peaks), size[1]) if peaks else None, median(row["seconds"] for row in rows))
 
 
 def fitted(columns, values, floor):
@@ -101,43 +102,155 @@ def fitted(columns, values, floor):
     return nnls(matrix / unit, values * weight)[0] / unit
 
 
-def law(rows):
-    """The law of one node: coefficients and spreads."""
-    known = [(size, peak) for size, peak, _ in rows if peak is not None]
-    known = [(size, peak) for size, peak in known if peak > SMALLEST] or known
-    totals = [sum(size[:2]) for size, _ in known]
-    constant = float(max(totals, default=1) > 3 * min(totals, default=1))  # sizes too alike cannot tell it from a slope
-    used = [max((size[i] for size, _ in known), default=0) > SMALL_PART for i in range(3)]
-    columns = [(constant, *(x * use for x, use in zip(size[:3], used, strict=True))) for size, _ in known]
-    peaks = np.array([peak for _, peak in known])
-    memory = fitted(columns, peaks, MEMORY_FLOOR) if known else np.array([0.0, 0.0, 1.0, 0.0])
-    steps = [(1.0, size[3]) for size, _, _ in rows]
-    times = np.array([seconds for *_, seconds in rows])
-    seconds = fitted(steps, times, TIME_FLOOR)
-    over = [
-        p / max(float(np.dot(c, memory)), s[1], 1)
-        for c, p, (s, _) in zip(columns, peaks, known, strict=True)
-        if p > LARGE
-    ]
-    late = [t / max(float(np.dot(c, seconds)), 1e-9) for c, t in zip(steps, times, strict=True) if t > LONG]
-    spread = [float(f"{max(1.0, *over):.3g}") if over else 1.0, float(f"{max(1.0, *late):.3g}") if late else 1.0]
-    return {"memory": [float(f"{x:.4g}") for x in memory], "seconds": [float(f"{x:.4g}") for x in seconds]} | {
-        "spread": spread
+def memory_law(rows, grown):
+    """Bytes, and the factors of inputs, result and work; the ``grown`` bytes of a library are known."""
+    known = [row for row in rows if row.peak is not None]
+    known = [row for row in known if row.peak > SMALLEST] or known
+    if not known:
+        return np.array([0.0, 0.0, 1.0, 0.0])
+    totals = [sum(row.size[:2]) for row in known]
+    constant = float(max(totals) > 3 * min(totals))  # sizes too alike cannot tell the constant from a slope
+    used = [max(row.size[i] for row in known) > SMALL_PART for i in range(3)]
+    columns = [(constant, *(x * use for x, use in zip(row.size, used, strict=False))) for row in known]
+    peaks = np.array([max(row.peak - row.loads * grown, row.size[1]) for row in known])
+    return fitted(columns, peaks, MEMORY_FLOOR + grown)
+
+
+def time_law(rows):
+    """Seconds, seconds for each operation, and the seconds of the library."""
+    constant = not all(row.loads for row in rows) or not any(row.loads for row in rows)
+    columns = [(float(constant), row.size[3], row.loads) for row in rows]
+    return fitted(columns, np.array([row.seconds for row in rows]), TIME_FLOOR)
+
+
+def peak_of(law, row, grown):
+    """The peak of a step by a fit in bytes, at least its result."""
+    return max(float(np.dot(law, (1.0, *row.size[:3]))), row.size[1], 1.0) + row.loads * grown
+
+
+def time_of(law, row):
+    """The seconds of a step by a fit."""
+    return max(float(np.dot(law, (1.0, row.size[3], row.loads))), 1e-6)
+
+
+def left_out(rows, grown):
+    """Measured over predicted, of peaks and of times, where the law was fitted without the size; None for few sizes."""
+    over, late = [], []
+    sizes = {row.size for row in rows}
+    for row in rows:
+        rest = [other for other in rows if other.size != row.size]
+        if len(sizes) > 2 and row.peak is not None and row.peak > LARGE / 2:
+            over.append(row.peak / peak_of(memory_law(rest, grown), row, grown))
+        if len(sizes) > 2 and row.seconds > LONG / 5:
+            late.append(row.seconds / time_of(time_law(rest), row))
+    return over, late
+
+
+def ranges(groups, loading):
+    """Ranges of peaks and times about each law; of all laws together for a node that was measured at few sizes."""
+    found = {node: left_out(rows, loading.get(node, ((), 0.0))[1]) for node, rows in groups.items()}
+    every = [np.concatenate([np.array(each[i]) for each in found.values()]) for i in (0, 1)]
+    usual = [np.quantile(ratios, (0.05, 0.95)) for ratios in every]
+    return {
+        node: [[short(min(1.0, *(own or usual[i]))), short(max(1.0, *(own or usual[i])))] for i, own in enumerate(each)]
+        for node, each in found.items()
     }
 
 
-def main():
-    """Collect the journals, fit the laws and write them."""
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(sys.argv[1] if len(sys.argv) > 1 else place)
-        if len(sys.argv) == 1:
-            collect(folder)
-        laws = {node: law(rows) for node, rows in sorted(grouped(folder).items())}
-    lines = ",\n".join(f'  "{node}": {json.dumps(each)}' for node, each in laws.items())
-    TARGET.write_text(f'{{"nodes": {{\n{lines}\n}}}}\n')
-    for node, each in laws.items():
+def short(value):
+    """A number of four significant digits."""
+    return float(f"{value:.4g}")
+
+
+def law(node, rows, loading, spread):
+    """The law of one node for the file."""
+    libraries, grown = loading.get(node, ((), 0.0))
+    memory, seconds = memory_law(rows, grown), time_law(rows)
+    found = {"memory": [short(x) for x in memory], "seconds": [short(x) for x in seconds[:2]], "spread": spread}
+    return found | ({"loads": [libraries, short(grown), short(seconds[2])]} if libraries else {})
+
+
+def unruled(runs):
+    """The largest result of each node that has no rule of the shape of its result."""
+    for run in runs:
+        sizes_in(run["words"])  # imports the nodes
+    bare = {each.path for each in registered_nodes() if each.hooks.shape is None and not each.before_run}
+    found = Counter()
+    for run in runs:
+        for row in run["steps"]:
+            if row["node"] in bare:
+                found[row["node"]] = max(found[row["node"]], row["bytes"])
+    return found
+
+
+def upper(groups):
+    """The law of a node that was never measured: the most that a shipped node took for its size, by each measure."""
+    works = {each.path: each.hooks.work is not None for each in registered_nodes()}
+    large = [(node, row) for node, rows in groups.items() for row in rows if not row.loads]
+    held = [(n, r) for n, r in large if r.peak is not None]
+    ratio = max(r.peak / sum(r.size[:2]) for n, r in held if not works[n] and r.peak > LARGE / 2)
+    least = max(r.peak for n, r in held if not works[n] and sum(r.size[:2]) < SMALL_PART)
+    work = max((r.peak - sum(r.size[:2])) / r.size[2] for n, r in held if works[n] and r.peak > LARGE / 2 and r.size[2])
+    slow = max(r.seconds / r.size[3] for n, r in large if not works[n] and r.seconds > LONG / 5 and r.size[3] > 1e5)
+    start = max(r.seconds for n, r in large if not works[n] and r.size[3] < 1e5)
+    return {"memory": [short(x) for x in (least, ratio, ratio, max(work, 0))], "seconds": [short(start), short(slow)]}
+
+
+def write(laws, guess):
+    """Write the file of the laws, and have it read again."""
+    lines = ",\n".join(f'  "{node}": {json.dumps(each)}' for node, each in sorted(laws.items()))
+    TARGET.write_text(f'{{"guess": {json.dumps(guess)},\n"nodes": {{\n{lines}\n}}}}\n')
+    for cached in (cost_laws._file, cost_laws.shipped, cost_laws.guess):
+        cached.cache_clear()
+
+
+def fit(folder):
+    """Fit the laws to the runs that are not held out, and write them."""
+    runs = read(folder, FIT)
+    most, loading = unruled(runs), loaders([run for run in runs if "grown" in run])
+    before = json.loads(TARGET.read_text())
+    known = {
+        node: {key: value for key, value in each.items() if key != "most"} for node, each in before["nodes"].items()
+    }
+    blank = {"memory": [0.0, 0.0, 1.0, 0.0], "seconds": [0.0, 0.0]}
+    told = {node: known.get(node, blank) | {"most": size} for node, size in most.items()}
+    write(known | told, before.get("guess", blank))
+    groups = grouped(runs, loading)
+    spreads = ranges(groups, loading)
+    laws = {node: law(node, rows, loading, spreads[node]) for node, rows in groups.items()}
+    for node, size in most.items():
+        laws.setdefault(node, blank)["most"] = size
+    write(known | laws, upper(groups))
+    for node, each in sorted(laws.items()):
         print(f"{node:32} {each}")
 
 
+def show(folder):
+    """Compare the laws with the steps of all runs."""
+    loading = loaders([run for run in read(folder, FIT | HELD_OUT) if "grown" in run])
+    laws = cost_laws.shipped()
+    for title, names in (("fitted", FIT), ("held out", HELD_OUT)):
+        met, within = Counter(), Counter()
+        for node, rows in sorted(grouped(read(folder, names), loading).items()):
+            for row in rows:
+                size, law = cost_laws.Size(*row.size), laws[node]
+                extra = law.loads if row.loads and law.loads else cost_laws.Loading((), 0.0, 0.0)
+                pairs = [("seconds", row.seconds, law.time(size) + extra.seconds, LONG, law.spread[1])]
+                if row.peak is not None:
+                    pairs.append(("peak", row.peak, law.peak(size) + extra.memory, LARGE, law.spread[0]))
+                for what, measured, expected, least, spread in pairs:
+                    if measured <= least:
+                        continue
+                    close = abs(measured / expected - 1) <= CLOSE
+                    met[what, close] += 1
+                    within[what, spread.least * 0.95 <= measured / expected <= spread.most * 1.05] += 1
+                    if not close:
+                        numbers = f"{measured:.4g} against {expected:.4g}: {measured / expected:.2f}"
+                        print(f"  {title}: {what} of {node} {numbers} at {[f'{x:.3g}' for x in row.size]}")
+        for what in ("seconds", "peak"):
+            total = met[what, True] + met[what, False]
+            print(f"{title}: {what} within 20 %: {met[what, True]} of {total}; in range {within[what, True]}")
+
+
 if __name__ == "__main__":
-    main()
+    show(sys.argv[1]) if sys.argv[2:] == ["show"] else fit(sys.argv[1])
