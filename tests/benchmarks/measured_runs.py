@@ -58,6 +58,7 @@ HELD_OUT = {
     "train_small, 192 px": ["train_small", *at(192, 128, 256, 192)],
     "train_demonstration, 160 px": ["train_demonstration", *S],
     "hdr_night, 384 px": ["hdr_night", *B],
+    "hdr_night, 768 px (as shipped)": ["hdr_night"],
     "dirty_windshield, 160 px": ["dirty_windshield", *S],
     "half_ring, 320 px": ["half_ring", *U],
     "six_lasers, 160 px": ["six_lasers", *at(160, 128, 540, 160)],
