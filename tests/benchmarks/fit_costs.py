@@ -79,7 +79,7 @@ def grouped(runs, loading, paces=None):
     found = {}
     for run in runs:
         sizes, there, pace = sizes_in(*run["words"]), set(), (paces or {}).get(run["name"], 1.0)
-        for row in run["steps"]:
+        for row in {json.dumps(row): row for row in run["steps"]}.values():  # a journal may repeat a line
             libraries = set(loading.get(row["node"], ((), 0))[0])
             first = not libraries <= there
             there |= libraries
