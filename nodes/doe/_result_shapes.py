@@ -27,7 +27,8 @@ for node in (flat, vortex, axicon, spiral_axicon, cubic, half_rings, zernike, pi
 
 @unet.work
 def _(result: Tensor, *inputs: Any, grid: int = 270, width: int = 32, **params: Any) -> tuple[float, float]:
-    return 4.0 * width * grid**2, float(width * grid) ** 2 + result.numel()
+    side = min(grid, len(result))
+    return 4.0 * width * side**2, float(width * side) ** 2 + result.numel()
 
 
 @material.shape

@@ -9,7 +9,7 @@ from neusee.nodes.metrics._peak_irradiance import Peak, peak_irradiance
 from neusee.nodes.metrics._picture_quality import Quality, quality
 from neusee.nodes.metrics._psf_contrast import Mtf, encircled, mtf
 from neusee.nodes.metrics._saturated_pixels import Saturated, saturated
-from neusee.nodes.metrics._spectral_error import _SIDE, spectral_error
+from neusee.nodes.metrics._spectral_error import _SAMPLES, _SIDE, spectral_error
 from neusee.nodes.metrics._suppression_ratios import bsr, light_outside, lsr, peak_bsr
 from neusee.nodes.shape_rules import double, scalars
 from neusee.nodes.values import Bands, LowRankCube, Psf, Pupil
@@ -42,6 +42,12 @@ def _(psf: Psf, radiance: Tensor | LowRankCube | None = None) -> Tensor:
     return double(*radiance.shape[:-2]) if isinstance(radiance, Tensor) else double(len(psf.intensity))
 
 
+@bsr.work
+def _(result: Tensor, psf: Psf, radiance: Tensor | LowRankCube | None = None) -> tuple[float, float]:
+    read = psf.intensity if radiance is None else radiance.planes if isinstance(radiance, LowRankCube) else radiance
+    return 0.0, float(read.numel())
+
+
 @peak_bsr.shape
 def _(image: Tensor, plain_image: Any) -> Tensor:
     return double(*image.shape[:-2])
@@ -57,5 +63,8 @@ def _(pupil: Pupil, bands: Bands, illuminant: Any = None, responses: Tensor | No
 
 @spectral_error.work
 def _(result: Tensor, pupil: Pupil, bands: Bands, *others: Any, **params: Any) -> tuple[float, float]:
-    values = 2.0 * len(bands.centres) * _SIDE**2
-    return 8.0 * values, values + pupil.height.numel()
+    count, across = len(bands.centres), max(pupil.height.shape)
+    values = 2.0 * count * _SIDE**2
+    thinned = -(-across // max(1, across // _SAMPLES))
+    wavelengths = 2 * count - 1 if count > 1 else 3
+    return 8.0 * values, 0.5 * pupil.height.numel() + wavelengths * (thinned**2 + _SIDE**2)

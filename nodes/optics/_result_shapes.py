@@ -16,6 +16,7 @@ from neusee.nodes.optics._transform._scaled_transform import _expected_seconds
 from neusee.nodes.shape_rules import at_least_single, blank, double, known, transform_operations
 from neusee.nodes.values import Bands, Channels, LowRankCube, Psf, Pupil, Stop
 
+_WAVE, _SQUARE = 10.0, 8.0  #: operations for the wave at a sample of the pupil, and for its square at a pixel
 _SHORT, _FINE = 400e-9, 4e-6  #: m, wavelength and pupil pitch where no value is known
 
 
@@ -42,7 +43,8 @@ def _(result: Psf, pupil: Pupil, *direction: Any, focal_length: float, pixel_pit
     integrated = params.get("sensor") == "integrated"
     views = len(_nodes(max(pupil.height.shape) * alpha)[0]) ** 2 if integrated else 1
     field = 8.0 * (pupil.height.numel() + axes[0].n_in * axes[1].n_out)
-    return field, bands * views * 1e9 * min(_expected_seconds(*axes).values())
+    waves = _WAVE * axes[0].n_in * axes[1].n_in + _SQUARE * axes[0].n_out * axes[1].n_out
+    return field, bands * views * (waves + 1e9 * min(_expected_seconds(*axes).values()))
 
 
 @image.shape

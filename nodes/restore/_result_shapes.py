@@ -7,7 +7,10 @@ from torch import Tensor
 
 from neusee.nodes.restore._colour_matrix import colour_matrix
 from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons
-from neusee.nodes.restore._inverse._fft_grid import halvings
+from neusee.nodes.restore._inverse._conjugate_gradients import LOWEST
+from neusee.nodes.restore._inverse._fft_grid import halvings, torus
+from neusee.nodes.restore._inverse._hidden_pixels import MOST, STEPS
+from neusee.nodes.restore._inverse._lowest_frequencies import MODES, SHARE
 from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
 from neusee.nodes.restore._inverse._wiener import wiener
 from neusee.nodes.restore._networks._fft_mamba import fft_mamba
@@ -17,7 +20,9 @@ from neusee.nodes.shape_rules import at_least_single, blank, double, like_first,
 from neusee.nodes.values import Psf
 
 _SYSTEM = 35.0  #: bytes for each element of a dense system: the matrix, its factors and copies
-_SOLVED = 400.0  #: operations of a dense solution that take as long as one operation of a transform
+_INVERTED = 0.30  #: operations of a transform that take as long as one of the cube of the side of an inverted matrix
+_WHITENED = 0.94  #: side of a dense system that needs as much memory as an inverted matrix of side 1
+_FILLED = 790.0  #: operations of a transform that take as long as an element of a matrix of covariances
 
 for node in (electrons, wiener, richardson_lucy, fft_mamba, nafnet, unet):
     node.shape(like_first)
@@ -43,8 +48,26 @@ def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any) 
     y, x = _torus(electrons, psf)
     coarse = max(electrons.shape[-2:]) / 2 ** halvings((electrons.shape[-2], electrons.shape[-1]))
     unknowns = len(electrons) * coarse**2  # of the coarsest grid, which is solved as a dense system
-    operations = len(electrons) * transform_operations(y, x) + unknowns**3 / _SOLVED
-    return max(31.0 * len(electrons) * y * x, _SYSTEM * unknowns**2), operations
+    steps, side = _descent(electrons, psf)
+    operations = steps + _FILLED * unknowns**2
+    largest = max(unknowns, _WHITENED * side)
+    return max(31.0 * len(electrons) * y * x, _SYSTEM * largest**2), operations
+
+
+def _descent(electrons: Tensor, psf: Psf) -> tuple[float, float]:
+    """Return the operations of the steps on all grids but the coarsest, and the largest matrix that speeds them up."""
+    channels, *picture = electrons.shape
+    rims = [min(k // 2, max(256, n // 2), n) for n, k in zip(picture, psf.intensity.shape[-2:], strict=True)]
+    size = torus((picture[0], picture[1]), (rims[0], rims[1]))
+    total, largest, steps = 0.0, 0.0, STEPS
+    for level in range(halvings((picture[0], picture[1]))):
+        y, x = (n >> level for n in size)
+        total += steps * channels * transform_operations(y, x)
+        if max(picture) / 2**level <= LOWEST:
+            side = float(min(channels * MODES, 3 * MODES, channels * y * x / SHARE))
+            total, largest = total + _INVERTED * side**3, max(largest, side)
+        steps = min(4 * steps, MOST)
+    return total, largest
 
 
 @richardson_lucy.work

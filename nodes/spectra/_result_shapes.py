@@ -8,7 +8,7 @@ from torch import Tensor
 from neusee.nodes.shape_rules import at_least_single, blank, double, like_first
 from neusee.nodes.spectra._camera_colour import grain, render
 from neusee.nodes.spectra._channel_responses import responses
-from neusee.nodes.spectra._dead_leaves import leaves
+from neusee.nodes.spectra._dead_leaves import _FINE, leaves
 from neusee.nodes.spectra._distinct_band_sums import rows
 from neusee.nodes.spectra._illuminant import illuminant, illuminate
 from neusee.nodes.spectra._linear_lift import lift_lmmse, lift_lmmse_mixture, lift_mallett, lift_mallett_mixture
@@ -78,6 +78,13 @@ def _(reflectances: Tensor, bands: Bands, *, count: int = 48, **params: Any) -> 
 @leaves.shape
 def _(spectra: Tensor, bands: Bands, *, shape: tuple[int, int], **params: Any) -> Tensor:
     return blank(len(bands.centres), *shape)
+
+
+@leaves.work
+def _(result: Tensor, *inputs: Any, **params: Any) -> tuple[float, float]:
+    """Return the work of a picture that is drawn several times as fine, in all bands at once."""
+    fine = float(_FINE**2 * result.numel())
+    return 4.0 * fine, fine
 
 
 @render.shape

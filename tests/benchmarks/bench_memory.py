@@ -1,10 +1,14 @@
-"""Peak memory of runs: predicted before the run, limit, and measured from outside while the run goes on.
+"""Peak memory of runs: predicted before the run, and measured; and what a limit of the memory does.
 
-    python tests/benchmarks/bench_memory.py             # every row; up to 5 GB and ten minutes on two cores
-    python tests/benchmarks/bench_memory.py small       # rows whose name holds this word
+    python tests/benchmarks/measured_runs.py FOLDER     # the runs
+    python tests/benchmarks/bench_memory.py FOLDER      # predicted against measured, as a table for RESULTS.md
+    python tests/benchmarks/bench_memory.py limits small    # runs with limits whose name holds this word, up to 5 GB
 
-Each run has an empty cache and its own process, whose resident memory is read every 5 ms. The limit is a tenth above
-the prediction. The last column is the outcome of the same run with a limit of 9/10 of the prediction.
+A prediction starts from the memory that the program of that run held before its first step, as ``neusee run`` does
+itself. The numbers of `workflows.explain.report_memory` are fitted to the runs that are not held out.
+
+With limits, each run has an empty cache and its own process, whose resident memory is read every 5 ms. The limit is a
+tenth above the prediction. The last column is the outcome of the same run with a limit of 9/10 of the prediction.
 """
 
 import json
@@ -14,9 +18,21 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
 
-from fit_costs import at
+import numpy as np
+from fit_costs import read
+from measured_runs import FIT, HELD_OUT, at
+from scipy.optimize import nnls
+
+from neusee.workflows.explain import report_memory
+from neusee.workflows.explain.run_forecast import lanes_for, planned
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.store.result_store import Store
 
 FIRST, PAPER = "first_light", "paper_table1"
 ROWS = {
@@ -61,12 +77,63 @@ def predicted(words):
     return running, reporting
 
 
-def main():
-    """Print one line of a table for each run."""
+def forecast(run):
+    """Predicted memory of a measured run in bytes: the program, with its steps, its report, and what it shows."""
+    name, *changes = [word for word in run["words"] if word != "--exact"]
+    recipe, shown = replace(load(name, changes), exact="--exact" in run["words"]), []
+
+    def watched(works, kept, costs, *others):
+        shown.append(sum(costs.size_of(step) for step in kept))
+        return report_memory.report_peak(works, kept, costs, *others)
+
+    engine, none = "neusee.workflows.engine", SimpleNamespace(modules={})
+    with tempfile.TemporaryDirectory() as place, ExitStack() as stack:
+        for target, value in (
+            (f"{engine}.local_executor.process_memory", lambda: run["before"]),
+            (f"{engine}.cost_laws.sys", none),
+            (f"{engine}.cost_model.sys", none),
+            ("neusee.workflows.explain.run_forecast.report_peak", watched),
+        ):
+            stack.enter_context(mock.patch(target, value))
+        lanes = lanes_for(recipe, "cpu", 10**12)
+        plan = planned(recipe, Store(Path(place)), lanes)
+    return lanes["cpu"].held, plan.running, plan.reporting, shown[0]
+
+
+def compare(folder):
+    """Print predicted and measured memory of all runs, and the numbers of the report that fit best."""
+    head = "run", "", "predicted: steps, report", "measured: steps, report", "measured / predicted"
+    print(f"| {' | '.join(head)} |\n|{'---|' * len(head)}")
+    ratios, rows = {}, []
+    for kind, names in (("fitted", FIT), ("held out", HELD_OUT)):
+        for run in read(folder, names):
+            held, running, reporting, shown = forecast(run)
+            ratio = max(run["running"], run["reporting"]) / max(running, reporting)
+            ratios.setdefault(kind, []).append(ratio)
+            if kind == "fitted":
+                rows.append((1e6, running - held, shown, run["reporting"] - held, run["reporting"]))
+            both = (f"{one / 1e6:.0f}, {two / 1e6:.0f}" for one, two in ((running, reporting), _ends(run)))
+            print(f"| {' | '.join((run['name'], kind, *both, f'{ratio:.2f}'))} |")
+    for kind, found in ratios.items():
+        close = sum(abs(ratio - 1) <= 0.2 for ratio in found)
+        print(f"{kind}: peak of the process within 20 %: {close} of {len(found)}, {min(found):.2f} to {max(found):.2f}")
+    table = np.array(rows)
+    best = nnls(table[:, :3] / table[:, 4:], table[:, 3] / table[:, 4])[0]
+    print("report: MB for drawing, share held back, copies:", ", ".join(f"{x:.3g}" for x in best))
+    before = [run["before"] / 1e6 for run in read(folder, FIT | HELD_OUT)]
+    print(f"memory before the first step: {min(before):.0f} to {max(before):.0f} MB")
+
+
+def _ends(run):
+    return run["running"], run["reporting"]
+
+
+def limits(word, *_):
+    """Print one line of a table for each run with limits whose name holds the word."""
     head = "run", "predicted: steps, report", "limit", "measured", "measured / predicted", "worst step", "limit of 9/10"
     print(f"| {' | '.join(head)} |\n|{'---|' * len(head)}")
     for name, words in ROWS.items():
-        if sys.argv[1:] and sys.argv[1] not in name:
+        if word not in name:
             continue
         parts = predicted(words)
         most = max(parts)
@@ -96,4 +163,4 @@ def worst(steps):
 
 
 if __name__ == "__main__":
-    main()
+    limits(*sys.argv[2:], "") if sys.argv[1] == "limits" else compare(sys.argv[1])

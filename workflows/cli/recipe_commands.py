@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -96,13 +97,12 @@ def _predicted(
 
     A run on this machine ends before any step if the limit of memory, or the memory that is free, is too small.
     """
-    from neusee.workflows.engine.local_executor import lanes_of
-    from neusee.workflows.explain.run_forecast import planned
+    from neusee.workflows.explain.run_forecast import lanes_for, planned
     from neusee.workflows.report.console import forecast_line
 
     if silent and not local:
         return {}
-    plan = planned(recipe, store, lanes_of(device.split(","), memory))
+    plan = planned(recipe, store, lanes_for(recipe, device, memory))
     if local and plan.refused:
         fail(f"{'memory' if memory is None else '--memory'}: {plan.refused}; nothing was run")
     slots = plan.schedule.slots if plan.schedule else ()
@@ -153,8 +153,9 @@ def plan(
     """Show which steps a run would compute, where and for how long.
 
     Nothing is computed. Bytes follow from the shape of each result; seconds and memory from laws of each node that
-    were measured, and from earlier runs on this machine. A guess for a node without a measurement is marked. With
-    --devices the run is simulated on machines that you do not have: makespan, utilisation and critical path.
+    were measured, and from earlier runs on this machine, each with its range. A guess for a node without a
+    measurement is marked and counts at its upper end. With --devices the run is simulated on machines that you do
+    not have: makespan, utilisation and critical path.
     """
     recipe, command = load(words, "plan", exact=exact)
     from neusee.workflows.explain import run_forecast
@@ -162,14 +163,14 @@ def plan(
     check_device(device)
     if devices:
         with refusing():
-            lines, refused = run_forecast.simulated_lines(recipe, the_store(), devices), False
+            found = run_forecast.Forecast(run_forecast.simulated_lines(recipe, the_store(), devices), [], {}, False)
     else:
-        lines, refused = run_forecast.plan_lines(recipe, the_store(), device, memory_limit(memory))
+        found = run_forecast.forecast(recipe, the_store(), device, memory_limit(memory))
     if as_json:
-        say_json({"command": shlex.join(command), "refused": refused, "lines": lines})
+        say_json({"command": shlex.join(command), **asdict(found)})
     else:
-        say(lines)
-    if refused:
+        say(found.lines)
+    if found.refused:
         raise typer.Exit(FAILED)
 
 

@@ -3,13 +3,15 @@
 The peak memory of a step is ``a + b inputs + c result + d work`` bytes beyond the memory in use before, and its time is
 ``e + f operations`` seconds. ``node_costs.json`` has the coefficients of each shipped node, which
 tests/benchmarks/fit_costs.py fits to runs of the shipped recipes on a CPU, and the spread of the runs about the law.
+Seconds are the processor time of one thread, so that a busy machine does not make a law slow.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -20,8 +22,7 @@ from neusee.workflows.engine.band_results import bands_in
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.recipe.step_shapes import Form, bytes_of, complete, form_of, inputs_of, without_values
 
-_UPPER = 4.0  #: peak memory and time of a node that was never measured, as a multiple of what its tensors alone take
-_LEAST = 1 << 26  #: bytes of a result whose shape is not known, at the least
+_LEAST = float(1 << 26)  #: bytes of a result whose shape is not known, in a recipe without any known shape
 
 
 class Size(NamedTuple):
@@ -35,13 +36,34 @@ class Size(NamedTuple):
     known: bool = True  #: False where the shape of the result is a guess
 
 
+class Range(NamedTuple):
+    """The least and the largest value that a cost may take, as multiples of its prediction."""
+
+    least: float = 1.0
+    most: float = 1.0
+
+
+Spread = tuple[Range, Range]  #: of the peak memory, and of the seconds
+EXACT: Spread = (Range(), Range())
+
+
+class Loading(NamedTuple):
+    """The additional cost of the first step of a process that uses some libraries, because it loads them."""
+
+    libraries: tuple[str, ...]
+    memory: float  #: bytes, which the process keeps
+    seconds: float
+
+
 @dataclass(frozen=True, slots=True)
 class Law:
     """The costs of a node as functions of the `Size` of a step."""
 
     memory: tuple[float, float, float, float]  #: bytes, and factors of inputs, result and work
     seconds: tuple[float, float]  #: s, and s for each operation
-    spread: tuple[float, float] = (1.0, 1.0)  #: factor by which a run may exceed the law, for memory and for seconds
+    spread: Spread = EXACT  #: of runs about the law
+    loads: Loading | None = None  #: the libraries that the node loads, whose cost is not in the numbers above
+    most: float = 0.0  #: bytes of the largest result that was measured, for a node without a rule of the shape
 
     def peak(self, size: Size) -> float:
         """Return the peak memory of a step in bytes beyond the memory in use before; at least its result."""
@@ -53,22 +75,56 @@ class Law:
         return self.seconds[0] + self.seconds[1] * size.operations
 
 
-#: for a node that was never measured: the upper end of what the shipped nodes need
-GUESS = Law((float(1 << 24), _UPPER, _UPPER, 2.0), (0.01, 1e-7), (1.0, 1.0))
+@cache
+def _file() -> Mapping[str, Any]:
+    text = resources.files(__package__).joinpath("node_costs.json").read_text(encoding="utf-8")
+    found: dict[str, Any] = json.loads(text)
+    return found
 
 
 @cache
 def shipped() -> Mapping[str, Law]:
     """Return the laws of the shipped nodes, by the path of the node."""
-    text = resources.files(__package__).joinpath("node_costs.json").read_text(encoding="utf-8")
-    return {
-        path: Law(tuple(law["memory"]), tuple(law["seconds"]), tuple(law["spread"]))
-        for path, law in json.loads(text)["nodes"].items()
-    }
+    return {path: _law(law) for path, law in _file()["nodes"].items()}
+
+
+@cache
+def guess() -> Law:
+    """Return the law of a node that was never measured: the largest costs for its size that any shipped node has."""
+    return _law(_file()["guess"])
+
+
+def _law(law: Mapping[str, Any]) -> Law:
+    spread = (Range(*law["spread"][0]), Range(*law["spread"][1])) if "spread" in law else EXACT
+    loads = Loading(tuple(law["loads"][0]), *law["loads"][1:]) if "loads" in law else None
+    return Law(tuple(law["memory"]), tuple(law["seconds"]), spread, loads, law.get("most", 0.0))
+
+
+def libraries_of(paths: Iterable[str]) -> float:
+    """Return the bytes of the libraries that the nodes with these paths load, and this process has not loaded yet."""
+    total, there = 0.0, set(sys.modules)
+    for path in paths:
+        law = shipped().get(path)
+        if law and law.loads and not there.issuperset(law.loads.libraries):
+            there.update(law.loads.libraries)
+            total += law.loads.memory
+    return total
 
 
 def sizes_of(recipe: Recipe, order: Sequence[str]) -> dict[str, Size]:
-    """Return the size of each step in ``order`` before anything runs; ``order`` lists each step after its inputs."""
+    """Return the size of each step in ``order`` before anything runs; ``order`` lists each step after its inputs.
+
+    A result of unknown shape counts as large as its inputs, or as the largest known result of the recipe if that is
+    larger.
+    """
+    found = _sizes(recipe, order, 0.0)
+    if all(size.known for size in found.values()):
+        return found
+    told = [size.result for size in found.values() if size.known and size.result < math.inf]
+    return _sizes(recipe, order, max(told, default=_LEAST))
+
+
+def _sizes(recipe: Recipe, order: Sequence[str], least: float) -> dict[str, Size]:
     forms: dict[str, Form] = {}
     found: dict[str, Size] = {}
     for name in order:
@@ -79,18 +135,25 @@ def sizes_of(recipe: Recipe, order: Sequence[str]) -> dict[str, Size]:
         except OverflowError:
             found[name] = Size(0.0, math.inf, math.inf, math.inf)
             continue
-        found[name] = _size(step, inputs, forms[name], [found[source] for source in dict.fromkeys(step.sources)])
-        if forms[name] is None:  # a guess, so that the sizes of later steps can be computed
+        below = [found[source] for source in dict.fromkeys(step.sources)]
+        found[name] = _size(step, inputs, forms[name], below, least)
+        if forms[name] is None and not found[name].known:  # a guess, so that the sizes of later steps can be computed
             forms[name] = next((x for x in inputs if x is not None), None)
     return found
 
 
-def _size(step: Step, inputs: Sequence[Form], form: Form, below: Sequence[Size]) -> Size:
-    known = form is not None and all(size.known for size in below)
+def _size(step: Step, inputs: Sequence[Form], form: Form, below: Sequence[Size], least: float) -> Size:
+    known = all(size.known for size in below)
     if form is not None and complete(step.node, inputs):
         return size_of(step.node, inputs, step.params, form)._replace(known=known)
     read = sum(size.result for size in below)
-    result = bytes_of(form) if form is not None else max(read, float(_LEAST))
+    law = shipped().get(step.node.path)
+    if form is not None:
+        result = bytes_of(form)
+    elif law and law.most:
+        result = law.most
+    else:
+        result, known = max(read, least), False
     return Size(read, result, 0.0, (read + result) / 4, 0, known)
 
 

@@ -7,14 +7,15 @@ was never measured, the upper end of what shipped nodes need.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 from types import MappingProxyType
 from typing import Any
 
-from neusee.workflows.engine.cost_laws import GUESS, Law, Size, shipped
+from neusee.workflows.engine.cost_laws import EXACT, Law, Loading, Range, Size, Spread, guess, shipped
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import device_kind
 from neusee.workflows.recipe.known_before_run import machine_memory
@@ -35,13 +36,15 @@ class Estimate:
     bytes: float  #: size of the result
     work: float  #: memory during the run, beside the inputs and the result
     known: bool  #: False for a guess: neither the shape nor a measurement of the node is known
-    spread: tuple[float, float] = (1.0, 1.0)  #: factor by which peak memory and time may exceed the prediction
+    spread: Spread = EXACT  #: of the peak memory and of the seconds
     bands: int = 0  #: number of bands that can be computed one after another; 0 if not known
+    sized: bool = True  #: False where the size of the result is a guess as well
+    libraries: float = 0.0  #: bytes of the libraries that the step loads, which count in the memory of the program
 
     @property
     def peak(self) -> float:
         """Return the memory of the step beside its inputs, in bytes."""
-        return self.bytes + self.work
+        return self.bytes + self.work + self.libraries
 
 
 class Costs:
@@ -68,6 +71,31 @@ class Costs:
         rows = self._steps.get(f"{step.name} {step.node.path}", [])[-_NEWEST:]
         return self._repeated(rows, kinds, None) if rows else self._guess(step.node.path, kinds, size)
 
+    def in_turn(self, steps: Iterable[tuple[str, Step, Row | None]], kinds: Sequence[str]) -> dict[str, Estimate]:
+        """Predict the costs of steps that run one after another: a library costs the first step that loads it.
+
+        Args: steps: a key, the step, and the measured costs of the same result or None. Returns: the costs by key.
+        """
+        found, there = dict[str, Estimate](), set(sys.modules)
+        for key, step, exact in steps:
+            found[key] = self.of(step, kinds, exact)
+            law = shipped().get(step.node.path)
+            if law and law.loads and not there.issuperset(law.loads.libraries):
+                there.update(law.loads.libraries)
+                if not self._measured(step, exact):
+                    found[key] = _loading(found[key], law.loads)
+        return found
+
+    def _measured(self, step: Step, exact: Row | None) -> bool:
+        """Return True if the costs of a step are those of earlier runs, which loaded the libraries as well."""
+        size = self._sizes.get(step.name)
+        rows = self._nodes.get(step.node.path, [])
+        return (
+            bool(exact and _is_measured(exact))
+            or size is None
+            or any(_alike(_size(row), size) for row in rows if _size(row))
+        )
+
     def with_sizes(self, sizes: Mapping[str, Size]) -> Costs:
         """Return the same measurements for the steps with other ``sizes``."""
         found = copy(self)
@@ -87,7 +115,7 @@ class Costs:
             return self._repeated(same, kinds, size, law)
         if law is None and not rows:
             return self._guess(path, kinds, size)
-        base = law or GUESS
+        base = law or guess()
         factors = _scales(base, rows[-_NEWEST:], self._faster)
         peak = max(size.result, factors[0] * base.peak(size))
         on_cpu = factors[1] * base.time(size)
@@ -100,17 +128,20 @@ class Costs:
         """Predict a step by the median of earlier runs of the same size."""
         result = size.result if size else float(median(row["bytes"] for row in rows))
         peaks = [float(row["peak"]) for row in rows if row.get("peak") is not None]
-        least = law.peak(size) / law.spread[0] if law and size else 0.0
+        least = law.peak(size) * law.spread[0].least if law and size else 0.0
         peak = max(median(peaks) if peaks else 0.0, result, least)
         seconds = {kind: self._seconds(rows, kind) for kind in kinds}
-        return Estimate(seconds, result, peak - result, True, (1.0, 1.0), size.bands if size else 0)
+        usual = law.spread if law else EXACT
+        spread = (_range(peaks, peak, usual[0]), _range([row["seconds"] for row in rows], None, usual[1]))
+        return Estimate(seconds, result, peak - result, True, spread, size.bands if size else 0)
 
     def _guess(self, path: str, kinds: Sequence[str], size: Size | None) -> Estimate:
         """Predict the upper end of the costs of a step whose node was never measured or whose shape is unknown."""
-        size, law = size or Size(0.0, 0.0, 0.0, 0.0, known=False), shipped().get(path, GUESS)
-        on_cpu, peak = law.spread[1] * law.time(size), law.spread[0] * law.peak(size)
+        size, law = size or Size(0.0, 0.0, 0.0, 0.0, known=False), shipped().get(path) or guess()
+        on_cpu, peak = law.spread[1].most * law.time(size), law.spread[0].most * law.peak(size)
         seconds = {kind: on_cpu / self._faster(kind) for kind in kinds}
-        return Estimate(seconds, size.result, peak - size.result, False, (1.0, 1.0), size.bands)
+        spread = (Range(size.result / peak if peak else 0.0, 1.0), Range(0.0, 1.0))
+        return Estimate(seconds, size.result, peak - size.result, False, spread, size.bands, size.known)
 
     def _seconds(self, rows: Sequence[Row], kind: str) -> float:
         here = [row for row in rows if _kind(row) == kind]
@@ -134,6 +165,20 @@ class Costs:
                 if cpu > 0 and median(seconds) > 0:
                     found.setdefault(kind, []).append(cpu / median(seconds))
         return {kind: median(ratios) for kind, ratios in found.items()}
+
+
+def _loading(cost: Estimate, loads: Loading) -> Estimate:
+    """Return the costs of a step that loads a library before it computes."""
+    seconds = {kind: time + loads.seconds for kind, time in cost.seconds.items()}
+    return replace(cost, seconds=seconds, libraries=loads.memory)
+
+
+def _range(values: Sequence[float], expected: float | None, usual: Range) -> Range:
+    """Return the range of measured ``values`` about their median, or ``usual`` for fewer than two values."""
+    expected = expected or (median(values) if values else 0.0)
+    if len(values) < 2 or expected <= 0.0:
+        return usual
+    return Range(min(1.0, min(values) / expected), max(1.0, max(values) / expected))
 
 
 def _is_measured(row: Row) -> bool:

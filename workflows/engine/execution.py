@@ -22,7 +22,7 @@ from neusee.workflows.engine.local_executor import Local
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare, room_for
 from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, StepJob
-from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order
+from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order, nodes_of
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key, key_of
@@ -51,7 +51,7 @@ class Execution:
     ) -> None:
         self.recipe, self.store, self.devices, self.watch = recipe, store, devices, watch
         self.wanted = frozenset(wanted)
-        self.own = Local(devices, store, self._fetch, memory)
+        self.own = Local(devices, store, self._fetch, memory, nodes_of(recipe, self.wanted))
         self.executor = executor or self.own
         self.code = Code(store.code_memo)
         self.began = time.time()

@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from typing import Any
 
 import torch
 
+from neusee.workflows.engine.cost_laws import libraries_of
 from neusee.workflows.engine.memory_use import free_memory, pool_of, process_memory, there_is
 from neusee.workflows.engine.step_job import Lane, Outcome, StepJob, carry_out
 from neusee.workflows.engine.write_behind import WriteBehind
@@ -20,19 +21,19 @@ from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 
 _SHARE = 0.9  #: fraction of a device's memory that a schedule may use
-LOADED = 450 << 20  #: bytes of the interpreter with the libraries that steps load, as measured
 
 
-def lanes_of(devices: Sequence[str], memory: int | None = None) -> dict[str, Lane]:
+def lanes_of(devices: Sequence[str], memory: int | None = None, nodes: Iterable[str] = ()) -> dict[str, Lane]:
     """Return one `Lane` for each device; devices with a common memory divide the bytes that a schedule may use.
 
-    ``memory`` limits the memory of each GPU, and for the CPU the memory of this process with what the program itself
-    holds; if None, the limit is most of a GPU, or most of the memory that is free now.
+    Args: memory: the limit of the memory of each GPU, and for the CPU of the memory of this process with what the
+    program itself holds; if None, most of a GPU, or most of the memory that is free now. nodes: the paths of the nodes
+    that will run, whose libraries the program holds as well.
     """
     pools = [pool_of(device) for device in devices]
     found = {}
     for device in devices:
-        held = program_memory() if pool_of(device) == "cpu" else 0
+        held = program_memory(nodes) if pool_of(device) == "cpu" else 0
         limit = memory_limit(memory) if pool_of(device) == "cpu" else memory or _SHARE * there_is(device)
         found[device] = Lane(device, (limit - held) / pools.count(pool_of(device)), held)
     return found
@@ -43,9 +44,9 @@ def memory_limit(memory: int | None) -> float:
     return memory or process_memory() + _SHARE * free_memory()
 
 
-def program_memory() -> int:
-    """Return the memory of this process in bytes before the first step, with the libraries that the steps load."""
-    return max(process_memory(), LOADED)
+def program_memory(nodes: Iterable[str] = ()) -> float:
+    """Return the memory of this process in bytes before the first step, with the libraries that ``nodes`` load."""
+    return process_memory() + libraries_of(nodes)
 
 
 class Local:
@@ -54,9 +55,14 @@ class Local:
     shares = True
 
     def __init__(
-        self, devices: Sequence[str], store: Store, fetch: Callable[[Key], Any], memory: int | None = None
+        self,
+        devices: Sequence[str],
+        store: Store,
+        fetch: Callable[[Key], Any],
+        memory: int | None = None,
+        nodes: Iterable[str] = (),
     ) -> None:
-        self.lanes = lanes_of(devices, memory)
+        self.lanes = lanes_of(devices, memory, nodes)
         self._store, self._fetch = store, fetch
         self._queue: deque[StepJob] = deque()
         self.later = WriteBehind()

@@ -44,7 +44,7 @@ def prepare(
     The keys ``there`` are of values that are in memory already. Other values that no job computes are read.
     """
     kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
-    expected = {w.key: costs.of(w.step, kinds, abouts.get(w.key)) for w in works}
+    expected = costs.in_turn(((w.key, w.step, abouts.get(w.key)) for w in works), kinds)
     read = {
         key: 0.0 if key in there else costs.size_of(name)
         for work in works

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from textwrap import wrap
 from typing import Any
 
 from neusee.workflows.engine.cost_laws import sizes_of
@@ -13,12 +14,12 @@ from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import past_costs, prepare, running_peak
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.step_job import Lane, StepJob
+from neusee.workflows.explain.forecast_table import forecast_rows, seconds_text, table_lines
 from neusee.workflows.explain.report_memory import report_peak, shown_steps
-from neusee.workflows.graph.recipe_graph import Recipe, needed
-from neusee.workflows.keys.cache_key import Key, device_kind
+from neusee.workflows.graph.recipe_graph import Recipe, needed, nodes_of
+from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
 from neusee.workflows.report.contents import steps_of, wanted
-from neusee.workflows.report.text_table import columns
 from neusee.workflows.store.byte_sizes import format_size
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -42,6 +43,12 @@ class Plan:
     reporting: float = 0.0  #: peak memory of this process in bytes while the report is written
 
 
+def lanes_for(recipe: Recipe, device: str, memory: int | None) -> dict[str, Lane]:
+    """Return the lanes of a run on the devices ``device``, with the libraries that its steps load in the program."""
+    cheaper = with_substitutions(recipe, wanted(recipe))
+    return lanes_of(device.split(","), memory, nodes_of(cheaper, wanted(recipe)))
+
+
 def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
     """Return the forecast of a run: the steps to compute and to read, their costs and their schedule."""
     recipe = with_substitutions(recipe, wanted(recipe))
@@ -58,7 +65,7 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
     costs = past_costs(store, sizes_of(recipe, order)) if works else Costs([])
     abouts = {work.key: about for work in works if (about := store.about(work.key))}
     kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
-    expected = {w.step.name: costs.of(w.step, kinds, abouts.get(w.key)) for w in works}
+    expected = costs.in_turn(((w.step.name, w.step, abouts.get(w.key)) for w in works), kinds)
     empty = Plan(recipe, order, keys, left_out, awake, loaded, expected, {}, None)
     try:
         found = prepare(works, costs, abouts, lanes, [keys[name] for name in wanted(recipe)])
@@ -83,7 +90,7 @@ def _with_report(plan: Plan, store: Store, costs: Costs, lanes: Mapping[str, Lan
     works = [_work(plan.recipe, name, keys, devices) for name in order if name in set(makers.values())]
     costs = costs.with_sizes(sizes_of(plan.recipe, order))
     try:
-        peak = report_peak(works, {name: keys[name] for name in shown}, costs, lanes)
+        peak = report_peak(works, {name: keys[name] for name in shown}, costs, lanes, plan.running)
     except TooLarge as error:
         return replace(plan, refused=f"for the report, {error}")
     limit = sum(lane.memory for lane in cpu) + max((lane.held for lane in cpu), default=0.0)
@@ -94,13 +101,42 @@ def _with_report(plan: Plan, store: Store, costs: Costs, lanes: Mapping[str, Lan
     return replace(plan, refused=f"{why}: give more memory, or choose a smaller picture or number of bands")
 
 
-def plan_lines(recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None) -> tuple[list[str], bool]:
-    """Return the table of a forecast as lines, and True if the run would lack memory."""
-    lanes = lanes_of(device.split(","), memory)
+@dataclass(frozen=True)
+class Forecast:
+    """Forecast of a run for a reader: lines of text, and the costs of each step as values for JSON."""
+
+    lines: list[str]
+    steps: list[dict[str, Any]]
+    totals: dict[str, Any]
+    refused: bool  #: True if the run would lack memory
+
+
+def forecast(recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None) -> Forecast:
+    """Return the forecast of a run with the table of its steps, its totals, and whether it would lack memory."""
+    lanes = lanes_for(recipe, device, memory)
     plan = planned(recipe, store, lanes)
-    rows = [_row(name, plan, store) for name in plan.order]
-    head = ["step", "node", "state", "where", "seconds", "bytes", "memory", "reads"]
-    return [*columns([head, *rows]), *_sums(plan, lanes)], bool(plan.refused)
+    rows, totals = forecast_rows(plan, store), _totals(plan)
+    return Forecast([*table_lines(rows), *_sums(plan, lanes, totals)], rows, totals, bool(plan.refused))
+
+
+def _totals(plan: Plan) -> dict[str, Any]:
+    """Return the totals of a forecast over all steps as values for JSON: seconds with their range, bytes and memory."""
+    took = plan.schedule.makespan if plan.schedule else None
+    sums = [(cost.seconds["cpu"], cost.spread[1]) for cost in plan.expected.values()]
+    alone = sum(seconds for seconds, _ in sums)
+    ends = {
+        "least": sum(seconds * around.least for seconds, around in sums),
+        "most": sum(seconds * around.most for seconds, around in sums),
+    }
+    ranged = {end: took * total / alone for end, total in ends.items()} if took and alone else {}
+    return {
+        "steps": len(plan.expected),
+        "guesses": sum(not cost.known for cost in plan.expected.values()),
+        "seconds": took and {"expected": took, **ranged},
+        "bytes": sum(cost.bytes for cost in plan.expected.values()),
+        "memory_of_steps": plan.running or None,
+        "memory_of_report": plan.reporting or None,
+    }
 
 
 def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
@@ -114,50 +150,36 @@ def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
         sorted({"cpu", *(device.kind for device in cluster.devices)}),
     )
     names = steps_of(recipe)
-    return cluster_lines(recipe, {name: costs.of(recipe.steps[name], kinds) for name in names}, cluster)
+    return cluster_lines(recipe, costs.in_turn(((name, recipe.steps[name], None) for name in names), kinds), cluster)
 
 
-def _row(name: str, plan: Plan, store: Store) -> list[str]:
-    step, about = plan.recipe.steps[name], store.about(plan.keys[name])
-    reads = ", ".join(dict.fromkeys(step.sources))
-    if plan.left_out.get(name):
-        return [name, step.node.path, "left out", "", "", "", "", reads]
-    if name in plan.expected:
-        cost = plan.expected[name]
-        where = plan.lanes.get(name, "?")
-        seconds = cost.seconds.get(device_kind(where), cost.seconds["cpu"])
-        mark = "" if cost.known else "guess: "
-        costs = [f"{mark}{seconds:.3f} s", f"{mark}{format_size(cost.bytes)}", f"{mark}{format_size(cost.peak)}"]
-        return [name, step.node.path, "run", where, *costs, reads]
-    state = "stored" if store.has(plan.keys[name]) else "run" if name in plan.awake else "not needed"
-    known = [f"{about['seconds']:.3f} s", format_size(about["bytes"])] if about else ["", ""]
-    return [name, step.node.path, state, "", *known, "", reads]
-
-
-def _sums(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
+def _sums(plan: Plan, lanes: Mapping[str, Lane], totals: Mapping[str, Any]) -> list[str]:
     """Return text lines with the totals of a forecast over all steps, and with the steps that may be left out."""
-    ran, new = len(plan.expected), sum(e.bytes for e in plan.expected.values())
-    guesses = sum(not e.known for e in plan.expected.values())
     lines = []
     if unsure := [name for name, known in plan.left_out.items() if known is None]:
-        lines.append(f"left out or not, depending on the values of the inputs: {', '.join(unsure)}")
-    took = f"about {plan.schedule.makespan:.3g} s" if plan.schedule else "no schedule"
-    guessed = f", {guesses} of them guessed at the upper end, because never measured" if guesses else ""
-    read = format_size(sum(plan.loaded.values()))
-    lines.append(
-        f"{ran} of {len(plan.order)} steps would run{guessed}: {took}, {format_size(int(new))} new, {read} to load"
-    )
+        lines += _wrapped(f"left out or not, depending on the values of the inputs: {', '.join(unsure)}")
+    seconds = totals["seconds"]
+    took = f"about {seconds_text(seconds)} s" if seconds else "no schedule" if seconds is None else "no time"
+    guessed = f", {totals['guesses']} of them guessed at the upper end, because never measured"
+    read, new = format_size(sum(plan.loaded.values())), format_size(int(totals["bytes"]))
+    would = f"{totals['steps']} of {len(plan.order)} steps would run{guessed if totals['guesses'] else ''}"
+    lines += _wrapped(f"{would}: {took}, {new} new, {read} to load")
     if plan.schedule:
         for name, lane in lanes.items():
             peak = format_size(plan.schedule.peak.get(name, 0.0))
             lines.append(f"memory  {name}: {peak} at most, of {format_size(max(lane.memory, 0.0))}")
     if plan.running:
         held = format_size(max(lane.held for lane in lanes.values()))
-        lines.append(
+        lines += _wrapped(
             f"memory  process: {format_size(plan.running)} while the steps run, of which the program itself holds "
             f"{held}; {format_size(plan.reporting)} while the report is written"
         )
-    return [*lines, *([f"refused: {plan.refused}"] if plan.refused else [])]
+    return [*lines, *(_wrapped(f"refused: {plan.refused}") if plan.refused else [])]
+
+
+def _wrapped(text: str) -> list[str]:
+    """Return a text as lines of at most 80 columns; the later lines are indented."""
+    return wrap(text, 80, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
 def _work(recipe: Recipe, name: str, keys: Mapping[str, Key], devices: Sequence[str]) -> StepJob:

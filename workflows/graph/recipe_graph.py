@@ -134,6 +134,11 @@ def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
     return in_order({name: step.sources for name, step in recipe.steps.items()}, outputs)
 
 
+def nodes_of(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
+    """Return the paths of the nodes that must run to compute the steps ``outputs``, each once."""
+    return list(dict.fromkeys(recipe.steps[name].node.path for name in needed(recipe, outputs)))
+
+
 def dependents(recipe: Recipe, roots: Iterable[str], order: Iterable[str] | None = None) -> set[str]:
     """Return the names of the steps ``roots`` and of all steps that depend on ``roots``, directly or not.
 

@@ -74,9 +74,9 @@ def said_of(found: Mapping[str, Any]) -> list[str]:
     if found["ran"]:
         lines.append(f"{found['ran']} of {found['steps']} steps ran: {_seconds(found['seconds'])} of computing time.")
     if found["told"]:
-        known = "these steps" if found["told"] == found["ran"] else f"the {found['told']} that had run before"
+        known = "these steps" if found["told"] == found["ran"] else f"the {found['told']} whose time was no guess"
         predicted, actual = _seconds(found["predicted"]), _seconds(found["actual"])
-        lines.append(f"Predicted from earlier runs for {known}: {predicted}; actual: {actual}.")
+        lines.append(f"Predicted for {known}: {predicted}; actual: {actual}.")
     if found["planned"] is not None:
         planned, span = _seconds(found["planned"]), _seconds(found["span"])
         lines.append(f"Planned duration, with parallel branches: {planned}; actual: {span}.")

@@ -217,9 +217,14 @@ def test_plan_computes_nothing_and_knows_what_is_stored(neusee, here):
     assert "0 of 3 steps would run" in out
     _, out, _ = neusee("plan", "mine.yaml", "mask.max_height=1.3 um")
     rows = {line.split()[0]: line.split() for line in out.splitlines()}
-    assert rows["cone"][2] == "stored"
-    assert rows["made"][2] == "run"
-    assert rows["made"][3] != "?"
+    assert rows["cone"][1] == "stored"
+    assert rows["made"][1] == "cpu"
+    steps = {
+        row["step"]: row
+        for row in json.loads(neusee("plan", "mine.yaml", "mask.max_height=1.3 um", "--json")[1])["steps"]
+    }
+    assert steps["cone"]["state"] == "stored"
+    assert (steps["made"]["state"], steps["made"]["where"]) == ("run", "cpu")
 
 
 def test_plan_follows_what_would_be_left_out(neusee, here):

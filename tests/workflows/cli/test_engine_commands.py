@@ -178,4 +178,4 @@ def test_a_plan_of_what_never_ran_has_numbers_and_names_the_guesses(neusee, here
     laws = {path: law for path, law in cost_laws.shipped().items() if path != "restore.wiener"}
     monkeypatch.setattr("neusee.workflows.engine.cost_model.shipped", lambda: laws)
     line = next(line for line in neusee("plan", "first_light")[1].splitlines() if line.startswith("deconvolved"))
-    assert line.count("guess: ") == 3
+    assert line.count("guess <") == 2  # the bytes of the result are known from its shape

@@ -1,14 +1,17 @@
 """What a step is expected to cost."""
 
+import importlib
+import sys
+
 import pytest
 import torch
 
-from neusee.nodes import node, optics, shape_rules
-from neusee.workflows.engine.cost_laws import GUESS, Law, Size, shipped, size_of
+from neusee.nodes import doe, node, optics, registered_nodes, shape_rules
+from neusee.workflows.engine.cost_laws import Law, Loading, Size, guess, libraries_of, shipped, size_of, sizes_of
 from neusee.workflows.engine.cost_model import Costs
 from neusee.workflows.engine.placement_inputs import MOST_PARTS, parts_of
 from neusee.workflows.graph.diagnostics import Location
-from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.graph.recipe_graph import Recipe, Step
 
 SMALL, LARGE = Size(1e8, 1e8, 0.0, 5e7), Size(4e8, 4e8, 0.0, 2e8)
 
@@ -30,9 +33,9 @@ def row(name, seconds, size=100, device="cpu", peak=None, node=blur.path, of=Non
 def test_of_what_nobody_measured_there_is_a_guess_at_the_upper_end_that_says_so():
     found = Costs([], {"a": SMALL}).of(step("a"), ["cpu", "cuda"])
     assert not found.known
-    assert found.peak == GUESS.peak(SMALL) > 4 * (SMALL.inputs + SMALL.result)
+    assert found.peak == guess().peak(SMALL) > 4 * (SMALL.inputs + SMALL.result)
     assert found.bytes == SMALL.result
-    assert found.seconds["cpu"] == GUESS.time(SMALL) > found.seconds["cuda"] > 0
+    assert found.seconds["cpu"] == guess().time(SMALL) > found.seconds["cuda"] > 0
 
 
 def test_nothing_is_known_of_a_step_without_a_shape_but_it_does_not_count_as_nothing():
@@ -50,8 +53,8 @@ def test_the_costs_follow_the_size_and_not_the_name():
     larger = Costs(rows, {"a": LARGE}).of(step("a"), ["cpu"])
     assert larger.known
     assert larger.bytes == LARGE.result
-    assert larger.peak == pytest.approx(4e8 * GUESS.peak(LARGE) / GUESS.peak(SMALL))
-    assert larger.seconds["cpu"] == pytest.approx(1.5 * GUESS.time(LARGE) / GUESS.time(SMALL))
+    assert larger.peak == pytest.approx(4e8 * guess().peak(LARGE) / guess().peak(SMALL))
+    assert larger.seconds["cpu"] == pytest.approx(1.5 * guess().time(LARGE) / guess().time(SMALL))
 
 
 def test_a_shipped_law_is_scaled_by_the_runs_of_this_machine():
@@ -144,3 +147,66 @@ def test_a_step_is_cut_into_no_more_parts_than_it_has_bands():
     assert parts_of(psf, Costs([], {"psf": many}).of(psf, ["cpu"])) == MOST_PARTS
     assert parts_of(psf, Costs([], {"psf": SMALL}).of(psf, ["cpu"])) == MOST_PARTS
     assert parts_of(step("a"), Costs([], {"a": few}).of(step("a"), ["cpu"])) == 1
+
+
+def loading(memory=1e8, seconds=2.0):
+    """The laws of a machine on which two nodes load the same library."""
+    loads = Loading(("a library that no machine has",), memory, seconds)
+    return {path: Law((1e6, 1.0, 1.0, 0.0), (0.5, 0.0), loads=loads) for path in (blur.path, "optics.psf")}
+
+
+def test_a_library_costs_the_first_step_that_loads_it_and_counts_once_in_the_program(monkeypatch):
+    for module in ("cost_model", "cost_laws"):
+        monkeypatch.setattr(f"neusee.workflows.engine.{module}.shipped", loading)
+    names = {"a": blur, "b": optics.psf, "c": blur}
+    costs = Costs([], dict.fromkeys(names, SMALL))
+    found = costs.in_turn(((name, step(name, each), None) for name, each in names.items()), ["cpu"])
+    assert [found[name].seconds["cpu"] for name in names] == [2.5, 0.5, 0.5]
+    assert found["a"].peak - found["b"].peak == 1e8
+    assert found["a"].work == found["b"].work, "the program holds the library, so no schedule counts it again"
+    assert libraries_of([blur.path, "optics.psf", "sensor.crop"]) == 1e8
+    monkeypatch.setitem(sys.modules, "a library that no machine has", sys)
+    assert libraries_of([blur.path, "optics.psf"]) == 0.0
+    assert costs.in_turn([("a", step("a"), None)], ["cpu"])["a"].seconds["cpu"] == 0.5
+
+
+def test_what_a_step_took_with_its_library_is_not_charged_for_the_library_again(monkeypatch):
+    monkeypatch.setattr("neusee.workflows.engine.cost_model.shipped", loading)
+    found = Costs([row("a", 2.6, peak=3e8, of=SMALL)], {"a": SMALL}).in_turn([("a", step("a"), None)], ["cpu"])
+    assert found["a"].seconds["cpu"] == 2.6
+    assert found["a"].peak == 3e8
+
+
+def test_the_range_of_a_step_that_ran_is_that_of_its_runs_and_of_a_law_that_of_the_law():
+    rows = [row("a", seconds, peak=peak, of=SMALL) for seconds, peak in ((1.0, 3e8), (2.0, 4e8), (3.0, 6e8))]
+    memory, time = Costs(rows, {"a": SMALL}).of(step("a"), ["cpu"]).spread
+    assert time == (0.5, 1.5)
+    assert memory == (0.75, 1.5)
+    law = shipped()["restore.wiener"]
+    assert law.spread[1].least < 1 < law.spread[1].most < 2
+
+
+def test_the_result_of_a_step_without_a_rule_is_no_larger_than_the_largest_known_result():
+    """Before, it counted as 64 MB, and each further step of the same kind as four times as much."""
+    at = Location("t.yaml", 1, 1)
+    known = Step("known", optics.stop, {"samples": 8, "pitch": 1e-5, "diameter": 8e-5}, {}, at, {})
+    flat = Step("flat", doe.flat, {}, {"stop": "known"}, at, {})
+    own = [Step(f"own{i}", blur, {}, {"x": "flat" if i == 0 else f"own{i - 1}"}, at, {}) for i in range(5)]
+    recipe = Recipe("t", "", 1, 0.0, ("own4",), {s.name: s for s in (known, flat, *own)})
+    sizes = sizes_of(recipe, list(recipe.steps))
+    assert not any(sizes[s.name].known for s in own)
+    assert {sizes[s.name].result for s in own} == {sizes["flat"].result} == {8 * 8 * 4.0}
+    alone = Recipe("t", "", 1, 0.0, ("own",), {"own": Step("own", blur, {}, {}, at, {})})
+    assert sizes_of(alone, ["own"])["own"].result > 1e7
+
+
+def test_a_guess_needs_the_most_that_a_shipped_node_needs_for_its_size():
+    """The ratio of peak to inputs and result, of the nodes that declare no further work, bounds what a guess needs."""
+    for path in shipped():
+        importlib.import_module(f"neusee.nodes.{path.partition('.')[0]}")  # registers the nodes
+    works = {each.path for each in registered_nodes() if each.hooks.work is not None}
+    ratios = {
+        path: law.peak(LARGE) / (LARGE.inputs + LARGE.result) for path, law in shipped().items() if path not in works
+    }
+    bound = guess().peak(LARGE) / (LARGE.inputs + LARGE.result)
+    assert max(ratios.values()) < bound < 3 * max(ratios.values())

@@ -80,7 +80,10 @@ def test_the_shapes_of_a_learnt_mask_are_those_of_its_run(size, tmp_path):
     compare(recipe, ("height", "psf[mask]", "truth"), Store(tmp_path))
 
 
-@pytest.mark.parametrize("name", ["first_light", "demonstration", "six_lasers", *CAMERA, *LEARNT])
+CALIBRATED = ["calibrate", "calibrate_camera", "train_lift"]  #: with nodes whose results have a shape by their values
+
+
+@pytest.mark.parametrize("name", ["first_light", "demonstration", "six_lasers", *CAMERA, *LEARNT, *CALIBRATED])
 def test_every_step_of_a_shipped_recipe_has_a_shape_and_a_measured_law(name):
     recipe = load(name, [])
     recipe = with_substitutions(recipe, wanted(recipe))

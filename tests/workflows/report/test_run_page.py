@@ -400,7 +400,7 @@ def test_time_is_added_up_with_each_key_once():
     assert (found["read"], found["written"]) == (400, 1000)
     assert run_timing.said_of(found) == [
         "2 of 7 steps ran: 3 s of computing time.",
-        "Predicted from earlier runs for the 1 that had run before: 1.5 s; actual: 1 s.",
+        "Predicted for the 1 whose time was no guess: 1.5 s; actual: 1 s.",
         "Planned duration, with parallel branches: 2.5 s; actual: 2.25 s.",
         "The cache served 4 steps and saved 8 s, 72.7 % of all computing time.",
         "Read from the cache: 400 B; written to it: 1 kB.",
