@@ -150,8 +150,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/optics/_transform/_pupil_field.py",
-        "turns.copy_(self.screens.height[rows, columns]).mul_(unit * self.view.turns_height)",
-        "torch.mul(self.screens.height[rows, columns], unit * self.view.turns_height, out=turns)",
+        "torch.add(self.tilt_u[columns], turns, alpha=self.view.turns_height, out=turns)",
+        "torch.add(self.tilt_u[columns], (self.screens.height[rows, columns] * self.view.turns_height), out=turns)",
         within("nodes/optics", "psf_independent.py::test_the_error_is_as_stated_from_the_height_map_to_the_intensity"),
     ),
     Mutant(

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
-from types import UnionType
+from types import MappingProxyType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
 
 import typer
@@ -91,7 +91,7 @@ def recipe_lines() -> list[str]:
     return [*titles, "", "groups, as in `neusee run laser=six`", *groups]
 
 
-def nodes_lines(own: Own) -> list[str]:
+def nodes_lines(own: Own = MappingProxyType({})) -> list[str]:
     """Return a line for each node, sorted by family, with the first sentence of its docstring."""
     from neusee.workflows.recipe.node_families import all_nodes, broken_families, family_title
 
@@ -105,7 +105,7 @@ def nodes_lines(own: Own) -> list[str]:
     return [*lines[1:], *([""] if broken else []), *broken]
 
 
-def node_lines(name: str, own: Own) -> list[str]:
+def node_lines(name: str, own: Own = MappingProxyType({})) -> list[str]:
     """Return the help on one node; for `reading` the interpretations of the paper, for `glossary` the field's terms."""
     from neusee.workflows.recipe.node_families import all_nodes
 

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from neusee.workflows.keys.module_origin import Kind, module_path
+from neusee.workflows.keys.module_origin import Kind, contents, module_path
 from neusee.workflows.keys.source_summary import ROOT, Import, Summary, Use
 
 Lookup = Callable[[str], tuple[Path, Summary] | None]
@@ -64,7 +64,7 @@ class Imports:
         if module == ROOT:
             return True
         inside = package == ROOT or self._kind_of(package) in ("source", "folder")
-        if package in sys.modules and "__path__" not in vars(sys.modules[package]):
+        if package in sys.modules and "__path__" not in contents(package):
             return False
         return inside and module_path(module) is not None
 

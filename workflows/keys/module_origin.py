@@ -13,9 +13,9 @@ import os
 import re
 import sys
 import sysconfig
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 Kind = Literal["python", "distribution", "source", "binary", "folder", "absent", "nowhere"]
 _STANDARD = tuple({sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")})
@@ -139,10 +139,15 @@ def _text(folder: str, name: str) -> bytes:
         return b""
 
 
+def contents(module: str) -> Mapping[str, Any]:
+    """Return what a loaded module holds, without asking the module; ``sys.modules`` may hold any object."""
+    return getattr(sys.modules[module], "__dict__", {})
+
+
 def _without_file(module: str, top: str, packages: frozenset[str]) -> Origin:
     """Return the origin of a module without a file: a folder of modules, a built-in part, or a missing module."""
     if module in sys.modules:
-        inside = vars(sys.modules[module])
+        inside = contents(module)
         if inside.get("__path__") is not None and not inside.get("__file__"):
             return Origin("folder")
         installed = "" if top in packages or module == top else version_of(top)
@@ -157,7 +162,7 @@ def _without_file(module: str, top: str, packages: frozenset[str]) -> Origin:
 def _folders_above(module: str) -> list[str]:
     """Return the folders of the package that a module is in."""
     parent = module.rpartition(".")[0]
-    return list(vars(sys.modules[parent]).get("__path__", ())) if parent in sys.modules else _folders(parent)
+    return list(contents(parent).get("__path__", ())) if parent in sys.modules else _folders(parent)
 
 
 def _folders(package: str) -> list[str]:

@@ -17,7 +17,7 @@ from neusee.nodes import metrics, restore
 from neusee.nodes.exact_convolution import exact_convolutions
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.process_settings import settings
-from neusee.workflows.recipe.step_declarations import all_nodes
+from neusee.workflows.recipe.node_families import all_nodes
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ for name in sys.argv[2:]:
     importlib.import_module(name)
 from pathlib import Path
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.recipe.step_declarations import all_nodes
+from neusee.workflows.recipe.node_families import all_nodes
 code = Code(Path(sys.argv[1]))
 print(json.dumps({node.path: code.of(node) for _, node in all_nodes()}))
 """
