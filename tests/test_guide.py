@@ -8,15 +8,18 @@ import importlib
 import re
 import shlex
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import typer
 from safetensors.torch import save_file
 from typer.main import get_command
 
 from neusee.nodes.restore._networks._nafnet import NAFNet
+from neusee.nodes.restore._networks._restorer import start_network
 from neusee.workflows.cli import app, catalogue
 from neusee.workflows.cli.command_frame import split
 from neusee.workflows.evaluation.pipelines import compose_pipelines, read_pipelines
@@ -75,7 +78,8 @@ def folder(tmp_path_factory):
     (folder / "my" / "set" / "EMVA1288_descriptor.txt").write_text("v 4.0\nn 12 4 4\nd 1000 0\n" + 2 * "i dark.npy\n")
     shutil.copy(ROOT / "recipes" / "samples" / "camera_levels.csv", folder / "my.csv")
     (folder / "camera.csv").write_text("wavelength,red,green,blue\n400,0,0,1\n550,0,1,0\n700,1,0,0\n")
-    save_file(NAFNet(width=16).state_dict(), folder / "net.safetensors")
+    network = start_network(partial(NAFNet, width=16), torch.Generator().manual_seed(0))
+    save_file(network.state_dict(), folder / "net.safetensors")
     np.save(folder / "mask.npy", np.zeros((540, 540)))
     return folder
 
