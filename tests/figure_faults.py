@@ -11,6 +11,7 @@ import numpy as np
 
 SMALLEST = 9.0  #: points
 TOUCH = 1.5  #: pixels by which the boxes of two texts may overlap, because a box has a rim around its letters
+COVERED = 0.2  #: share of a text's box that another may cover: numbers of two axes touch where the axes meet
 SPREAD = 1.35  #: largest size of all that is drawn, relative to the canvas
 
 
@@ -99,12 +100,16 @@ def _tick_labels(axis: Any) -> list[Any]:
 
 
 def _overlapping(texts: list[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
-    """Return the pairs of texts whose boxes overlap; the box of an oblique text says too little."""
+    """Return the pairs of texts of which one covers the other; the box of an oblique text says too little."""
     upright = [(text, box) for text, box in texts if text.get_rotation() % 90 == 0]
     x0, y0, x1, y1 = np.array([box.extents for _, box in upright]).reshape(-1, 4).T
     across = np.minimum.outer(x1, x1) - np.maximum.outer(x0, x0)
     along = np.minimum.outer(y1, y1) - np.maximum.outer(y0, y0)
-    pairs = np.argwhere(np.triu((across > TOUCH) & (along > TOUCH), 1))
+    area = (x1 - x0) * (y1 - y0)
+    covered = np.clip(across - TOUCH, 0, None) * np.clip(along - TOUCH, 0, None) > COVERED * np.minimum.outer(
+        area, area
+    )
+    pairs = np.argwhere(np.triu(covered, 1))
     both = [(upright[i][0], upright[j][0]) for i, j in pairs]
     return [(a, b) for a, b in both if a.get_text() != b.get_text()]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ _BAND = (5.0, 50.0, 95.0)  #: percentiles
 _POINTS = 1500  #: most points of a chain in the picture
 _PAGE = 11.4  #: inches, the width of the page at 100 pixels an inch
 _LABEL_PAD = 0.08  #: distance of the labels from the numbers of an axis, as a share of a panel
+_WIDEST = 13  #: characters of a line of a label
 _NEARLY_ALL = (0.005, 0.995)  #: quantiles, so that a single draw does not squeeze a panel of the corner plot
 _LEAST = 0.1  #: DN², the variance at which a level without scatter is drawn
 _CLIPPED = {"marker": "v", "color": VERMILION, "markerfacecolor": "none",
@@ -72,7 +74,7 @@ def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -
         warnings.simplefilter("ignore")  # corner warns of contours that few draws reach
         corner.corner(
             draws,
-            labels=list(names),
+            labels=[_wrapped(name) for name in names],
             truths=list(nominal),
             truth_color=ORANGE,
             range=_ranges(draws, nominal),
@@ -82,6 +84,11 @@ def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -
     for ax in figure.axes:
         ax.tick_params(labelsize=0.9 * text)
     return figure
+
+
+def _wrapped(label: str) -> str:
+    """Return a label with its lines broken between words, so that it is no wider than a panel."""
+    return "\n".join(textwrap.fill(line, _WIDEST) for line in label.splitlines())
 
 
 def _ranges(draws: FloatArray, nominal: Sequence[float]) -> list[tuple[float, float]]:
