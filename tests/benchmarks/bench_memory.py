@@ -13,7 +13,6 @@ tenth above the prediction. The last column is the outcome of the same run with 
 
 import json
 import os
-import re
 import subprocess
 import sys
 import tempfile
@@ -42,7 +41,6 @@ ROWS = {
     "paper_table1, 1024 px": [PAPER, *at(1024, 1024, 1080, 1024)],
     "paper_table1, 2048 px (as shipped)": [PAPER],
 }
-UNITS = {"B": 1, "kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}
 
 
 def neusee(place, *words):
@@ -69,12 +67,10 @@ def watched(process):
 def predicted(words):
     """The predicted peak memory of a run with an empty cache in bytes: of its steps, and of its report."""
     with tempfile.TemporaryDirectory() as place:
-        out, err = neusee(place, "plan", *words).communicate()
-    line = next((line for line in out.splitlines() if line.startswith("memory  process:")), "")
-    parts = re.findall(r"([\d.]+) ([kMGT]?B)", line)
-    assert len(parts) == 3, out + err
-    running, _, reporting = (float(number) * UNITS[unit] for number, unit in parts)
-    return running, reporting
+        out, err = neusee(place, "plan", *words, "--json").communicate()
+    assert out, err
+    totals = json.loads(out)["totals"]
+    return totals["memory_of_steps"], totals["memory_of_report"]
 
 
 def forecast(run):
