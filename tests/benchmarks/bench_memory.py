@@ -78,9 +78,9 @@ def forecast(run):
     name, *changes = [word for word in run["words"] if word != "--exact"]
     recipe, shown = replace(load(name, changes), exact="--exact" in run["words"]), []
 
-    def watched(works, kept, costs, *others):
-        shown.append(sum(costs.size_of(step) for step in kept))
-        return report_memory.report_peak(works, kept, costs, *others)
+    def watched(works, known, keys, costs, *others):
+        shown.append(report_memory.shown_at_once(known, costs))
+        return report_memory.report_peak(works, known, keys, costs, *others)
 
     engine, none = "neusee.workflows.engine", SimpleNamespace(modules={})
     with tempfile.TemporaryDirectory() as place, ExitStack() as stack:

@@ -108,9 +108,10 @@ class Execution:
                 continue
 
     def close(self) -> None:
-        """Save the digests of code, finish all writes, and delete the executor, which has a reference to this run."""
+        """Save the digests of code, finish all writes, and delete the values and the executor, which refers to this."""
         self.code.save()
         self.own.cancel()
+        self.values.clear()
         del self.own, self.executor
 
     def account(self, order: list[str]) -> dict[str, StepRecord]:

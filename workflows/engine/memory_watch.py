@@ -1,6 +1,6 @@
-"""Watch over the memory of this process while steps run: a step that takes the process above its limit is stopped.
+"""Watch over the memory of this process: a step or a report that takes the process above its limit is stopped.
 
-A thread reads the resident memory some fifty times a second and raises `MemoryLimit` in the thread of the step, which
+A thread reads the resident memory some fifty times a second and raises `MemoryLimit` in its thread, which
 stops when its current call of a library returns. A single call that allocates too much is covered by the prediction
 before the run alone.
 """
@@ -20,7 +20,7 @@ _raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
 
 class MemoryLimit(Exception):
-    """Error of a step during which the memory of the process exceeded the limit of the run."""
+    """Error of a step or a report during which the memory of the process exceeded the limit of the run."""
 
     def __str__(self) -> str:
         limits = f", the limit is {format_size(int(_last[1]))}" if _last[1] else ""
@@ -32,7 +32,7 @@ class MemoryLimit(Exception):
 
 _last = [0.0, 0.0]  # bytes of the process and the limit when a step was last stopped
 _limits: list[float] = []
-_inside: dict[int, bool] = {}  # threads that compute a step; True if the step was told to stop
+_inside: dict[int, bool] = {}  # threads that are watched; True if told to stop
 _guard = threading.RLock()
 _wake = threading.Event()
 _thread: list[threading.Thread] = []
@@ -40,7 +40,7 @@ _thread: list[threading.Thread] = []
 
 @contextmanager
 def limited(limit: float) -> Iterator[None]:
-    """Limit the memory of this process to ``limit`` bytes while the ``with`` block runs steps."""
+    """Limit the memory of this process to ``limit`` bytes while the ``with`` block runs."""
     with _guard:
         _limits.append(limit)
     try:
@@ -53,10 +53,10 @@ def limited(limit: float) -> Iterator[None]:
 @contextmanager
 def guarded() -> Iterator[None]:
     """Raise `MemoryLimit` in the ``with`` block when the process exceeds its limit; do nothing without a limit."""
-    if not _limits:
+    here = threading.get_ident()
+    if not _limits or here in _inside:  # the block outside is told
         yield
         return
-    here = threading.get_ident()
     with _guard:
         _inside[here] = False
         if not _thread:

@@ -12,7 +12,7 @@ import torch
 from neusee.workflows.engine.device_names import check_devices
 from neusee.workflows.engine.execution import Execution
 from neusee.workflows.engine.local_executor import memory_limit
-from neusee.workflows.engine.memory_use import process_peak
+from neusee.workflows.engine.memory_use import give_back, process_peak
 from neusee.workflows.engine.memory_watch import limited
 from neusee.workflows.engine.node_call import to_device
 from neusee.workflows.engine.placement_inputs import running_peak
@@ -114,6 +114,7 @@ def run(
             recipe = with_substitutions(stricter, wanted)
         finally:
             work.close()
+            give_back()
 
 
 def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:

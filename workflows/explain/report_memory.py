@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 
 from neusee.workflows.engine.cost_model import Costs
 from neusee.workflows.engine.local_executor import program_memory
@@ -15,32 +16,60 @@ from neusee.workflows.report.contents import FIGURES, FILES
 #: Three numbers that tests/benchmarks/bench_memory.py fits to the measured memory of the reports of shipped recipes.
 DRAWING = 63e6  #: bytes of the libraries that draw pictures and write files
 HELD_BACK = 0.0765  #: share of the memory of the steps that the process does not give back to the system
-COPIES = 2.06  #: copies of all results that are shown, while their pictures and files are made
+COPIES = 2.06  #: copies of the results in memory, while a picture or file of them is made
 _NEED = re.compile(r"\??(?P<step>[\w.]+(\[[^\]]*\])?)$")  # not a parameter and not a function of a step
 
 
 def shown_steps(recipe: Recipe) -> list[str]:
     """Return the steps whose results the pictures and data files of a run show, as far as the recipe has them."""
-    needs = [need for figure in FIGURES for need in figure.needs.values()]
-    needs += [need for _, each in FILES.values() for need in each.values()]
-    found: dict[str, None] = dict.fromkeys(name for name in recipe.outputs if name in recipe.steps)
-    for need in needs:
-        if match := _NEED.match(need):
-            pattern = re.escape(match["step"]).replace(r"\*", "[^,]*")
-            found.update(dict.fromkeys(name for name in recipe.steps if re.fullmatch(pattern, name)))
-    return list(found)
+    groups = [recipe.outputs, *(group for job in _jobs(recipe) for group in job)]
+    return list(dict.fromkeys(name for group in groups for name in group if name in recipe.steps))
 
 
 def report_peak(
-    works: list[StepJob], kept: Mapping[str, str], costs: Costs, lanes: Mapping[str, Lane], running: float = 0.0
+    works: list[StepJob],
+    recipe: Recipe,
+    keys: Mapping[str, str],
+    costs: Costs,
+    lanes: Mapping[str, Lane],
+    running: float = 0.0,
 ) -> float:
     """Return the predicted peak memory of this process in bytes while the report is written.
 
-    Args: works: the steps that only the report needs. kept: the keys of the results that are shown, by step.
+    Args: works: the steps that only the report needs. keys: the keys of the results that are shown, by step.
     running: the predicted peak memory of this process while the steps run.
     """
-    schedule = prepare(works, costs, {}, lanes, list(kept.values())).schedule if works else None
+    schedule = prepare(works, costs, {}, lanes, list(keys.values())).schedule if works else None
     made = max(schedule.peak.values(), default=0.0) if schedule else 0.0
-    shown = COPIES * sum(costs.size_of(name) for name in kept)
     held = max((lane.held for lane in lanes.values()), default=0.0) or program_memory()
+    shown = COPIES * shown_at_once(recipe, costs)
     return held + DRAWING + HELD_BACK * max(0.0, running - held) + max(made, shown)
+
+
+def shown_at_once(recipe: Recipe, costs: Costs) -> float:
+    """Return the largest number of bytes of results that are in memory together while pictures and files are made.
+
+    The outputs of the recipe stay in memory. Another result is there from the first picture or file that shows it to
+    the last, as `workflows.report.shown_values` holds it.
+    """
+    most = 0.0
+    for groups in _jobs(recipe):
+        uses, there = Counter(name for group in groups for name in group), set(recipe.outputs)
+        for group in groups:
+            there.update(group)
+            most = max(most, sum(costs.size_of(name) for name in there if name in recipe.steps))
+            uses.subtract(group)
+            there = {name for name in there if uses[name] > 0 or name in recipe.outputs}
+    return most
+
+
+def _jobs(recipe: Recipe) -> tuple[Sequence[Sequence[str]], ...]:
+    """Return the steps that each picture shows, and the steps that each data file shows."""
+    pictures = [list(_found(recipe, figure.needs)) for figure in FIGURES]
+    return pictures, [*(list(_found(recipe, needs)) for _, needs in FILES.values()), recipe.outputs]
+
+
+def _found(recipe: Recipe, needs: Mapping[str, str]) -> Iterator[str]:
+    for match in filter(None, map(_NEED.match, needs.values())):
+        pattern = re.escape(match["step"]).replace(r"\*", "[^,]*")
+        yield from (name for name in recipe.steps if re.fullmatch(pattern, name))

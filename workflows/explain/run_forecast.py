@@ -90,7 +90,7 @@ def _with_report(plan: Plan, store: Store, costs: Costs, lanes: Mapping[str, Lan
     works = [_work(plan.recipe, name, keys, devices) for name in order if name in set(makers.values())]
     costs = costs.with_sizes(sizes_of(plan.recipe, order))
     try:
-        peak = report_peak(works, {name: keys[name] for name in shown}, costs, lanes, plan.running)
+        peak = report_peak(works, plan.recipe, {name: keys[name] for name in shown}, costs, lanes, plan.running)
     except TooLarge as error:
         return replace(plan, refused=f"for the report, {error}")
     limit = sum(lane.memory for lane in cpu) + max((lane.held for lane in cpu), default=0.0)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.engine.runner import Result, run
+from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.step_record import StepRecord
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code
@@ -16,6 +16,7 @@ from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
 from neusee.workflows.report.contents import FIGURES
 from neusee.workflows.report.requirements import Found, Missing, find
+from neusee.workflows.report.shown_values import in_turn
 from neusee.workflows.store.derived_files import DerivedFiles
 
 GRAPH = (
@@ -117,9 +118,8 @@ def _made(jobs: Sequence[Job], result: Result, shelf: DerivedFiles, missing: dic
     """Compute the figures or data files that the store lacks from the results of a run, and return all paths."""
     paths = {file.name: path for file, key, _ in jobs if (path := shelf.find(key, file.suffix))}
     new = [job for job in jobs if job[0].name not in paths]
-    steps = {step for _, _, found in new for x in found.values() for step in x.steps}
-    values = run(result.recipe, result.store, sorted(steps), device=result.device).values if new else {}
-    for file, key, found in new:
+    needed = [sorted({step for x in found.values() for step in x.steps}) for _, _, found in new]
+    for (file, key, found), values in zip(new, in_turn(needed, result), strict=True):
         arguments = {name: x.make(values) for name, x in found.items()}
         try:
             content = file.make(**arguments)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from neusee.workflows.engine.local_executor import memory_limit
+from neusee.workflows.engine.memory_watch import MemoryLimit, guarded, limited
 from neusee.workflows.engine.runner import Result, run
 from neusee.workflows.engine.step_job import Executor
 from neusee.workflows.explain.why_rerun import explained
@@ -18,7 +21,7 @@ from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report import run_page, run_timing
 from neusee.workflows.report.contents import wanted
 from neusee.workflows.report.data_exports import exports
-from neusee.workflows.report.run_folder import RunFolder, new_run
+from neusee.workflows.report.run_folder import NotWritten, RunFolder, new_run
 from neusee.workflows.report.run_pictures import pictures, timeline
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
@@ -63,9 +66,19 @@ def simulate(
         result = run(recipe, store, wanted(recipe), explained(recipe, store, note), device, executor, memory)
         result = replace(result, done={name: finished.get(name, done) for name, done in result.done.items()})
         key = digest([[name, result.keys[name]] for name in wanted(result.recipe)])
-        with new_run(runs, recipe.name, key) as folder:
+        with limited(memory_limit(memory)), _watched(), new_run(runs, recipe.name, key) as folder:
             doc = _write(result, folder, command, caught)
     return Simulation(folder.path, doc)
+
+
+@contextmanager
+def _watched() -> Iterator[None]:
+    """Raise `NotWritten` if the memory of the process exceeds its limit while the report is written."""
+    try:
+        with guarded():
+            yield
+    except MemoryLimit as error:
+        raise NotWritten(f"the report was stopped, and no part of it is left: {error}") from error
 
 
 def _write(

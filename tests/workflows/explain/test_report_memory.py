@@ -18,7 +18,7 @@ def test_the_steps_that_pictures_and_files_show_are_found_and_parameters_are_not
 
 
 def test_a_limit_that_suffices_for_the_steps_and_not_for_the_report_is_refused(tmp_path):
-    recipe = load("paper_table1", [])
+    recipe = load("calibrate", [])
     free = planned(recipe, Store(tmp_path), lanes_of(["cpu"], 10**11))
     assert free.refused == ""
     assert free.reporting > free.running > program_memory()
