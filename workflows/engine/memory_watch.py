@@ -12,10 +12,11 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from neusee.workflows.engine.memory_use import process_memory
+from neusee.workflows.engine.memory_use import give_back, process_memory
 from neusee.workflows.store.byte_sizes import format_size
 
 _PAUSE = 0.02  #: s between two looks
+_NEAR = 0.9  #: share of the limit from which memory that was freed is given back to the system
 _raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
 
@@ -80,8 +81,10 @@ def _look() -> None:
         with _guard:
             if not _inside:
                 _wake.clear()
-            now, limit = process_memory(), min(_limits, default=float("inf"))
-            if now > limit:
+            limit = min(_limits, default=float("inf"))
+            if process_memory() > _NEAR * limit:
+                give_back()
+            if (now := process_memory()) > limit:
                 _stop(now, limit)
         threading.Event().wait(_PAUSE)
 
