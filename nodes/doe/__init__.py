@@ -5,13 +5,14 @@ from neusee.nodes.doe._analytic_masks import axicon, cubic, flat, half_rings, sp
 from neusee.nodes.doe._fabrication_limits import fabricate
 from neusee.nodes.doe._minimum_feature import smooth
 from neusee.nodes.doe._parametrisations import PARAMETRISATIONS, Drawn, Modes, Pixels, Rings, Written
-from neusee.nodes.doe._refractive_index import Material, material, wave_height
+from neusee.nodes.doe._refractive_index import Glass, Material, material, wave_height
 from neusee.nodes.doe._sampled_height_map import pixelwise, read_height_map
 from neusee.nodes.doe._unet_height_map import unet
 
 __all__ = [
     "PARAMETRISATIONS",
     "Drawn",
+    "Glass",
     "Material",
     "Modes",
     "Pixels",

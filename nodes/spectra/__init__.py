@@ -7,6 +7,7 @@ from neusee.nodes.spectra._channel_responses import responses
 from neusee.nodes.spectra._dead_leaves import leaves
 from neusee.nodes.spectra._distinct_band_sums import rows
 from neusee.nodes.spectra._illuminant import illuminant, illuminate
+from neusee.nodes.spectra._laser_table import line_table
 from neusee.nodes.spectra._linear_lift import (
     lift_lmmse,
     lift_lmmse_mixture,
@@ -40,6 +41,7 @@ __all__ = [
     "lift_mst_plus_plus",
     "lift_pictures",
     "line",
+    "line_table",
     "mean_wavelength",
     "metamers",
     "need_mst_plus_plus_bands",
