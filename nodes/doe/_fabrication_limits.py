@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import refuse_half
-from neusee.nodes.doe._refractive_index import AnyGlass, Glass, refuse_material, wave_height
+from neusee.nodes.doe._refractive_index import AnyGlass, Glass, nearest_known, refuse_material, wave_height
 from neusee.nodes.units import PositiveLength, Wavelength
 
 Levels = Annotated[int, Field(ge=2)]
@@ -95,8 +95,9 @@ def _(
 ) -> float:
     """Return an upper bound of the relative change of a height map by fabrication; 0 if every height fits.
 
-    A small change of height may be a large phase: the bound is never below the phase, in radians at 400 nm, of that
-    change. Wrapping turns no phase at ``wrap_at``, and counts in full all the same.
+    A small change of height may be a large phase: the bound is never below the phase, in radians, of that change at
+    400 nm, or at the nearest wavelength at which the glass is known. Wrapping turns no phase at ``wrap_at``, and counts
+    in full all the same.
     """
     top = max_height if wrap_at is None else wave_height(material, wrap_at)
     if not height.finite or top is None:
@@ -106,7 +107,10 @@ def _(
     if change == 0:
         return 0.0
     fabricated = fabricate(ends, material=material, wrap_at=wrap_at, levels=levels, max_height=max_height)
-    deepest, phase = float(fabricated.abs().max()), 2 * math.pi * change / wave_height(material, _VIOLET)
+    deepest, phase = (
+        float(fabricated.abs().max()),
+        2 * math.pi * change / wave_height(material, nearest_known(material, _VIOLET)),
+    )
     return max(phase, change / deepest if deepest > 0 else math.inf)
 
 

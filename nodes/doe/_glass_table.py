@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator, ConfigDict, Field, with_config
 from torch import Tensor
 from typing_extensions import TypedDict
 
@@ -17,8 +17,8 @@ from neusee.nodes.units import Real, Wavelength
 
 _AREAS = {"um^2": 1.0, "um2": 1.0, "µm^2": 1.0, "µm2": 1.0, "µm²": 1.0, "um²": 1.0, "nm^2": 1e-6, "nm2": 1e-6}
 _COLUMNS = (
-    "write a header such as wavelength (um),n (1) and two columns, or B (1),C (um^2),from (nm),to (nm) with one row for "
-    "each term of the Sellmeier formula"
+    "write a header such as wavelength (um),n (1) and two columns, or B (1),C (um^2),from (nm),to (nm) with one row "
+    "for each term of the Sellmeier formula"
 )
 _FROM_AIR, _LARGEST = 1.0, 5.0  #: no glass has an index outside these
 _AREA = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
@@ -37,10 +37,9 @@ def _area(value: Any) -> float:
 Area = Annotated[float, BeforeValidator(_area, json_schema_input_type=str)]  #: um^2
 
 
+@with_config(ConfigDict(extra="forbid"))
 class Sellmeier(TypedDict):
     """Coefficients of n^2 = 1 + sum of B w^2 / (w^2 - C), and the range of wavelengths over which they were fitted."""
-
-    __pydantic_config__ = ConfigDict(extra="forbid")  # type: ignore[misc]  # pydantic reads it from the class
 
     B: Annotated[tuple[Real, ...], Field(min_length=1)]
     C: Annotated[tuple[Area, ...], Field(min_length=1)]  #: um^2
@@ -53,7 +52,7 @@ def glass_index(glass: Path | Sellmeier, wavelengths: Tensor) -> Tensor:
     Raises ValueError for wavelengths outside the range of the table or the coefficients.
     """
     low, high = glass_range(glass)
-    first, last = float(wavelengths.min()), float(wavelengths.max())
+    first, last = (float(end) for end in torch.aminmax(wavelengths.detach()))
     if first < low * (1 - 1e-12) or last > high * (1 + 1e-12):
         outside = f"{first * 1e9:.5g} nm" if first < low else f"{last * 1e9:.5g} nm"
         extent = f"{low * 1e9:.5g} to {high * 1e9:.5g} nm"
@@ -69,6 +68,12 @@ def glass_range(glass: Path | Sellmeier) -> tuple[float, float]:
     if isinstance(known, Table):
         return float(known.wavelengths[0]), float(known.wavelengths[-1])
     return known["range"]
+
+
+def index_rows(file: Path) -> tuple[Tensor, Tensor] | None:
+    """Return the wavelengths in m and the indices in the rows of a file, or None for a file of coefficients."""
+    known = _from_file(file)
+    return (known.wavelengths, known.values[0]) if isinstance(known, Table) else None
 
 
 def refuse_glass(glass: Path | Sellmeier) -> None:

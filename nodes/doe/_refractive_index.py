@@ -56,6 +56,21 @@ def wave_height(name: AnyGlass, wavelength: float) -> float:
     return wavelength / float(excess_index(name, torch.tensor(wavelength, dtype=torch.float64)))
 
 
+def index_curve(glass: AnyGlass, count: int = 400) -> tuple[Tensor, Tensor]:
+    """Return ``count`` wavelengths in m over the range in which a material is known, and its refractive index there."""
+    low, high = _name_and_range(glass)[1]
+    wavelengths = torch.linspace(low, high, count, dtype=torch.float64)
+    return wavelengths, excess_index(glass, wavelengths) + 1
+
+
+def nearest_known(name: AnyGlass, wavelength: float) -> float:
+    """Return the wavelength in m nearest to ``wavelength`` at which the index of a material of your own is known."""
+    if isinstance(name, str):
+        return wavelength
+    low, high = glass_range(name)
+    return min(max(wavelength, low), high)
+
+
 @node(rtol=1e-12)
 def material(bands: Bands, *, material: Glass = "fused silica") -> Tensor:
     """Compute the refractive index of the mask minus the refractive index of air, which is taken as 1.

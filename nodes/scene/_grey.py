@@ -11,8 +11,8 @@ _LUMINANCE = (0.2126, 0.7152, 0.0722)  #: of linear red, green and blue with the
 
 def luminance(rgb: Tensor, axis: int) -> Tensor:
     """Return the luminance of linear sRGB, whose three channels lie along ``axis`` of ``rgb`` and have size 1 then."""
-    parts = [share * part for share, part in zip(_LUMINANCE, rgb.split(1, axis), strict=True)]
-    return parts[0] + parts[1] + parts[2]
+    red, green, blue = (share * rgb.narrow(axis, i, 1) for i, share in enumerate(_LUMINANCE))
+    return red + green + blue
 
 
 @node(rtol=1e-6)

@@ -111,7 +111,8 @@ def _widths(found: Curves) -> Numbers:
     if unit not in LENGTHS:
         heading = found.columns[1].heading
         raise ValueError(f"{found.file.name}: column 3, {heading}, has no widths: write fwhm (nm)")
-    return found.values[1] * LENGTHS[unit]
+    widths: Numbers = found.values[1] * LENGTHS[unit]
+    return widths
 
 
 def _divided(table: Table, count: int) -> Bands:
