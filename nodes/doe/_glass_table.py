@@ -42,8 +42,21 @@ class Sellmeier(TypedDict):
     """Coefficients of n^2 = 1 + sum of B w^2 / (w^2 - C), and the range of wavelengths over which they were fitted."""
 
     B: Annotated[tuple[Real, ...], Field(min_length=1)]
-    C: Annotated[tuple[Area, ...], Field(min_length=1)]  #: um^2
+    C: tuple[Area, ...]  #: um^2
     range: tuple[Wavelength, Wavelength]  #: m
+
+
+#: of `Sellmeier` as a recipe writes the coefficients
+SELLMEIER_SCHEMA = {
+    "type": "object",
+    "properties": {
+        "B": {"type": "array", "items": {"type": "number"}},
+        "C": {"type": "array", "items": {"type": "string"}},
+        "range": {"type": "array", "items": {"type": "string"}, "minItems": 2, "maxItems": 2},
+    },
+    "required": ["B", "C", "range"],
+    "additionalProperties": False,
+}
 
 
 def glass_index(glass: Path | Sellmeier, wavelengths: Tensor) -> Tensor:

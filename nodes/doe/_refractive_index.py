@@ -1,18 +1,25 @@
 """Materials of the mask, and their refractive indices relative to air."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
+from pydantic import Discriminator, Tag, WithJsonSchema
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.doe._glass_table import Sellmeier, glass_index, glass_range, refuse_glass
+from neusee.nodes.doe._glass_table import SELLMEIER_SCHEMA, Sellmeier, glass_index, glass_range, refuse_glass
 from neusee.nodes.units import DataFile
 from neusee.nodes.values import Bands
 
 Material = Literal["fused silica", "PMMA", "BK7", "photoresist"]
-Glass = Material | DataFile | Sellmeier  #: a known material, a file with a table or coefficients, or coefficients
+#: a known material, a file with a table or coefficients, or coefficients
+Glass = Annotated[
+    Annotated[Material | DataFile, Tag("file")]
+    | Annotated[Sellmeier, Tag("coefficients"), WithJsonSchema(SELLMEIER_SCHEMA)],
+    Discriminator(lambda value: "coefficients" if isinstance(value, Mapping) else "file"),
+]
 AnyGlass = str | Path | Sellmeier  #: `Glass` as a function receives it
 
 

@@ -102,7 +102,7 @@ def _fits(file: Path, shape: tuple[int, ...], grid: PupilGrid, pitch: float | No
     if same and (pitch is None or abs(pitch / grid.pitch - 1) <= 1e-6):
         return None
     if pitch is None or len(shape) != 2 or min(shape) < 2:
-        fix = f"state the pitch of the height map to resample it, or set samples to {shape[-1] if shape else 1}"
+        fix = f"state its pitch to resample it, or set samples to {shape[-1] if shape else 1}"
         raise ParameterError("file", f"{file.name} is {shape}, not the pupil grid ({samples}, {samples}): {fix}")
     if problem := too_small(shape, pitch, grid):
         raise ParameterError("pitch", f"{file.name}: {problem}")

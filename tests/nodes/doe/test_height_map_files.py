@@ -165,7 +165,7 @@ def test_a_map_smaller_than_the_pupil_is_refused(tmp_path, shape, pitch):
 
 def test_a_map_that_is_not_square_needs_its_pitch(tmp_path):
     np.save(tmp_path / "map.npy", np.zeros((64, 60)))
-    assert "(64, 60), not the pupil grid (64, 64): state the pitch" in refused(tmp_path / "map.npy")[1]
+    assert "(64, 60), not the pupil grid (64, 64): state its pitch" in refused(tmp_path / "map.npy")[1]
 
 
 @pytest.mark.parametrize("kind", ["npy", "safetensors", "exr"])
