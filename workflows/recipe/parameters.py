@@ -133,7 +133,7 @@ def _problems(
 
 
 def _deepest(value: Value, path: tuple[int | str, ...]) -> Value:
-    """Return the value at a path of keys below ``value``, without the keys that do not exist, such as names of types."""
+    """Return the value at a path of keys below ``value``; keys that it lacks, such as names of types, are skipped."""
     for key in path:
         value = value.child(key) or value
     return value

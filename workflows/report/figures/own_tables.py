@@ -54,7 +54,7 @@ def _filled(panels: Sequence[Draw]) -> Any:
     columns = min(3, len(panels))
     figure, axes = canvas(_WIDTH * columns, 4.2 * -(-len(panels) // columns), -(-len(panels) // columns), columns)
     for ax in axes.ravel()[len(panels) :]:
-        ax.set_visible(False)
+        ax.remove()
     for draw, ax in zip(panels, axes.ravel(), strict=False):
         draw(figure, ax)
     return figure
