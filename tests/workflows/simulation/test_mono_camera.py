@@ -66,12 +66,14 @@ def test_1064_nm_gives_the_photons_of_the_direct_sum(mono):
     assert wanted.max() > 25500 / 0.69  # the laser alone fills a pixel
 
 
+@pytest.mark.slow
 def test_the_same_laser_is_missing_from_the_picture_of_an_eye(mono):
     recipe, result = mono("laser_photons", "sensor.camera=CIE 1931", "camera=neusee")
     assert float(result["laser_photons[plain,infrared]"].abs().max()) == 0
     assert any("no channel of CIE 1931 sees 5 of 5 bands" in note for note in recipe.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("restore", ["wiener", "richardson_lucy"])
 def test_the_whole_chain_runs_with_one_channel_and_its_pictures_are_grey(mono, restore):
     _, result = mono("raw, developed, restored, truth, scene, restored_quality, saturated", f"restore={restore}")
@@ -86,6 +88,7 @@ def test_the_whole_chain_runs_with_one_channel_and_its_pictures_are_grey(mono, r
     assert float(result["restored_quality"].psnr) > 10
 
 
+@pytest.mark.slow
 def test_a_grey_scene_is_developed_to_its_luminance(mono):
     """Behind the plain lens and without a laser, a flat grey field keeps its level: the matrix balances white."""
     words = ["laser=none", "scene=siemens", "sensor.read_noise=0 e-", "restore=wiener_blind"]
