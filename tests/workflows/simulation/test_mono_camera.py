@@ -54,7 +54,7 @@ def mono(tmp_path):
 
 def test_1064_nm_gives_the_photons_of_the_direct_sum(mono):
     """Irradiance times QE over its largest, wavelength, exposure and area of a pixel, over the energy of a photon."""
-    _, result = mono("spot, laser_photons, line, charge")
+    _, result = mono('"spot[plain,infrared]", "laser_photons[plain,infrared]", "line[infrared]"')
     line, spot = result["line[infrared]"], result["spot[plain,infrared]"].double().numpy()
     wanted = np.zeros(spot.shape[1:])
     for centre, image in zip(line.centres.numpy(), spot, strict=True):
