@@ -133,7 +133,9 @@ def test_the_page_of_a_run_shows_the_mono_camera(tmp_path, mono, monkeypatch):
     latest = tmp_path / "runs" / "latest"
     drawn = {path.stem for path in (latest / "figures").iterdir()}
     assert drawn >= {"overview", "spectra", "tables", "suppression", "psf", "height", "sensor", "graph"}
-    assert 'id="tables">Your own tables' in (latest / "report.html").read_text()
+    page = (latest / "report.html").read_text()
+    assert 'id="tables">Your own tables' in page
+    assert "LSR at 700 nm, the band nearest to the laser at 1064 nm" in page
     assert {path.name for path in (latest / "data").iterdir()} >= {"raw_mask.png", "raw_mask.exr", "restored.exr"}
     raw = np.asarray(Image.open(latest / "data" / "raw_mask.png"))
     assert raw.shape == (48, 48)
