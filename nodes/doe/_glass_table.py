@@ -12,7 +12,7 @@ from typing_extensions import TypedDict
 from neusee.nodes import ParameterError
 from neusee.nodes.input_files import once_per_version
 from neusee.nodes.spectra._spectral_tables import Table
-from neusee.nodes.spectra._table_files import LENGTHS, Rows, curves, refused, table_rows
+from neusee.nodes.spectra._table_files import LENGTHS, Curves, Rows, curves, refused, table_rows
 from neusee.nodes.units import Real, Wavelength
 
 _AREAS = {"um^2": 1.0, "um2": 1.0, "µm^2": 1.0, "µm2": 1.0, "µm²": 1.0, "um²": 1.0, "nm^2": 1e-6, "nm2": 1e-6}
@@ -155,7 +155,28 @@ def _from_file(file: Path) -> Table | Sellmeier:
         raise ValueError(f"{file.name} has {len(found.values) + 1} columns in place of 2")
     low = (found.values <= _FROM_AIR) | (found.values >= _LARGEST)
     found.refuse(low, lambda n: f"{n:g} is no refractive index: write n, between 1 and {_LARGEST:g}, and not n - 1")
+    _refuse_gap(found)
     return found.table()
+
+
+def _refuse_gap(found: Curves) -> None:
+    """Raise ValueError for a gap between two rows in which the cubic leaves the straight line by more than half a step.
+
+    The step is the largest of the gap and its neighbours. A few rows close together decide the slope in a wide gap.
+    """
+    table = found.table()
+    at, values = table.wavelengths, table.values[0]
+    middle = (at[1:] + at[:-1]) / 2
+    off = (_interpolated(table, middle) - (values[1:] + values[:-1]) / 2).abs()
+    steps = torch.nn.functional.pad(values.diff().abs(), (1, 1))
+    wrong = (off > 1e-5 + torch.stack([steps[:-2], steps[1:-1], steps[2:]]).amax(0) / 2).nonzero()
+    if len(wrong):
+        row = int(wrong[0])
+        ends = f"{float(at[row]) * 1e9:g} and {float(at[row + 1]) * 1e9:g} nm"
+        fix = "give rows there, in steps as small as beside the gap"
+        raise ValueError(
+            f"{found.file.name}:{found.lines[row + 1]}: the rows do not tell the index between {ends}: {fix}"
+        )
 
 
 def _coefficients(file: Path, rows: Rows) -> Sellmeier:

@@ -196,5 +196,7 @@ def _mat_value(file: Path, name: str) -> NDArray[Any]:
 
 
 def _native(values: NDArray[Any]) -> NDArray[Any]:
-    """Return values in the byte order of this machine, as torch needs."""
+    """Return values in the byte order of this machine and of at most 64 bits, as torch needs."""
+    if values.dtype.kind == "f" and values.dtype.itemsize > 8:
+        return values.astype(np.float64)
     return values.astype(values.dtype.newbyteorder("="), copy=False)

@@ -101,8 +101,11 @@ def _fits(file: Path, shape: tuple[int, ...], grid: PupilGrid, pitch: float | No
     same = shape == (samples, samples)
     if same and (pitch is None or abs(pitch / grid.pitch - 1) <= 1e-6):
         return None
-    if pitch is None or len(shape) != 2 or min(shape) < 2:
-        fix = f"state its pitch to resample it, or set samples to {shape[-1] if shape else 1}"
+    if len(shape) != 2 or min(shape) < 2:
+        raise ParameterError("file", f"{file.name} is {shape}, not the pupil grid ({samples}, {samples}), nor a height "
+                             "map that can be resampled: save a map with two axes")  # fmt: skip
+    if pitch is None:
+        fix = f"state its pitch to resample it, or set samples to {shape[-1]}"
         raise ParameterError("file", f"{file.name} is {shape}, not the pupil grid ({samples}, {samples}): {fix}")
     if problem := too_small(shape, pitch, grid):
         raise ParameterError("pitch", f"{file.name}: {problem}")

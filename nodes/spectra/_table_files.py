@@ -141,7 +141,7 @@ def _is_number(cell: str) -> bool:
         float(cell)
     except ValueError:
         return False
-    return True
+    return "_" not in cell  # Python reads 1_0 as 10
 
 
 def _number(file: Path, line: int, index: int, column: Column, cell: str) -> float:

@@ -71,7 +71,14 @@ def test_a_picture_states_the_height_of_white(tmp_path):
     assert note == "map.png: white counts as 1.2 um high, because nothing states its height: give depth"
 
 
-@pytest.mark.parametrize("order", [">f8", "<f4", ">i4"])
+@pytest.mark.parametrize("shape", [(), (0, 0), (1, 64), (3, 64, 64)])
+@pytest.mark.parametrize("pitch", [None, 1e-3])
+def test_an_array_without_two_axes_is_no_map(tmp_path, shape, pitch):
+    np.save(tmp_path / "map.npy", np.zeros(shape))
+    assert refused(tmp_path / "map.npy", pitch=pitch)[1].endswith("save a map with two axes")
+
+
+@pytest.mark.parametrize("order", [">f8", "<f4", ">i4", "longdouble"])
 def test_the_byte_order_of_a_file_does_not_matter(tmp_path, order):
     np.save(tmp_path / "map.npy", np.arange(4096).reshape(64, 64).astype(order))
     assert_close(read(tmp_path / "map.npy", unit=1e-9), torch.arange(4096.0).reshape(64, 64) * 1e-9)

@@ -94,6 +94,12 @@ MISTAKES = {
         GLASS + "0.4,0.5\n0.7,0.48\n",
         "mine.csv:2, column 2, n (1): 0.5 is no refractive index: write n",
     ),
+    "gap in a glass": (
+        "glass",
+        GLASS + "0.35,1.5352\n0.351,1.5350\n0.352,1.5347\n0.7,1.51\n0.75,1.5092\n",
+        "mine.csv:5: the rows do not tell the index between 352 and 700 nm: give rows there",
+    ),
+    "underscore": ("light", LIGHT + "350,1_0\n800,1\n", "mine.csv:2: '1_0' is not a number"),
     "n and k": ("glass", "wavelength (um),n (1),k (1)\n0.4,1.5,0\n0.7,1.4,0\n", "mine.csv has 3 columns in place of 2"),
     "root of C": ("glass", SELLMEIER + "0.7,0.3,400,700\n", "the coefficients give no index between 1 and 5 at "),
     "unit of C": ("glass", "B (1),C (um),from (nm),to (nm)\n1,0.01,400,700\n", "mine.csv: C needs a unit such as um^2"),
