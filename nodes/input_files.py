@@ -59,18 +59,23 @@ def not_finite(file: Path, count: int) -> str:
 def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield the number of the line and the cells of each row of a CSV file that is not empty.
 
+    A line that begins with ``#`` is a comment, such as the source of the table.
+
     Raises ValueError for text that is not UTF-8, for another separator than a comma, and for more rows than the limit.
     """
     with file.open(newline="", encoding="utf-8-sig") as opened:
-        reader = csv.reader(opened)
+        reader = csv.reader("" if line.startswith("#") else line for line in opened)
+        first = True
         try:
             for count, row in enumerate(reader):
-                if count == 0:
-                    _refuse_separator(file, row)
                 if count > ROWS:
                     raise ValueError(f"{file.name} has more than {ROWS} rows: give a shorter table")
-                if row:
-                    yield reader.line_num, row
+                if not row:
+                    continue
+                if first:
+                    _refuse_separator(file, row)
+                first = False
+                yield reader.line_num, row
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{file.name} is not a CSV file in UTF-8 ({error}): save the table as CSV") from None
 

@@ -67,6 +67,10 @@ def folder(tmp_path_factory):
         path = folder / re.match(r"# (my/[\w/]+\.yaml): .*\.\n", text)[1]
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
+    for text in (block for page in PAGES for block in blocks(page, "csv")):
+        path = folder / re.match(r"# (my/[\w/]+\.csv): .*\.\n", text)[1]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
     for text in (block for page in PAGES for block in blocks(page, "python")):
         if named := re.match(r"# (my/\w+\.py)\n", text):
             (folder / named[1]).write_text(text, encoding="utf-8")

@@ -3,15 +3,18 @@
 from neusee.nodes.doe import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.doe._analytic_masks import axicon, cubic, flat, half_rings, spiral_axicon, vortex, zernike
 from neusee.nodes.doe._fabrication_limits import fabricate
+from neusee.nodes.doe._glass_table import index_rows
+from neusee.nodes.doe._height_map_files import read_height_map
 from neusee.nodes.doe._minimum_feature import smooth
 from neusee.nodes.doe._parametrisations import PARAMETRISATIONS, Drawn, Modes, Pixels, Rings, Written
-from neusee.nodes.doe._refractive_index import Material, material, wave_height
-from neusee.nodes.doe._sampled_height_map import pixelwise, read_height_map
+from neusee.nodes.doe._refractive_index import Glass, Material, index_curve, material, wave_height
+from neusee.nodes.doe._sampled_height_map import height_map, pixelwise
 from neusee.nodes.doe._unet_height_map import unet
 
 __all__ = [
     "PARAMETRISATIONS",
     "Drawn",
+    "Glass",
     "Material",
     "Modes",
     "Pixels",
@@ -22,6 +25,9 @@ __all__ = [
     "fabricate",
     "flat",
     "half_rings",
+    "height_map",
+    "index_curve",
+    "index_rows",
     "material",
     "pixelwise",
     "read_height_map",

@@ -4,7 +4,7 @@ Radius r and coordinates u, v are in units of the stop's radius, slopes in waves
 """
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from pydantic import Field
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neusee.nodes import node
 from neusee.nodes.doe._height_from_phase import height_checks, height_from_phase
-from neusee.nodes.doe._refractive_index import Material
+from neusee.nodes.doe._refractive_index import AnyGlass, Glass, refuse_material
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, polar
 from neusee.nodes.optics._zernike import surface
 from neusee.nodes.units import Angle, Count, Length, Real, Wavelength
@@ -32,7 +32,7 @@ def flat(stop: Stop) -> Tensor:
 
 
 @node()
-def vortex(stop: Stop, *, charge: int, wavelength: Wavelength = 550e-9, material: Material = "fused silica") -> Tensor:
+def vortex(stop: Stop, *, charge: int, wavelength: Wavelength = 550e-9, material: Glass = "fused silica") -> Tensor:
     """Return the height map of a vortex, phi = charge * theta, whose phase ramp has its step on the -u axis.
 
     Shapes: stop -> (v, u).
@@ -45,7 +45,7 @@ def vortex(stop: Stop, *, charge: int, wavelength: Wavelength = 550e-9, material
 
 
 @node()
-def axicon(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material: Material = "fused silica") -> Tensor:
+def axicon(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material: Glass = "fused silica") -> Tensor:
     """Return the height map of an axicon, phi = 2 pi waves r, which turns the focal spot into a ring.
 
     Shapes: stop -> (v, u).
@@ -59,7 +59,7 @@ def axicon(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material
 
 @node()
 def spiral_axicon(
-    stop: Stop, *, waves: Real, charge: int, wavelength: Wavelength = 550e-9, material: Material = "fused silica"
+    stop: Stop, *, waves: Real, charge: int, wavelength: Wavelength = 550e-9, material: Glass = "fused silica"
 ) -> Tensor:
     """Return the height map of an axicon with a vortex: phi = 2 pi waves r + charge * theta.
 
@@ -74,7 +74,7 @@ def spiral_axicon(
 
 
 @node()
-def cubic(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material: Material = "fused silica") -> Tensor:
+def cubic(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material: Glass = "fused silica") -> Tensor:
     """Return the height map of phi = 2 pi waves (u**3 + v**3), which gives an MTF without zeros over a long focus.
 
     Shapes: stop -> (v, u).
@@ -105,7 +105,7 @@ def half_rings(
     alternate: bool = True,
     orientation: Angle = 0.0,
     wavelength: Wavelength = 550e-9,
-    material: Material = "fused silica",
+    material: Glass = "fused silica",
 ) -> Tensor:
     """Return the height map that focuses each annulus to half a ring: phi = 2 pi a r sgn(cos(theta - orientation)).
 
@@ -127,7 +127,7 @@ def zernike(
     *,
     coefficients: dict[Count, Length],
     wavelength: Wavelength = 550e-9,
-    material: Material = "fused silica",
+    material: Glass = "fused silica",
 ) -> Tensor:
     """Return the height map of a sum of Zernike polynomials, given root mean square optical paths by Noll number.
 
@@ -141,5 +141,11 @@ def zernike(
     return height_from_phase(phase, grid, wavelength, material)
 
 
+def _refuse_wavelength(*, wavelength: float = 550e-9, material: AnyGlass = "fused silica", **params: Any) -> list[str]:
+    return refuse_material("wavelength", material, torch.tensor([wavelength], dtype=torch.float64))
+
+
 for _mask in (flat, vortex, axicon, spiral_axicon, cubic, half_rings, zernike):
     _mask.check(height_checks)
+for _mask in (vortex, axicon, spiral_axicon, cubic, half_rings, zernike):
+    _mask.preflight(_refuse_wavelength)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import refuse_half
-from neusee.nodes.doe._refractive_index import Material, wave_height
+from neusee.nodes.doe._refractive_index import AnyGlass, Glass, nearest_known, refuse_material, wave_height
 from neusee.nodes.units import PositiveLength, Wavelength
 
 Levels = Annotated[int, Field(ge=2)]
@@ -25,20 +25,24 @@ def _quantize(height: Tensor, step: float, levels: int, cyclic: bool) -> Tensor:
     return height + change.detach()  # without a tangent too
 
 
-def _refuse(material: Material, wrap_at: float | None, levels: int | None, max_height: float | None) -> None:
+def _refuse(material: AnyGlass, wrap_at: float | None, levels: int | None, max_height: float | None) -> None:
     if wrap_at is not None and max_height is not None and wave_height(material, wrap_at) > max_height:
         wave = f"{wave_height(material, wrap_at) * 1e6:.3f} um"
-        text = f"{max_height * 1e6:.3g} um is less than one wave of wrap_at in {material}: needs at least {wave}"
+        text = f"{max_height * 1e6:.3g} um is less than one wave of wrap_at in {_name(material)}: needs at least {wave}"
         raise ParameterError("max_height", text)
     if levels is not None and wrap_at is None and max_height is None:
         raise ParameterError("levels", f"{levels} levels need a total depth: set wrap_at or max_height")
+
+
+def _name(material: AnyGlass) -> str:
+    return material if isinstance(material, str) else "this glass"
 
 
 @node(rtol=1e-5)
 def fabricate(
     height: Tensor,
     *,
-    material: Material = "fused silica",
+    material: Glass = "fused silica",
     wrap_at: Wavelength | None = None,
     levels: Levels | None = None,
     max_height: PositiveLength | None = None,
@@ -69,7 +73,7 @@ def fabricate(
 
 @fabricate.reference
 def _(
-    height: Tensor, *, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None
+    height: Tensor, *, material: AnyGlass, wrap_at: float | None, levels: int | None, max_height: float | None
 ) -> Tensor:
     """Compare each height with every allowed height, and return the nearest allowed height."""
     wave = None if wrap_at is None else wave_height(material, wrap_at)
@@ -87,12 +91,13 @@ def _(
 
 @fabricate.skip_bound
 def _(
-    height: TensorStats, *, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None
+    height: TensorStats, *, material: AnyGlass, wrap_at: float | None, levels: int | None, max_height: float | None
 ) -> float:
     """Return an upper bound of the relative change of a height map by fabrication; 0 if every height fits.
 
-    A small change of height may be a large phase: the bound is never below the phase, in radians at 400 nm, of that
-    change. Wrapping turns no phase at ``wrap_at``, and counts in full all the same.
+    A small change of height may be a large phase: the bound is never below the phase, in radians, of that change at
+    400 nm, or at the nearest wavelength at which the glass is known. Wrapping turns no phase at ``wrap_at``, and counts
+    in full all the same.
     """
     top = max_height if wrap_at is None else wave_height(material, wrap_at)
     if not height.finite or top is None:
@@ -102,7 +107,10 @@ def _(
     if change == 0:
         return 0.0
     fabricated = fabricate(ends, material=material, wrap_at=wrap_at, levels=levels, max_height=max_height)
-    deepest, phase = float(fabricated.abs().max()), 2 * math.pi * change / wave_height(material, _VIOLET)
+    deepest, phase = (
+        float(fabricated.abs().max()),
+        2 * math.pi * change / wave_height(material, nearest_known(material, _VIOLET)),
+    )
     return max(phase, change / deepest if deepest > 0 else math.inf)
 
 
@@ -120,7 +128,8 @@ def _largest_change(ends: Tensor, top: float, levels: int | None, cyclic: bool) 
 
 
 @fabricate.preflight
-def _(*, material: Material, wrap_at: float | None, levels: int | None, max_height: float | None) -> list[str]:
+def _(*, material: AnyGlass, wrap_at: float | None, levels: int | None, max_height: float | None) -> list[str]:
+    refuse_material("wrap_at", material, None if wrap_at is None else torch.tensor([wrap_at], dtype=torch.float64))
     _refuse(material, wrap_at, levels, max_height)
     if max_height is not None and wrap_at is None:
         return [

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check
-from neusee.nodes.doe._refractive_index import Material, wave_height
+from neusee.nodes.doe._refractive_index import AnyGlass, wave_height
 from neusee.nodes.optics._pupil_grid import PupilGrid, inside
 
 
-def height_from_phase(phase: Tensor, grid: PupilGrid, wavelength: float, material: Material) -> Tensor:
+def height_from_phase(phase: Tensor, grid: PupilGrid, wavelength: float, material: AnyGlass) -> Tensor:
     """Return the height map (float32, m) that delays ``wavelength`` by ``phase``; the least height is 0.
 
     The height outside the stop is 0 too.

@@ -1,14 +1,26 @@
 """Materials of the mask, and their refractive indices relative to air."""
 
-from typing import Literal, NamedTuple
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
 
 import torch
+from pydantic import Discriminator, Tag, WithJsonSchema
 from torch import Tensor
 
-from neusee.nodes import Check, node
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.doe._glass_table import SELLMEIER_SCHEMA, Sellmeier, glass_index, glass_range, refuse_glass
+from neusee.nodes.units import DataFile
 from neusee.nodes.values import Bands
 
 Material = Literal["fused silica", "PMMA", "BK7", "photoresist"]
+#: a known material, a file with a table or coefficients, or coefficients
+Glass = Annotated[
+    Annotated[Material | DataFile, Tag("file")]
+    | Annotated[Sellmeier, Tag("coefficients"), WithJsonSchema(SELLMEIER_SCHEMA)],
+    Discriminator(lambda value: "coefficients" if isinstance(value, Mapping) else "file"),
+]
+AnyGlass = str | Path | Sellmeier  #: `Glass` as a function receives it
 
 
 class _Dispersion(NamedTuple):
@@ -33,36 +45,93 @@ _DISPERSION: dict[str, _Dispersion] = {
 }
 
 
-def excess_index(name: Material, wavelengths: Tensor) -> Tensor:
-    """Return n - 1 of a material at wavelengths in m; the result is differentiable and keeps the dtype."""
+def excess_index(name: AnyGlass, wavelengths: Tensor) -> Tensor:
+    """Return n - 1 of a material at wavelengths in m; the result is differentiable and keeps the dtype.
+
+    Raises ValueError for wavelengths outside the range of a material of your own.
+    """
+    if not isinstance(name, str):
+        return glass_index(name, wavelengths) - 1
     material, square = _DISPERSION[name], (wavelengths * 1e6).square()
     if material.cauchy:
         return torch.stack([a / square**k for k, a in enumerate(material.cauchy)]).sum(0) - 1
     return (1 + torch.stack([b * square / (square - c) for b, c in material.sellmeier]).sum(0)).sqrt() - 1
 
 
-def wave_height(name: Material, wavelength: float) -> float:
+def wave_height(name: AnyGlass, wavelength: float) -> float:
     """Return the height of the mask, in m, that delays light of ``wavelength`` by one wave."""
     return wavelength / float(excess_index(name, torch.tensor(wavelength, dtype=torch.float64)))
 
 
+def index_curve(glass: AnyGlass, count: int = 400) -> tuple[Tensor, Tensor]:
+    """Return ``count`` wavelengths in m over the range in which a material is known, and its refractive index there."""
+    low, high = _name_and_range(glass)[1]
+    wavelengths = torch.linspace(low, high, count, dtype=torch.float64)
+    return wavelengths, excess_index(glass, wavelengths) + 1
+
+
+def nearest_known(name: AnyGlass, wavelength: float) -> float:
+    """Return the wavelength in m nearest to ``wavelength`` at which the index of a material of your own is known."""
+    if isinstance(name, str):
+        return wavelength
+    low, high = glass_range(name)
+    return min(max(wavelength, low), high)
+
+
 @node(rtol=1e-12)
-def material(bands: Bands, *, material: Material = "fused silica") -> Tensor:
+def material(bands: Bands, *, material: Glass = "fused silica") -> Tensor:
     """Compute the refractive index of the mask minus the refractive index of air, which is taken as 1.
+
+    ``material`` is one of four names; or Sellmeier coefficients, B without unit and C in um^2, with the range of
+    wavelengths over which they were fitted; or a CSV file with either, with a header such as
+    ``wavelength (um),n (1)`` or ``B (1),C (um^2),from (nm),to (nm)``.
 
     Shapes: bands -> (band,), float64.
     Units:  wavelengths m; result 1.
-    Error:  error of the fit: 1e-5 for the glasses, 1e-3 for the polymers.
+    Error:  error of the fit: 1e-5 for the glasses, 1e-3 for the polymers. A table is interpolated by the cubic through
+            the four nearest rows: 1e-7 for glass in steps of 10 nm. A glass of your own is never extrapolated.
+    Raises: ParameterError before the run for a glass that does not reach over the bands, and for a file without such
+            numbers.
     Source: fused silica: Malitson, J. Opt. Soc. Am. 55, 1205 (1965); N-BK7: SCHOTT data sheet; PMMA: fit to
         Sultanova et al., Acta Phys. Pol. A 116, 585 (2009); photoresist: MicroChem SU-8 3000 data sheet (2011), Cauchy.
     """
     return excess_index(material, bands.centres.to(torch.float64))
 
 
+@material.preflight
+def _(*, bands: Bands | None = None, material: AnyGlass = "fused silica") -> list[str]:
+    return refuse_material("material", material, None if bands is None or bands.centres.is_meta else bands.centres)
+
+
+def refuse_material(parameter: str, material: AnyGlass, wavelengths: Tensor | None) -> list[str]:
+    """Raise ParameterError for a material of your own that is wrong or not known at wavelengths in m; return no notes.
+
+    ``parameter`` is the parameter that the wavelengths come from; a wrong file is always a mistake of ``material``.
+    """
+    if isinstance(material, str):
+        return []
+    refuse_glass(material)
+    if wavelengths is not None:
+        try:
+            glass_index(material, wavelengths)
+        except ValueError as error:
+            raise ParameterError(parameter, str(error)) from None
+    return []
+
+
 @material.check
-def _(result: Tensor, bands: Bands, *, material: Material) -> list[Check]:
-    (low, high), centres = _DISPERSION[material].fit, bands.centres
-    text = f"{material}: n - 1 from {float(result[0]):.4f} to {float(result[-1]):.4f}"
-    fitted = low <= float(centres.min()) and float(centres.max()) <= high
+def _(result: Tensor, bands: Bands, *, material: AnyGlass) -> list[Check]:
+    name, (low, high) = _name_and_range(material)
+    text = f"{name}: n - 1 from {float(result[0]):.4f} to {float(result[-1]):.4f}"
     extent = f"formula fitted over {low * 1e9:.0f} to {high * 1e9:.0f} nm"
+    if not isinstance(material, str):
+        extent = f"known from {low * 1e9:.0f} to {high * 1e9:.0f} nm"
+    fitted = low <= float(bands.centres.min()) and float(bands.centres.max()) <= high
     return [Check(text, bool((result > 0).all())), Check(extent if fitted else f"{extent}, used outside it", fitted)]
+
+
+def _name_and_range(material: AnyGlass) -> tuple[str, tuple[float, float]]:
+    """Return the name of a material, and the wavelengths in m between which its index is known."""
+    if isinstance(material, str):
+        return material, _DISPERSION[material].fit
+    return material.name if isinstance(material, Path) else "own Sellmeier coefficients", glass_range(material)

@@ -1,101 +1,25 @@
 """A height map read from a file, or a smooth random height map at which a training starts."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from neusee.nodes import ParameterError, node
+from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.doe._height_from_phase import height_checks
-from neusee.nodes.input_files import once_per_version, refuse_large_array
+from neusee.nodes.doe._height_map_files import map_header, read_height_map
+from neusee.nodes.doe._map_resampling import Between, coarser, jump, resampled, resampling_error, too_small
+from neusee.nodes.input_files import once_per_version
 from neusee.nodes.optics._phase_screen import screen
-from neusee.nodes.optics._pupil_grid import grid_of
+from neusee.nodes.optics._pupil_grid import PupilGrid, grid_of
 from neusee.nodes.units import DataFile, PositiveLength
 from neusee.nodes.values import Stop
 
-if TYPE_CHECKING:
-    from PIL.Image import Image
-
-_GREYS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}  #: the level of white in each mode of a grey picture
 Scale = Annotated[float, Field(gt=0, le=1)]  #: share of the pupil's diameter
-
-
-def _header(file: Path) -> tuple[int, ...]:
-    """Return the shape of the height map in a file without reading the heights."""
-    from safetensors import SafetensorError
-
-    try:
-        return _shape_in(file)
-    except ParameterError:
-        raise
-    except (SafetensorError, OSError, ValueError, EOFError) as error:
-        raise ParameterError("file", f"{file.name} cannot be read as a height map: {error}") from error
-
-
-def _shape_in(file: Path) -> tuple[int, ...]:
-    if file.suffix == ".npy":
-        import numpy as np
-
-        head = np.load(file, mmap_mode="r", allow_pickle=False)
-        _refuse_other_than_numbers(file, str(head.dtype), head.dtype.kind in "fiu")
-        return tuple(head.shape)
-    if file.suffix == ".safetensors":
-        from safetensors import safe_open
-
-        with safe_open(file, framework="pt") as tensors:
-            heights = tensors.get_slice(_name(file, list(tensors.keys())))
-            kind = str(heights.get_dtype())
-            _refuse_other_than_numbers(file, kind, kind.startswith(("F", "BF", "I", "U")))
-            return tuple(heights.get_shape())
-    if file.suffix == ".png":
-        with _levels(file) as picture:
-            return picture.height, picture.width
-    raise ParameterError("file", f"{file.name}: a height map is read from .npy, .safetensors or grey .png")
-
-
-def _refuse_other_than_numbers(file: Path, kind: str, real: bool) -> None:
-    """Raise ParameterError for values that are not real numbers, such as complex ones, before their part is dropped."""
-    if not real:
-        text = f"{file.name} holds values of type {kind}: save the heights as real numbers, in m"
-        raise ParameterError("file", text)
-
-
-def _levels(file: Path) -> "Image":
-    """Open a greyscale picture file; raise ParameterError for a picture that is not greyscale."""
-    from PIL import Image
-
-    picture = Image.open(file)
-    if picture.mode not in _GREYS:
-        picture.close()
-        raise ParameterError(
-            "file", f"{file.name} is {picture.mode}, not grey: store one grey level per sample, in 8 or 16 bits"
-        )
-    return picture
-
-
-def _name(file: Path, names: list[str]) -> str:
-    if "height" in names or len(names) == 1:
-        return "height" if "height" in names else names[0]
-    found = ", ".join(sorted(names)) or "nothing"
-    raise ParameterError("file", f"{file.name} holds {found}: name the tensor of the height map 'height'")
-
-
-def read_height_map(file: Path, depth: float) -> Tensor:
-    """Read a height map in m from a file; ``depth`` is the height of white in a picture."""
-    import numpy as np
-
-    if file.suffix == ".png":
-        with _levels(file) as picture:
-            levels = torch.from_numpy(np.asarray(picture, dtype=np.float64))
-            return (levels * (depth / _GREYS[picture.mode])).to(torch.float32)
-    if file.suffix == ".npy":
-        return torch.from_numpy(np.load(file, allow_pickle=False)).to(torch.float32)
-    from safetensors.torch import load_file
-
-    tensors = load_file(file)
-    return tensors[_name(file, list(tensors))].to(torch.float32)
+_DEPTH = 1.2e-6  #: m, height of white where neither the recipe nor the file says
+_TALLEST = 0.01  #: m; a higher mask is a mistake of the unit
 
 
 @node()
@@ -103,63 +27,183 @@ def pixelwise(
     stop: Stop,
     *,
     file: DataFile | None = None,
-    depth: PositiveLength = 1.2e-6,
+    depth: PositiveLength | None = None,
+    unit: PositiveLength | None = None,
+    pitch: PositiveLength | None = None,
+    between: Between = "linear",
     scale: Scale = 0.1,
     rng: torch.Generator,
 ) -> Tensor:
     """Read a height map from ``file``, or return a smooth random height map between 0 and ``depth``.
 
+    The file is a .npy, .safetensors, .exr or .mat file whose value 1 is the height ``unit`` (1 m unless stated), or a
+    grey .png whose white is ``depth`` (1.2 um unless stated). A file with samples ``pitch`` apart is interpolated to
+    the pupil grid; without ``pitch`` it has the samples of the pupil grid. The header of a file other than .npy may
+    state the three.
+
     The features of the random height map are ``scale`` diameters wide. It is a start for training: a flat height map
     is a saddle point, where the suppression has no gradient.
 
     Shapes: stop -> (v, u).
-    Units:  m; a .png holds grey levels, of which white is ``depth``.
-    Error:  exact.
-    Raises: ParameterError for a file without a height map, or of another shape than the pupil grid; ValueError for a
-            height that is negative or not finite.
+    Units:  m.
+    Error:  exact without ``pitch``. Linear interpolation: h^2 / 8 of the curvature, which the check estimates as the
+            difference from cubic interpolation; `nearest` takes the sample whose centre is nearest.
+    Raises: ParameterError for a file without a height map, of another shape than the pupil grid or smaller than the
+            clear aperture, with 16-bit floats, complex values or, before linear interpolation, jumps as of a wrapped
+            map; ValueError for a height that is negative or not finite.
     Source: by definition.
     """
     if file is None:
         noise = screen(grid_of(stop), scale, rng)
-        return (depth * torch.sigmoid(1.5 * noise)).to(torch.float32)
-    _fits(file, _header(file), stop)
-    height = read_height_map(file, depth)
-    if not bool(torch.isfinite(height).all()) or float(height.min()) < 0:
-        low = float(height.min())
-        raise ValueError(f"{file.name}: lowest height {low:.3g} m, but every height must be finite and at least 0")
-    return height
+        return ((_DEPTH if depth is None else depth) * torch.sigmoid(1.5 * noise)).to(torch.float32)
+    lengths = _lengths(file, depth, unit, pitch)
+    own = _fits(file, map_header(file).shape, grid_of(stop), lengths["pitch"])
+    height = read_height_map(file, lengths["depth"], lengths["unit"])
+    if problem := _wrong(file, height):
+        raise ValueError(problem)
+    return height if own is None else resampled(height, own, grid_of(stop), between)
 
 
-def _fits(file: Path, shape: tuple[int, ...], stop: Stop) -> None:
-    samples = int(stop.samples)
-    if shape != (samples, samples):
-        fix = f"resample the height map, or set samples to {shape[-1] if shape else 1}"
+def height_map(
+    file: Path, *, depth: float | None = None, unit: float | None = None, pitch: float | None = None
+) -> tuple[Tensor, float | None]:
+    """Read a height map in m as its file samples it, and the distance of its samples in m, None if nothing states it.
+
+    The parameters are those of `pixelwise`.
+    """
+    lengths = _lengths(file, depth, unit, pitch)
+    return read_height_map(file, lengths["depth"], lengths["unit"]), lengths["pitch"]
+
+
+def _lengths(file: Path, depth: float | None, unit: float | None, pitch: float | None) -> dict[str, Any]:
+    """Return the lengths that the recipe or the header of the file states, in m.
+
+    Raises ParameterError where recipe and header differ.
+    """
+    stated = map_header(file).stated
+    lengths: dict[str, Any] = {"depth": _DEPTH, "unit": 1.0, "pitch": None} | stated
+    for name, value in (("depth", depth), ("unit", unit), ("pitch", pitch)):
+        if value is None:
+            continue
+        if name in stated and abs(stated[name] / value - 1) > 1e-6:
+            here, there = (f"{x * 1e6:.6g} um" for x in (value, stated[name]))
+            raise ParameterError(name, f"{here}, but the header of {file.name} says {there}: leave one of them out")
+        lengths[name] = value
+    return lengths
+
+
+def _fits(file: Path, shape: tuple[int, ...], grid: PupilGrid, pitch: float | None) -> float | None:
+    """Return the pitch from which a height map is interpolated, or None if it has the samples of the pupil grid.
+
+    Raises ParameterError for another size than the pupil needs.
+    """
+    samples = grid.samples
+    same = shape == (samples, samples)
+    if same and (pitch is None or abs(pitch / grid.pitch - 1) <= 1e-6):
+        return None
+    if len(shape) != 2 or min(shape) < 2:
+        raise ParameterError("file", f"{file.name} is {shape}, not the pupil grid ({samples}, {samples}), nor a height "
+                             "map that can be resampled: save a map with two axes")  # fmt: skip
+    if pitch is None:
+        fix = f"state its pitch to resample it, or set samples to {shape[-1]}"
         raise ParameterError("file", f"{file.name} is {shape}, not the pupil grid ({samples}, {samples}): {fix}")
+    if problem := too_small(shape, pitch, grid):
+        raise ParameterError("pitch", f"{file.name}: {problem}")
+    return pitch
 
 
 @pixelwise.preflight
-def _(*, stop: Stop | None, file: Path | None, **_: Any) -> list[str]:
-    if file is not None:
-        shape = _header(file)
-        refuse_large_array(file, shape)
-        if stop is not None:
-            _fits(file, shape, stop)
-        if problem := _wrong_heights(file):
-            raise ParameterError("file", problem)
-    return []
+def _(
+    *,
+    stop: Stop | None,
+    file: Path | None,
+    depth: float | None = None,
+    unit: float | None = None,
+    pitch: float | None = None,
+    between: Between = "linear",
+    **_: Any,
+) -> list[str]:
+    if file is None:
+        return []
+    _refuse_unused(file, depth, unit)
+    lengths = _lengths(file, depth, unit, pitch)
+    own = None if stop is None else _fits(file, map_header(file).shape, grid_of(stop), lengths["pitch"])
+    if problem := _wrong_heights(file, lengths["depth"], lengths["unit"]):
+        raise ParameterError("file", problem)
+    notes = _white_note(file, depth)
+    if own is None or stop is None:
+        return notes
+    if between == "linear" and (step := _jump(file, lengths["depth"], lengths["unit"], own, grid_of(stop))):
+        fix = "unwrap a wrapped map, or set between: nearest to keep the steps"
+        raise ParameterError("file", f"{file.name}: {step}, which linear interpolation makes a ramp: {fix}")
+    note = coarser(own, grid_of(stop))
+    return [*notes, *([f"{file.name}: {note}"] if note else [])]
+
+
+def _white_note(file: Path, depth: float | None) -> list[str]:
+    """Return a note on a picture of which nothing states the height of white."""
+    if file.suffix.lower() != ".png" or depth is not None or "depth" in map_header(file).stated:
+        return []
+    return [f"{file.name}: white counts as {_DEPTH * 1e6:g} um high, because nothing states its height: give depth"]
+
+
+def _refuse_unused(file: Path, depth: float | None, unit: float | None) -> None:
+    """Raise ParameterError for a length that does not apply to the kind of file."""
+    if file.suffix.lower() == ".png" and unit is not None:
+        raise ParameterError("unit", f"{file.name} holds grey levels: give depth, the height of white")
 
 
 @once_per_version
-def _wrong_heights(file: Path) -> str:
-    """Return a message for a file whose heights cannot be read or are negative or not finite, else an empty text."""
+def _wrong_heights(file: Path, depth: float, unit: float) -> str:
+    """Return a message for a file whose heights cannot be read or are wrong, else an empty text."""
     try:
-        height = read_height_map(file, 1.0)
+        return _wrong(file, read_height_map(file, depth, unit))
     except (OSError, ValueError, SyntaxError) as error:
         return f"{file.name} cannot be read as a height map: {error}"
-    low = float(height.min())
-    if bool(torch.isfinite(height).all()) and low >= 0:
-        return ""
-    return f"{file.name}: lowest height {low:.3g} m, but every height must be finite and at least 0"
 
 
-pixelwise.check(height_checks)
+def _wrong(file: Path, height: Tensor) -> str:
+    """Return a message for heights that are not finite, negative, or higher than any mask, else an empty text."""
+    finite = torch.isfinite(height)
+    if not bool(finite.all()):
+        row, column = (int(i) for i in (~finite).nonzero()[0])
+        found = f"{int((~finite).sum())} heights are NaN or infinite, the first in row {row}, column {column}"
+        return f"{file.name}: {found}, but every height must be finite and at least 0"
+    low, high = (float(x) for x in torch.aminmax(height))
+    if low < 0:
+        return f"{file.name}: lowest height {low:.3g} m, but every height must be finite and at least 0"
+    if high > _TALLEST:
+        return f"{file.name}: highest height {high:.3g} m: state the unit of the file, such as unit: 1 um"
+    return ""
+
+
+@once_per_version
+def _jump(file: Path, depth: float, unit: float, pitch: float, grid: PupilGrid) -> str:
+    return jump(read_height_map(file, depth, unit), pitch, grid)
+
+
+@pixelwise.check
+def _(
+    result: Tensor,
+    stop: Stop,
+    *,
+    file: Path | None = None,
+    depth: float | None = None,
+    unit: float | None = None,
+    pitch: float | None = None,
+    between: Between = "linear",
+    **_: Any,
+) -> list[Check]:
+    checks = height_checks(result)
+    if file is None:
+        return checks
+    lengths, grid = _lengths(file, depth, unit, pitch), grid_of(stop)
+    shape = map_header(file).shape
+    own = _fits(file, shape, grid, lengths["pitch"])
+    if own is None:
+        return checks
+    height = read_height_map(file, lengths["depth"], lengths["unit"])
+    text = f"{file.name} resampled from {' x '.join(map(str, shape))} samples {own * 1e6:.4g} um apart"
+    if between == "linear":
+        text += f", rms error {resampling_error(height, own, grid) * 1e9:.2g} nm"
+    return [*checks, Check(text)]

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
+from neusee.nodes.scene._grey import luminance
 from neusee.nodes.sensor._exposure import channel_weights
 from neusee.nodes.sensor._saturation import Efficiency
 from neusee.nodes.spectra._spectral_tables import paints, to_srgb
@@ -28,8 +29,9 @@ def colour_matrix(
 
     Linear least mean square over the reflectances s of colour charts, C = E[s s^T]: M = T C A^T (A C A^T)^-1, where
     A s are the electrons under this illuminant and T s is the linear sRGB under D65. The matrix includes white balance.
+    A sensor with a single channel sees no colour: T s is the luminance then, equal in red, green and blue.
 
-    Shapes: bands, illuminant, level (band,), responses (3, band) -> (3, 3) float64.
+    Shapes: bands, illuminant, level (band,), responses (channel, band) -> (3, channel) float64.
     Units:  linear sRGB per electron.
     Error:  metamerism: rms 0.01 to 0.05 on the charts, depending on the channels; larger for saturated lights. The
             light of the scene is assumed to be reflected once.
@@ -40,7 +42,7 @@ def colour_matrix(
     second = spectra.T @ spectra / len(spectra)
     pixel = {"pixel_pitch": pixel_pitch, "exposure": exposure}
     counts = _counts(bands, illuminant, responses, level, quantum_efficiency, **pixel)
-    rgb = to_srgb(bands.centres)
+    rgb = _target(bands.centres, len(counts))
     seen = counts @ second @ counts.T
     ridge = (1e-12 * seen.diagonal().mean()).clamp_min(1e-200) * torch.eye(len(seen), dtype=torch.float64)
     matrix: Tensor = torch.linalg.solve(seen + ridge, counts @ second @ rgb.T).T
@@ -52,8 +54,15 @@ def _(result: Tensor, *inputs: Any, **params: float) -> list[Check]:
     bands, illuminant, responses, level = inputs
     spectra = _paints(bands.centres)
     counts = _counts(bands, illuminant, responses, level, **params)
-    off = (spectra @ counts.T @ result.T - spectra @ to_srgb(bands.centres).T).square().mean().sqrt()
-    return [Check(f"rms colour error {float(off):.3f} on colour charts", float(off) < 0.1)]
+    off = (spectra @ counts.T @ result.T - spectra @ _target(bands.centres, len(result[0])).T).square().mean().sqrt()
+    what = "colour" if len(result[0]) > 1 else "luminance"
+    return [Check(f"rms {what} error {float(off):.3f} on colour charts", float(off) < 0.1)]
+
+
+def _target(centres: Tensor, channels: int) -> Tensor:
+    """Return the matrix (3, band) from reflectance to linear sRGB, or to grey for a sensor with a single channel."""
+    rgb = to_srgb(centres)
+    return rgb if channels > 1 else luminance(rgb, 0).expand(3, -1)
 
 
 def _counts(

@@ -47,15 +47,16 @@ def clipped(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Ten
 def colour(channels: Tensor, matrix: Tensor) -> Tensor:
     """Convert the channels of the sensor to linear sRGB by a colour matrix.
 
-    Shapes: channels (..., 3, y, x), matrix (3, 3) -> (..., 3, y, x).
+    Shapes: channels (..., channel, y, x), matrix (3, channel) -> (..., 3, y, x).
     Units:  channels e-; result linear sRGB, white 1; colours out of gamut below 0.
     Error:  the error of the matrix: no matrix is right for all spectra.
-    Raises: ValueError for a number of channels other than three.
+    Raises: ValueError where channels and matrix differ in the number of channels.
     Source: Reinhard et al., High Dynamic Range Imaging, 2nd ed. (colour spaces as 3 x 3 matrices).
     """
     if channels.ndim < 3 or channels.shape[-3] != matrix.shape[-1]:
         raise ValueError(
-            f"channels {tuple(channels.shape)} do not fit the matrix {tuple(matrix.shape)}: give (3, y, x)"
+            f"channels {tuple(channels.shape)} do not fit the matrix {tuple(matrix.shape)}: "
+            "compute both from the same `responses` step"
         )
     channels = single(channels)
     flat = matrix.to(channels) @ channels.flatten(-2)

@@ -39,8 +39,8 @@ def _(channels: Tensor, matrix: Tensor) -> Tensor:
 
 
 @colour_matrix.shape
-def _(*inputs: Any, **params: Any) -> Tensor:
-    return double(3, 3)
+def _(bands: Any, illuminant: Any, responses: Tensor, *inputs: Any, **params: Any) -> Tensor:
+    return double(3, len(responses))
 
 
 @wiener.work

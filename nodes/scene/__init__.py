@@ -2,6 +2,7 @@
 
 from neusee.nodes.scene import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.scene._exr_picture import exr
+from neusee.nodes.scene._grey import grey
 from neusee.nodes.scene._hyperspectral import hyperspectral
 from neusee.nodes.scene._photograph import photograph
 from neusee.nodes.scene._photograph_folder import Photographs, choose_photograph, crop_photograph, list_photographs
@@ -13,6 +14,7 @@ __all__ = [
     "choose_photograph",
     "crop_photograph",
     "exr",
+    "grey",
     "hyperspectral",
     "list_photographs",
     "photograph",

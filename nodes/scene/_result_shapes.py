@@ -7,14 +7,17 @@ from torch import Tensor
 
 from neusee.nodes.scene._cube_files import Layout
 from neusee.nodes.scene._exr_picture import exr, picture_size
+from neusee.nodes.scene._grey import grey
 from neusee.nodes.scene._hyperspectral import hyperspectral, rows_and_columns
 from neusee.nodes.scene._large_picture import is_large
 from neusee.nodes.scene._photograph import photograph, read_header
 from neusee.nodes.scene._test_targets import targets
-from neusee.nodes.shape_rules import blank
+from neusee.nodes.shape_rules import blank, like_first
 from neusee.nodes.values import Bands
 
 Size = tuple[int, int]
+
+grey.shape(like_first)
 
 
 @targets.shape

@@ -3,10 +3,11 @@
 from neusee.nodes.spectra import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.spectra._bands import bands, filters, line, mean_wavelength
 from neusee.nodes.spectra._camera_colour import grain, render
-from neusee.nodes.spectra._channel_responses import responses
+from neusee.nodes.spectra._channel_responses import camera_curves, responses
 from neusee.nodes.spectra._dead_leaves import leaves
 from neusee.nodes.spectra._distinct_band_sums import rows
-from neusee.nodes.spectra._illuminant import illuminant, illuminate
+from neusee.nodes.spectra._illuminant import illuminant, illuminate, light_curve
+from neusee.nodes.spectra._laser_table import laser_table, line_table
 from neusee.nodes.spectra._linear_lift import (
     lift_lmmse,
     lift_lmmse_mixture,
@@ -26,11 +27,13 @@ from neusee.nodes.spectra._mst_lift_node import (
 
 __all__ = [
     "bands",
+    "camera_curves",
     "compress",
     "filters",
     "grain",
     "illuminant",
     "illuminate",
+    "laser_table",
     "leaves",
     "lift_lmmse",
     "lift_lmmse_mixture",
@@ -39,7 +42,9 @@ __all__ = [
     "lift_matrix",
     "lift_mst_plus_plus",
     "lift_pictures",
+    "light_curve",
     "line",
+    "line_table",
     "mean_wavelength",
     "metamers",
     "need_mst_plus_plus_bands",

@@ -1,5 +1,7 @@
 """Illuminants, and the radiance of a scene under an illuminant."""
 
+import re
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -7,57 +9,111 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes._half_precision import single
-from neusee.nodes.spectra._spectral_tables import daylight, light, require_range
-from neusee.nodes.units import Temperature
+from neusee.nodes.input_files import once_per_version
+from neusee.nodes.spectra._spectral_tables import Table, daylight, light, require_range
+from neusee.nodes.spectra._table_files import Curves, curves, refused
+from neusee.nodes.units import DataFile, Temperature
 from neusee.nodes.values import Bands, LowRankCube
 
 Kind = Literal[
     "daylight", "D50", "D55", "D65", "D75", "A", "E", "FL2", "FL7", "FL11", "HP1",
     "LED-B1", "LED-B2", "LED-B3", "LED-B4", "LED-B5", "LED-BH1", "LED-RGB1", "LED-V1", "LED-V2",
 ]  # fmt: skip
+_COLUMNS = "write a header such as wavelength (nm),power (W/nm), then two columns"
+_LONGER = "give a longer table, or choose bands inside that range"
 
 
 @node(rtol=1e-9)
-def illuminant(bands: Bands, *, kind: Kind = "daylight", temperature: Temperature = 6504.0) -> Tensor:
-    """Average the relative spectral power of a CIE illuminant over each band.
+def illuminant(bands: Bands, *, kind: Kind | DataFile = "daylight", temperature: Temperature = 6504.0) -> Tensor:
+    """Average the relative spectral power of an illuminant over each band: a CIE illuminant, or a table of your own.
 
-    Only the kind `daylight` uses `temperature`.
+    Only the kind `daylight` uses `temperature`. A table is a CSV file with a header such as
+    ``wavelength (nm),power (W/nm)`` and two columns; only the ratio of its powers counts.
 
     Shapes: -> (band,) float64.
     Units:  relative, mean 1 over the bands.
-    Error:  linear interpolation between samples 1 to 10 nm apart; 31 bands shift the white of D65 by 0.2 %.
-    Raises: ParameterError before the run for daylight outside 4000 to 25 000 K; ValueError where bands leave the table.
+    Error:  linear interpolation between samples 1 to 10 nm apart; 31 bands shift the white of D65 by 0.2 %. A table is
+            not extrapolated.
+    Raises: ParameterError before the run for daylight outside 4000 to 25 000 K, and for a file without such a table or
+            with a table that does not reach over all bands; ValueError where bands leave the table.
     Source: CIE 15:2004 (D series, A, E, FL, HP), CIE 15:2018 (LED), by way of colour-science.
     """
-    table = daylight(temperature) if kind == "daylight" else light(kind)
-    edges = torch.cat([bands.centres - bands.widths / 2, bands.centres + bands.widths / 2])
-    require_range(edges, table.wavelengths, f"{kind} is tabulated from")
+    table = _light(kind, temperature)
+    name = _name(kind)
+    edges = _edges(bands)
+    require_range(edges, table.wavelengths, f"{name} is tabulated from")
     power = table.over(bands)[0]
     if not float(power.mean()) > 0:
         low, high = float(edges.min()) * 1e9, float(edges.max()) * 1e9
-        raise ValueError(f"illuminant {kind} gives no light from {low:.4g} to {high:.4g} nm: choose other bands")
+        raise ValueError(f"illuminant {name} gives no light from {low:.4g} to {high:.4g} nm: choose other bands")
     return (power / power.mean()).to(bands.centres.device)
 
 
 @illuminant.preflight
-def _(*, kind: str = "daylight", temperature: float = 6504.0) -> list[str]:
+def _(*, bands: Bands | None = None, kind: str | Path = "daylight", temperature: float = 6504.0) -> list[str]:
     if kind == "daylight" and not 4000 <= temperature <= 25000:
         raise ParameterError(
             "temperature",
             f"CIE daylight is defined from 4000 K to 25000 K, not at {temperature:g} K: choose kind A or an LED",
         )
+    if isinstance(kind, Path):
+        table = light_curve(kind).table()
+        if bands is not None and not bands.centres.is_meta:
+            try:
+                require_range(_edges(bands), table.wavelengths, f"{kind.name} is tabulated from", _LONGER)
+            except ValueError as error:
+                raise ParameterError("kind", str(error)) from None
     return []
 
 
 @illuminant.check
-def _(result: Tensor, bands: Bands, *, kind: str = "daylight", temperature: float = 6504.0) -> list[Check]:
-    name = f"{kind} {temperature:g} K" if kind == "daylight" else kind
+def _(result: Tensor, bands: Bands, *, kind: str | Path = "daylight", temperature: float = 6504.0) -> list[Check]:
+    name = f"{kind} {temperature:g} K" if kind == "daylight" else _name(kind)
     peak = float(bands.centres[int(result.argmax())]) * 1e9
     return [
         Check(
             f"{name}: relative power {float(result.min()):.2f} to {float(result.max()):.2f}, largest at {peak:.4g} nm"
         )
     ]
+
+
+def light_curve(file: Path) -> Curves:
+    """Read the spectral power of a light from a CSV file."""
+    try:
+        return _light_curve(file)
+    except (OSError, ValueError) as error:
+        raise refused("kind", _COLUMNS, error) from None
+
+
+@once_per_version
+def _light_curve(file: Path) -> Curves:
+    found = curves(file, None)
+    if len(found.values) != 1:
+        raise ValueError(f"{file.name} has {len(found.values) + 1} columns in place of 2")
+    heading = found.columns[0].heading
+    if re.search(r"photon|mol|%", heading):
+        fix = "divide photons by the wavelength, and write a unit of power, such as W/nm or 1"
+        raise ValueError(f"{file.name}: {heading} is no spectral power: {fix}")
+    if not found.columns[0].unit:
+        raise ValueError(f"{file.name}: column 2, {heading}, has no unit: write power (W/nm), or power (1) if relative")
+    found.refuse(found.values < 0, lambda value: f"a light cannot have the power {value:g}")
+    if not found.values.any():
+        raise ValueError(f"{file.name} has no power at any wavelength")
+    return found
+
+
+def _light(kind: str | Path, temperature: float) -> Table:
+    if isinstance(kind, Path):
+        return light_curve(kind).table()
+    return daylight(temperature) if kind == "daylight" else light(kind)
+
+
+def _name(kind: str | Path) -> str:
+    return kind.name if isinstance(kind, Path) else kind
+
+
+def _edges(bands: Bands) -> Tensor:
+    return torch.cat([bands.centres - bands.widths / 2, bands.centres + bands.widths / 2])
 
 
 @node(bands={"reflectance": -3, "illuminant": 0, "return": -3}, accepts_low_rank=("reflectance",))

@@ -1,5 +1,6 @@
 """Shapes of the results of the spectral nodes."""
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -7,7 +8,7 @@ from torch import Tensor
 
 from neusee.nodes.shape_rules import at_least_single, blank, double, like_first
 from neusee.nodes.spectra._camera_colour import grain, render
-from neusee.nodes.spectra._channel_responses import responses
+from neusee.nodes.spectra._channel_responses import channel_count, responses
 from neusee.nodes.spectra._dead_leaves import _FINE, leaves
 from neusee.nodes.spectra._distinct_band_sums import rows
 from neusee.nodes.spectra._illuminant import illuminant, illuminate
@@ -24,8 +25,8 @@ def _(bands: Bands, **params: Any) -> Tensor:
 
 
 @responses.shape
-def _(bands: Bands, **params: Any) -> Tensor:
-    return double(3, len(bands.centres))
+def _(bands: Bands, *, camera: str | Path = "CIE 1931") -> Tensor:
+    return double(channel_count(camera), len(bands.centres))
 
 
 @rows.shape

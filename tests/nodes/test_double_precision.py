@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes import doe, flare, losses, metrics, optics, restore, sensor, spectra
+from neusee.nodes import doe, flare, losses, metrics, optics, restore, scene, sensor, spectra
 from neusee.nodes.values import Bands, LowRankCube, Psf, Pupil, Stop
 from tests.nodes.optics.independent_psf import window
 from tests.nodes.test_contract import NODES
@@ -327,6 +327,8 @@ CASES = [
          {"gain": 2.7, "offset": 390.1}),
     case(sensor.add_photons, (PICTURE, [TRUTH], [PICTURE]), lambda p, a, b: exact(p) + exact(a[0]) + exact(b[0])),
     case(sensor.expose, (IMAGE, BANDS, RESPONSES, LEVEL), photons, SHUTTER),
+    case(scene.grey, (PICTURE,),
+         lambda p: np.stack(3 * [L("0.2126") * exact(p)[0] + L("0.7152") * exact(p)[1] + L("0.0722") * exact(p)[2]])),
     case(sensor.full_well, (PICTURE,), lambda e, capacity: np.minimum(exact(e), L(capacity)), {"capacity": 0.7}),
     case(sensor.level, (IMAGE, BANDS, RESPONSES), level, {"strength": 0.7, **WELL}),
     case(sensor.saturation, (BANDS,), lambda b, **_: saturating(b), WELL),
@@ -360,7 +362,8 @@ _ELSEWHERE = {
         "sensor.photon_transfer", "sensor.read_noise", "spectra.grain", "spectra.leaves", "spectra.metamers"),
     "reads tables or files": ("calibrate.descriptor", "calibrate.frames", "calibrate.table", "restore.colour_matrix",
         "spectra.illuminant", "spectra.lift_lmmse", "spectra.lift_lmmse_mixture", "spectra.lift_mallett",
-        "spectra.lift_mallett_mixture", "spectra.reflectances", "spectra.render", "spectra.responses"),
+        "spectra.lift_mallett_mixture", "spectra.line_table", "spectra.reflectances", "spectra.render",
+        "spectra.responses"),
     "is a fit or a likelihood, with tests of its own": ("calibrate.camera", "calibrate.camera_prior",
         "calibrate.density", "calibrate.least_squares", "calibrate.levels", "calibrate.prior", "calibrate.reduce",
         "calibrate.sufficient", "restore.richardson_lucy", "restore.wiener", "spectra.compress"),

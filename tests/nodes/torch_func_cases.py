@@ -170,6 +170,7 @@ CASES = {
         {"read_noise": 5.0},
         to=1e-3,
     ),
+    "scene.grey": Case("0", (PICTURE,)),
     "scene.targets": Case("high", (), {"kind": "siemens", "shape": (12, 12), "high": number(0.9)}),
     "sensor.crop": Case("0", (SCENE,), {"shape": (8, 8)}),
     "sensor.dark_current": Case("0", (RAW,), {"mean": 2.0, "full_well": 25500.0}),
@@ -232,6 +233,7 @@ NOTHING_TO_FOLLOW = {
     "scene.exr": "reads a file",
     "scene.hyperspectral": "reads a file",
     "scene.photograph": "reads a file",
+    "spectra.line_table": "reads a file",
 }
 
 

@@ -27,8 +27,17 @@ KINDS: dict[str, tuple[dict[str, str], tuple[str, ...]]] = {
         ("neusee validate NAME.yaml", "neusee run NAME.yaml", "pytest test_NAME.py"),
     ),
     "sensor": (
-        {"sensor/NAME.yaml": "sensor.yaml.txt", "sensor/test_NAME.py": "test_sensor.py.txt"},
-        ("neusee run first_light sensor=NAME", "pytest sensor/test_NAME.py"),
+        {
+            "sensor/NAME.yaml": "sensor.yaml.txt",
+            "sensor/NAME_colour.csv": "sensor_colour.csv.txt",
+            "sensor/NAME_mono.csv": "sensor_mono.csv.txt",
+            "sensor/test_NAME.py": "test_sensor.py.txt",
+        },
+        (
+            "neusee run first_light sensor=NAME",
+            "neusee run first_light sensor=NAME sensor.camera=sensor/NAME_mono.csv camera=mono",
+            "pytest sensor/test_NAME.py",
+        ),
     ),
 }
 

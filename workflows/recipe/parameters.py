@@ -108,14 +108,14 @@ def _problems(
 ) -> Iterator[Diagnostic]:
     """Yield a diagnostic for each parameter of a step that is wrong, unknown or missing."""
     details = error.errors(include_url=False)
-    strangers = [str(e["loc"][0]) for e in details if e["type"] == "extra_forbidden"]
+    strangers = [str(e["loc"][0]) for e in details if e["type"] == "extra_forbidden" and len(e["loc"]) == 1]
     meant = {nearest(name, node.params.model_fields) for name in strangers}
     now = {new_name(f"{node.path}.{name}") for name in strangers}
     wrong: dict[tuple[Location, str], list[str]] = {}
     gone: dict[str, Diagnostic] = {}
     for e in details:
         name = str(e["loc"][0])
-        if e["type"] == "extra_forbidden":
+        if e["type"] == "extra_forbidden" and len(e["loc"]) == 1:
             unknown = f"unknown to {node.path}; {nearest(name, node.params.model_fields)}"
             message = instead(f"{node.path}.{name}") or unknown
             gone.setdefault(message, Diagnostic(values[name].key, f"{given.name}.{name}", message))
@@ -133,9 +133,9 @@ def _problems(
 
 
 def _deepest(value: Value, path: tuple[int | str, ...]) -> Value:
-    """Return the value at a path of keys below ``value``, or the last value on the path that exists."""
-    while path and (child := value.child(path[0])):
-        value, path = child, path[1:]
+    """Return the value at a path of keys below ``value``; keys that it lacks, such as names of types, are skipped."""
+    for key in path:
+        value = value.child(key) or value
     return value
 
 
@@ -147,6 +147,10 @@ def _said(value: Value) -> str:
 
 def _message(error: ErrorDetails) -> str:
     """Return the message of a pydantic error, rewritten so that the user knows which value to write."""
+    if error["type"] == "missing" and isinstance(error["loc"][-1], str):
+        return f"lacks {error['loc'][-1]}"
+    if error["type"] == "extra_forbidden":
+        return "has no meaning here"
     if error["type"] == "missing":
         return f"must have at least {int(error['loc'][-1]) + 1} values"
     text = error["msg"].removeprefix("Value error, ")

@@ -8,6 +8,7 @@ drawing function:
     psf[mask]                    the value of a step
     spot[mask,*]                 a dictionary with the value of each copy of a step
     psf[mask].pixel_pitch        a parameter of a step
+    line[*].file                 a dictionary with a parameter of each copy of a step
     psf[mask]()                  a function: the node of a step with the parameters of the step
 
 A leading ``?`` marks an optional argument: if the recipe lacks the step, the figure is drawn without this argument.
@@ -33,6 +34,7 @@ class Figure:
     caption: str
     draw: str  #: the drawing function, as ``module:function`` below neusee.workflows
     needs: Mapping[str, str]
+    only_tables: bool = False  #: True for a figure that is drawn only if an argument is a table of the user
 
 
 _TABLES = tomllib.loads(resources.files(__package__).joinpath("contents.toml").read_text(encoding="utf-8"))

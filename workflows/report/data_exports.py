@@ -53,25 +53,27 @@ def safetensors(**values: Any) -> bytes:
 
 
 def exr(image: Tensor) -> bytes:
-    """Encode an RGB image (3, y, x) as a float32 OpenEXR file."""
+    """Encode an RGB image (3, y, x) as a float32 OpenEXR file, or a grey image (1, y, x) with the one channel Y."""
     import OpenEXR
 
-    pixels = {"RGB": image.detach().cpu().float().permute(1, 2, 0).contiguous().numpy()}
+    values = image.detach().cpu().float().permute(1, 2, 0).contiguous().numpy()
+    pixels = {"Y": values[..., 0].copy()} if len(image) == 1 else {"RGB": values}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     return _written(".exr", lambda path: OpenEXR.File(header, pixels).write(str(path)))
 
 
 def png16(image: Tensor) -> bytes:
-    """Encode an image (3, y, x) of integers in [0, 65535] as a lossless 16-bit RGB PNG."""
+    """Encode an image of integers in [0, 65535] as a lossless 16-bit PNG: RGB for (3, y, x), grey for (1, y, x)."""
     words = image.detach().cpu().double().round()
-    if image.ndim != 3 or image.shape[0] != 3 or float(words.min()) < 0 or float(words.max()) > 65535:
+    if image.ndim != 3 or image.shape[0] not in (1, 3) or float(words.min()) < 0 or float(words.max()) > 65535:
         raise ValueError(
-            f"a 16-bit PNG needs shape (3, y, x) and values in [0, 65535]; this image has shape {tuple(image.shape)}"
+            "a 16-bit PNG needs shape (3, y, x) or (1, y, x) and values in [0, 65535]; this image has shape "
+            f"{tuple(image.shape)}"
         )
     height, width = image.shape[1:]
     big = words.permute(1, 2, 0).to(torch.int32).numpy().astype(">u2").reshape(height, -1)
     lines = b"".join(b"\0" + row.tobytes() for row in big)
-    head = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
+    head = struct.pack(">IIBBBBB", width, height, 16, 2 if len(image) == 3 else 0, 0, 0, 0)
     chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(lines, 6)), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(*c) for c in chunks)
 

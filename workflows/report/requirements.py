@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -53,7 +54,7 @@ def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code) -> Foun
         params = [[name, plain(value)] for name, value in step.params.items()]
         return Found((), lambda values: Bound(step), [step.node.path, code.of(step.node), params])
     if match := _PARAMETER.fullmatch(need):
-        value = _step(match["step"], recipe).params.get(match["name"])
+        value = _parameter(match["step"], match["name"], recipe)
         return Found((), lambda values: value, plain(value))
     if need.endswith("*]"):
         return _items(need[:-2], recipe, keys)
@@ -61,6 +62,21 @@ def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code) -> Foun
     if need not in keys:
         raise Missing(f"no output of this run needs the step {need}")
     return Found((need,), lambda values: values[need], keys[need])
+
+
+def _parameter(step: str, name: str, recipe: Recipe) -> Any:
+    """Return a parameter of a step, or a dictionary with the parameter of each copy of a step such as ``line[*]``."""
+    if not step.endswith("*]"):
+        return _step(step, recipe).params.get(name)
+    prefix = step[:-2]
+    return {n[len(prefix) : -1]: s.params.get(name) for n, s in recipe.steps.items() if n.startswith(prefix)}
+
+
+def is_table(value: Any) -> bool:
+    """Return True for a parameter that is a file or coefficients, or a dictionary with such a parameter."""
+    if isinstance(value, Mapping):
+        return any(isinstance(part, Path | tuple) for part in value.values())
+    return isinstance(value, Path)
 
 
 def _step(name: str, recipe: Recipe) -> Step:

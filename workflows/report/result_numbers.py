@@ -125,7 +125,11 @@ def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, s
         return 0, "the first band"
     lines = _lines(recipe, keys)
     wavelength = mean_wavelength(value(lines[0])) if lines else _DESIGN_WAVELENGTH
-    return nearest(value(BANDS).centres, wavelength)
+    bands = value(BANDS)
+    band, name = nearest(bands.centres, wavelength)
+    if abs(float(bands.centres[band]) - wavelength) > float(bands.widths[band]):
+        name += f", the band nearest to the laser at {wavelength * 1e9:.0f} nm"
+    return band, name
 
 
 def _lines(recipe: Recipe, keys: Container[str]) -> list[str]:

@@ -89,7 +89,7 @@ def document(
         "timing": {**time, "said": said_of(time)},
         "steps": steps,
         "figures": _figures(missing, bool(time["ran"])),
-        "missing": [{"name": n, "title": _TITLES.get(n, n), "why": why} for n, why in missing.items()],
+        "missing": [{"name": n, "title": _TITLES.get(n, n), "why": why} for n, why in missing.items() if why],
         "facts": _facts(result),
         "inputs": _inputs(recipe),
     }

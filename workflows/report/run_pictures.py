@@ -15,7 +15,7 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
 from neusee.workflows.report.contents import FIGURES
-from neusee.workflows.report.requirements import Found, Missing, find
+from neusee.workflows.report.requirements import Found, Missing, find, is_table
 from neusee.workflows.report.shown_values import in_turn
 from neusee.workflows.store.derived_files import DerivedFiles
 
@@ -41,6 +41,7 @@ class DerivedFile:
     kind: Sequence[Any]  #: the parts of the key that do not depend on the results
     needs: Mapping[str, str]
     make: Callable[..., bytes]
+    only_tables: bool = False  #: True for a file that is made only if an argument is a table of the user
 
 
 Job = tuple[DerivedFile, str, Mapping[str, Found]]  #: a file, its key, and the arguments of its ``make``
@@ -49,7 +50,10 @@ Job = tuple[DerivedFile, str, Mapping[str, Found]]  #: a file, its key, and the 
 def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
     """Draw the pictures of a run; return the paths of the pictures, and the reason for each picture that is missing."""
     drawing = engine(*sorted({figure.draw.partition(":")[0] for figure in FIGURES}), "report.figures.recipe_graph")
-    files = (DerivedFile(f.name, ".png", ("figure", f.draw, drawing), f.needs, _function(f.draw)) for f in FIGURES)
+    files = (
+        DerivedFile(f.name, ".png", ("figure", f.draw, drawing), f.needs, _function(f.draw), f.only_tables)
+        for f in FIGURES
+    )
     paths, missing = files_of(files, result, shelf)
     return {**paths, "graph": _graph(result, shelf, drawing)}, missing
 
@@ -57,13 +61,19 @@ def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict
 def files_of(
     files: Iterable[DerivedFile], result: Result, shelf: DerivedFiles
 ) -> tuple[dict[str, Path], dict[str, str]]:
-    """Make the figures or data files that the store lacks; return all paths, and the reason for each missing file."""
+    """Make the figures or data files that the store lacks; return all paths, and the reason for each missing file.
+
+    The reason is empty for a figure of tables where the recipe has none.
+    """
     code, jobs, missing = Code(result.store.code_memo), list[Job](), dict[str, str]()
     for file in files:
         try:
             found = _arguments(file.needs, result, code)
         except Missing as why:
             missing[file.name] = str(why)
+            continue
+        if file.only_tables and not any(is_table(x.make({})) for x in found.values()):
+            missing[file.name] = ""
             continue
         jobs.append((file, digest(*file.kind, [[name, x.identity] for name, x in found.items()]), found))
     code.save()

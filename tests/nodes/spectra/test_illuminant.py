@@ -14,7 +14,7 @@ from neusee.nodes.values import Bands
 NM = 1e-9
 SCENE = bands(start=400 * NM, stop=700 * NM, count=31)
 FINE = bands(start=400 * NM, stop=700 * NM, count=301)
-KINDS = illuminant.hints["kind"].__args__
+KINDS = illuminant.hints["kind"].__args__[0].__args__
 
 
 def white(samples, power):

@@ -69,8 +69,8 @@ def spectral(path, n):
     OpenEXR.File({}, {f"S0.{w},0nm": np.full((4, n), 0.5, np.float32) for w in (400, 500, 600, 700)}).write(str(path))
 
 
-def npy(shape, kind=np.float32):
-    return lambda path, n: np.save(path, np.ones((*shape, n), kind))
+def npy(shape, kind=np.float32, value=1):
+    return lambda path, n: np.save(path, np.full((*shape, n), value, kind))
 
 
 def matlab(path, n):
@@ -101,7 +101,15 @@ FILES = {
     "cube": ("cube", "a.npy", npy((4, 5)), 4, "VALUES", 80, "a.npy has 4 x 5 x 5 values, more than the limit of"),
     "MATLAB": ("cube", "a.mat", matlab, 5, "VALUES", 80, "a.mat has 4 x 6 x 4 values, more than the limit of"),
     "spectra": ("cube", "a.exr", spectral, 5, "VALUES", 80, "a.exr has 4 x 4 x 6 values, more than the limit of"),
-    "heights": ("height", "a.npy", npy((4,)), 4, "VALUES", 16, "a.npy has 4 x 5 values, more than the limit of"),
+    "heights": (
+        "height",
+        "a.npy",
+        npy((4,), value=1e-6),
+        4,
+        "VALUES",
+        16,
+        "a.npy has 4 x 5 values, more than the limit of",
+    ),
     "frames": ("frames", "a.npy", npy((4,), np.uint16), 4, "VALUES", 16, "a.npy has 20 values, more than the limit of"),
     "FITS": ("frames", "a.fits", fits, 4, "VALUES", 16, "a.fits has 20 values, more than the limit of"),
     "table": ("levels", "a.csv", table, 8, "ROWS", 8, "a.csv has more than 8 rows: give a shorter table"),

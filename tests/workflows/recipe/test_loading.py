@@ -175,7 +175,7 @@ def test_a_preflight_sees_an_input_that_parameters_alone_decide(read, mistakes, 
     assert read(ON_A_GRID, "steps.written.with.feature=15 um").notes == ()
     assert not (tmp_path / "cache").exists()  # nothing is stored
     _heights(tmp_path, 8)
-    message = "mask.npy is (8, 8), not the pupil grid (4, 4): resample the height map, or set samples to 8"
+    message = "mask.npy is (8, 8), not the pupil grid (4, 4): state its pitch to resample it, or set samples to 8"
     assert mistakes(ON_A_GRID) == [f"mine.yaml:5:56 | steps.mask.with.file = mask.npy | {message}"]
     assert read(ON_A_GRID, "steps.stop.with.samples=8", "steps.stop.with.diameter=80 um")
 

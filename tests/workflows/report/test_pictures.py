@@ -21,6 +21,7 @@ from neusee.workflows.report.figures import (
     camera_overview,
     numerics,
     optics,
+    own_tables,
     photon_transfer,
     recipe_graph,
     scene_spectra,
@@ -109,7 +110,7 @@ psf_step.reference = psf_of  # type: ignore[attr-defined]
 
 
 @pytest.fixture(scope="module")
-def drawings(light: SimpleNamespace) -> dict[str, tuple]:
+def drawings(light: SimpleNamespace, table_arguments: dict) -> dict[str, tuple]:
     """Every drawing with arguments that fit it."""
     lines = {"green": Bands(*(x[1:3] for x in bands()))}
     return {
@@ -134,6 +135,7 @@ def drawings(light: SimpleNamespace) -> dict[str, tuple]:
                 lines=lines,
             ),
         ),
+        "tables": (own_tables.tables, table_arguments),
         "sensor": (photon_transfer.transfer, dict(measured=transfer_curve())),
         "stability": (numerics.stability, dict(step=linear_image, psf=light.plain)),
         "error_time": (numerics.error_time, dict(step=psf_step, pupil=pupil(4.0))),
@@ -202,7 +204,15 @@ def _ticks_shown(ax):
 
 
 def test_axes_say_their_unit(drawings):
-    units = {"psf": "µm", "suppression": "nm", "spectra": "nm", "sensor": "DN", "error_time": "ms", "height": "mm"}
+    units = {
+        "tables": "nm",
+        "psf": "µm",
+        "suppression": "nm",
+        "spectra": "nm",
+        "sensor": "DN",
+        "error_time": "ms",
+        "height": "mm",
+    }
     for name, unit in units.items():
         draw, arguments = drawings[name]
         labels = [ax.get_xlabel() for ax in draw.__wrapped__(**arguments).axes]

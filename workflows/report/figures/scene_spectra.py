@@ -14,7 +14,8 @@ from neusee.workflows.report.figures.camera_overview import high
 from neusee.workflows.report.figures.style import BLUE, GREEN, VERMILION, canvas, drawn, encoded, nanometres, picture
 
 _POINTS = ("A", "B", "C")
-_CHANNELS = ((VERMILION, "R"), (GREEN, "G"), (BLUE, "B"))
+CHANNELS = ((VERMILION, "channel R"), (GREEN, "channel G"), (BLUE, "channel B"))
+MONO = ((BLUE, "the one channel"),)
 
 
 @drawn
@@ -74,8 +75,8 @@ def _spectra(ax: Any, scene: Tensor, radiance: Tensor, bands: Bands, points: lis
 def _channels(ax: Any, illuminant: Tensor, responses: Tensor, bands: Bands) -> None:
     nm = nanometres(bands.centres)
     ax.plot(nm, illuminant.cpu().numpy(), color="black", linestyle="--", label="illuminant")
-    for channel, (colour, name) in zip(responses, _CHANNELS, strict=True):
-        ax.plot(nm, channel.cpu().numpy(), color=colour, label=f"channel {name}")
+    for channel, (colour, name) in zip(responses, CHANNELS if len(responses) > 1 else MONO, strict=True):
+        ax.plot(nm, channel.cpu().numpy(), color=colour, label=name)
     ax.set(title="illuminant and channels", ylabel="relative")
 
 

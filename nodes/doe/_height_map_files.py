@@ -1,0 +1,202 @@
+"""Files with the height map of a mask: .npy, .safetensors, grey .png, .exr and .mat.
+
+Beside the heights, a file other than .npy may state ``unit``, the height of the value 1, ``depth``, the height of white
+in a .png, and ``pitch``, the distance of the samples, each as a text with a unit, such as ``1 um``. These stand in the
+metadata of .safetensors, in a text chunk of .png, in the header of .exr and in a variable of .mat.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neusee.nodes import ParameterError
+from neusee.nodes.input_files import once_per_version, refuse_large_array
+from neusee.nodes.scene._spectral_exr import exr_header, exr_parts
+from neusee.nodes.units import read_quantity
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+_GREYS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}  #: the level of white in each mode of a grey picture
+_WORDS = ("unit", "depth", "pitch")  #: what a file may state beside the heights
+_HALF = ("float16", "F16", "BF16")  #: names of types with 8 or 11 bits
+_MAT_73 = b"MATLAB 7.3 MAT-file"
+_REAL_MAT = {"double", "single", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "logical"}
+
+
+class MapHeader(NamedTuple):
+    """The size of a height map in a file, and the lengths in m that the file states."""
+
+    shape: tuple[int, ...]
+    stated: dict[str, float]  #: some of ``unit``, ``depth`` and ``pitch``
+
+
+@once_per_version
+def map_header(file: Path) -> MapHeader:
+    """Return the header of a height map in a file without reading the heights."""
+    from safetensors import SafetensorError
+
+    suffix = file.suffix.lower()
+    if suffix not in _HEADERS:
+        raise ParameterError(
+            "file", f"{file.name}: a height map is read from .exr, .mat, .npy, .safetensors or grey .png"
+        )
+    try:
+        header: MapHeader = _HEADERS[suffix](file)
+    except ParameterError:
+        raise
+    except (SafetensorError, OSError, ValueError, EOFError, SyntaxError, RuntimeError) as error:
+        raise ParameterError("file", f"{file.name} cannot be read as a height map: {error}") from error
+    refuse_large_array(file, header.shape)
+    return header
+
+
+def read_height_map(file: Path, depth: float, unit: float = 1.0) -> Tensor:
+    """Read a height map in m, float32, from a file.
+
+    ``depth`` is the height of white in a picture, and ``unit`` the height of the value 1 in any other file.
+    """
+    suffix = file.suffix.lower()
+    if suffix == ".png":
+        with _levels(file) as picture:
+            levels = torch.from_numpy(np.asarray(picture, dtype=np.float64))
+            return (levels * (depth / _GREYS[picture.mode])).to(torch.float32)
+    values = _array(file, suffix)
+    return values.to(torch.float32) if unit == 1.0 else (values.double() * unit).to(torch.float32)
+
+
+def _array(file: Path, suffix: str) -> Tensor:
+    if suffix == ".safetensors":
+        from safetensors.torch import load_file
+
+        tensors = load_file(file)
+        return tensors[_name(file, list(tensors))]
+    if suffix == ".exr":
+        with exr_parts(file) as opened:
+            channels = opened.channels()
+            return torch.from_numpy(np.array(channels[_name(file, list(channels))].pixels))
+    values = _mat_value(file, _mat_name(file)) if suffix == ".mat" else np.load(file, allow_pickle=False)
+    return torch.from_numpy(np.ascontiguousarray(_native(values)))
+
+
+def _stated(file: Path, found: dict[str, Any]) -> dict[str, float]:
+    """Return the lengths, in m, that the header of a file states as texts with a unit."""
+    lengths = {}
+    for word in _WORDS:
+        if word in found:
+            try:
+                lengths[word] = read_quantity(found[word], "m")
+            except ValueError as error:
+                raise ParameterError("file", f"{file.name}: {word} = {found[word]} in the header {error}") from None
+            if lengths[word] <= 0:
+                raise ParameterError("file", f"{file.name}: {word} = {found[word]} in the header must be above 0")
+    return lengths
+
+
+def _npy(file: Path) -> MapHeader:
+    head = np.load(file, mmap_mode="r", allow_pickle=False)
+    _refuse_other_than_numbers(file, str(head.dtype), head.dtype.kind in "fiu")
+    return MapHeader(tuple(head.shape), {})
+
+
+def _safetensors(file: Path) -> MapHeader:
+    from safetensors import safe_open
+
+    with safe_open(file, framework="pt") as tensors:
+        heights = tensors.get_slice(_name(file, list(tensors.keys())))
+        kind = str(heights.get_dtype())
+        _refuse_other_than_numbers(file, kind, kind.startswith(("F", "BF", "I", "U")))
+        return MapHeader(tuple(heights.get_shape()), _stated(file, tensors.metadata() or {}))
+
+
+def _png(file: Path) -> MapHeader:
+    with _levels(file) as picture:
+        return MapHeader(
+            (picture.height, picture.width), _stated(file, {str(word): text for word, text in picture.info.items()})
+        )
+
+
+def _exr(file: Path) -> MapHeader:
+    header, _, size = exr_header(file)
+    refuse_large_array(file, size)
+    _refuse_other_than_numbers(file, str(_array(file, ".exr").dtype).removeprefix("torch."), real=True)
+    return MapHeader(size, _stated(file, header))
+
+
+def _mat(file: Path) -> MapHeader:
+    name = _mat_name(file)
+    size, kind = _mat_listed(file)[name]
+    _refuse_other_than_numbers(file, kind, kind in _REAL_MAT)
+    if np.iscomplexobj(_mat_value(file, name)):  # the header of a .mat file does not say
+        _refuse_other_than_numbers(file, "complex", real=False)
+    words = {word: _mat_value(file, word) for word in _WORDS if word in _mat_listed(file)}
+    return MapHeader(size, _stated(file, {word: " ".join(map(str, np.ravel(text))) for word, text in words.items()}))
+
+
+_HEADERS = {".npy": _npy, ".safetensors": _safetensors, ".png": _png, ".exr": _exr, ".mat": _mat}
+
+
+def _refuse_other_than_numbers(file: Path, kind: str, real: bool) -> None:
+    """Raise ParameterError for values that are not real numbers, or that are too coarse for heights."""
+    if not real:
+        text = f"{file.name} holds values of type {kind}: save the heights as real numbers, in m"
+        raise ParameterError("file", text)
+    if kind in _HALF:
+        coarse = "which resolve 1/2000 of a height, and no height below 0.06 um in m"
+        raise ParameterError("file", f"{file.name} holds 16-bit floats ({kind}), {coarse}: save 32-bit floats")
+
+
+def _levels(file: Path) -> "Image":
+    """Open a greyscale picture file; raise ParameterError for a picture that is not greyscale."""
+    from PIL import Image
+
+    picture = Image.open(file)
+    if picture.mode not in _GREYS:
+        picture.close()
+        raise ParameterError(
+            "file", f"{file.name} is {picture.mode}, not grey: store one grey level per sample, in 8 or 16 bits"
+        )
+    return picture
+
+
+def _name(file: Path, names: list[str]) -> str:
+    if "height" in names or len(names) == 1:
+        return "height" if "height" in names else names[0]
+    found = ", ".join(sorted(names)) or "nothing"
+    raise ParameterError("file", f"{file.name} holds {found}: name the tensor of the height map 'height'")
+
+
+def _mat_listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Return the shape and the type of each variable of a .mat file."""
+    from scipy.io import whosmat
+
+    with file.open("rb") as opened:
+        if opened.read(len(_MAT_73)) == _MAT_73:
+            fix = f"save it in MATLAB by save('{file.name}', 'height', '-v7')"
+            raise ParameterError("file", f"{file.name} is a .mat file of version 7.3, which is HDF5: {fix}")
+    try:
+        return {name: (tuple(size), kind) for name, size, kind in whosmat(file)}
+    except Exception as error:  # scipy raises many kinds of errors for foreign bytes
+        raise ParameterError("file", f"{file.name} cannot be read as a .mat file: {error}") from None
+
+
+def _mat_name(file: Path) -> str:
+    return _name(file, [name for name, (_, kind) in _mat_listed(file).items() if name not in _WORDS or kind != "char"])
+
+
+def _mat_value(file: Path, name: str) -> NDArray[Any]:
+    from scipy.io import loadmat
+
+    values: NDArray[Any] = loadmat(file, variable_names=[name])[name]
+    return values
+
+
+def _native(values: NDArray[Any]) -> NDArray[Any]:
+    """Return values in the byte order of this machine and of at most 64 bits, as torch needs."""
+    if values.dtype.kind == "f" and values.dtype.itemsize > 8:
+        return values.astype(np.float64)
+    return values.astype(values.dtype.newbyteorder("="), copy=False)
