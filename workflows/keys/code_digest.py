@@ -77,14 +77,21 @@ class Code:
         self._codes: dict[int, tuple[Node, str]] = {}  # digest of each node, by id
         self._parts: dict[str, Parts] = {}  # by digest
 
-    def of(self, node: Node) -> str:
+    def of(self, node: Node, modules: tuple[str, ...] = ()) -> str:
         """Return the digest of the code of a node, with what the node declares and what its function holds.
 
+        ``modules``: those of the network classes that a step gives the node, which count as a whole.
         Raises `LookupError` with place and fix for code that reads what cannot be followed.
         """
         if id(node) not in self._codes:
             self._codes[id(node)] = node, self._of(node)
-        return self._codes[id(node)][1]
+        code = self._codes[id(node)][1]
+        for module in modules:
+            whole = self._whole(module)
+            self._refuse(whole, "", node)
+            parts = {**self._whole(node.fn.__module__).parts, **whole.parts}
+            code = self._named(digest(code, whole.code), parts, is_private(code) or is_private(whole.code))
+        return code
 
     def digest(self, module: str) -> str:
         """Return the digest of a module and of all that it imports, directly or not.
@@ -272,12 +279,6 @@ _summarised = functools.lru_cache(1000)(summarise)  #: several stores in one pro
 def _decides_nothing(module: str) -> bool:
     """Return True for a module that decides no result, such as the rules for the shapes of a family of nodes."""
     return module in _LEFT_OUT or (module.startswith(f"{ROOT}.") and module.endswith("._result_shapes"))
-
-
-def source_file(module: str) -> Path | None:
-    """Return the source file of a module without importing the module, or None if there is no source file."""
-    path = module_path(module)
-    return Path(path) if path else None
 
 
 def _packages(module: str) -> frozenset[str]:
