@@ -106,4 +106,4 @@ def _same_options(trained: Mapping[str, Any], options: Mapping[str, Any], weight
 
 
 def _word(value: object) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
+    return value if isinstance(value, str) else json.dumps(value, sort_keys=True)

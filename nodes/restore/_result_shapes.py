@@ -27,6 +27,8 @@ _SYSTEM = 35.0  #: bytes for each element of a dense system: the matrix, its fac
 _INVERTED = 0.30  #: operations of a transform that take as long as one of the cube of the side of an inverted matrix
 _WHITENED = 0.94  #: side of a dense system that needs as much memory as an inverted matrix of side 1
 _FILLED = 790.0  #: operations of a transform that take as long as an element of a matrix of covariances
+_KEPT = 1 / 8  #: bytes of inner results of a network that need as much memory as a byte of the usual work of a node
+_LAYER = 1e-3  #: operations of a transform that take as long as one of a layer
 
 for node in (electrons, wiener, richardson_lucy, fft_mamba, nafnet, network, unet):
     node.shape(like_first)
@@ -112,4 +114,4 @@ def _(
     if architecture is None:
         return _layers(result)
     trial, pixels = tried(architecture, parameters, multiple), result[0].numel() / reduce**2
-    return trial.memory * min(pixels, tile**2 if tile else math.inf), trial.operations * pixels
+    return _KEPT * trial.memory * min(pixels, tile**2 if tile else math.inf), _LAYER * trial.operations * pixels

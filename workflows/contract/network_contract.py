@@ -67,7 +67,7 @@ def _check_key(network: type[nn.Module]) -> Iterator[Finding]:
     """Find whether a cache key covers all that the code of the class reads."""
     with tempfile.TemporaryDirectory() as folder:
         try:
-            Code(Path(folder) / "code.json").of(restore.network, (network.__module__,))
+            Code(Path(folder) / "code.json").of(restore.network, ((network.__module__, network.__qualname__),))
         except LookupError as error:
             yield Finding("key", False, str(error.args[0]))
         else:

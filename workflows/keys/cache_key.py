@@ -53,7 +53,7 @@ def key_of(
 def code_of(step: Step, code: Code) -> str:
     """Return the digest of the code of a step: of its node, and of the network classes that its parameters name."""
     classes = [value.network for value in step.params.values() if isinstance(value, Architecture)]
-    return code.of(step.node, tuple(dict.fromkeys(each.__module__ for each in classes)))
+    return code.of(step.node, tuple(dict.fromkeys((each.__module__, each.__qualname__) for each in classes)))
 
 
 def is_private(key: Key) -> bool:

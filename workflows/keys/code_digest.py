@@ -77,18 +77,18 @@ class Code:
         self._codes: dict[int, tuple[Node, str]] = {}  # digest of each node, by id
         self._parts: dict[str, Parts] = {}  # by digest
 
-    def of(self, node: Node, modules: tuple[str, ...] = ()) -> str:
+    def of(self, node: Node, classes: tuple[tuple[str, str], ...] = ()) -> str:
         """Return the digest of the code of a node, with what the node declares and what its function holds.
 
-        ``modules``: those of the network classes that a step gives the node, which count as a whole.
+        ``classes``: module and name of the network classes that a step gives the node; their modules count as a whole.
         Raises `LookupError` with place and fix for code that reads what cannot be followed.
         """
         if id(node) not in self._codes:
             self._codes[id(node)] = node, self._of(node)
         code = self._codes[id(node)][1]
-        for module in modules:
+        for module, name in classes:
             whole = self._whole(module)
-            self._refuse(whole, "", node)
+            self._refuse(whole, module, node, {name.partition(".")[0]})
             parts = {**self._whole(node.fn.__module__).parts, **whole.parts}
             code = self._named(digest(code, whole.code), parts, is_private(code) or is_private(whole.code))
         return code
@@ -112,7 +112,7 @@ class Code:
     def _of(self, node: Node) -> str:
         module = node.fn.__module__
         code, whole = self.digest(module), self._whole(module)
-        self._refuse(whole, module, node)
+        self._refuse(whole, module, node, {node.fn.__name__, "_"})
         plain = getattr(sys.modules.get(module), node.fn.__name__, None) is node
         if plain and not node.depends:
             return code
@@ -167,9 +167,8 @@ class Code:
         self._parts[code] = parts
         return code
 
-    def _refuse(self, whole: Whole, module: str, node: Node) -> None:
-        """Raise `LookupError` for the first construct that is not followed and not declared."""
-        own = {node.fn.__name__, "_"}
+    def _refuse(self, whole: Whole, module: str, node: Node, own: set[str]) -> None:
+        """Raise `LookupError` for the first construct that is not followed, not declared, and that ``own`` reaches."""
         for name, look in whole.looks.items():
             if look.summary is None or look.path is None or not (look.summary.constructs or look.changing):
                 continue

@@ -27,7 +27,7 @@ _ARITHMETIC = "add|sub|mul|floordiv|truediv|mod|neg|pow|getitem|eq|ne|lt|le|gt|g
 _OPERATOR = re.compile(rf"torch\.ops\.aten\.(?!from_file)\w+\.\w+|_operator\.({_ARITHMETIC})|math\.(floor|ceil|trunc)")
 _IN_FORMULA = re.compile(
     r"Mul|Add|Pow|Integer|Symbol|Mod|PythonMod|FloorDiv|CleanDiv|Max|Min|Rational|positive|integer|nonnegative|True|"
-    r"False|Eq|Ne|Le|Lt|Ge|Gt|L|size|stride|storage_offset|and|or|not|int_oo|evaluate|[suz]\d+|\d+|x|picture|args"
+    r"False|Eq|Ne|Le|Lt|Ge|Gt|L|size|stride|storage_offset|and|or|not|int_oo|evaluate|[suz]\d+|\d+"
 )
 _CONTAINERS = ("builtins.tuple", "builtins.list", "builtins.dict", None)
 _FLOAT = 7  #: of float32, in the graph of a file
@@ -81,7 +81,7 @@ class _Exported(OwnNetwork):
 
 def read_sizes(file: Path, multiple: int | None, sizes: tuple[int, int] | None) -> None:
     """Raise ParameterError for a file that is not to be read, or that was exported for other sizes than ``sizes``."""
-    sides = _tried(file)
+    sides = _tried(file, multiple or 1)
     for axis, size, side in zip("yx", sizes or (), sides if sizes else (), strict=True):
         own = side.multiple if multiple is None else multiple
         size += -size % own
@@ -93,12 +93,13 @@ def read_sizes(file: Path, multiple: int | None, sizes: tuple[int, int] | None) 
 
 
 @once_per_version
-def _tried(file: Path) -> tuple[Side, Side]:
-    """Try an exported network on a small picture, and return the sizes that it takes."""
+def _tried(file: Path, multiple: int) -> tuple[Side, Side]:
+    """Try an exported network on a small picture with sides of a multiple, and return the sizes that it takes."""
     net = exported_network(file)
     sides = _checked(file, file.read_bytes()).sides
-    y, x = (side.multiple * math.ceil(max(side.least, 33) / side.multiple) for side in sides)
-    y, x = min(y, int(min(sides[0].most, y))), min(x, int(min(sides[1].most, x)))
+    steps = [math.lcm(side.multiple, multiple) for side in sides]
+    y, x = (step * math.ceil(max(side.least, 33) / step) for side, step in zip(sides, steps, strict=True))
+    y, x = int(min(y, sides[0].most)), int(min(x, sides[1].most))
     if y * x <= _TRIED:
         try_network(net, sizes=(y, x))
     return sides
@@ -147,8 +148,9 @@ def _graph(file: Path, program: Any) -> Graph:
     module = program["graph_module"]
     formulas = [value for key, value in _pairs(module) if key == "expr_str"]
     for text in (*formulas, *program.get("range_constraints", {}), *(program.get("guards_code") or ())):
-        wrong = [word for word in re.findall(r"\w+", str(text)) if not _IN_FORMULA.fullmatch(word)]
-        if wrong or not re.fullmatch(r"[\w\s()\[\]'\".,=<>!*/%+-]*", str(text)):
+        bare = re.sub(r"L\['\w+'\]", "L", str(text))  # the input of the network, by its name
+        wrong = [word for word in re.findall(r"\w+", bare) if not _IN_FORMULA.fullmatch(word)]
+        if wrong or not re.fullmatch(r"[\w\s()\[\]'\".,=<>!*/%+-]*", bare):
             raise _refused(file, f"has a formula of sizes with other names: {str(text)[:60]}")
     return Graph(_sides(file, program, module), str(program.get("torch_version", "of another version")))
 

@@ -3,14 +3,15 @@
 import functools
 import json
 import math
+import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.utils.flop_counter import FlopCounterMode
+from torch.overrides import TorchFunctionMode
 
 from neusee.nodes import ParameterError
 from neusee.nodes._mirror_padding import mirrored
@@ -18,6 +19,7 @@ from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.network_classes import Architecture
 from neusee.nodes.restore._networks._restorer import Restorer
 
+_DRAWING = threading.Lock()  #: one thread at a time seeds the random numbers of the process
 _LEAST = 32  #: pixels of the smaller side of the picture on which a network is tried, at least
 #: errors of Python and torch that the code of a network may raise
 _FAILURES = (RuntimeError, TypeError, ValueError, LookupError, AttributeError, ArithmeticError, AssertionError)
@@ -81,7 +83,8 @@ class OwnNetwork(Restorer):
             raise
         except _FAILURES as error:
             text = " ".join(str(error).split()) or type(error).__name__
-            lines = [frame for frame in traceback.extract_tb(error.__traceback__) if "/torch/" not in frame.filename]
+            frames = traceback.extract_tb(error.__traceback__)
+            lines = [one for one in frames if "/torch/" not in one.filename and one.name != "__torch_function__"]
             place = f"{lines[-1].filename.rpartition('/')[2]}:{lines[-1].lineno}: " if lines[1:] else ""
             raise ValueError(f"{self.name} fails for a picture {_sizes(picture)}: {place}{text}") from error
 
@@ -96,7 +99,7 @@ def own_network(
     """
     try:
         arguments = architecture.arguments(parameters)
-        with torch.random.fork_rng(devices=[]):
+        with _DRAWING, torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             inner = architecture.network(**(parameters or {}))
     except _FAILURES as error:
@@ -122,18 +125,15 @@ def try_network(
     random = torch.Generator().manual_seed(1)
     picture = torch.rand(1, 3, y, x, generator=random, dtype=torch.float64).to(device, dtype)
     net.to(device, dtype).eval()
-    bytes_of_layers: list[int] = []
-    hooks = [part.register_forward_hook(_noting(bytes_of_layers)) for part in _leaves(net)]
     given = picture.clone()
     try:
-        with torch.no_grad(), FlopCounterMode(display=False) as counted, torch.random.fork_rng(devices=[]):
-            first, second = net.called(given), net.called(picture.clone())
+        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+            with _Counting() as counted:
+                first = net.called(given)
+            second = net.called(picture.clone())
     except ValueError as error:
         hint = f"; if it needs sides of a certain multiple, write multiple = 8 in the class (now {net.multiple})"
         raise ParameterError("architecture", f"{error}{hint if 'picture 1 x' in str(error) else ''}") from error
-    finally:
-        for hook in hooks:
-            hook.remove()
     if not torch.equal(given, picture):
         raise ParameterError("architecture", f"{net.name} {_CHANGES}")
     if first.dtype != dtype:
@@ -142,7 +142,7 @@ def try_network(
         )
     if not torch.equal(first, second):
         raise ParameterError("architecture", f"{net.name} gives other numbers for the same picture in eval(): {_DRAWS}")
-    return Trial(counted.get_total_flops() / (2 * y * x), sum(bytes_of_layers) / (2 * y * x))
+    return Trial(counted.operations / (y * x), counted.memory / (y * x))
 
 
 _CHANGES = "changes its input: work on a copy, such as picture.clone()"
@@ -160,15 +160,31 @@ def _tried(architecture: Architecture, parameters: str, multiple: int | None) ->
     return try_network(own_network(architecture, json.loads(parameters), multiple))
 
 
-def _noting(found: list[int]) -> Callable[..., None]:
-    def note(part: nn.Module, inputs: Any, result: Any) -> None:
-        found.append(result.nbytes if isinstance(result, Tensor) else 0)
+class _Counting(TorchFunctionMode):
+    """A mode of torch that counts operations, and the bytes of all results that share no memory with their input."""
 
-    return note
+    def __init__(self) -> None:
+        super().__init__()
+        self.operations, self.memory = 0.0, 0.0
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        tensors = [x for x in args if isinstance(x, Tensor)]
+        if isinstance(result, Tensor) and result.data_ptr() not in [x.data_ptr() for x in tensors]:
+            self.operations += _operations(getattr(func, "__name__", ""), tensors, result)
+            self.memory += result.nbytes
+        return result
 
 
-def _leaves(net: nn.Module) -> list[nn.Module]:
-    return [part for part in net.modules() if not next(part.children(), None)]
+def _operations(name: str, tensors: list[Tensor], result: Tensor) -> float:
+    """Return the operations of a function of torch: two for each product of a layer, otherwise one for each number."""
+    if name.startswith("conv_transpose"):
+        return 2.0 * tensors[0].numel() * tensors[1][0].numel()
+    if name.startswith(("conv", "linear")):
+        return 2.0 * result.numel() * tensors[1][0].numel()
+    if name in ("matmul", "__matmul__", "bmm", "mm", "scaled_dot_product_attention"):
+        return 2.0 * result.numel() * tensors[0].shape[-1]
+    return float(result.numel())
 
 
 def _sizes(picture: Tensor) -> str:
