@@ -40,7 +40,7 @@ class Network(SettingsBlock):
     pyramid: bool = False
     frequency: Literal["complex", "amp_phase"] = "complex"
     architecture: NetworkClass | None = None  #: a class of the user, in place of a kind and its options
-    parameters: dict[str, Any] = Field(default_factory=dict)  #: arguments of this class
+    parameters: dict[str, Any] | None = None  #: arguments of this class
     multiple: Annotated[int, Field(ge=1, le=1024)] | None = None  #: of this class: divisor of the sides of a picture
 
     @property
@@ -50,8 +50,6 @@ class Network(SettingsBlock):
 
     @model_validator(mode="after")
     def _fits(self) -> Network:
-        if self.architecture is None and (self.parameters or self.multiple):
-            raise ValueError(f"{'parameters' if self.parameters else 'multiple'} needs architecture: name your class")
         if self.architecture is None and self.options and self.kind != "fft_mamba":
             raise ValueError(f"{', '.join(self.options)}: only the network fft_mamba has such options, not {self.kind}")
         return self
@@ -149,7 +147,7 @@ def read_training(composed: Composed, context: dict[str, Any] | None = None) -> 
     if block is None:
         return composed, None
     composed, training = read_block(composed, KEY, Training, _plain(block), context)
-    if training and training.network.architecture and (wrong := list(_wrong_network(block.items["network"], training))):
+    if training and "network" in block.items and (wrong := list(_wrong_network(block.items["network"], training))):
         return composed.with_problems(wrong), None
     if training is None or training.photographs is None or training.photographs.is_dir():
         return composed, training
@@ -162,12 +160,17 @@ def _wrong_network(given: Value, training: Training) -> Iterator[Diagnostic]:
     """Yield a diagnostic for each setting of the packaged networks, and for a class that fails on a small picture."""
     from neusee.nodes.restore import own_network, try_network
 
+    network = training.network
+    if network.architecture is None:
+        if alone := next((value for name in _OF_CLASS[1:] if (value := given.child(name)) and value.plain), None):
+            yield Diagnostic(
+                alone.mark, alone.name, "is of a class of your own: name it by architecture: mynet.MyClass"
+            )
+        return
     for name, value in given.items.items():
         if name not in _OF_CLASS and not Path(value.mark.folder).is_relative_to(packaged()):
             text = f"{name} is of the networks of neusee: write parameters: {{{name}: {value.plain}}} for your class"
             yield Diagnostic(value.mark, value.name, text)
-    network = training.network
-    assert network.architecture is not None
     try:
         net = own_network(network.architecture, network.parameters, network.multiple)
         if not any(one.requires_grad for one in net.parameters()):
