@@ -82,7 +82,9 @@ class _Exported(OwnNetwork):
 def read_sizes(file: Path, multiple: int | None, sizes: tuple[int, int] | None) -> None:
     """Raise ParameterError for a file that is not to be read, or that was exported for other sizes than ``sizes``."""
     sides = _tried(file, multiple or 1)
-    for axis, size, side in zip("yx", sizes or (), sides if sizes else (), strict=True):
+    if sizes is None:
+        return
+    for axis, size, side in zip("yx", sizes, sides, strict=True):
         own = side.multiple if multiple is None else multiple
         size += -size % own
         if not side.least <= size <= side.most or size % side.multiple:
@@ -146,6 +148,8 @@ def _graph(file: Path, program: Any) -> Graph:
         if key in ("in_spec", "out_spec") and isinstance(value, str) and value:
             _check_containers(file, json.loads(value))
     module = program["graph_module"]
+    if any(_trains(node) for node in module["graph"]["nodes"]):
+        raise _refused(file, "was exported in training mode: call eval() of the network before torch.export")
     formulas = [value for key, value in _pairs(module) if key == "expr_str"]
     for text in (*formulas, *program.get("range_constraints", {}), *(program.get("guards_code") or ())):
         bare = re.sub(r"L\['\w+'\]", "L", str(text))  # the input of the network, by its name
@@ -153,6 +157,12 @@ def _graph(file: Path, program: Any) -> Graph:
         if wrong or not re.fullmatch(r"[\w\s()\[\]'\".,=<>!*/%+-]*", bare):
             raise _refused(file, f"has a formula of sizes with other names: {str(text)[:60]}")
     return Graph(_sides(file, program, module), str(program.get("torch_version", "of another version")))
+
+
+def _trains(node: Any) -> bool:
+    """Return True for an operator that computes otherwise in training, such as dropout, and is told to do so."""
+    given = {one.get("name"): one.get("arg", {}).get("as_bool") for one in node["inputs"]}
+    return given.get("training") is True or given.get("train") is True
 
 
 def _check_containers(file: Path, spec: Any) -> None:
