@@ -22,7 +22,7 @@ from neusee.nodes.restore._networks._restorer import Restorer
 _DRAWING = threading.Lock()  #: one thread at a time seeds the random numbers of the process
 _LEAST = 32  #: pixels of the smaller side of the picture on which a network is tried, at least
 #: errors of Python and torch that the code of a network may raise
-_FAILURES = (RuntimeError, TypeError, ValueError, LookupError, AttributeError, ArithmeticError, AssertionError)
+_FAILURES = (RuntimeError, TypeError, ValueError, LookupError, AttributeError, ArithmeticError, AssertionError, OSError)
 
 
 class Trial(NamedTuple):
