@@ -28,6 +28,7 @@ from neusee.workflows.recipe.text.renamed_keys import instead
 
 GROUP = "neusee.nodes"  #: group of the entry points by which packages install families of nodes
 
+NO_FAMILY = "no family of your own is called"  #: first words of a mistake
 Own = Mapping[str, ModuleType]  #: modules of the families that a recipe names, by family
 _NO_OWN: Own = {}
 _family_of: dict[str, str] = {}  #: family of each module of a user, because a node has one name in a process
@@ -95,7 +96,7 @@ def module_of(family: str, own: Own = _NO_OWN) -> ModuleType:
         return own[family]
     if family in _installed():
         return _load(family)
-    raise LookupError(f"no family {family} of your own; {nearest(family, [*own, *_installed()])}")
+    raise LookupError(f"{NO_FAMILY} {family}; {nearest(family, [*own, *_installed()])}")
 
 
 def class_context(own: Own) -> dict[str, Any]:
@@ -126,7 +127,9 @@ def own_nodes(family: str, module: ModuleType) -> dict[str, Node]:
         if isinstance(value, Node) and f"{value.fn.__module__}.".startswith(f"{name}.")
     }
     if not found and not network_classes(module):
-        raise LookupError(f"{name} defines no node: decorate a function with @node() of neusee.nodes")
+        raise LookupError(
+            f"{name} defines no node: decorate a function with @node() of neusee.nodes, or write a network class"
+        )
     if _family_of.setdefault(name, family) != family:
         raise LookupError(f"{name} is the family {_family_of[name]} in this process: use that name, or a new process")
     for key, node in found.items():

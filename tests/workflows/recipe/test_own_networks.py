@@ -218,7 +218,7 @@ MISTAKES = [
     ("network.architecture=net_m.small", "net_m.small is no class of torch.nn.Module; did you mean Small?"),
     (
         "network.architecture=other.Small",
-        "no family other of your own; there are: net_m; list the file of the class, such as `nodes: [other.py]`",
+        "no family of your own is called other; there are: net_m; list the file of the class, such as `nodes",
     ),
     ("network.architecture=net_m", "must be the name of a network class in a family of your own, such as mynet.Small"),
     ("network.architecture=3", "must be the name of a network class in a family of your own"),
@@ -284,6 +284,18 @@ def test_a_mistake_is_located_before_anything_runs(given, message, mine, tmp_pat
     assert place == "argument 1"
     assert path.startswith(given.partition("=")[0])
     assert text.startswith(message)
+
+
+def test_a_file_that_cannot_be_imported_is_one_mistake_at_its_entry(mine, tmp_path):
+    recipe = mine("net_b")
+    (tmp_path / "net_c.py").write_text("import nothing_of_this_name\n")
+    recipe.write_text(recipe.read_text().replace("net_b", "net_c"))
+    (found,) = problems(recipe, (), tmp_path)
+    assert found.startswith("mine.yaml:2:9 | nodes.0 = net_c.py | net_c.py cannot be imported: net_c.py:1: ModuleNotF")
+    (tmp_path / "net_d.py").write_text("from torch import nn\n")
+    recipe.write_text(recipe.read_text().replace("net_c", "net_d"))
+    (found,) = problems(recipe, (), tmp_path)
+    assert found.startswith("mine.yaml:2:9 | nodes.0 = net_d.py | net_d defines no node")
 
 
 def test_weights_of_other_shapes_are_a_mistake_at_the_file_of_weights(mine, tmp_path):
