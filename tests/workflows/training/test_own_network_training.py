@@ -14,6 +14,7 @@ from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, Poin
 from neusee.workflows.evaluation.evaluation_scenes import scenes
 from neusee.workflows.evaluation.pipelines import EvaluationRefused, compose_pipelines, read_pipelines
 from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.run_training import _identity, train
 
 TINY = [
@@ -215,3 +216,13 @@ def test_an_option_in_a_shared_folder_is_found(mine, tmp_path, monkeypatch):
     asked = read_pipelines(f"flat+mine@{tmp_path / 'wrong.safetensors'}", tmp_path / "away")
     with pytest.raises(EvaluationRefused, match=r"wrong.safetensors: a is \(1,\), own_.*Small has None"):
         compose_pipelines("first_light", TINY, asked, tmp_path / "away")
+
+
+def test_all_processes_have_the_running_means_of_the_first(monkeypatch):
+    net, sent = torch.nn.Sequential(torch.nn.Conv2d(3, 3, 1), torch.nn.BatchNorm2d(3)), []
+    monkeypatch.setattr(torch.distributed, "broadcast", lambda buffer, source: sent.append((buffer, source)))
+    ALONE.share_buffers(net)
+    assert not sent
+    Mesh(data=2, rank=1).share_buffers(net)
+    assert [source for _, source in sent] == [0, 0, 0]
+    assert all(x is y for (x, _), y in zip(sent, net.buffers(), strict=True))

@@ -81,7 +81,7 @@ class Mesh:
         return dict(zip(names, total.tolist(), strict=True))
 
     def share_buffers(self, net: nn.Module) -> None:
-        """Give each process the buffers of the first one, such as the running means of a batch norm."""
+        """Copy the buffers of a network, such as the running means of a batch norm, from the first process to all."""
         if self.size > 1:
             for buffer in net.buffers():
                 dist.broadcast(buffer, 0)
