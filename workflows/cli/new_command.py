@@ -48,7 +48,7 @@ def new(
     folder: Annotated[Path, typer.Option("--in", help="Folder to write in.")] = Path(),
     debug: Debug = False,
 ) -> None:
-    """Write the start of a node, network, mask, recipe or sensor of your own.
+    """Write the start of a node, network, mask, recipe or sensor.
 
     The start works as it is and has a test. No file is replaced.
     """
