@@ -1,4 +1,4 @@
-"""A restoring network of a user: its construction, its call with the errors that it may make, and a first try."""
+"""A restoring network of a user: how it is built and called, and a first call that shows mistakes and costs."""
 
 import functools
 import json
@@ -16,6 +16,7 @@ from torch.overrides import TorchFunctionMode
 from neusee.nodes import ParameterError
 from neusee.nodes._mirror_padding import mirrored
 from neusee.nodes.bicubic_resize import resize
+from neusee.nodes.exact_convolution import exact_convolutions
 from neusee.nodes.network_classes import Architecture
 from neusee.nodes.restore._networks._restorer import Restorer
 
@@ -127,7 +128,7 @@ def try_network(
     net.to(device, dtype).eval()
     given = picture.clone()
     try:
-        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        with torch.no_grad(), torch.random.fork_rng(devices=[]), exact_convolutions(picture, deterministic=True):
             with _Counting() as counted:
                 first = net.called(given)
             second = net.called(picture.clone())
