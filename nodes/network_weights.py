@@ -38,21 +38,29 @@ def file_metadata(net: nn.Module) -> dict[str, str]:
 
 def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> None:
     """Raise ParameterError unless a weights file fits a network: names, shapes, options, and finite numbers."""
+    net = empty(make)
+    fits(net, weights, f"this network (width {width})", getattr(net, "options", {}))
+
+
+def fits(net: nn.Module, weights: Path, called: str, options: Mapping[str, Any]) -> None:
+    """Raise ParameterError unless a weights file fits a module, which messages name ``called``.
+
+    ``options`` are those of the network, with which the options in the metadata of the file must agree.
+    """
     from safetensors import SafetensorError, safe_open
 
-    net = empty(make)
     shapes = {name: tuple(tensor.shape) for name, tensor in net.state_dict().items()}
     try:
         with safe_open(weights, framework="pt") as tensors:
             stored = {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
-            options = (tensors.metadata() or {}).get(OPTIONS)
+            trained = (tensors.metadata() or {}).get(OPTIONS)
     except SafetensorError as error:
         raise ParameterError("weights", f"{weights.name} is not a safetensors file: {error}") from error
-    if options is not None:
-        _same_options(_options(options, weights), getattr(net, "options", {}), weights)
+    if trained is not None:
+        _same_options(_options(trained, weights), options, weights)
     for name in sorted(shapes | stored):
         if shapes.get(name) != stored.get(name):
-            text = f"{weights.name}: {name} is {stored.get(name)}, this network (width {width}) has {shapes.get(name)}"
+            text = f"{weights.name}: {name} is {stored.get(name)}, {called} has {shapes.get(name)}"
             raise ParameterError("weights", text)
     if problem := _not_finite(weights):
         raise ParameterError("weights", problem)
@@ -93,8 +101,9 @@ def _same_options(trained: Mapping[str, Any], options: Mapping[str, Any], weight
     for name in options:
         if name in trained and trained[name] != options[name]:
             text = f"{weights.name} was trained with {name}: {_word(trained[name])}, and this network has {name}: "
-            raise ParameterError("weights", f"{text}{_word(options[name])}; write {name}: {_word(trained[name])}")
+            fix = "name that class" if name == "class" else f"write {name}: {_word(trained[name])}"
+            raise ParameterError("weights", f"{text}{_word(options[name])}; {fix}")
 
 
 def _word(value: object) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
+    return value if isinstance(value, str) else json.dumps(value, sort_keys=True)

@@ -10,6 +10,7 @@ import shlex
 import shutil
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -84,6 +85,10 @@ def folder(tmp_path_factory):
     (folder / "camera.csv").write_text("wavelength,red,green,blue\n400,0,0,1\n550,0,1,0\n700,1,0,0\n")
     network = start_network(partial(NAFNet, width=16), torch.Generator().manual_seed(0))
     save_file(network.state_dict(), folder / "net.safetensors")
+    page = (GUIDE / "own_networks.md").read_text(encoding="utf-8")
+    names: dict[str, Any] = {}
+    exec(re.search(r"^```python\n(# my/smallnet.py\n.*?)^```", page, re.MULTILINE | re.DOTALL)[1], names)
+    save_file(names["SmallUNet"](16).state_dict(), folder / "smallnet.safetensors")
     np.save(folder / "mask.npy", np.zeros((540, 540)))
     return folder
 

@@ -8,12 +8,15 @@ from neusee.nodes.restore._inverse._wiener import wiener
 from neusee.nodes.restore._networks._critic import critic_slopes, critics, skip_critic_draws
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba, fft_mamba
 from neusee.nodes.restore._networks._nafnet import NAFNet, nafnet
+from neusee.nodes.restore._networks._network_node import network
+from neusee.nodes.restore._networks._own_network import OwnNetwork, own_network, try_network
 from neusee.nodes.restore._networks._restorer import Restorer, parameter_groups, start_network
 from neusee.nodes.restore._networks._unet import UNet, unet
 
 __all__ = [
     "FFTMamba",
     "NAFNet",
+    "OwnNetwork",
     "Restorer",
     "UNet",
     "clipped",
@@ -24,10 +27,13 @@ __all__ = [
     "electrons",
     "fft_mamba",
     "nafnet",
+    "network",
+    "own_network",
     "parameter_groups",
     "richardson_lucy",
     "skip_critic_draws",
     "start_network",
+    "try_network",
     "unet",
     "wiener",
 ]

@@ -1,10 +1,12 @@
 """Shapes of the results of the restoring nodes, and the work of the deconvolution and of the networks."""
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from neusee.nodes.network_classes import Architecture
 from neusee.nodes.restore._colour_matrix import colour_matrix
 from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons
 from neusee.nodes.restore._inverse._conjugate_gradients import LOWEST
@@ -15,6 +17,8 @@ from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
 from neusee.nodes.restore._inverse._wiener import wiener
 from neusee.nodes.restore._networks._fft_mamba import fft_mamba
 from neusee.nodes.restore._networks._nafnet import nafnet
+from neusee.nodes.restore._networks._network_node import network
+from neusee.nodes.restore._networks._own_network import tried
 from neusee.nodes.restore._networks._unet import unet
 from neusee.nodes.shape_rules import at_least_single, blank, double, like_first, transform_operations
 from neusee.nodes.values import Psf
@@ -23,8 +27,10 @@ _SYSTEM = 35.0  #: bytes for each element of a dense system: the matrix, its fac
 _INVERTED = 0.30  #: operations of a transform that take as long as one of the cube of the side of an inverted matrix
 _WHITENED = 0.94  #: side of a dense system that needs as much memory as an inverted matrix of side 1
 _FILLED = 790.0  #: operations of a transform that take as long as an element of a matrix of covariances
+_KEPT = 1 / 8  #: bytes of inner results of a network that need as much memory as a byte of the usual work of a node
+_LAYER = 1e-3  #: operations of a transform that take as long as one of a layer
 
-for node in (electrons, wiener, richardson_lucy, fft_mamba, nafnet, unet):
+for node in (electrons, wiener, richardson_lucy, fft_mamba, nafnet, network, unet):
     node.shape(like_first)
 
 
@@ -91,3 +97,21 @@ def _layers(result: Tensor, *inputs: Any, width: int = 32, **params: Any) -> tup
 
 for node in (fft_mamba, nafnet, unet):
     node.work(_layers)
+
+
+@network.work
+def _(
+    result: Tensor,
+    picture: Tensor,
+    *,
+    architecture: Architecture | None = None,
+    parameters: dict[str, Any] | None = None,
+    multiple: int | None = None,
+    tile: int | None = None,
+    reduce: int = 1,
+    **params: Any,
+) -> tuple[float, float]:
+    if architecture is None:
+        return _layers(result)
+    trial, pixels = tried(architecture, parameters, multiple), result[0].numel() / reduce**2
+    return _KEPT * trial.memory * min(pixels, tile**2 if tile else math.inf), _LAYER * trial.operations * pixels

@@ -99,6 +99,11 @@ def _networks(folder):
             "0", (single,), {"weights": saved(folder, "fft_mamba", partial(FFTMamba, **sizes)), **sizes}
         ),
         "restore.nafnet": Case("0", (single,), {"weights": saved(folder, "nafnet", partial(NAFNet, 4)), "width": 4}),
+        "restore.network": Case(
+            "0",
+            (single,),
+            {"weights": saved(folder, "own", partial(UNet, 4)), "architecture": UNet, "parameters": {"width": 4}},
+        ),
         "restore.unet": Case("0", (single,), {"weights": saved(folder, "unet", partial(UNet, 4)), "width": 4}),
         "spectra.lift_mst_plus_plus": Case(
             "0",

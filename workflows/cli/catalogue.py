@@ -101,8 +101,19 @@ def nodes_lines(own: Own = MappingProxyType({})) -> list[str]:
     for family, paths in groupby(nodes, lambda path: path.partition(".")[0]):
         lines += ["", _first(family_title(family, own))]
         lines += [f"{path:<{width}}  {_first(nodes[path].__doc__)}" for path in paths]
+    lines += _networks(own)
     broken = broken_families().values()
     return [*lines[1:], *([""] if broken else []), *broken]
+
+
+def _networks(own: Own) -> list[str]:
+    """Return a line for each network class of the user's families."""
+    from neusee.nodes.network_classes import network_classes
+
+    lines = ["", "Network classes, for restore.network"]
+    for family, module in own.items():
+        lines += [f"{family}.{name}  {_first(vars(x).get('__doc__'))}" for name, x in network_classes(module).items()]
+    return lines if len(lines) > 2 else []
 
 
 def node_lines(name: str, own: Own = MappingProxyType({})) -> list[str]:
@@ -161,7 +172,8 @@ def _kind(hint: Any) -> str:
         return f"{_kind(arguments[0])} {_limits(hint)}".strip()
     if arguments:
         return _composed(hint, arguments)
-    names = {"int": "whole number", "float": "number", "bool": "true | false", "NoneType": "none", "str": "text"}
+    names = {"int": "whole number", "float": "number", "bool": "true | false", "NoneType": "none", "str": "text",
+             "Any": "any value", "Architecture": "a network class of yours, such as mynet.SmallUNet"}  # fmt: skip
     return names.get(getattr(hint, "__name__", ""), str(hint))
 
 

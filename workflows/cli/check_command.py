@@ -14,6 +14,8 @@ from neusee.workflows.cli.command_list import DONE, MISSED
 from neusee.workflows.cli.command_options import AsJson, Debug
 
 if TYPE_CHECKING:
+    from torch import nn
+
     from neusee.nodes import Node
 
 _MARKS = {True: "ok", False: "FAIL", None: "-"}
@@ -27,36 +29,44 @@ def check(
     """Check whether nodes keep what the nodes of neusee keep.
 
     Docstring, annotations, hooks, what a cache key covers; on the example of each node: the reference, gradients
-    against finite differences, bands, bounds and shapes. The exit code is 3 if a rule fails. Runs the code.
+    against finite differences, bands, bounds and shapes. A network class of yours is called on small pictures. The exit
+    code is 3 if a rule fails. Runs the code.
     """
+    from neusee.workflows.contract.network_contract import check_network
     from neusee.workflows.contract.node_contract import check_node
 
     with failing(LookupError):
-        found = {name: check_node(node) for name, node in _nodes(place).items()}
+        nodes, networks = _found(place)
+        found = {name: check_node(node) for name, node in nodes.items()}
+        found |= {name: check_network(name, network) for name, network in networks.items()}
     if as_json:
         say([json.dumps({name: [asdict(f) for f in findings] for name, findings in found.items()}, indent=1)])
     for name, findings in found.items() if not as_json else ():
         say([name, *(f"  {_MARKS[f.ok]:<4}  {f.rule:<11}  {f.text}" for f in findings), ""])
     failed = sum(f.ok is False for findings in found.values() for f in findings)
     if not as_json:
-        say(
-            [
-                f"{len(found)} node{'s' * (len(found) != 1)}: "
-                + (f"{failed} rules fail" if failed else "every rule holds")
-            ]
-        )
+        end = f"{failed} rules fail" if failed else "every rule holds"
+        say([f"{_count(len(nodes), len(networks))}: {end}"])
     raise typer.Exit(MISSED if failed else DONE)
 
 
-def _nodes(place: str) -> dict[str, Node]:
-    """Return the nodes at a place by name; raise `LookupError` if there are none."""
+def _count(nodes: int, networks: int) -> str:
+    """Return the numbers of nodes and networks as text, such as ``2 nodes and 1 network``."""
+    counts = [(nodes, "node")] * (nodes > 0 or not networks) + [(networks, "network")] * (networks > 0)
+    return " and ".join(f"{count} {what}{'s' * (count != 1)}" for count, what in counts)
+
+
+def _found(place: str) -> tuple[dict[str, Node], dict[str, type[nn.Module]]]:
+    """Return the nodes and the network classes at a place by name; raise `LookupError` if there are none."""
+    from neusee.workflows.contract.network_contract import whole_networks
     from neusee.workflows.recipe.node_families import find_node, import_own, is_known, nodes_of, own_nodes
 
     family = place.partition(".")[0]
     if not place.endswith(".py") and "/" not in place and is_known(family):
         if place != family:
-            return {place: find_node(place)}
-        return {f"{family}.{name}": node for name, node in nodes_of(family).items()}
+            return {place: find_node(place)}, {}
+        return {f"{family}.{name}": node for name, node in nodes_of(family).items()}, {}
     module = import_own(place, Path.cwd())
     name = module.__name__.rpartition(".")[2]
-    return {f"{name}.{key}": node for key, node in own_nodes(name, module).items()}
+    nodes = {f"{name}.{key}": node for key, node in own_nodes(name, module).items()}
+    return nodes, {f"{name}.{key}": value for key, value in whole_networks(module).items()}

@@ -32,7 +32,7 @@ COMMANDS = {
     "evaluate": ("evaluate_command", "Compare masks and restorers on the same scenes and lasers."),
     "recipes": ("catalogue", "List the recipes and the groups of options."),
     "nodes": ("catalogue", "List the nodes, or explain one node."),
-    "new": ("new_command", "Write the start of a node, mask, recipe or sensor of your own."),
+    "new": ("new_command", "Write the start of a node, network, mask, recipe or sensor."),
     "check": ("check_command", "Check whether nodes keep what the nodes of neusee keep."),
     "schema": ("catalogue", "Print the JSON schema of recipes for editors."),
     "study": ("study_commands", "Study how accurate, stable and certain a recipe's numbers are."),

@@ -18,6 +18,15 @@ KINDS: dict[str, tuple[dict[str, str], tuple[str, ...]]] = {
         {"NAME.py": "node.py.txt", "test_NAME.py": "test_node.py.txt"},
         ("neusee check NAME.py", "pytest test_NAME.py"),
     ),
+    "network": (
+        {
+            "NAME.py": "network.py.txt",
+            "restore/NAME.yaml": "network.yaml.txt",
+            "train_NAME.yaml": "train_network.yaml.txt",
+            "test_NAME.py": "test_network.py.txt",
+        },
+        ("neusee check NAME.py", "neusee train train_NAME.yaml", "pytest test_NAME.py"),
+    ),
     "mask": (
         {"NAME.py": "mask.py.txt", "doe/NAME.yaml": "mask.yaml.txt", "test_NAME.py": "test_mask.py.txt"},
         ("neusee check NAME.py", "neusee run first_light doe=NAME", "pytest test_NAME.py"),
@@ -48,7 +57,7 @@ def new(
     folder: Annotated[Path, typer.Option("--in", help="Folder to write in.")] = Path(),
     debug: Debug = False,
 ) -> None:
-    """Write the start of a node, mask, recipe or sensor of your own.
+    """Write the start of a node, network, mask, recipe or sensor.
 
     The start works as it is and has a test. No file is replaced.
     """

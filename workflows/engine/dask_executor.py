@@ -21,7 +21,7 @@ import torch
 from neusee.workflows.engine.memory_use import there_is
 from neusee.workflows.engine.step_job import InputMissing, Lane, Outcome, StepJob, carry_out
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.keys.cache_key import Key, is_private
+from neusee.workflows.keys.cache_key import Key, code_of, is_private
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.seal import Unsigned, check_signature, secrets, signature
 from neusee.workflows.recipe.node_families import all_nodes
@@ -194,7 +194,7 @@ def _one_here(work: StepJob, here: _Here) -> Outcome:
     if is_private(work.key):
         text = "the loaded code is not that of its file, so no other process can use the result: restart Python"
         return Outcome(work, error=RunError(work.step, [], OSError(text)))
-    if here.code.of(work.step.node) != work.origin["code"]:
+    if code_of(work.step, here.code) != work.origin["code"]:
         text = f"the code of {work.step.node.path} differs on a worker: install the same version there"
         return Outcome(work, error=RunError(work.step, [], OSError(text)))
     outcome = carry_out(work, partial(here.fetch, kinds=kinds_of(work)), here.store)

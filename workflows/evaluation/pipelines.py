@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 
-from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError, nearest
+from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.recipe.text.option_groups import groups_of, packaged
+from neusee.workflows.recipe.text.composition import compose
 from neusee.workflows.recipe.text.overrides import Override
 
 NONE = "none"  #: name of the restorer that restores nothing, and of the case without a laser
@@ -116,7 +116,7 @@ def compose_pipelines(
     wrong: dict[str, None] = {}
     for pipeline in pipelines:
         try:
-            words = [*changes, *_words(pipeline)]
+            words = [*changes, *_words(pipeline, partial(_takes, recipe, changes, folder))]
             recipe_of = cache(partial(_with_laser, recipe, words, fwhm, folder))
             for case in (NONE, next(iter(CASES))):
                 _check(recipe_of(case), pipeline)
@@ -134,28 +134,30 @@ def _one_line(problem: Diagnostic) -> str:
     return " ".join(str(RecipeError([problem])).split())
 
 
-def _words(pipeline: Pipeline) -> list[str]:
+def _words(pipeline: Pipeline, takes: Callable[[str, str], str]) -> list[str]:
     """Return the recipe arguments that set the mask and the restorer of a pipeline, such as ``doe=flat``."""
     words = [f"doe={pipeline.mask}"]
     if pipeline.height_file:
-        words.append(f"doe.{_takes('doe', pipeline.mask)}={pipeline.height_file.absolute()}")
+        words.append(f"doe.{takes('doe', pipeline.mask)}={pipeline.height_file.absolute()}")
     if pipeline.restorer != NONE:
         words.append(f"restore={pipeline.restorer}")
     if pipeline.weights:
-        words.append(f"restore.{_takes('restore', pipeline.restorer)}={pipeline.weights.absolute()}")
+        words.append(f"restore.{takes('restore', pipeline.restorer)}={pipeline.weights.absolute()}")
     return words
 
 
-def _takes(group: str, option: str) -> str:
-    """Return the name of the file parameter of a mask or restorer; raise `EvaluationRefused` if there is none."""
-    options = groups_of(packaged()).get(group, [])
-    path = packaged() / group / f"{option}.yaml"
-    if option == NONE or (option in options and not path.is_file()):
-        raise EvaluationRefused(f"{option} takes no file: remove @ and the file name")
-    if not path.is_file():
-        raise EvaluationRefused(f"no option {option} in {group}; {nearest(option, options)}")
-    if match := re.search(r"\b(file|weights): null", path.read_text(encoding="utf-8")):
-        return match[1]
+def _takes(recipe: str, changes: Sequence[str | Override], folder: Path, group: str, option: str) -> str:
+    """Return the name of the file parameter of a mask or restorer; raise `EvaluationRefused` if there is none.
+
+    The option may be packaged, or of the user: beside the recipe, or in a folder that every recipe searches.
+    """
+    composed = compose(recipe, [*changes, f"{group}={option}"], folder) if option != NONE else None
+    if composed and (problem := next((p for p in composed.diagnostics if p.message.startswith("no option")), None)):
+        raise EvaluationRefused(problem.message)
+    block = composed.root.items.get(group) if composed else None
+    for name in ("file", "weights"):
+        if block is not None and name in block.items:
+            return name
     raise EvaluationRefused(f"{option} takes no file: remove @ and the file name")
 
 

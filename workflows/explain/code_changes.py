@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neusee.workflows.keys.code_digest import source_file
 from neusee.workflows.keys.code_memo import read_parts
+from neusee.workflows.keys.module_origin import source_file
 from neusee.workflows.keys.process_settings import USUAL
 
 _STATE, _SETTINGS = "state of ", "settings"

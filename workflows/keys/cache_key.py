@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neusee.nodes.network_classes import Architecture
 from neusee.workflows.keys.input_file_digest import file_digest
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ def key_of(
     node = step.node
     parts: dict[str, Any] = {
         "node": node.path,
-        "code": code.of(node),
+        "code": code_of(step, code),
         "params": {name: plain(value) for name, value in step.params.items()},
         "inputs": [_keys_of(step.wires.get(name), keys) for name in node.inputs],
     }
@@ -47,6 +48,12 @@ def key_of(
         parts["stream"] = [seed, step.name, device_kind(device)]
     private = any(map(is_private, [parts["code"], *(keys[name] for name in step.sources)]))
     return (PRIVATE + digest(parts)[:24] if private else digest(parts)), parts
+
+
+def code_of(step: Step, code: Code) -> str:
+    """Return the digest of the code of a step: of its node, and of the network classes that its parameters name."""
+    classes = [value.network for value in step.params.values() if isinstance(value, Architecture)]
+    return code.of(step.node, tuple(dict.fromkeys((each.__module__, each.__qualname__) for each in classes)))
 
 
 def is_private(key: Key) -> bool:
@@ -82,6 +89,8 @@ def plain(value: Any) -> Any:
         return {"items": sorted(([plain(k), plain(v)] for k, v in value.items()), key=repr)}
     if isinstance(value, tuple | list):
         return [plain(v) for v in value]
+    if isinstance(value, Architecture):
+        return {"class": f"{value.network.__module__}.{value.network.__qualname__}"}
     if isinstance(value, complex):
         return {"complex": [value.real, value.imag]}
     raise TypeError(f"a parameter must be a number, a string, a file or a collection of these, not {value!r}")

@@ -77,14 +77,21 @@ class Code:
         self._codes: dict[int, tuple[Node, str]] = {}  # digest of each node, by id
         self._parts: dict[str, Parts] = {}  # by digest
 
-    def of(self, node: Node) -> str:
+    def of(self, node: Node, classes: tuple[tuple[str, str], ...] = ()) -> str:
         """Return the digest of the code of a node, with what the node declares and what its function holds.
 
+        ``classes``: module and name of the network classes that a step gives the node; their modules count as a whole.
         Raises `LookupError` with place and fix for code that reads what cannot be followed.
         """
         if id(node) not in self._codes:
             self._codes[id(node)] = node, self._of(node)
-        return self._codes[id(node)][1]
+        code = self._codes[id(node)][1]
+        for module, name in classes:
+            whole = self._whole(module)
+            self._refuse(whole, module, node, {name.partition(".")[0]})
+            parts = {**self._whole(node.fn.__module__).parts, **whole.parts}
+            code = self._named(digest(code, whole.code), parts, is_private(code) or is_private(whole.code))
+        return code
 
     def digest(self, module: str) -> str:
         """Return the digest of a module and of all that it imports, directly or not.
@@ -105,7 +112,7 @@ class Code:
     def _of(self, node: Node) -> str:
         module = node.fn.__module__
         code, whole = self.digest(module), self._whole(module)
-        self._refuse(whole, module, node)
+        self._refuse(whole, module, node, {node.fn.__name__, "_"})
         plain = getattr(sys.modules.get(module), node.fn.__name__, None) is node
         if plain and not node.depends:
             return code
@@ -160,9 +167,8 @@ class Code:
         self._parts[code] = parts
         return code
 
-    def _refuse(self, whole: Whole, module: str, node: Node) -> None:
-        """Raise `LookupError` for the first construct that is not followed and not declared."""
-        own = {node.fn.__name__, "_"}
+    def _refuse(self, whole: Whole, module: str, node: Node, own: set[str]) -> None:
+        """Raise `LookupError` for the first construct that is not followed, not declared, and that ``own`` reaches."""
         for name, look in whole.looks.items():
             if look.summary is None or look.path is None or not (look.summary.constructs or look.changing):
                 continue
@@ -272,12 +278,6 @@ _summarised = functools.lru_cache(1000)(summarise)  #: several stores in one pro
 def _decides_nothing(module: str) -> bool:
     """Return True for a module that decides no result, such as the rules for the shapes of a family of nodes."""
     return module in _LEFT_OUT or (module.startswith(f"{ROOT}.") and module.endswith("._result_shapes"))
-
-
-def source_file(module: str) -> Path | None:
-    """Return the source file of a module without importing the module, or None if there is no source file."""
-    path = module_path(module)
-    return Path(path) if path else None
 
 
 def _packages(module: str) -> frozenset[str]:

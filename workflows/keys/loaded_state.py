@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 import xxhash
+from torch import nn
 
 from neusee.nodes import Node
 from neusee.workflows.keys.code_objects import function_code
@@ -220,7 +221,8 @@ def counted_values(module: ModuleType, summary: Summary, free: Collection[str], 
     values = {name: value for name, value in vars(module).items() if name not in free}
     nodes = [name for name, value in values.items() if root and isinstance(value, Node)]
     if nodes:
-        names = read_names(summary.statements, [*nodes, "_"])
+        classes = [name for name, value in values.items() if isinstance(value, type) and issubclass(value, nn.Module)]
+        names = read_names(summary.statements, [*nodes, *classes, "_"])
         return {name: value for name, value in values.items() if name in names}
     noted = written_only(summary.statements)
     return {name: value for name, value in values.items() if name not in noted}

@@ -67,6 +67,12 @@ def module_path(module: str) -> str | None:
     return next(filter(None, (_file_in(folder, name) for folder in _folders_above(module))), None)
 
 
+def source_file(module: str) -> Path | None:
+    """Return the source file of a module without importing the module, or None if there is no source file."""
+    path = module_path(module)
+    return Path(path) if path else None
+
+
 def module_file(folder: str | Path, names: Sequence[str]) -> Path | None:
     """Return the source file of a module or package below a folder, or None if there is no such file.
 

@@ -21,8 +21,8 @@ from neusee.workflows.recipe.expected_numbers import unaffected_expectations
 from neusee.workflows.recipe.global_settings import expectations, outputs_of, seed_and_tolerance
 from neusee.workflows.recipe.graph_cache import CachedGraph, cache_graph, cached_graph
 from neusee.workflows.recipe.known_before_run import CheckedStep, check_steps, refuse_indices
-from neusee.workflows.recipe.node_families import Own
-from neusee.workflows.recipe.own_families import KEY, read_own_families
+from neusee.workflows.recipe.node_families import NO_FAMILY, Own, class_context
+from neusee.workflows.recipe.own_families import KEY, OwnFamilies, read_own_families
 from neusee.workflows.recipe.parameters import Checker
 from neusee.workflows.recipe.step_declarations import Declared, declare, device_of
 from neusee.workflows.recipe.text.composition import Composed, compose
@@ -93,12 +93,14 @@ def _checked(composed: Composed, graph: CachedGraph) -> Recipe:
 def check(composed: Composed) -> Recipe:
     """Return a composed recipe after a check of all its values; raise `RecipeError` with all mistakes."""
     blocks = [composed.root.items[key] for key in (TRAINING, LIFTING) if key in composed.root.items]
-    composed, training = read_training(composed)
+    mistakes: list[Diagnostic] = []
+    own = read_own_families(composed.root, mistakes)
+    composed, training = read_training(composed.with_problems(mistakes), class_context(own.modules))
     composed, lifting = read_lift_training(composed)
     composed, uncertain = settle(composed)
     diagnostics = list(composed.diagnostics)
     root, references = composed.root, References(composed.root, diagnostics, dict(composed.replaced))
-    own, checker = read_own_families(root, diagnostics), Checker([])
+    checker = Checker([], own=own.modules)
     checker.files[(KEY,)] = own.places
     graph = cached_graph(root, own.modules)
     steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, diagnostics, own)
@@ -113,8 +115,8 @@ def check(composed: Composed) -> Recipe:
     references.finish()
     if not composed.whole:  # a missing group causes further errors
         diagnostics = list(composed.diagnostics)
-    if diagnostics or checker.diagnostics:
-        raise RecipeError([*diagnostics, *checker.diagnostics])
+    if problems := _causes([*diagnostics, *checker.diagnostics], own):
+        raise RecipeError(problems)
     if graph is None:
         cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
     config = Config(_final_values(wiring, bound, checker, uncertain) | dict(_settings(blocks, checker)))
@@ -122,6 +124,11 @@ def check(composed: Composed) -> Recipe:
     notes = (*composed.notes, *own.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
     parts = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
     return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting)
+
+
+def _causes(problems: list[Diagnostic], own: OwnFamilies) -> list[Diagnostic]:
+    """Return the mistakes without those that follow from a family that could not be read."""
+    return [each for each in problems if own.is_whole or not each.message.startswith(NO_FAMILY)]
 
 
 def _bind(

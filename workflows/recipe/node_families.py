@@ -17,15 +17,18 @@ from collections.abc import Iterator, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import neusee.nodes
 from neusee.nodes import Node
+from neusee.nodes.network_classes import FAMILY, network_classes
 from neusee.nodes.own_modules import import_file
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.recipe.text.renamed_keys import instead
 
 GROUP = "neusee.nodes"  #: group of the entry points by which packages install families of nodes
 
+NO_FAMILY = "no family of your own is called"  #: first words of a mistake
 Own = Mapping[str, ModuleType]  #: modules of the families that a recipe names, by family
 _NO_OWN: Own = {}
 _family_of: dict[str, str] = {}  #: family of each module of a user, because a node has one name in a process
@@ -87,6 +90,20 @@ def is_known(family: str) -> bool:
     return _is_ours(family) or family in _installed()
 
 
+def module_of(family: str, own: Own = _NO_OWN) -> ModuleType:
+    """Return the module of a family of the user or of an installed package; raise `LookupError` for any other name."""
+    if family in own:
+        return own[family]
+    if family in _installed():
+        return _load(family)
+    raise LookupError(f"{NO_FAMILY} {family}; {nearest(family, [*own, *_installed()])}")
+
+
+def class_context(own: Own) -> dict[str, Any]:
+    """Return the context in which the models of parameters find the network classes of a user."""
+    return {FAMILY: functools.partial(module_of, own=own)}
+
+
 def family_title(family: str, own: Own = _NO_OWN) -> str:
     """Return the first line of the docstring of a family's module; raise `LookupError` as `nodes_of` does."""
     if family in own:
@@ -101,7 +118,7 @@ def family_title(family: str, own: Own = _NO_OWN) -> str:
 def own_nodes(family: str, module: ModuleType) -> dict[str, Node]:
     """Return the nodes that a module or package of a user defines, each named after the family.
 
-    Raises `LookupError` if the module defines no node, or belongs to a family of another name.
+    Raises `LookupError` if the module defines neither a node nor a network, or belongs to a family of another name.
     """
     name = module.__name__
     found = {
@@ -109,8 +126,10 @@ def own_nodes(family: str, module: ModuleType) -> dict[str, Node]:
         for key, value in vars(module).items()
         if isinstance(value, Node) and f"{value.fn.__module__}.".startswith(f"{name}.")
     }
-    if not found:
-        raise LookupError(f"{name} defines no node: decorate a function with @node() of neusee.nodes")
+    if not found and not network_classes(module):
+        raise LookupError(
+            f"{name} defines no node: decorate a function with @node() of neusee.nodes, or write a network class"
+        )
     if _family_of.setdefault(name, family) != family:
         raise LookupError(f"{name} is the family {_family_of[name]} in this process: use that name, or a new process")
     for key, node in found.items():

@@ -16,6 +16,8 @@ from neusee.nodes import Node, ParameterError
 from neusee.nodes.units import IsFile
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.graph.recipe_graph import Step, Wire
+from neusee.workflows.recipe.node_families import Own, class_context
+from neusee.workflows.recipe.own_families import VARIABLE as NO_CODE
 from neusee.workflows.recipe.text.references import broken
 from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, kind
@@ -31,6 +33,7 @@ class Checker:
     notes: dict[str, None] = field(default_factory=dict)
     #: full path of a file, or of several files, by the path of the value in the recipe
     files: dict[tuple[str | int, ...], Any] = field(default_factory=dict)
+    own: Own = field(default_factory=dict)  #: the user's families of nodes, whose network classes a parameter may name
 
     def read(self, node: Node, given: Value, step: Location) -> dict[str, Any] | None:
         """Return the validated parameters of a step with the defaults of its node, or None if a parameter is wrong."""
@@ -43,11 +46,17 @@ class Checker:
         values = {str(name): value for name, value in given.items.items()}
         plain = {name: self._plain(node, name, value) for name, value in values.items()}
         try:
-            model = node.params.model_validate(plain)
+            model = node.params.model_validate(plain, context=class_context(self.own))
         except ValidationError as error:
             self.diagnostics += _problems(error, node, values, given, step)
             return None
-        return {name: getattr(model, name) for name in node.params.model_fields}
+        params = {name: getattr(model, name) for name in node.params.model_fields}
+        for name, value in values.items():
+            if isinstance(params[name], Path) and params[name].suffix == ".pt2" and os.environ.get(NO_CODE):
+                message = f"a file of torch.export holds code, which {NO_CODE} or --no-code refuses to run"
+                self.diagnostics.append(Diagnostic(value.mark, _said(value), message))
+                return None
+        return params
 
     def preflight(
         self,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.keys.cache_key import plain
+from neusee.workflows.keys.cache_key import code_of, plain
 from neusee.workflows.keys.code_digest import Code
 
 _PARAMETER = re.compile(r"(?P<step>[^.]+)\.(?P<name>\w+)")
@@ -52,7 +52,7 @@ def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code) -> Foun
     if need.endswith("()"):
         step = _step(need[:-2], recipe)
         params = [[name, plain(value)] for name, value in step.params.items()]
-        return Found((), lambda values: Bound(step), [step.node.path, code.of(step.node), params])
+        return Found((), lambda values: Bound(step), [step.node.path, code_of(step, code), params])
     if match := _PARAMETER.fullmatch(need):
         value = _parameter(match["step"], match["name"], recipe)
         return Found((), lambda values: value, plain(value))

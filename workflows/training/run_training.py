@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -14,8 +15,10 @@ from neusee.nodes.network_weights import file_metadata
 from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings
-from neusee.workflows.recipe.blocks.train_block import KEY, Stage, Training
+from neusee.workflows.recipe.blocks.train_block import KEY, Network, Stage, Training
+from neusee.workflows.recipe.own_families import KEY as OWN_NODES
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.loop.checkpoint import export
 from neusee.workflows.training.loop.resumable_loop import Losses, Progress, ResumableLoop, Watch
@@ -60,7 +63,7 @@ def train(
         raise MeshError("--stage mask runs in a single process: start the training without torchrun")
     _require_equal_shares(recipe, settings, mesh)
     photographs = _photographs(recipe, settings, bool(with_pictures))
-    folder = runs / f"{recipe.name}_train_{_key(recipe, settings, photographs)}"
+    folder = runs / f"{recipe.name}_train_{_key(recipe, settings, photographs, Code(store.code_memo))}"
     folder.mkdir(parents=True, exist_ok=True)
     if not mesh.first:
         progress, watch = (lambda line: None), None
@@ -93,15 +96,24 @@ def _photographs(recipe: Recipe, settings: Training, needed: bool) -> Photograph
     return Photographs((file,) if isinstance(file, Path) else ())
 
 
-def _key(recipe: Recipe, settings: Training, photographs: Photographs) -> str:
+def _key(recipe: Recipe, settings: Training, photographs: Photographs, code: Code) -> str:
     """Return a digest of all settings that can change a trained network or mask, as a part of the folder name."""
     items = recipe.config.settings.items()
-    values = {name: str(setting.value) for name, setting in items if not name.startswith(f"{KEY}.")}
+    left_out = (f"{KEY}.", OWN_NODES)
+    values = {name: str(setting.value) for name, setting in items if not name.startswith(left_out)}
     defaults = {"mask": MaskSettings(), "clip": 10.0, "reduction": "mean"}
     usual = {name for name, x in defaults.items() if getattr(settings, name) == x}  # so that older trainings continue
     block = settings.model_copy(update={"keep": 1, "show": 1}).model_dump(mode="json", exclude={"tensorboard", *usual})
-    block["network"] = {"kind": settings.network.kind, "width": settings.network.width, **settings.network.options}
+    block["network"] = _identity(settings.network, code)
     return digest("training", values, block, [path.name for path in photographs.paths])[:8]
+
+
+def _identity(network: Network, code: Code) -> dict[str, Any]:
+    """Return what identifies the network of a training; a class of the user counts with its code."""
+    if network.architecture is None:
+        return {"kind": network.kind, "width": network.width, **network.options}
+    made = code.digest(network.architecture.network.__module__)
+    return {"class": str(network.architecture), "code": made, **network.model_dump(include={"parameters", "multiple"})}
 
 
 class _TrainingLoop(ResumableLoop[Learner]):
@@ -181,8 +193,10 @@ class _TrainingLoop(ResumableLoop[Learner]):
     def show(self) -> None:
         """Write a PNG file with a picture of the last batch, its restoration and the true picture side by side."""
         sample = self.seen[0]
+        self.learner.net.eval()
         with torch.no_grad():
             restored = self.learner.net(sample.picture[:1])[0].float()
+        self.learner.net.train()
         shown = strip([sample.picture[0].detach(), restored, sample.truth[0]])
         if self.board:
             self.board.add_image(f"stage {self.stage}", shown, self._iterations_of_all_stages - 1, dataformats="HWC")
@@ -192,8 +206,8 @@ class _TrainingLoop(ResumableLoop[Learner]):
         if self.stage == 1:
             with torch.no_grad():
                 export(self.folder, "mask", {"height": self.learner.height()})
-        net = self.learner.average.module if self.learner.average else self.learner.net
-        export(self.folder, "network", net.state_dict(), file_metadata(self.learner.net))
+        net: Any = self.learner.average.module if self.learner.average else self.learner.net
+        export(self.folder, "network", net.stored.state_dict(), file_metadata(self.learner.net))
 
     @property
     def _mask_source(self) -> str:

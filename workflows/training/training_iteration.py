@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
@@ -16,13 +17,16 @@ from neusee.nodes.doe import PARAMETRISATIONS
 from neusee.nodes.restore import (
     FFTMamba,
     NAFNet,
+    OwnNetwork,
     Restorer,
     UNet,
     critic_slopes,
     critics,
+    own_network,
     parameter_groups,
     skip_critic_draws,
     start_network,
+    try_network,
 )
 from neusee.nodes.values import Psf, Stop
 from neusee.workflows.engine.node_call import call
@@ -51,12 +55,22 @@ class Learner:
     ) -> None:
         self.settings, self.seed, self.device, self.mesh = settings, recipe.seed, device, mesh
         self._stop: Stop | None = None
+        self._moment = 0, 0  # stage and iteration
         self.mask = nn.Module() if designed or not settings.learn else self._start(recipe, settings.learn)
-        net = start_network(lambda: _network_of(settings.network), self._rng("network"))
-        self.net: Restorer = net.to(settings.dtype)
+        self.net: Restorer = self._network(settings.network)
         self.critics = nn.ModuleList(critics(self._rng("critics"), settings.critics.width)).to(settings.dtype)
         self.average = averaged(self.net, settings.average)
         self.begin(Stage(iterations=0), learns=True)
+
+    def _network(self, network: Network) -> Restorer:
+        """Return the network with its initial weights; that of a user's class passes one call on this device first."""
+        if network.architecture is None:
+            return start_network(lambda: _network_of(network), self._rng("network")).to(self.settings.dtype)
+        own = own_network(
+            network.architecture, network.parameters, network.multiple, stream_seed(self.seed, "train network")
+        )
+        try_network(own, self.settings.dtype, self.device)
+        return own.train()
 
     def _start(self, recipe: Recipe, learn: str) -> nn.Module:
         """Return the mask of the recipe step ``learn`` as a PyTorch module with trainable parameters."""
@@ -116,6 +130,7 @@ class Learner:
         pictures, and all processes apply the sum of the gradients.
         """
         self.generator_optimizer.zero_grad(set_to_none=True)
+        self._moment = stage, iteration
         shared = samples.begin(self.height()) if samples.shared else Shared.of({})
         found = self._mask_suppression(shared, samples) if self.learns else {}
         batch, seen, pairs = self.stage.batch, list[Sample](), dict[int, tuple[Scales, Scales]]()
@@ -131,6 +146,8 @@ class Learner:
         found["slope"] = self._move(
             self.generator_optimizer, found, (self.net, self.mask) if self.learns else (self.net,)
         )
+        if isinstance(self.net, OwnNetwork):
+            self.mesh.share_buffers(self.net)
         if self.average:
             self.average.update_parameters(self.net)
         if self.stage.adversarial:
@@ -167,7 +184,7 @@ class Learner:
         """Restore a training picture; return its weighted loss terms, true picture and detached restored picture."""
         low = torch.autocast(device_kind(self.device), torch.bfloat16, self.settings.precision == "bfloat16")
         picture = sample.picture if self.learns else sample.picture.detach()
-        with low:
+        with low, self._seeded(sample):
             coarse, fine = self.net.pyramid(picture)
         estimate = Scales(coarse.to(self.settings.dtype), fine.to(self.settings.dtype))
         y, x = sample.truth.shape[-2:]
@@ -182,6 +199,16 @@ class Learner:
             scores = (-critic(e).mean() for critic, e in zip(self.critics, estimate, strict=True))
             terms["adversarial"] = (self.stage.adversarial, sum(scores, zero))
         return terms, truth, Scales(estimate.coarse.detach(), estimate.fine.detach())
+
+    @contextmanager
+    def _seeded(self, sample: Sample) -> Iterator[None]:
+        """Seed the random numbers of a user's network, such as those of dropout, by picture and iteration."""
+        if not isinstance(self.net, OwnNetwork):
+            yield
+            return
+        with torch.random.fork_rng([self.device] if self.device.startswith("cuda") else []):
+            torch.manual_seed(stream_seed(self.seed, f"train layers {self._moment} {sample.drawn['noise']}"))
+            yield
 
     def _errors(self, estimate: Scales, truth: Scales) -> Iterator[Tensor]:
         how = {} if self.settings.reduction == "mean" else {"reduction": self.settings.reduction}

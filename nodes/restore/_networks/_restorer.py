@@ -47,6 +47,11 @@ class Restorer(nn.Module, ABC):
     def forward(self, picture: Tensor) -> Tensor:
         return self.pyramid(picture)[1]
 
+    @property
+    def stored(self) -> nn.Module:
+        """Return the module whose tensors a file of weights holds."""
+        return self
+
 
 class Flat(Restorer):
     """A restoring network that works at full size only; its coarse estimate is the reduced fine estimate."""
@@ -126,10 +131,17 @@ def restored(
     ``tile``: the side of the pieces in which a larger picture is restored. ``reduce``: the factor by which the picture
     is first reduced and afterwards enlarged, antialiased; ``detail`` adds the detail that the reduction loses.
     """
+    return restored_by(lambda: loaded(make, _needed(weights)), picture, tile, reduce, detail)
+
+
+def restored_by(
+    ready: Callable[[], nn.Module], picture: Tensor, tile: int | None = None, reduce: int = 1, detail: bool = False
+) -> Tensor:
+    """Restore a picture as `restored` does, by the network with weights that ``ready`` returns."""
     if picture.ndim != 3 or len(picture) != 3:
         raise ValueError(f"a picture {tuple(picture.shape)} is not a colour picture: give (3, y, x)")
     refuse_not_finite("the network would spread them to every pixel", picture=picture)
-    net = loaded(make, _needed(weights)).requires_grad_(False).eval().to(picture.device)
+    net = ready().requires_grad_(False).eval().to(picture.device)
     with exact_convolutions(picture, deterministic=True), torch.autocast(picture.device.type, enabled=False):
         y, x = picture.shape[-2:]
         whole = picture.float()[None]

@@ -28,14 +28,17 @@ class SettingsBlock(BaseModel):
 Settings = TypeVar("Settings", bound=SettingsBlock)
 
 
-def read_block(composed: Composed, key: str, model: type[Settings], plain: Any) -> tuple[Composed, Settings | None]:
+def read_block(
+    composed: Composed, key: str, model: type[Settings], plain: Any, context: dict[str, Any] | None = None
+) -> tuple[Composed, Settings | None]:
     """Return a recipe without its block ``key``, and the validated settings from that block.
 
-    ``plain`` is the plain data of the block. Mistakes in the block add diagnostics, and the settings are None.
+    ``plain`` is the plain data of the block, and ``context`` has what the models of the settings need to know of the
+    recipe. Mistakes in the block add diagnostics, and the settings are None.
     """
     block, rest = composed.root.items[key], composed.without(key)
     try:
-        return rest, model.model_validate(plain)
+        return rest, model.model_validate(plain, context=context)
     except ValidationError as error:
         return rest.with_problems(_problem(block, model, each) for each in error.errors()), None
 
@@ -45,7 +48,7 @@ def _problem(block: Value, model: type[BaseModel], error: Any) -> Diagnostic:
     value = block
     for key in error["loc"]:
         value = value.child(key) or value
-    text = str(error["msg"])
+    text = str(error["msg"]).removeprefix("Value error, ")
     if error["type"] == "extra_forbidden":
         names = _fields(model, error["loc"])
         return Diagnostic(value.key, value.name, instead(value.name) or f"unknown; {nearest(error['loc'][-1], names)}")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field, model_validator
 
+from neusee.nodes import ParameterError
+from neusee.nodes.network_classes import NetworkClass
 from neusee.workflows.graph.diagnostics import Diagnostic
 from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings, MaskTraining
 from neusee.workflows.recipe.blocks.settings_block import (
@@ -20,9 +23,11 @@ from neusee.workflows.recipe.blocks.settings_block import (
     read_block,
 )
 from neusee.workflows.recipe.text.composition import Composed
+from neusee.workflows.recipe.text.option_groups import packaged
 from neusee.workflows.recipe.text.yaml_values import Value
 
 KEY = "train"  #: key of the block in a recipe
+_OF_CLASS = ("architecture", "parameters", "multiple")  #: settings of a network class of the user
 
 
 class Network(SettingsBlock):
@@ -34,15 +39,18 @@ class Network(SettingsBlock):
     directions: Literal[2, 4] = 2  #: of fft_mamba, like the next two
     pyramid: bool = False
     frequency: Literal["complex", "amp_phase"] = "complex"
+    architecture: NetworkClass | None = None  #: a class of the user, in place of a kind and its options
+    parameters: dict[str, Any] | None = None  #: arguments of this class
+    multiple: Annotated[int, Field(ge=1, le=1024)] | None = None  #: of this class: divisor of the sides of a picture
 
     @property
     def options(self) -> dict[str, Any]:
         """Return the restoration network's options that differ from the defaults, without the kind and the width."""
-        return self.model_dump(exclude={"kind", "width"}, exclude_defaults=True)
+        return self.model_dump(exclude={"kind", "width", *_OF_CLASS}, exclude_defaults=True)
 
     @model_validator(mode="after")
     def _fits(self) -> Network:
-        if self.options and self.kind != "fft_mamba":
+        if self.architecture is None and self.options and self.kind != "fft_mamba":
             raise ValueError(f"{', '.join(self.options)}: only the network fft_mamba has such options, not {self.kind}")
         return self
 
@@ -130,17 +138,47 @@ class Training(SettingsBlock):
         return torch.float64 if self.precision == "float64" else torch.float32
 
 
-def read_training(composed: Composed) -> tuple[Composed, Training | None]:
-    """Return a recipe without its block ``train``, and the settings from the block; report mistakes as diagnostics."""
+def read_training(composed: Composed, context: dict[str, Any] | None = None) -> tuple[Composed, Training | None]:
+    """Return a recipe without its block ``train``, and the settings from the block; report mistakes as diagnostics.
+
+    ``context`` has the families of nodes in which a network class is found.
+    """
     block = composed.root.items.get(KEY)
     if block is None:
         return composed, None
-    composed, training = read_block(composed, KEY, Training, _plain(block))
+    composed, training = read_block(composed, KEY, Training, _plain(block), context)
+    if training and "network" in block.items and (wrong := list(_wrong_network(block.items["network"], training))):
+        return composed.with_problems(wrong), None
     if training is None or training.photographs is None or training.photographs.is_dir():
         return composed, training
     value = block.items["photographs"]
     problem = Diagnostic(value.mark, value.name, f"the path {training.photographs} is not a folder of photographs")
     return composed.with_problems([problem]), None
+
+
+def _wrong_network(given: Value, training: Training) -> Iterator[Diagnostic]:
+    """Yield a diagnostic for each setting of the packaged networks, and for a class that fails on a small picture."""
+    from neusee.nodes.restore import own_network, try_network
+
+    network = training.network
+    if network.architecture is None:
+        if alone := next((value for name in _OF_CLASS[1:] if (value := given.child(name)) and value.plain), None):
+            yield Diagnostic(
+                alone.mark, alone.name, "is of a class of your own: name it by architecture: mynet.MyClass"
+            )
+        return
+    for name, value in given.items.items():
+        if name not in _OF_CLASS and not Path(value.mark.folder).is_relative_to(packaged()):
+            text = f"{name} is of the networks of neusee: write parameters: {{{name}: {value.plain}}} for your class"
+            yield Diagnostic(value.mark, value.name, text)
+    try:
+        net = own_network(network.architecture, network.parameters, network.multiple)
+        if not any(one.requires_grad for one in net.parameters()):
+            raise ParameterError("architecture", f"{network.architecture} has nothing to train: it has no parameters")
+        try_network(net, training.dtype)
+    except ParameterError as error:
+        value = given.child(error.parameter) or given.items["architecture"]
+        yield Diagnostic(value.mark, value.name, str(error))
 
 
 def _plain(block: Value) -> Any:

@@ -113,5 +113,5 @@ def export(folder: Path, name: str, tensors: Mapping[str, torch.Tensor], about: 
     """Write tensors and metadata to the file ``<name>.safetensors`` in a folder."""
     from safetensors.torch import save
 
-    whole = {key: x.detach().cpu().contiguous() for key, x in tensors.items()}
+    whole = {key: x.detach().cpu().contiguous().clone() for key, x in tensors.items()}
     write_whole(folder / f"{name}.safetensors", save(whole, about or None))

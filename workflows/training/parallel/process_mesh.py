@@ -80,6 +80,12 @@ class Mesh:
         dist.all_reduce(total)
         return dict(zip(names, total.tolist(), strict=True))
 
+    def share_buffers(self, net: nn.Module) -> None:
+        """Copy the buffers of a network, such as the running means of a batch norm, from the first process to all."""
+        if self.size > 1:
+            for buffer in net.buffers():
+                dist.broadcast(buffer, 0)
+
     def add_gradients(self, parts: Iterable[nn.Module]) -> None:
         """Replace the gradient of each module parameter by its sum over all processes."""
         if self.size == 1:
