@@ -55,8 +55,9 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 def cases(found):
-    """Return one test case for each thing that is found on a page."""
-    return [pytest.param(x, id=f"{page.stem}-{n}") for page in WRITTEN for n, x in enumerate(found(page))]
+    """Return one test case for each thing that is found on a page; what stands on several pages is one case."""
+    places = {x: f"{page.stem}-{n}" for page in reversed(WRITTEN) for n, x in reversed(list(enumerate(found(page))))}
+    return [pytest.param(x, id=place) for x, place in places.items()]
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +82,10 @@ def folder(tmp_path_factory):
     network = start_network(partial(NAFNet, width=16), torch.Generator().manual_seed(0))
     save_file(network.state_dict(), folder / "net.safetensors")
     np.save(folder / "mask.npy", np.zeros((540, 540)))
+    (folder / "my_photographs").mkdir()
+    for name in ("holiday.jpg", "my_photographs/one.jpg"):
+        shutil.copy(ROOT / "recipes" / "samples" / "china.jpg", folder / name)
+    shutil.copy(ROOT / "recipes" / "samples" / "night.exr", folder / "street.exr")
     return folder
 
 
@@ -148,7 +153,7 @@ def test_the_page_of_commands_has_every_command():
 
 @pytest.mark.parametrize("page", WRITTEN, ids=lambda page: page.stem)
 def test_every_relative_link_resolves(page):
-    links = re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text(encoding="utf-8"))
+    links = re.findall(r"\]\((?!https?:|reference/)([^)#]+)", page.read_text(encoding="utf-8"))
     assert not [link for link in links if not (page.parent / link).is_file()]
 
 
@@ -157,6 +162,23 @@ def test_the_index_has_one_line_for_each_page():
     assert sorted(re.findall(r"^- \[[\w ]+\]\((\w+)\.md\): .+\.$", text, re.MULTILINE)) == sorted(
         page.stem for page in PAGES if page.stem != "index"
     )
+
+
+def test_the_gallery_has_a_section_with_command_picture_and_time_for_each_recipe():
+    text = (GUIDE / "gallery.md").read_text(encoding="utf-8")
+    sections = dict(re.findall(r"^## `(\w+)`\n(.*?)(?=^## )", text, re.MULTILINE | re.DOTALL))
+    assert sorted(sections) == sorted(path.stem for path in (ROOT / "recipes").glob("*.yaml"))
+    for name, section in sections.items():
+        assert re.search(rf"^    neusee (run|train) {name}\b", section, re.MULTILINE), name
+        assert "<!-- picture " in section, name
+        assert re.search(r"^Time: (\d+ s\b|half an hour|hours|days)", section, re.MULTILINE), name
+
+
+def test_the_gallery_credits_each_picture_that_ships():
+    credits = (GUIDE / "gallery.md").read_text(encoding="utf-8").partition("## Credits")[2]
+    shown = {path.name for kind in ("jpg", "exr") for path in (ROOT / "recipes" / "samples").glob(f"*.{kind}")}
+    assert shown
+    assert not [name for name in shown if f"`{name}`" not in credits]
 
 
 def test_the_readme_is_short_and_its_picture_small():

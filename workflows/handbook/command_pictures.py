@@ -21,18 +21,25 @@ class NoPicture(RuntimeError):
 
 
 def draw_pictures(
-    pictures: Iterable[Picture], work: Path, target: Path, progress: Callable[[str], None]
+    pictures: Iterable[Picture], work: Path, target: Path, progress: Callable[[str], None], strict: bool = True
 ) -> dict[Picture, str]:
-    """Run each command once in the folder ``work``, copy the pictures to ``target`` and return their file names."""
+    """Run each command once in the folder ``work``, copy the pictures to ``target`` and return their file names.
+
+    If a command fails, a ``strict`` build raises `NoPicture`; any other build says so and goes on without the picture.
+    """
     by_words: dict[tuple[str, ...], list[Picture]] = {}
     for picture in pictures:
         by_words.setdefault(picture.words, []).append(picture)
     target.mkdir(parents=True, exist_ok=True)
     names: dict[Picture, str] = {}
     for number, (words, wanted) in enumerate(by_words.items(), 1):
-        results = _run(words, work, work / f"results_{number}")
-        for picture in wanted:
-            names[picture] = _take(picture, results, target)
+        try:
+            results = _run(words, work, work / f"results_{number}")
+            names |= {picture: _take(picture, results, target) for picture in wanted}
+        except NoPicture as error:
+            if strict:
+                raise
+            progress(f"no picture: {error}")
         progress(f"command {number} of {len(by_words)}: neusee {' '.join(words)}")
     return names
 

@@ -57,14 +57,14 @@ def build_handbook(
     """Build the handbook in the folder ``out`` and return the path of its first page.
 
     ``reference`` has the pages that the program writes about itself, by path. Without ``pictures`` no command of a page
-    runs. A ``strict`` build fails at a link that leads nowhere.
+    runs. A ``strict`` build fails at a link that leads nowhere, and at a command of a page that fails.
     """
     check_modules()
     check_folder(out)
     pages = {**read_pages(), **reference}
     with TemporaryDirectory(prefix="neusee_handbook_") as folder:
         docs, site = Path(folder, "docs"), Path(folder, "site")
-        drawn = _draw(pages, Path(folder), docs / "pictures", progress) if pictures else {}
+        drawn = _draw(pages, Path(folder), docs / "pictures", progress, strict) if pictures else {}
         _write_docs(pages, drawn, docs)
         settings = Path(folder, "mkdocs.yml")
         settings.write_text(settings_text(pages, docs, site), encoding="utf-8")
@@ -110,9 +110,12 @@ def _named(entry: Any, pages: Mapping[str, str]) -> set[str]:
     return {path for each in entry for inner in each.values() for path in _named(inner, pages)}
 
 
-def _draw(pages: Mapping[str, str], work: Path, target: Path, progress: Callable[[str], None]) -> dict[Picture, str]:
+def _draw(
+    pages: Mapping[str, str], work: Path, target: Path, progress: Callable[[str], None], strict: bool
+) -> dict[Picture, str]:
     write_files(pages, work)
-    return draw_pictures([picture for text in pages.values() for picture in pictures_of(text)], work, target, progress)
+    wanted = [picture for text in pages.values() for picture in pictures_of(text)]
+    return draw_pictures(wanted, work, target, progress, strict)
 
 
 def _write_docs(pages: Mapping[str, str], drawn: Mapping[Picture, str], docs: Path) -> None:
