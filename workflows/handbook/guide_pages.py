@@ -64,9 +64,9 @@ def with_pictures(text: str, paths: Mapping[Picture, str]) -> str:
         picture = next(wanted)
         if picture not in paths:
             return mark[0]
-        caption = picture.caption
-        return (
-            f'<figure markdown="span">\n![{caption}]({paths[picture]})\n<figcaption>{caption}</figcaption>\n</figure>'
+        shown = (
+            f"[![{picture.caption}]({paths[picture]})]({paths[picture]})"  # a click shows the picture at its full size
         )
+        return f'<figure markdown="span">\n{shown}\n<figcaption>{picture.caption}</figcaption>\n</figure>'
 
     return _MARK.sub(figure, text)

@@ -71,6 +71,9 @@ def test_a_command_that_fails_is_named_with_its_message(tmp_path):
     picture = Picture(("run", "no_such_recipe"), "figures/a.png", "Nothing.")
     with pytest.raises(NoPicture, match=r"neusee run no_such_recipe ended with exit code 2: .*no_such_recipe"):
         draw_pictures([picture], tmp_path, tmp_path / "pictures", print)
+    said = []
+    assert draw_pictures([picture], tmp_path, tmp_path / "pictures", said.append, strict=False) == {}
+    assert said[0].startswith("no picture: neusee run no_such_recipe ended with exit code 2")
 
 
 def test_every_picture_of_the_guide_has_a_command_and_a_sentence():
@@ -216,3 +219,11 @@ def test_a_second_build_replaces_the_first(site, reference):
     build.build_handbook(site, reference, False, print)
     assert not (site / "old.html").exists()
     assert (site / "index.html").exists()
+
+
+@pytest.mark.long
+def test_every_picture_of_the_guide_is_drawn_by_its_command(reference, tmp_path):
+    pytest.importorskip("material")
+    page = build.build_handbook(tmp_path / "handbook", reference, True, print, strict=True)
+    wanted = {(p.words, p.file) for text in read_pages().values() for p in pictures_of(text)}
+    assert len(list((page.parent / "pictures").iterdir())) == len(wanted) > 30
