@@ -8,6 +8,7 @@ import importlib
 import re
 import shlex
 import shutil
+import zlib
 from functools import partial
 from pathlib import Path
 
@@ -187,6 +188,17 @@ def test_every_run_of_the_tutorial_and_the_how_tos_computes_its_outputs(words, s
     result = load(name, changes, folder).run(kept)
     assert result.recipe.outputs
     assert all(result[output] is not None for output in result.recipe.outputs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("code", cases(lambda page: blocks(page, "python")))
+def test_every_python_block_runs_with_the_small_camera(code, small_camera, kept, tmp_path, monkeypatch):
+    monkeypatch.setenv("NEUSEE_CACHE", str(kept.root))
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / f"block_{zlib.crc32(code.encode()):x}.py"
+    path.write_text(code, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    importlib.import_module(path.stem)
 
 
 def repeated(page):
