@@ -68,12 +68,12 @@ def test_the_files_of_the_reader_are_written(tmp_path):
 
 
 def test_a_command_that_fails_is_named_with_its_message(tmp_path):
-    picture = Picture(("run", "no_such_recipe"), "figures/a.png", "Nothing.")
-    with pytest.raises(NoPicture, match=r"neusee run no_such_recipe ended with exit code 2: .*no_such_recipe"):
+    picture = Picture(("cache", "no_such"), "figures/a.png", "Nothing.")
+    with pytest.raises(NoPicture, match=r"neusee cache no_such ended with exit code 2: .*no_such"):
         draw_pictures([picture], tmp_path, tmp_path / "pictures", print)
     said = []
     assert draw_pictures([picture], tmp_path, tmp_path / "pictures", said.append, strict=False) == {}
-    assert said[0].startswith("no picture: neusee run no_such_recipe ended with exit code 2")
+    assert said[0].startswith("no picture: neusee cache no_such ended with exit code 2")
 
 
 def test_every_picture_of_the_guide_has_a_command_and_a_sentence():
