@@ -31,6 +31,7 @@ def draw_pictures(
     for picture in pictures:
         by_words.setdefault(picture.words, []).append(picture)
     target.mkdir(parents=True, exist_ok=True)
+    progress(f"commands that draw pictures: {len(by_words)}; what the cache holds is not computed again")
     names: dict[Picture, str] = {}
     for number, (words, wanted) in enumerate(by_words.items(), 1):
         try:

@@ -73,7 +73,8 @@ def test_a_command_that_fails_is_named_with_its_message(tmp_path):
         draw_pictures([picture], tmp_path, tmp_path / "pictures", print)
     said = []
     assert draw_pictures([picture], tmp_path, tmp_path / "pictures", said.append, strict=False) == {}
-    assert said[0].startswith("no picture: neusee cache no_such ended with exit code 2")
+    assert said[0].startswith("commands that draw pictures: 1;")
+    assert said[1].startswith("no picture: neusee cache no_such ended with exit code 2")
 
 
 def test_every_picture_of_the_guide_has_a_command_and_a_sentence():
