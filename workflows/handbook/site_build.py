@@ -25,6 +25,7 @@ from neusee.workflows.handbook.guide_pages import (
     with_pictures,
     write_files,
 )
+from neusee.workflows.report.run_folder import writable_folder
 
 _MARK = ".neusee_handbook"  #: the file by which a folder is known as a handbook, which a new build may replace
 _REST = "More"  #: the section of the pages that the list `nav` of the settings does not name
@@ -44,9 +45,11 @@ def check_modules() -> None:
 
 
 def check_folder(out: Path) -> None:
-    """Raise `HandbookError` if ``out`` is a file, or holds other files than a handbook."""
-    if out.exists() and not out.is_dir():
-        raise HandbookError(f"{out} is a file: name a folder")
+    """Raise `HandbookError` if ``out`` cannot be written, or holds other files than a handbook."""
+    try:
+        writable_folder(out)
+    except ValueError as error:
+        raise HandbookError(f"--out: {error}") from None
     if out.is_dir() and any(out.iterdir()) and not (out / _MARK).is_file():
         raise HandbookError(f"{out} holds files that are no handbook, and a build replaces a folder: name a new folder")
 
@@ -138,8 +141,12 @@ def _run_mkdocs(settings: Path, strict: bool) -> None:
 
 
 def _replace(out: Path, site: Path) -> None:
-    """Put the new handbook in the place of an old one."""
-    if out.exists():
-        shutil.rmtree(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    shutil.move(site, out)
+    """Put the files of the new handbook in the place of the files of an old one."""
+    out.mkdir(parents=True, exist_ok=True)
+    for old in out.iterdir():
+        if old.is_dir() and not old.is_symlink():
+            shutil.rmtree(old)
+        else:
+            old.unlink()
+    for new in site.iterdir():
+        shutil.move(new, out / new.name)

@@ -126,9 +126,11 @@ def test_a_folder_with_other_files_is_refused_and_kept(monkeypatch, capsys, tmp_
     code, err = ended(["--out", str(tmp_path)], capsys)
     assert code == 2
     assert f"{tmp_path} holds files that are no handbook" in err
-    code, err = ended(["--out", str(tmp_path / "thesis.txt")], capsys)
-    assert code == 2
-    assert "thesis.txt is a file" in err
+    for place in ("thesis.txt", "thesis.txt/deep"):
+        code, err = ended(["--out", str(tmp_path / place)], capsys)
+        assert code == 2
+        assert "neusee handbook: --out: " in err
+        assert "thesis.txt" in err
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
 
 
@@ -215,10 +217,14 @@ def test_the_search_of_files_knows_every_page(site, reference):
 
 
 @pytest.mark.slow
-def test_a_second_build_replaces_the_first(site, reference):
+def test_a_second_build_replaces_the_first_and_follows_no_link(site, reference, tmp_path):
     (site / "old.html").write_text("old")
+    (site / "link").symlink_to(tmp_path)
+    (tmp_path / "thesis.txt").write_text("years of work")
     build.build_handbook(site, reference, False, print)
     assert not (site / "old.html").exists()
+    assert not (site / "link").is_symlink()
+    assert (tmp_path / "thesis.txt").exists()
     assert (site / "index.html").exists()
 
 
