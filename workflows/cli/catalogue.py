@@ -99,8 +99,8 @@ def nodes_lines(own: Own = MappingProxyType({})) -> list[str]:
     width = max(map(len, nodes), default=0)
     lines: list[str] = []
     for family, paths in groupby(nodes, lambda path: path.partition(".")[0]):
-        lines += ["", _first(family_title(family, own))]
-        lines += [f"{path:<{width}}  {_first(nodes[path].__doc__)}" for path in paths]
+        lines += ["", first_sentence(family_title(family, own))]
+        lines += [f"{path:<{width}}  {first_sentence(nodes[path].__doc__)}" for path in paths]
     lines += _networks(own)
     broken = broken_families().values()
     return [*lines[1:], *([""] if broken else []), *broken]
@@ -112,7 +112,7 @@ def _networks(own: Own) -> list[str]:
 
     lines = ["", "Network classes, for restore.network"]
     for family, module in own.items():
-        lines += [f"{family}.{name}  {_first(vars(x).get('__doc__'))}" for name, x in network_classes(module).items()]
+        lines += [f"{family}.{name}  {first_sentence(vars(x).get('__doc__'))}" for name, x in network_classes(module).items()]
     return lines if len(lines) > 2 else []
 
 
@@ -131,7 +131,8 @@ def node_lines(name: str, own: Own = MappingProxyType({})) -> list[str]:
     node, uses = nodes[name], list(_uses(name))
     lines = [name, "", *inspect.cleandoc(node.__doc__ or "").splitlines(), "", "inputs"]
     lines += [f"  {i}{' (optional)' if i in node.optional else ''}" for i in node.inputs] or ["  none"]
-    lines += ["", "parameters", *(_parameters(node) or ["  none"])]
+    rows = [[f"  {name}", words] for name, words in parameter_rows(node)]
+    lines += ["", "parameters", *(columns(rows) or ["  none"])]
     for path in dict.fromkeys(path for _, step in uses for path in _readings_of(step)):
         lines += ["", *_reading(path)]
     return [*lines, "", f"written in  {', '.join(dict.fromkeys(file for file, _ in uses)) or 'no recipe'}"]
@@ -149,13 +150,14 @@ def _recipes() -> Path:
     return Path(neusee.recipes.__file__).parent
 
 
-def _parameters(node: Node) -> list[str]:
+def parameter_rows(node: Node) -> list[list[str]]:
+    """Return the name of each parameter of a node, and its type and default value in words."""
     rows = []
     for name, field in node.params.model_fields.items():
         value = "none" if field.default is None else str(field.default)
         default = "required" if field.is_required() else f"default {value}"
-        rows.append([f"  {name}", f"{_kind(node.hints[name])}; {default}"])
-    return columns(rows)
+        rows.append([name, f"{_kind(node.hints[name])}; {default}"])
+    return rows
 
 
 def _kind(hint: Any) -> str:
@@ -230,6 +232,6 @@ def _reading(path: str) -> list[str]:
     ]
 
 
-def _first(text: str | None) -> str:
+def first_sentence(text: str | None) -> str:
     """Return the first sentence of a text."""
     return inspect.cleandoc(text or "").partition("\n\n")[0].replace("\n", " ").partition(". ")[0].rstrip(".")

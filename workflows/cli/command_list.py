@@ -35,6 +35,7 @@ COMMANDS = {
     "new": ("new_command", "Write the start of a node, network, mask, recipe or sensor."),
     "check": ("check_command", "Check whether nodes keep what the nodes of neusee keep."),
     "schema": ("catalogue", "Print the JSON schema of recipes for editors."),
+    "handbook": ("handbook_command", "Build the handbook with its pictures and open it."),
     "study": ("study_commands", "Study how accurate, stable and certain a recipe's numbers are."),
     "cache": ("cache_commands", "List, check, remove and keep stored results."),
 }

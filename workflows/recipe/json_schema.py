@@ -31,6 +31,18 @@ _DEVICE: Schema = {"type": ["string", "null"], "pattern": r"^(any|cpu|gpu|mps|cu
 _ANY: Schema = {}
 _FAMILY: Schema = {"type": "object", "additionalProperties": {"type": "string"}, "maxProperties": 1}
 _NODES: Schema = {"anyOf": [{"type": "string"}, _FAMILY]}
+_MEANINGS = {
+    "defaults": "Groups that come first, in order.",
+    "nodes": "Files and modules with your own nodes.",
+    "steps": "The graph: under each name a node, its inputs and its parameters; null removes a step.",
+    "seed": "Start of all random numbers.",
+    "tolerance": "Largest error of an output, relative to its largest element; 0 is exact.",
+    "outputs": "Steps whose results the run is for.",
+    "posterior": "Joint distribution of several values.",
+    "train": "Settings of `neusee train`.",
+    "train_lift": "Settings of the training of a network from RGB to spectra.",
+    "expect": "Numbers from an independent source, which each run checks.",
+}
 #: types of values that a reference may replace
 _REFERABLE = {"float", "int", "bool", "literal", "tuple", "list", "dict", "function-before"}
 _NUMBER = r"(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
@@ -46,20 +58,25 @@ def schema(own: Own = MappingProxyType({})) -> Schema:
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "neusee recipe",
         "type": "object",
-        "properties": {
-            "defaults": {"type": "array", "items": _defaults(), "description": "Groups that come first, in order."},
-            "nodes": {"type": "array", "items": _NODES, "description": "Files and modules with your own nodes."},
-            "steps": {"type": "object", "additionalProperties": {"$ref": "#/$defs/step"}},
-            "seed": {"anyOf": [{"type": "integer", "minimum": 0}, REFERENCE]},
-            "tolerance": {"anyOf": [{"type": "number", "minimum": 0}, REFERENCE]},
-            "outputs": {"type": ["array", "string"], "items": {"type": "string"}},
-            "posterior": {"anyOf": [{"type": "string"}, {"type": "object"}, {"type": "null"}]},
-            "train": {"anyOf": [{"$ref": "#/$defs/train"}, {"type": "null"}]},
-            "train_lift": {"type": ["object", "null"]},
-            "expect": {"type": "object", "additionalProperties": {"$ref": "#/$defs/expectation"}},
-        },
+        "properties": {name: {**value, "description": _MEANINGS[name]} for name, value in _keys().items()},
         "additionalProperties": True,
         "$defs": {"step": _step(nodes), "expectation": _expectation(), **_parameters(nodes), **_training()},
+    }
+
+
+def _keys() -> dict[str, Schema]:
+    """Return the JSON schema of the value of each key of a recipe."""
+    return {
+        "defaults": {"type": "array", "items": _defaults()},
+        "nodes": {"type": "array", "items": _NODES},
+        "steps": {"type": "object", "additionalProperties": {"$ref": "#/$defs/step"}},
+        "seed": {"anyOf": [{"type": "integer", "minimum": 0}, REFERENCE]},
+        "tolerance": {"anyOf": [{"type": "number", "minimum": 0}, REFERENCE]},
+        "outputs": {"type": ["array", "string"], "items": {"type": "string"}},
+        "posterior": {"anyOf": [{"type": "string"}, {"type": "object"}, {"type": "null"}]},
+        "train": {"anyOf": [{"$ref": "#/$defs/train"}, {"type": "null"}]},
+        "train_lift": {"type": ["object", "null"]},
+        "expect": {"type": "object", "additionalProperties": {"$ref": "#/$defs/expectation"}},
     }
 
 
