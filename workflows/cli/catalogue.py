@@ -112,7 +112,9 @@ def _networks(own: Own) -> list[str]:
 
     lines = ["", "Network classes, for restore.network"]
     for family, module in own.items():
-        lines += [f"{family}.{name}  {first_sentence(vars(x).get('__doc__'))}" for name, x in network_classes(module).items()]
+        lines += [
+            f"{family}.{name}  {first_sentence(vars(x).get('__doc__'))}" for name, x in network_classes(module).items()
+        ]
     return lines if len(lines) > 2 else []
 
 
