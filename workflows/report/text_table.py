@@ -20,7 +20,7 @@ def columns(rows: Rows, numbers: str = "<", gap: str = "  ") -> list[str]:
 def indented(rows: Rows) -> list[str]:
     """Return an indented line of text for each table row, with numbers aligned right and a dash for an empty cell."""
     full = [[name, *(cell or "–" for cell in cells)] for name, *cells in rows]
-    return [f"  {line}" for line in columns(full, ">", "   ")]
+    return [f"  {line}" for line in columns(full, ">", "  ")]
 
 
 def by_family(names: Iterable[str]) -> dict[str, list[str]]:

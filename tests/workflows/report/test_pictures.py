@@ -117,6 +117,10 @@ def drawings(light: SimpleNamespace) -> dict[str, tuple]:
             camera_overview.overview,
             dict(truth=scene(), plain=scene() + 0.3, mask=scene(), restored=scene(), spots={"green": spot()}),
         ),
+        "overview without restoration": (
+            camera_overview.overview,
+            dict(truth=scene(), plain=scene() + 0.3, mask=scene()),
+        ),
         "height": (optics.height, dict(pupil=pupil(4.0))),
         "psf": (optics.psf, dict(plain=light.plain, mask=light.mask, bands=bands(), pixel_pitch=PIXEL)),
         "suppression": (
@@ -147,7 +151,7 @@ def drawings(light: SimpleNamespace) -> dict[str, tuple]:
     }
 
 
-NAMES = [f.name for f in contents.FIGURES] + ["graph"]
+NAMES = [f.name for f in contents.FIGURES] + ["graph", "overview without restoration"]
 
 
 @pytest.mark.parametrize("name", NAMES)
