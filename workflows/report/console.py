@@ -9,20 +9,18 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-import textwrap
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.recipe.paper_readings import consequences
 from neusee.workflows.report.mask_story import SENTENCES
 from neusee.workflows.report.run_page import shape_of, unchecked_lines, unit_of
-from neusee.workflows.report.text_table import by_family, columns, indented, lasts
+from neusee.workflows.report.text_table import by_family, columns, indented, lasts, wrapped
 from neusee.workflows.report.tolerance_spent import said_of_economies
 
 if TYPE_CHECKING:
@@ -237,7 +235,7 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str
     lines += [doc["spectral"]["said"]] if doc.get("spectral") else []
     rows = [[row["name"], *row["cells"]] for row in doc["table"]["rows"]]
     lines += ["", *indented([["", *doc["table"]["columns"]], *rows])] if rows else []
-    lines += [line for text in doc["table"]["legend"] for line in _wrapped(text)]
+    lines += [line for text in doc["table"]["legend"] for line in wrapped(text)]
     lines += story_lines(doc)
     lines += ["", f"{doc['verdict']}  ({doc['counts']}, {doc['seconds']:.2f} s)"]
     lines += [
@@ -254,12 +252,8 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str
 
 def story_lines(doc: Mapping[str, Any]) -> list[str]:
     """Return the sentences on what the mask buys and costs, after an empty line and no wider than the terminal."""
-    lines = [line for name in SENTENCES if name in doc["story"] for line in _wrapped(doc["story"][name])]
+    lines = [line for name in SENTENCES if name in doc["story"] for line in wrapped(doc["story"][name])]
     return ["", *lines] if lines else []
-
-
-def _wrapped(text: str) -> list[str]:
-    return textwrap.wrap(text, get_terminal_size().columns, initial_indent="  ", subsequent_indent="  ")
 
 
 def left_out_line(doc: Mapping[str, Any]) -> str:
