@@ -57,8 +57,10 @@ def _buys(plain: Arm, mask: Arm, lsr: Mapping[str, float], laser: bool) -> str:
         change = f"the brightest pixel receives {much} {word} light than behind the plain lens ({ends}"
     if not laser:
         return f"No laser shines here, from which the mask could protect the sensor: {change})."
-    bought = "protection for the sensor" if less >= 1 + _EQUAL else "no protection here"
-    return f"The mask buys {bought}: {change}{'; ' * bool(lsr)}{_ratios(lsr)})."
+    bought = (
+        "protection for" if less >= _TIMES else "little protection for" if less >= 1 + _EQUAL else "no protection of"
+    )
+    return f"The mask buys {bought} the sensor: {change}{'; ' * bool(lsr)}{_ratios(lsr)})."
 
 
 def _suppression(lsr: Mapping[str, float]) -> str:
@@ -91,8 +93,8 @@ def _picture(plain: Arm, mask: Arm, restored: Arm) -> str:
     end = f", and {after:.1f} dB after restoration" if _QUALITY in restored else ""
     text = f"PSNR {before:.1f} dB with the plain lens{',' if end else ' and'} {behind:.1f} dB with the mask{end}"
     if behind >= before:
-        return f"It costs no picture quality here: {text}"
-    return f"It costs picture quality{', which restoration wins back' if after >= before else ''}: {text}"
+        return f"The mask costs no picture quality here: {text}"
+    return f"The mask costs picture quality{', which restoration wins back' if after >= before else ''}: {text}"
 
 
 def _saturation(plain: Arm, mask: Arm) -> str:

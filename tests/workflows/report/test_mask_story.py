@@ -26,26 +26,42 @@ def test_both_sentences_have_the_numbers_of_the_run():
     assert said(restored=17.67) == {
         "buys": "The mask buys protection for the sensor: the brightest pixel receives 236 times less light than "
         "behind the plain lens (3.87 in place of 912 times saturation; LSR 0.00149 at 530 nm).",
-        "costs": "It costs picture quality: PSNR 27.1 dB with the plain lens, 14.6 dB with the mask, and 17.7 dB after "
-        "restoration; 418 pixels saturate with the mask, 244 without.",
+        "costs": "The mask costs picture quality: PSNR 27.1 dB with the plain lens, 14.6 dB with the mask, and 17.7 dB "
+        "after restoration; 418 pixels saturate with the mask, 244 without.",
     }
 
 
 def test_a_mask_that_gains_nothing_is_not_praised():
     worse = said(plain=MASK, mask=PLAIN, lsr={"530 nm": 1.0})["buys"]
-    assert worse.startswith("The mask buys no protection here: the brightest pixel receives 236 times more light than")
+    assert worse.startswith(
+        "The mask buys no protection of the sensor: the brightest pixel receives 236 times more light than"
+    )
     same = said(mask=PLAIN, lsr={"530 nm": 1.0})["buys"]
-    assert same.startswith("The mask buys no protection here: the brightest pixel receives as much light as behind")
+    assert same.startswith(
+        "The mask buys no protection of the sensor: the brightest pixel receives as much light as behind"
+    )
     assert same.endswith("LSR 1 at 530 nm).")
 
 
 @pytest.mark.parametrize(
     ("mask", "restored", "opening"),
     [
-        (14.59, None, "It costs picture quality: PSNR 27.1 dB with the plain lens and 14.6 dB with the mask;"),
-        (14.59, 27.08, "It costs picture quality, which restoration wins back: PSNR 27.1 dB with the plain lens, 14.6"),
-        (27.08, 12.0, "It costs no picture quality here: PSNR 27.1 dB with the plain lens, 27.1 dB with the mask, and"),
-        (math.inf, None, "It costs no picture quality here: PSNR 27.1 dB with the plain lens and inf dB with the"),
+        (14.59, None, "The mask costs picture quality: PSNR 27.1 dB with the plain lens and 14.6 dB with the mask;"),
+        (
+            14.59,
+            27.08,
+            "The mask costs picture quality, which restoration wins back: PSNR 27.1 dB with the plain lens, 14.6",
+        ),
+        (
+            27.08,
+            12.0,
+            "The mask costs no picture quality here: PSNR 27.1 dB with the plain lens, 27.1 dB with the mask, and",
+        ),
+        (
+            math.inf,
+            None,
+            "The mask costs no picture quality here: PSNR 27.1 dB with the plain lens and inf dB with the",
+        ),
     ],
 )
 def test_the_cost_follows_from_the_quality(mask, restored, opening):
@@ -83,6 +99,13 @@ def test_without_a_laser_the_mask_is_not_said_to_protect():
 )
 def test_a_small_change_is_told_in_percent(peak, words):
     assert words in said({"peak/I_sat": 3.46}, {"peak/I_sat": peak}, lsr={}, laser=False)["buys"]
+
+
+def test_a_mask_that_protects_little_is_not_praised():
+    found = said({"peak/I_sat": 912.0}, {"peak/I_sat": 608.0})["buys"]
+    assert found.startswith(
+        "The mask buys little protection for the sensor: the brightest pixel receives 33 % less light"
+    )
 
 
 def test_several_lasers_have_the_least_and_the_largest_ratio():
