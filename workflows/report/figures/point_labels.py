@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 _OFFSETS = ((6, 4), (6, -12), (-6, 4), (-6, -12), (0, 9), (0, -17), (16, 13), (-16, 13), (16, -21), (-16, -21))
 _MARKER = 12  #: pixels, the side of the square that the marker of a point takes
 _APART = 3  #: pixels between two labels side by side
+_FRAME = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "black", "linewidth": 0.8}
 _FEW = 2.5  #: decades of an axis with numbers between the powers of ten
 _SUBS = (((1.0, 2.0, 5.0), 0.3), ((1.0, 3.0), 0.47))  #: numbers of a decade, and their least distance in decades
 _POINTS = 9.0  #: size of the numbers of an axis
@@ -24,15 +25,18 @@ class PointLabel(NamedTuple):
     colour: str
 
 
-def place_labels(figure: Any, points: Mapping[Any, Sequence[PointLabel]]) -> None:
-    """Write the labels of the points of each diagram where nothing is covered; omit labels without free space."""
+def place_labels(figure: Any, points: Mapping[Any, Sequence[PointLabel]], framed: bool = False) -> None:
+    """Write the labels of the points of each diagram where nothing is covered; omit labels without free space.
+
+    ``framed`` labels have a white box, to be read on a picture.
+    """
     figure.draw_without_rendering()
     renderer = figure.canvas.get_renderer()
     for ax, own in points.items():
         taken = _taken(ax, own, renderer)
         for point in own:
             if point.text:
-                _place(ax, point, taken, renderer)
+                _place(ax, point, taken, renderer, framed)
 
 
 def _taken(ax: Any, points: Sequence[PointLabel], renderer: Any) -> list[Any]:
@@ -48,12 +52,13 @@ def _taken(ax: Any, points: Sequence[PointLabel], renderer: Any) -> list[Any]:
     ]
 
 
-def _place(ax: Any, point: PointLabel, taken: list[Any], renderer: Any) -> None:
+def _place(ax: Any, point: PointLabel, taken: list[Any], renderer: Any, framed: bool) -> None:
     """Write a label at the first offset at which it overlaps no box in ``taken``, and append its box to ``taken``."""
     from matplotlib.patheffects import withStroke
 
     inside = ax.get_window_extent()
     style = {"color": point.colour, "path_effects": [withStroke(linewidth=2.5, foreground="white")], "zorder": 5}
+    style |= {"bbox": _FRAME} if framed else {}
     for x, y in _OFFSETS:
         side = "left" if x > 0 else "right" if x < 0 else "center"
         at = {"xytext": (x, y), "textcoords": "offset points", "ha": side}
@@ -61,7 +66,7 @@ def _place(ax: Any, point: PointLabel, taken: list[Any], renderer: Any) -> None:
         text.set_in_layout(False)
         box = text.get_window_extent(renderer)
         whole = inside.x0 <= box.x0 and box.x1 <= inside.x1 and inside.y0 <= box.y0 and box.y1 <= inside.y1
-        if whole and not any(box.padded(_APART, 0).overlaps(other) for other in taken):
+        if whole and not any(box.padded(_APART, _APART * framed).overlaps(other) for other in taken):
             taken.append(box)
             return
         text.remove()

@@ -17,7 +17,7 @@ LOOKS = {
 }
 _WIDTH, _HEIGHT = 1.75, 0.66  #: inches, space for a box
 _INSIDE = 0.92  #: width of a box, as a share of its space
-_LETTER = 6.2  #: points, mean width of a letter in a box
+_LETTER = 5.7  #: points, mean width of a letter in a box
 
 
 @drawn
@@ -110,7 +110,7 @@ def _box(ax: Any, x: float, y: float, text: str, look: str) -> None:
     style: dict[str, Any] = {"boxstyle": "round,pad=0.0,rounding_size=0.08", "mutation_aspect": 1.6, "zorder": 2}
     style |= {"facecolor": LOOKS[look][0], "edgecolor": "#444444", "linestyle": "--" if look == "left out" else "-"}
     ax.add_patch(FancyBboxPatch((x - _INSIDE / 2, y - 0.26), _INSIDE, 0.52, **style))
-    ax.text(x, y, text, ha="center", va="center", fontsize=9.5, zorder=3, linespacing=1.0)
+    ax.text(x, y, text, ha="center", va="center", fontsize=9.5, zorder=3, linespacing=1.15)
 
 
 def broken(name: str, letters: int, copies: str = "") -> str:

@@ -50,7 +50,7 @@ def spectra(
         ax.set_ylim(bottom=0.0)
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
     labels = [PointLabel(x, y, name, BLACK) for name, (y, x) in zip(_POINTS, points, strict=True)]
-    place_labels(figure, {axes[0, 0]: labels})
+    place_labels(figure, {axes[0, 0]: labels}, framed=True)
     return figure
 
 
