@@ -41,7 +41,7 @@ def test_a_label_without_free_space_is_omitted():
         assert box.x1 <= inside.x1
 
 
-@pytest.mark.parametrize(("low", "high"), [(1e5, 9e5), (2e-6, 4e6), (3e-5, 5e-3), (0.2, 30)])
+@pytest.mark.parametrize(("low", "high"), [(1e5, 9e5), (2e-6, 4e6), (3e-5, 5e-3)])
 def test_plain_numbers_are_apart(low, high):
     figure, axes = canvas(2.4, 2.0)
     ax = axes[0, 0]
