@@ -15,6 +15,7 @@ from neusee.workflows.evaluation.confidence_intervals import MetricTable
 from neusee.workflows.placement.heft_schedule import Schedule, Slot
 from neusee.workflows.report.figures import gantt, numerics, optics, photon_transfer, recipe_graph, scene_spectra
 from neusee.workflows.report.figures.style import canvas
+from neusee.workflows.studies.accuracy import accuracy_figures
 from neusee.workflows.studies.leave_out import leave_out_study
 from neusee.workflows.studies.leave_out.scene_costs import SceneCost
 from neusee.workflows.studies.stability.case_result import Cell
@@ -130,6 +131,12 @@ def test_numbers_that_differ_in_the_last_digits_are_short():
     for ax, offset in zip(figure.axes, (True, False), strict=True):
         assert bool(ax.xaxis.get_offset_text().get_text()) == offset
         assert max(len(label.get_text()) for label in ax.get_xticklabels()) <= 8
+
+
+def test_the_legend_of_one_step_is_no_wider_than_its_diagram():
+    names = ("precision", "method", "window", "samples of the pupil")
+    lines = [accuracy_figures.Line(name, [accuracy_figures.Dot(1e-3, 1e-6, "fft")]) for name in names]
+    accuracy_figures.steps([("optics.psf", lines, 1e-2)])
 
 
 def test_radii_of_a_small_window_are_plain_numbers():
