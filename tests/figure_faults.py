@@ -90,12 +90,14 @@ def _texts(figure: Any, axes: list[Any]) -> list[Any]:
 
 
 def _tick_labels(axis: Any) -> list[Any]:
-    low, high = sorted(axis.get_view_interval())
-    rim = 1e-6 * (high - low)
     if not axis.get_visible():
         return []
+    scale = axis.get_transform()  # of a logarithmic axis, for example: its rim is a share of its decades
+    low, high = sorted(scale.transform(np.asarray(axis.get_view_interval(), dtype=float)))
+    rim = 1e-6 * (high - low)
     ticks = [*axis.get_major_ticks(), *axis.get_minor_ticks()]
-    seen = [tick for tick in ticks if low - rim <= tick.get_loc() <= high + rim]
+    places = scale.transform(np.array([tick.get_loc() for tick in ticks], dtype=float))
+    seen = [tick for tick, place in zip(ticks, places, strict=True) if low - rim <= place <= high + rim]
     return [label for tick in seen for label in (tick.label1, tick.label2)]
 
 
@@ -120,11 +122,21 @@ def _same_looks(figure: Any, axes: list[Any]) -> list[str]:
     found = []
     for legend in legends:
         names = [text.get_text() for text in legend.get_texts()]
-        looks = dict(zip(names, map(_look, legend.legend_handles), strict=True))
+        looks = dict(zip(names, map(_looks, _entries(legend)), strict=True))
         repeated = {look for look, times in Counter(looks.values()).items() if times > 1}
         same = [name for name, look in looks.items() if look in repeated]
         found += [f"the legend has entries that look the same: {', '.join(same)}"] if same else []
     return found
+
+
+def _entries(legend: Any) -> list[list[Any]]:
+    """Return all artists of each entry of a legend, such as the line, the marker and the error bar of a point."""
+    columns = legend._legend_handle_box.get_children()
+    return [entry.get_children()[0].get_children() for column in columns for entry in column.get_children()]
+
+
+def _looks(artists: list[Any]) -> tuple[tuple[str, ...], ...]:
+    return tuple(map(_look, artists))
 
 
 def _look(handle: Any) -> tuple[str, ...]:

@@ -30,6 +30,24 @@ def test_a_sound_figure_has_no_fault():
     assert faults(lambda figure, ax: ax.legend()) == []
 
 
+def far_apart(figure, ax):
+    ax.loglog([0.3, 1e5], [1e-17, 1e-5])
+    ax.set(xlim=(0.15, 6e5), ylim=(4e-18, 2e-4))  # the numbers 0.1 and 1e-18 are just outside, and hidden
+
+
+def by_markers(figure, ax):
+    ax.clear()
+    for mark in "os":
+        ax.errorbar([1, 2], [1, 2], yerr=0.1, marker=mark, color="black", label=f"with {mark}")
+    ax.set_xlim(0, 3)
+    ax.legend()
+
+
+@pytest.mark.parametrize("draw", [far_apart, by_markers])
+def test_what_a_reader_tells_apart_is_no_fault(draw):
+    assert faults(draw) == []
+
+
 def twins(figure, ax):
     ax.plot([1, 2], [2, 1], color=ax.lines[0].get_color(), label="a twin")
     ax.legend()

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE, "#56B4E9", "#CC79A7", BLACK, "#777777")
 _STYLES = ("-", "--", ":", "-.")  #: line styles, of which the next begins when all colours are used
+_MARKERS = dict(zip(_STYLES, "osD^", strict=True))  #: marker of a point beside the line style of a curve
 _GREY = "#777777"
 _LETTERS = 16  #: characters of the longest row name that stays on one line
 
@@ -93,7 +94,7 @@ def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], nam
 def _top(tables: Iterable[MetricTable], metric: str) -> float:
     """Return the end of an axis that shows every mean, and intervals up to three times the largest mean."""
     found = [mean(table.at(metric, i)) for table in tables for i in range(len(table.strengths))]
-    largest = max(x.mean for x in found)
+    largest = max((x.mean for x in found if x.mean > 0), default=0.0)
     return 1.05 * max(largest, min(3 * largest, max([x.high for x in found if x.high > 0], default=0.0))) or 1.0
 
 
@@ -143,10 +144,10 @@ def plane(masks: Mapping[str, MaskOptics]) -> Any:
     ax.axvspan(x[0], floor, color=BLUE, alpha=0.12, linewidth=0, label="LSR: no mask that keeps its light is here")
     looks = _looks(list(masks))
     for name, mask in masks.items():
-        at, colour = float(mask.lsr.mean()), looks[name]["color"]
+        at, colour, mark = float(mask.lsr.mean()), looks[name]["color"], _MARKERS[looks[name]["linestyle"]]
         ax.plot([at, at], [mask.median.mean(), mask.rms.mean()], color=colour, linewidth=0.8)
-        ax.plot(at, mask.rms.mean(), "o", markersize=6, markerfacecolor="none", color=colour)
-        ax.plot(at, mask.median.mean(), "o", markersize=7, color=colour, label=name)
+        ax.plot(at, mask.rms.mean(), mark, markersize=6, markerfacecolor="none", color=colour)
+        ax.plot(at, mask.median.mean(), mark, markersize=7, color=colour, label=name)
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.set_xlim(x[0], x[-1])

@@ -13,12 +13,14 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.recipe.paper_readings import consequences
+from neusee.workflows.report.mask_story import SENTENCES
 from neusee.workflows.report.run_page import shape_of, unchecked_lines, unit_of
-from neusee.workflows.report.text_table import by_family, columns, indented, lasts
+from neusee.workflows.report.text_table import by_family, columns, indented, lasts, wrapped
 from neusee.workflows.report.tolerance_spent import said_of_economies
 
 if TYPE_CHECKING:
@@ -227,13 +229,14 @@ def forecast_line(seconds: float, steps: int, unknown: int) -> str:
 
 
 def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str]:
-    """Return the lines to print after a run: steps left out, result table, verdict, report path, next commands."""
+    """Return the lines to print after a run: steps left out, result table, gain by the mask, verdict, next commands."""
     lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
     lines += [left_out_line(doc)] if doc["left_out"] else []
     lines += [doc["spectral"]["said"]] if doc.get("spectral") else []
     rows = [[row["name"], *row["cells"]] for row in doc["table"]["rows"]]
     lines += ["", *indented([["", *doc["table"]["columns"]], *rows])] if rows else []
-    lines += [f"  {line}" for line in (*doc["table"]["legend"], *doc["table"].get("balance", ()))]
+    lines += [line for text in doc["table"]["legend"] for line in wrapped(text)]
+    lines += story_lines(doc)
     lines += ["", f"{doc['verdict']}  ({doc['counts']}, {doc['seconds']:.2f} s)"]
     lines += [
         f"  missed: {e['name']} = {e['found']:.5g}, expected {e['wanted']:.5g} ± {100 * e['rtol']:.2g} %"
@@ -242,7 +245,15 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str
     ]
     lines += [f"  {line}" for line in unchecked_lines(doc["unchecked"])]
     lines += [f"warning  {line}" for line in doc["warnings"]]
+    shown = any(figure["name"] == "overview" for figure in doc["figures"])
+    lines += [f"pictures {Path(path).parent / 'figures' / 'overview.png'}"] if shown else []
     return [*lines, f"report   {path}", "", "next", *[f"  {line}" for line in again]]
+
+
+def story_lines(doc: Mapping[str, Any]) -> list[str]:
+    """Return the sentences on what the mask buys and costs, after an empty line and no wider than the terminal."""
+    lines = [line for name in SENTENCES if name in doc["story"] for line in wrapped(doc["story"][name])]
+    return ["", *lines] if lines else []
 
 
 def left_out_line(doc: Mapping[str, Any]) -> str:
@@ -269,7 +280,7 @@ def next_commands(recipe: Recipe, words: Sequence[str], works: Callable[[Sequenc
     tried = {what: again for what, again in changed.items() if again and works(again)}
     shown = [[shlex.join(["neusee", "run", *again]), f"# {what}"] for what, again in tried.items()]
     shown += [
-        [shlex.join(["neusee", "plan", *words]), "# what would run, and for how long"],
+        [shlex.join(["neusee", "plan", *words]), "# what would run, how long"],
         ["neusee nodes optics.psf", "# what a step computes, and its source"],
         ["neusee recipes", "# what else there is"],
     ]

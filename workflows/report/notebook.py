@@ -87,7 +87,7 @@ def _of_table(result: Result) -> list[str]:
 
 
 def _of_overview() -> dict[str, str]:
-    return {name: need for name, need in FIGURES[0].needs.items() if not need.startswith("?")}
+    return {name: need.removeprefix("?") for name, need in FIGURES[0].needs.items() if "*" not in need}
 
 
 def _at_hand(result: Result, steps: Iterable[str]) -> dict[str, Any]:
@@ -159,10 +159,10 @@ def _pictures(values: Mapping[str, Any]) -> list[dict[str, Any]]:
     from neusee.workflows.report.figures.camera_overview import centre, high
 
     needs = _of_overview()
-    if all(need in values for need in needs.values()):
+    if all(need in values for need in FIGURES[0].needs.values() if not need.startswith("?")):
         truth = values[needs["truth"]]
         white = high(truth)
-        shown = {name: centre(values[need], truth) / white for name, need in needs.items()}
+        shown = {name: centre(values[need], truth) / white for name, need in needs.items() if need in values}
     else:
         found = {name: value for name, value in values.items() if _is_picture(value)}
         shown = {name: image.float() / high(image.float()) for name, image in list(found.items())[:4]}

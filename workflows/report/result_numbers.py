@@ -47,7 +47,17 @@ def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
 
 def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, Any]:
     """Return the table for plain lens, mask and restored picture, with the rows and columns that have numbers."""
-    band, where = _band(recipe, keys, value)
+    _, where = _band(recipe, keys, value)
+    numbers = arms(recipe, keys, value)
+    columns = [column for column in _COLUMNS if any(column in cells for cells in numbers.values())]
+    rows = [{"name": name, "cells": [_text(cells, c) for c in columns]} for name, cells in numbers.items() if cells]
+    legend = [text.format(band=where) for column, text in _LEGEND.items() if column in columns]
+    return {"columns": columns, "rows": rows, "legend": legend}
+
+
+def arms(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, dict[str, float]]:
+    """Return the numbers of the plain lens, of the mask and of the restored picture, by column of the result table."""
+    band, _ = _band(recipe, keys, value)
     numbers: dict[str, dict[str, float]] = {}
     for name, cells in TABLE.items():
         known = {column: value(step) for column, step in cells.items() if step in keys}
@@ -56,10 +66,23 @@ def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, An
             for column, (x, field, number, _) in _COLUMNS.items()
             if (found := _field(known.get(x), field)) is not None
         }
-    columns = [column for column in _COLUMNS if any(column in cells for cells in numbers.values())]
-    rows = [{"name": name, "cells": [_text(cells, c) for c in columns]} for name, cells in numbers.items() if cells]
-    legend = [text.format(band=where) for column, text in _LEGEND.items() if column in columns]
-    return {"columns": columns, "rows": rows, "legend": legend, "balance": balance(numbers, bool(_lines(recipe, keys)))}
+    return numbers
+
+
+def lines_of(recipe: Recipe, keys: Container[str]) -> list[str]:
+    """Return the steps among ``keys`` that give the spectral line of a laser whose strength is not 0."""
+    strengths = {name: recipe.config.values.get(f"lasers.{name[5:-1]}.strength") for name in _lines(recipe, keys)}
+    return [name for name, strength in strengths.items() if strength != 0]
+
+
+def suppressed(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, float]:
+    """Return the LSR of the mask at the wavelength of each laser that shines, by wavelength in nm as text."""
+    step = TABLE["with mask"]["LSR"]
+    if step not in keys or BANDS not in keys:
+        return {}
+    lsr, centres = value(step).flatten(), value(BANDS).centres
+    at = (nearest(centres, mean_wavelength(value(line))) for line in lines_of(recipe, keys))
+    return {name: float(lsr[min(band, lsr.numel() - 1)]) for band, name in at}
 
 
 def _field(found: Any, field: str) -> Tensor | None:
@@ -71,52 +94,6 @@ def _field(found: Any, field: str) -> Tensor | None:
 def _text(cells: Mapping[str, float], column: str) -> str:
     """Return a number of the result table as text, or an empty text if the table has no number there."""
     return _COLUMNS[column][3].format(cells[column]) if column in cells else ""
-
-
-def balance(numbers: Mapping[str, Mapping[str, float]], laser: bool = True) -> list[str]:
-    """Return what the mask gains and what the mask costs in a run as sentences, from the rows of the result table.
-
-    ``laser`` says whether a laser shines in this run.
-    """
-    plain, mask, restored = (numbers.get(name, {}) for name in ("plain lens", "with mask", "restored"))
-    gain = _gain(plain, mask, laser)
-    return [*gain, *_price(plain, mask, restored)] if gain else []
-
-
-def _gain(plain: Mapping[str, float], mask: Mapping[str, float], laser: bool) -> list[str]:
-    """Return a sentence with the ratio of the irradiance of the brightest pixel without and with the mask."""
-    peak = "peak/I_sat"
-    if not (plain.get(peak, 0.0) > 0 and mask.get(peak, 0.0) > 0):
-        return []
-    less = plain[peak] / mask[peak]
-    ends = f"{_text(mask, peak)} in place of {_text(plain, peak)} times the saturation irradiance"
-    if 0.99 < less < 1.01:
-        return [f"The mask does not change the light of the brightest pixel ({ends})."]
-    if less < 1:
-        return [f"The mask does not protect the sensor here: the brightest pixel receives {_times(1 / less)} times "
-                f"more light than behind the plain lens ({ends})."]  # fmt: skip
-    lower = f"the brightest pixel receives {_times(less)} times less light than behind the plain lens ({ends})"
-    if not laser:
-        return [f"No laser shines in this run, from which the mask could protect the sensor: {lower}."]
-    return [f"What the mask is for: {lower}, which protects the sensor from damage by a strong laser."]
-
-
-def _times(ratio: float) -> str:
-    """Return a ratio as text with three digits or, from 1000 on, as a whole number with commas."""
-    return f"{ratio:.3g}" if ratio < 999.5 else f"{ratio:,.0f}"
-
-
-def _price(plain: Mapping[str, float], mask: Mapping[str, float], restored: Mapping[str, float]) -> list[str]:
-    """Return a sentence with the picture quality and the saturated pixels without and with the mask."""
-    quality, lost, text = "PSNR (dB)", "saturated px", ""
-    worse = mask.get(quality, 0.0) < plain.get(quality, 0.0)
-    if quality in plain and quality in mask:
-        after = f" ({_text(restored, quality)} dB after restoration)" if quality in restored else ""
-        text = f"a PSNR of {_text(mask, quality)} dB{after} in place of {_text(plain, quality)} dB"
-    if lost in plain and lost in mask and plain[lost] != mask[lost]:
-        joint = (", but " if worse and mask[lost] < plain[lost] else ", and ") if text else ""
-        text += f"{joint}{_text(mask, lost)} saturated pixels in place of {_text(plain, lost)}"
-    return [f"{'The price' if worse else 'The picture'} with the mask: {text}."] if text else []
 
 
 def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, str]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Sequence
+from shutil import get_terminal_size
 
 Rows = Sequence[Sequence[str]]
 
@@ -20,7 +22,12 @@ def columns(rows: Rows, numbers: str = "<", gap: str = "  ") -> list[str]:
 def indented(rows: Rows) -> list[str]:
     """Return an indented line of text for each table row, with numbers aligned right and a dash for an empty cell."""
     full = [[name, *(cell or "–" for cell in cells)] for name, *cells in rows]
-    return [f"  {line}" for line in columns(full, ">", "   ")]
+    return [f"  {line}" for line in columns(full, ">", "  ")]
+
+
+def wrapped(text: str) -> list[str]:
+    """Return a text as indented lines that are no wider than the terminal."""
+    return textwrap.wrap(text, get_terminal_size().columns, initial_indent="  ", subsequent_indent="  ")
 
 
 def by_family(names: Iterable[str]) -> dict[str, list[str]]:

@@ -398,6 +398,8 @@ def test_the_overview_is_shown_by_one_stretch():
     pixels = [numpy.asarray(Image.open(io.BytesIO(base64.b64decode(p["png"])))) for p in made]
     assert [p.shape for p in pixels] == [(16, 16, 3)] * 4
     assert [int(p[0, 0, 0]) for p in pixels] == [255, 137, 0, 255]
+    del values["restored"]
+    assert [p["name"] for p in notebook._pictures({**values, "raw": white})] == ["truth", "plain lens", "with mask"]
 
 
 def test_showing_a_result_computes_nothing_that_took_long(store, monkeypatch):

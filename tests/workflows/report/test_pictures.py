@@ -149,6 +149,11 @@ def drawings(light: SimpleNamespace, table_arguments: dict) -> dict[str, tuple]:
     }
 
 
+def test_a_run_without_restoration_has_an_overview():
+    figure = camera_overview.overview.__wrapped__(truth=scene(), plain=scene() + 0.3, mask=scene())
+    assert [ax.get_title() for ax in figure.axes] == ["truth", "plain lens", "with mask"]
+
+
 NAMES = [f.name for f in contents.FIGURES] + ["graph"]
 
 

@@ -41,6 +41,20 @@ def test_a_label_without_free_space_is_omitted():
         assert box.x1 <= inside.x1
 
 
+@pytest.mark.parametrize(("low", "high"), [(1e5, 9e5), (2e-6, 4e6), (3e-5, 5e-3)])
+def test_plain_numbers_are_apart(low, high):
+    figure, axes = canvas(2.4, 2.0)
+    ax = axes[0, 0]
+    ax.loglog([low, high], [1, 2], "o")
+    plain_ticks(ax.xaxis)
+    figure.draw_without_rendering()
+    end = ax.get_xlim()
+    labels = [t.label1 for t in ax.xaxis.get_major_ticks() if end[0] <= t.get_loc() <= end[1] and t.label1.get_text()]
+    boxes = [label.get_window_extent(figure.canvas.get_renderer()) for label in labels]
+    assert len(boxes) >= 1
+    assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+
+
 @pytest.mark.parametrize(("low", "high"), [(6, 80), (0.02, 3), (1, 1e4)])
 def test_times_are_plain_numbers(low, high):
     figure, axes = canvas(5.0, 3.5)

@@ -16,7 +16,6 @@ from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
 from neusee.workflows.report import result_numbers, run_folder, run_page, run_pictures, run_timing
-from neusee.workflows.report.console import closing
 from neusee.workflows.report.figures import gantt
 from neusee.workflows.report.run_folder import find_run, new_run
 from neusee.workflows.simulation.simulate_recipe import simulate
@@ -184,60 +183,6 @@ def test_sentences_have_room_beside_wide_columns_and_show_no_backticks(done):
     assert '<th class="why">contradiction in the paper</th><th class="why">why</th>' in text
     assert re.search(r"\.why \{ min-width: \d+rem; \}", text)
     assert "<td>of <code>d</code> (C1)</td><td><code>e</code> &lt; f</td>" in text
-
-
-GAIN = {"peak/I_sat": 912.3, "PSNR (dB)": 27.07, "saturated px": 244.0}
-PRICE = {"peak/I_sat": 3.867, "PSNR (dB)": 14.59, "saturated px": 418.0}
-
-
-def test_the_page_says_what_a_mask_is_for_and_what_it_costs(done):
-    numbers = {"plain lens": GAIN, "with mask": PRICE, "restored": {"PSNR (dB)": 17.67}}
-    gain, price = result_numbers.balance(numbers)
-    assert "236 times less light than behind the plain lens (3.867 in place of 912.3 times the saturation" in gain
-    assert price == (
-        "The price with the mask: a PSNR of 14.59 dB (17.67 dB after restoration) in place of 27.07 dB, "
-        "and 418 saturated pixels in place of 244."
-    )
-    doc = {**done.document, "table": {**done.document["table"], "rows": [{"name": "a", "cells": []}]}}
-    assert gain not in run_page.page(doc, {})
-    doc["table"]["balance"] = [gain, price]
-    assert f"<p>{gain}</p>\n<p>{price}</p>" in run_page.page(doc, {})
-
-
-def test_a_mask_that_gains_nothing_is_not_praised():
-    (worse, price) = result_numbers.balance({"plain lens": PRICE, "with mask": GAIN})
-    assert worse.startswith("The mask does not protect the sensor here: the brightest pixel receives 236 times more")
-    assert price.startswith("The picture with the mask: a PSNR of 27.07 dB in place of 14.59 dB")
-    (same, _) = result_numbers.balance({"plain lens": GAIN, "with mask": GAIN})
-    assert same.startswith("The mask does not change")
-    assert result_numbers.balance({"plain lens": GAIN}) == []
-
-
-def test_the_terminal_says_what_a_mask_is_for_and_what_it_costs(done):
-    said = result_numbers.balance({"plain lens": GAIN, "with mask": PRICE})
-    doc = {**done.document, "table": {**done.document["table"], "balance": said}}
-    lines = closing(doc, "report.html", [])
-    assert [line.strip() for line in lines if line.strip() in said] == said
-
-
-def test_a_gain_is_not_called_a_price_and_an_equal_number_is_not_said():
-    (_, price) = result_numbers.balance({"plain lens": GAIN, "with mask": PRICE | {"saturated px": 0.0}})
-    assert price == (
-        "The price with the mask: a PSNR of 14.59 dB in place of 27.07 dB, but 0 saturated pixels in place of 244."
-    )
-    (_, price) = result_numbers.balance({"plain lens": GAIN, "with mask": PRICE | {"saturated px": 244.0}})
-    assert price == "The price with the mask: a PSNR of 14.59 dB in place of 27.07 dB."
-
-
-def test_a_large_ratio_has_no_exponent():
-    (gain, _) = result_numbers.balance({"plain lens": GAIN | {"peak/I_sat": 9.095e5}, "with mask": PRICE})
-    assert "receives 235,195 times less light" in gain
-
-
-def test_without_a_laser_the_mask_is_not_said_to_protect():
-    (gain, _) = result_numbers.balance({"plain lens": GAIN, "with mask": PRICE}, laser=False)
-    assert gain.startswith("No laser shines in this run")
-    assert "which protects" not in gain
 
 
 def test_a_section_without_a_figure_is_left_out_and_its_reason_is_a_note(done):

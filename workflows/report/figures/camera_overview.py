@@ -1,4 +1,4 @@
-"""Camera overview: the scene, its pictures without and with mask, the restored picture and the restoration error."""
+"""Camera overview: the scene, its pictures without and with mask, and the restored picture with its error."""
 
 from __future__ import annotations
 
@@ -13,22 +13,33 @@ from neusee.workflows.report.figures.style import ORANGE, canvas, drawn, encoded
 
 @drawn
 def overview(
-    *, truth: Tensor, plain: Tensor, mask: Tensor, restored: Tensor, spots: Mapping[str, Tensor] | None = None
+    *,
+    truth: Tensor,
+    plain: Tensor,
+    mask: Tensor,
+    restored: Tensor | None = None,
+    spots: Mapping[str, Tensor] | None = None,
 ) -> Any:
-    """Draw the scene, its pictures without and with mask, the restored picture and the restoration error."""
+    """Draw the scene, its pictures without and with mask, and the restored picture with its error if it is given."""
     white = high(truth)
-    pictures = {"truth": truth, "plain lens": plain, "with mask": mask, "restored": restored}
-    figure, axes = canvas(13.0, 3.4, 1, 5)
+    pictures = {"truth": truth, "plain lens": plain, "with mask": mask}
+    pictures |= {} if restored is None else {"restored": restored}
+    count = len(pictures) + (restored is not None)
+    figure, axes = canvas(2.6 * count, 3.4, 1, count)
     for ax, (name, image) in zip(axes[0], pictures.items(), strict=False):
         picture(ax, encoded(centre(image, truth) / white), name)
         _ring(ax, spots or {}, truth)
-    error = (centre(restored, truth) - truth).abs().mean(0) / white
-    shown = picture(axes[0, 4], error.cpu().numpy(), "|restored − truth|", cmap="viridis", vmin=0.0, vmax=high(error))
-    _ring(axes[0, 4], spots or {}, truth)
-    bar = figure.colorbar(shown, ax=axes[0, 4], fraction=0.046, pad=0.03, extend="max")
+    if restored is not None:
+        _error(figure, axes[0, -1], (centre(restored, truth) - truth).abs().mean(0) / white)
+        _ring(axes[0, -1], spots or {}, truth)
+    return figure
+
+
+def _error(figure: Any, ax: Any, error: Tensor) -> None:
+    shown = picture(ax, error.cpu().numpy(), "|restored − truth|", cmap="viridis", vmin=0.0, vmax=high(error))
+    bar = figure.colorbar(shown, ax=ax, fraction=0.046, pad=0.03, extend="max")
     bar.set_label("fraction of white", fontsize=9)
     bar.ax.tick_params(labelsize=9)
-    return figure
 
 
 def high(values: Tensor) -> float:

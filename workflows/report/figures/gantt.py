@@ -25,8 +25,8 @@ def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
     """
     ran = {step: (lane, began, seconds) for step, lane, began, seconds in rows}
     plan = {slot.task: (slot.device, slot.start, slot.end - slot.start) for slot in schedule.slots}
-    lanes = list(dict.fromkeys([*schedule.peak, *(lane for lane, _, _ in ran.values())]))
-    lanes = [lane for lane in lanes if any(span[0] == lane for span in (*plan.values(), *ran.values()))]
+    used = dict.fromkeys(lane for lane, _, _ in (*plan.values(), *ran.values()))
+    lanes = [*(lane for lane in schedule.peak if lane in used), *(lane for lane in used if lane not in schedule.peak)]
     steps = _shown(plan, ran)
     end = max((start + took for _, start, took in (*plan.values(), *ran.values())), default=0.0) or 1.0
     scale, unit = _unit(end)

@@ -31,7 +31,7 @@ def error_time(*, step: Callable[..., Any], pupil: Pupil) -> Any:
     plain_ticks(ax.xaxis)
     xlabel = "run time (ms), fastest of three; labels: window in pixels"
     ax.set(title="PSF of one band: error against run time", xlabel=xlabel, ylabel="largest error / peak")
-    ax.legend(loc="center left")
+    figure.legend(loc="outside lower center", ncols=2)
     place_labels(figure, {ax: [PointLabel(1e3 * seconds, e, f"{window}²", BLACK) for _, window, seconds, e in rows]})
     return figure
 

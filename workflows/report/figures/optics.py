@@ -10,6 +10,7 @@ from torch import Tensor
 from neusee.nodes import metrics
 from neusee.nodes.optics import mask_turns
 from neusee.nodes.values import Bands, Psf, Pupil
+from neusee.workflows.report.figures.point_labels import plain_ticks
 from neusee.workflows.report.figures.style import BLUE, GREEN, VERMILION, canvas, drawn, nanometres, nearest, picture
 
 _WAVELENGTHS = (450e-9, 550e-9, 638e-9)  #: m, at which phase and PSF are drawn
@@ -84,6 +85,7 @@ def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
     title = f"{arm}: encircled energy"
     ax.set(ylim=(0.0, 1.02), title=title, xlabel="radius (µm)", ylabel="share of the pupil's light")
     ax.legend(loc="best")
+    plain_ticks(ax.xaxis)
 
 
 @drawn

@@ -30,14 +30,15 @@ def transfer(*, measured: Tensor) -> Any:
     ax.loglog(light.numpy(), predicted[seen].sqrt().numpy(), "-", color="#777777", linewidth=1.2, label="predicted")
     shot = (predicted[seen] - predicted[0]).clamp_min(0.0).sqrt()
     ax.loglog(light.numpy(), shot.numpy(), "--", color=BLUE, label="shot noise, slope ½")
-    ax.axhline(floor, color=GREEN, linestyle="-.", label=f"dark noise, {floor:.3g} DN, slope 0")
+    if floor > 0:  # a sensor without noise has no floor, which a logarithmic axis could not show
+        ax.axhline(floor, color=GREEN, linestyle="-.", label=f"dark noise, {floor:.3g} DN, slope 0")
     full = float(signal.max())
     ax.axvline(full, color=VERMILION, linestyle=":", label=f"largest signal, {full:,.0f} DN above dark")
-    least = min([floor, *variance[seen].sqrt().tolist()]) / 3
+    least = min([x for x in (floor, *variance[seen].sqrt().tolist()) if x > 0], default=1.0) / 3
     if bool(clipped.any()):
         heights = variance[clipped].sqrt().clamp_min(1.3 * least)
         ax.loglog(signal[clipped].numpy(), heights.numpy(), "v", label="clipped: noise at most as drawn", **_OPEN)
-    ax.set_ylim(least, 3 * float(predicted.max().sqrt()))
+    ax.set_ylim(least, 3 * max(float(predicted.max().sqrt()), least))
     title = "photon-transfer curve of this sensor"
     ax.set(title=title, xlabel="mean above dark (DN)", ylabel="standard deviation (DN)")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)

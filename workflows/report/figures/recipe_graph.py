@@ -16,6 +16,8 @@ LOOKS = {
     "left out": ("#FFFFFF", "left out: within the tolerance"),
 }
 _WIDTH, _HEIGHT = 1.75, 0.66  #: inches, space for a box
+_INSIDE = 0.92  #: width of a box, as a share of its space
+_LETTER = 5.7  #: points, mean width of a letter in a box
 
 
 @drawn
@@ -25,13 +27,16 @@ def graph(*, sources: Mapping[str, Iterable[str]], states: Mapping[str, str]) ->
     places = layout(wires)
     columns = max((x for x, _ in places.values()), default=0.0) + 1
     rows = max((y for _, y in places.values()), default=0) + 1
-    figure, axes = canvas(min(max(_WIDTH * columns, 6.0), 15.0), _HEIGHT * rows + 0.7)
+    width = min(max(_WIDTH * columns, 6.0), 15.0)
+    letters = int(72 * _INSIDE * (width - 0.2) / columns / _LETTER)
+    figure, axes = canvas(width, _HEIGHT * rows + 0.7)
     ax = axes[0, 0]
     for name, befores in wires.items():
         for before in befores:
             _edge(ax, places[before], places[name])
     for name, (x, y) in places.items():
-        _box(ax, x, y, f"{name} ×{counts[name]}" if counts[name] > 1 else name, looks[name])
+        text = broken(name, letters, f" ×{counts[name]}" if counts[name] > 1 else "")
+        _box(ax, x, y, text, looks[name])
     ax.set(xlim=(-0.6, columns - 0.4), ylim=(rows - 0.5, -0.5))
     ax.axis("off")
     _legend(figure, looks.values())
@@ -104,8 +109,21 @@ def _box(ax: Any, x: float, y: float, text: str, look: str) -> None:
 
     style: dict[str, Any] = {"boxstyle": "round,pad=0.0,rounding_size=0.08", "mutation_aspect": 1.6, "zorder": 2}
     style |= {"facecolor": LOOKS[look][0], "edgecolor": "#444444", "linestyle": "--" if look == "left out" else "-"}
-    ax.add_patch(FancyBboxPatch((x - 0.46, y - 0.26), 0.92, 0.52, **style))
-    ax.text(x, y, text, ha="center", va="center", fontsize=9.5, zorder=3)
+    ax.add_patch(FancyBboxPatch((x - _INSIDE / 2, y - 0.26), _INSIDE, 0.52, **style))
+    ax.text(x, y, text, ha="center", va="center", fontsize=9.5, zorder=3, linespacing=1.15)
+
+
+def broken(name: str, letters: int, copies: str = "") -> str:
+    """Return the name of a step on at most two lines of ``letters``, shortened in the middle if it is still longer."""
+    if len(name + copies) <= letters:
+        return name + copies
+    cuts = [i + 1 for i, sign in enumerate(name[:-1]) if sign in "_. " and i < letters]
+    at = cuts[-1] if cuts else letters
+    room = max(letters - len(copies), 3)
+    first, rest = name[:at].rstrip(), name[at:]
+    return (
+        f"{first}\n{rest if len(rest) <= room else rest[: room // 2] + '…' + rest[-(room - room // 2 - 1) :]}{copies}"
+    )
 
 
 def _legend(figure: Any, looks: Iterable[str]) -> None:

@@ -11,7 +11,18 @@ from torch import Tensor
 from neusee.nodes.spectra import mean_wavelength
 from neusee.nodes.values import Bands
 from neusee.workflows.report.figures.camera_overview import high
-from neusee.workflows.report.figures.style import BLUE, GREEN, VERMILION, canvas, drawn, encoded, nanometres, picture
+from neusee.workflows.report.figures.point_labels import PointLabel, place_labels
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    VERMILION,
+    canvas,
+    drawn,
+    encoded,
+    nanometres,
+    picture,
+)
 
 _POINTS = ("A", "B", "C")
 CHANNELS = ((VERMILION, "channel R"), (GREEN, "channel G"), (BLUE, "channel B"))
@@ -39,6 +50,8 @@ def spectra(
         ax.set_xlabel("wavelength (nm)")
         ax.set_ylim(bottom=0.0)
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
+    labels = [PointLabel(x, y, name, BLACK) for name, (y, x) in zip(_POINTS, points, strict=True)]
+    place_labels(figure, {axes[0, 0]: labels}, framed=True)
     return figure
 
 
@@ -53,12 +66,9 @@ def _points(scene: Tensor) -> list[tuple[int, int]]:
 
 def _scene(ax: Any, scene: Tensor, points: list[tuple[int, int]]) -> None:
     picture(ax, encoded(scene / high(scene)), "three points of the scene")
-    box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "black", "linewidth": 0.8}
-    for name, (y, x) in zip(_POINTS, points, strict=True):
+    for y, x in points:
         for colour, width in (("white", 2.5), ("black", 1.0)):
             ax.plot(x, y, "o", mfc="none", mec=colour, markersize=9, mew=width)
-        beside = (-14 if x > scene.shape[-1] / 2 else 14, 0)
-        ax.annotate(name, (x, y), beside, textcoords="offset points", bbox=box, ha="center", va="center")
 
 
 def _spectra(ax: Any, scene: Tensor, radiance: Tensor, bands: Bands, points: list[tuple[int, int]]) -> None:
@@ -85,4 +95,5 @@ def _lasers(ax: Any, lines: Mapping[str, Bands]) -> None:
     for number, (name, line) in enumerate(lines.items()):
         nm = mean_wavelength(line) * 1e9
         label = f"laser {name}, {nm:.0f} nm" if len(lines) < 3 else f"{len(lines)} lasers" if number == 0 else None
-        ax.axvline(nm, color="#555555", linewidth=1.2, linestyle=":", label=label)
+        style = "-." if len(lines) == 2 and number == 1 else ":"
+        ax.axvline(nm, color="#555555", linewidth=1.2, linestyle=style, label=label)

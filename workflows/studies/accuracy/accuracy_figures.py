@@ -18,6 +18,7 @@ _STEP_EXACT = 1e-17  #: the same level in the diagrams of single steps, some of 
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, "#CC79A7", "#56B4E9", "#8B7500", "#555555")
 _MARKERS = "osD^vP*X"
 _GREY = "#777777"
+_ENTRY = 2.1  #: inches, room for an entry of a legend
 
 
 @dataclass(frozen=True)
@@ -74,8 +75,11 @@ def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
     """Draw error against run time in ms for each step, with a dotted line at the time of the reference node."""
     columns = min(3, len(diagrams))
     rows = -(-len(diagrams) // columns)
-    figure, axes = canvas(3.9 * columns + 0.4, 3.5 * rows + 0.7, rows, columns)
     styles = _styles(line.name for _, lines, _ in diagrams for line in lines)
+    width = 3.9 * columns + 0.4
+    across = min(int(width / _ENTRY), 1 + len(styles))
+    below = max(0.7, 0.25 * math.ceil((1 + len(styles)) / across))
+    figure, axes = canvas(width, 3.5 * rows + below, rows, columns)
     shown: list[Diagram] = []
     for ax, (name, lines, reference) in zip(axes.flat, diagrams, strict=False):
         scaled = [replace(line, dots=[replace(d, seconds=1e3 * d.seconds) for d in line.dots]) for line in lines]
@@ -88,7 +92,7 @@ def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
     for ax in list(axes.flat)[len(diagrams) :]:
         ax.set_axis_off()
     handles = {label: h for ax in axes.flat for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(5, len(handles)))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=across)
     _place_labels(figure, shown)
     return figure
 

@@ -136,7 +136,7 @@ def _scenes(result: LeaveOutResult) -> Section:
 
 @drawn
 def _bars(costs: Sequence[SceneCost]) -> Any:
-    figure, axes = canvas(8.0, 0.42 * len(costs) + 1.0)
+    figure, axes = canvas(8.0, 0.42 * len(costs) + 1.3)
     ax = axes[0, 0]
     names = [cost.scene for cost in costs]
     inside = [min(cost.computing, cost.seconds) for cost in costs]
@@ -148,8 +148,8 @@ def _bars(costs: Sequence[SceneCost]) -> Any:
     ax.invert_yaxis()
     ax.grid(False, axis="y")
     ax.set_xlabel("seconds, from an empty store")
-    ax.set_xlim(0, 1.15 * max(cost.seconds for cost in costs))
-    ax.legend(loc="lower right")
+    ax.set_xlim(0, 1.15 * max(cost.seconds for cost in costs) or 1.0)
+    figure.legend(loc="outside upper center", ncols=2)  # no bar and no note is there, whatever the times
     return figure
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from neusee.workflows.studies.stability.case_result import Cell
 
 _COLOURS = {"pass": "#9AD6C1", "warn": "#F6D58A", "fail": "#F2B08A"}
 _WIDE, _TALL = 0.52, 0.23  #: inches of a cell
+_LETTER = 0.085  #: inches, width of a letter
 _ACROSS = 22  #: largest number of nodes side by side; further nodes are drawn in a panel below
 
 Entry = tuple[str, str, str, Cell]  #: group, case, node, cell
@@ -23,11 +25,14 @@ def grid_picture(entries: Sequence[Entry]) -> Any:
     nodes = sorted({node for _, _, node, _ in entries}, key=lambda n: (n.startswith("losses."), n))
     panels = max(1, -(-len(nodes) // _ACROSS))
     across = max(1, -(-len(nodes) // panels))
-    figure, axes = canvas(2.0 + _WIDE * across, panels * (2.0 + _TALL * len(cases)), rows=panels)
+    left, above = (_LETTER * max(map(len, names), default=0) for names in ([case for _, case in cases], nodes))
+    width = max(6.0, left + 1.0 + _WIDE * across)
+    figure, axes = canvas(width, panels * (0.8 + 0.8 * above + _TALL * len(cases)), rows=panels)
     for ax, first in zip(axes[:, 0], range(0, max(1, len(nodes)), across), strict=True):
         _panel(ax, [e for e in entries if e[2] in nodes[first : first + across]], cases, nodes[first:], across)
     how = "largest error over the largest element, of the result or (g) of its gradient, whichever is nearer its bound"
-    figure.supxlabel(f"{how};  ! warn, × fail;  r refused, s seen, – no number to compare", fontsize=9)
+    text = f"{how};  ! warn, × fail;  r refused, s seen, – no number to compare"
+    figure.supxlabel(textwrap.fill(text, int(width / _LETTER)), fontsize=9)
     return figure
 
 
@@ -64,10 +69,12 @@ def _share(value: float, bound: float | None) -> float:
 
 
 def short_number(value: float) -> str:
-    """Return a number as text with one digit and an exponent, such as ``2e-7``."""
+    """Return a number as text with one digit and an exponent of at most two digits, such as ``2e-7`` and ``>e99``."""
     if value == 0:
         return "0"
     if not math.isfinite(value):
         return "inf" if value > 0 else "nan"
+    if not 1e-99 <= abs(value) < 9.5e99:
+        return "<e-99" if abs(value) < 1 else ">e99"
     mantissa, _, exponent = f"{value:.0e}".partition("e")
     return f"{mantissa}e{int(exponent)}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,7 +18,8 @@ _GREY = "#777777"
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE)
 _WIDE = 30.0  #: ratio of the largest to the least value of curves above which their axis is logarithmic
 _BINS = 24
-_TICKS = 4  #: numbers below a diagram of a number, at most; each may have seven characters
+_TICKS = 4  #: numbers below a diagram of a number, at most
+_LONGEST = 8  #: characters of such a number without its sign
 _APART = 0.1  #: inches around each diagram, so that a title does not touch the numbers above it
 _SLIGHT = 1e-6  #: share of a curve's largest element; no ratio to a smaller median is drawn
 _ALONG = 200  #: signals of a photon-transfer curve
@@ -49,9 +51,19 @@ def _bars(ax: Any, bars: Sequence[tuple[str, float, float]], middle: float) -> N
     ax.barh(range(len(bars)), up, 0.7, left=middle, color=ORANGE, label="input at its 95 % quantile")
     ax.axvline(middle, color=BLACK, linewidth=0.9)
     ax.set_yticks(range(len(bars)), [bar[0] for bar in bars])
-    ax.ticklabel_format(axis="x", useOffset=False)
-    ax.locator_params(axis="x", nbins=_TICKS)
+    _few_numbers(ax)
     ax.grid(False, axis="y")
+
+
+def _few_numbers(ax: Any) -> None:
+    """Write few numbers below a diagram, and take what all numbers share out of numbers that would be too long."""
+    low, high = ax.get_xlim()
+    decimals = max(0, math.ceil(-math.log10((high - low) / _TICKS)))
+    if len(f"{max(abs(low), abs(high)):.{decimals}f}") > _LONGEST:
+        ax.ticklabel_format(axis="x", style="sci", scilimits=(-2, 4), useOffset=True)
+    else:
+        ax.ticklabel_format(axis="x", useOffset=False)
+    ax.locator_params(axis="x", nbins=_TICKS)
 
 
 @drawn
@@ -61,6 +73,7 @@ def bands(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], axi
     Each family has an abscissa, and draws (draw, element) of each curve by name.
     """
     figure, axes = canvas(5.6 * len(curves), 5.4, 2, len(curves), sharex="col", height_ratios=[2, 1])
+    figure.get_layout_engine().set(h_pad=_APART)
     for (ax, below), (family, (x, members)) in zip(axes.T, curves.items(), strict=True):
         for (name, draws), colour in zip(members.items(), _COLOURS * len(members), strict=False):
             _band(ax, below, x, draws, colour, name)
@@ -136,8 +149,7 @@ def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) ->
         ax.hist(values, _BINS, color=BLUE, alpha=0.8)
         ax.axvline(middles[name], color=VERMILION, linewidth=1.2, label="value with every input at its median")
         ax.set_title(name)
-        ax.ticklabel_format(axis="x", useOffset=False)
-        ax.locator_params(axis="x", nbins=_TICKS)
+        _few_numbers(ax)
         ax.locator_params(axis="y", integer=True)
         ax.grid(False)
     for ax in list(axes.flat)[len(draws) :]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,12 +10,14 @@ from torch import Tensor
 
 from neusee.nodes import metrics
 from neusee.workflows.report.figures import optics
-from neusee.workflows.report.figures.style import canvas, drawn
+from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn
 from neusee.workflows.report.study_page import Section
 from neusee.workflows.training.mask_design.design_terms import Fabrication, Terms
 from neusee.workflows.training.mask_design.learnt_mask import LearntMask
 
 _COLUMNS = ("nm", "LSR", "even light", "BSR", "median MTF", "at most", "rms MTF", "at most")
+_COLOURS = (BLUE, ORANGE, GREEN, VERMILION, BLACK, "#CC79A7", "#56B4E9", "#777777")
+_STYLES = ("-", "--", ":", "-.")  #: line styles, of which the next begins when all colours are used
 _NAMES = ("lsr", "energy_floor", "bsr", "median_mtf", "median_mtf_bound", "rms_mtf", "rms_mtf_bound")
 
 
@@ -37,10 +40,13 @@ def history(rows: Sequence[Mapping[str, float]]) -> Any:
     names = [name for name in dict.fromkeys(n for row in rows for n in row) if name not in ("start", "iteration")]
     figure, axes = canvas(3.6 * max(len(names), 2), 3.2, 1, len(names))
     starts = sorted({row["start"] for row in rows})
+    looks = dict(zip(starts, itertools.cycle(itertools.product(_STYLES, _COLOURS)), strict=False))
     for ax, name in zip(axes[0], names, strict=True):
         for start in starts:
             own = [row for row in rows if row["start"] == start]
-            ax.plot([row["iteration"] for row in own], [row[name] for row in own], linewidth=1.2, label=f"{start:g}")
+            style, colour = looks[start]
+            look = {"linestyle": style, "color": colour, "linewidth": 1.2, "label": f"{start:g}"}
+            ax.plot([row["iteration"] for row in own], [row[name] for row in own], **look)
         ax.set_title(name)
         ax.set_xlabel("iteration")
         ax.ticklabel_format(axis="y", useOffset=False)

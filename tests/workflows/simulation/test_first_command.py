@@ -1,0 +1,31 @@
+"""The first command of the README tells what the README says."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.simulation.simulate_recipe import simulate
+from neusee.workflows.store.result_store import Store
+
+README = Path(__file__).parents[3] / "README.md"
+OUTPUTS = ("lsr[mask]", "peak[plain]", "peak[mask]", "developed_quality[plain]", "developed_quality[mask]")
+OUTPUTS += ("restored_quality", "saturated[plain]", "saturated[mask]")
+
+
+@pytest.mark.slow
+def test_the_story_has_the_numbers_of_the_readme(tmp_path):
+    recipe = replace(load("first_light"), outputs=OUTPUTS)
+    done = simulate(recipe, Store(tmp_path / "store"), tmp_path, ["neusee", "run"])
+    story = json.loads((done.folder / "provenance.json").read_text())["story"]
+    told = re.findall(r"\d[\d.,]*\d", story["buys"] + story["costs"])
+    assert told == ["236", "3.87", "912", "0.00149", "530", "27.1", "14.6", "17.7", "418", "244"]
+    text = README.read_text(encoding="utf-8")
+    assert not [number for number in told if not re.search(rf"\b{re.escape(number)}\b", text)]
+    page = done.page.read_text(encoding="utf-8")
+    assert page.index(story["buys"]) < page.index('alt="What the camera sees') < page.index('id="results"')

@@ -1,0 +1,113 @@
+"""What a mask buys and what it costs in a run, as two sentences with the numbers of the run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.report.result_numbers import Value, arms, lines_of, suppressed
+
+SENTENCES = ("buys", "costs")
+PLAIN, MASK, RESTORED = "plain lens", "with mask", "restored"
+_PEAK, _QUALITY, _LOST = "peak/I_sat", "PSNR (dB)", "saturated px"
+_EQUAL = 0.01  #: relative difference of two peaks below which the mask changes nothing
+_TIMES = 2.0  #: ratio of two peaks below which their difference is told in percent
+
+Arm = Mapping[str, float]
+
+
+def story(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, Any]:
+    """Return the sentences on what the mask of a run buys and costs, and their numbers; nothing without a pair."""
+    numbers = {name: _known(cells) for name, cells in arms(recipe, keys, value).items()}
+    lsr = suppressed(recipe, keys, value)
+    said = sentences(numbers, lsr, bool(lines_of(recipe, keys)))
+    return {**said, "numbers": {name: numbers[name] for name in numbers if said}, "lsr": lsr if said else {}}
+
+
+def sentences(numbers: Mapping[str, Arm], lsr: Mapping[str, float], laser: bool) -> dict[str, str]:
+    """Return the sentences ``buys`` and ``costs`` from the numbers of plain lens, mask and restored picture.
+
+    ``lsr`` has the laser suppression ratio of the mask by wavelength of each laser. ``laser`` is False if no laser
+    shines. A sentence whose numbers a run does not have for both the plain lens and the mask is left out.
+    """
+    plain, mask = numbers.get(PLAIN, {}), numbers.get(MASK, {})
+    if not plain or not mask:
+        return {}
+    texts = _buys(plain, mask, lsr, laser), _costs(plain, mask, numbers.get(RESTORED, {}))
+    return {name: text for name, text in zip(SENTENCES, texts, strict=True) if text}
+
+
+def _known(cells: Arm) -> dict[str, float]:
+    return {name: number for name, number in cells.items() if not math.isnan(number)}
+
+
+def _buys(plain: Arm, mask: Arm, lsr: Mapping[str, float], laser: bool) -> str:
+    """Return a sentence with the irradiance of the brightest pixel without and with the mask, and the LSR."""
+    if not (plain.get(_PEAK, 0.0) > 0 and mask.get(_PEAK, 0.0) > 0):
+        return _suppression(lsr)
+    less = plain[_PEAK] / mask[_PEAK]
+    ends = f"{_number(mask[_PEAK])} in place of {_number(plain[_PEAK])} times saturation"
+    if abs(less - 1) < _EQUAL:
+        change = f"the brightest pixel receives as much light as behind the plain lens ({ends}"
+    else:
+        word, ratio = ("less", less) if less > 1 else ("more", 1 / less)
+        much = f"{_number(ratio)} times" if ratio >= _TIMES else f"{100 * abs(1 / less - 1):.0f} %"
+        change = f"the brightest pixel receives {much} {word} light than behind the plain lens ({ends}"
+    if not laser:
+        return f"No laser shines here, from which the mask could protect the sensor: {change})."
+    bought = (
+        "protection for" if less >= _TIMES else "little protection for" if less >= 1 + _EQUAL else "no protection of"
+    )
+    return f"The mask buys {bought} the sensor: {change}{'; ' * bool(lsr)}{_ratios(lsr)})."
+
+
+def _suppression(lsr: Mapping[str, float]) -> str:
+    """Return a sentence with the LSR of the mask alone, for a run that does not compute the irradiance."""
+    if not lsr:
+        return ""
+    bought = "a weaker laser" if max(lsr.values()) < 1 - _EQUAL else "no weaker laser here"
+    return f"The mask buys {bought}: {_ratios(lsr)} of the peak behind the clear lens."
+
+
+def _ratios(lsr: Mapping[str, float]) -> str:
+    """Return the laser suppression ratio of a laser, or the least and the largest of several lasers, as text."""
+    if not lsr:
+        return ""
+    ends = sorted(lsr, key=lsr.__getitem__)
+    first, last = (f"{lsr[name]:.3g} at {name}" for name in (ends[0], ends[-1]))
+    return f"LSR {first}" if len(lsr) == 1 else f"LSR from {first} to {last}"
+
+
+def _costs(plain: Arm, mask: Arm, restored: Arm) -> str:
+    """Return a sentence with the picture quality and the saturated pixels without and with the mask."""
+    parts = [part for part in (_picture(plain, mask, restored), _saturation(plain, mask)) if part]
+    return f"{'; '.join(parts)}." if parts else ""
+
+
+def _picture(plain: Arm, mask: Arm, restored: Arm) -> str:
+    if _QUALITY not in plain or _QUALITY not in mask:
+        return ""
+    before, behind, after = (arm.get(_QUALITY, -math.inf) for arm in (plain, mask, restored))
+    end = f", and {after:.1f} dB after restoration" if _QUALITY in restored else ""
+    text = f"PSNR {before:.1f} dB with the plain lens{',' if end else ' and'} {behind:.1f} dB with the mask{end}"
+    if behind >= before:
+        return f"The mask costs no picture quality here: {text}"
+    return f"The mask costs picture quality{', which restoration wins back' if after >= before else ''}: {text}"
+
+
+def _saturation(plain: Arm, mask: Arm) -> str:
+    """Return how many pixels saturate with the mask and with the plain lens, as text."""
+    if _LOST not in plain or _LOST not in mask:
+        return ""
+    with_mask, without = (f"{arm[_LOST]:,.0f}" for arm in (mask, plain))
+    if with_mask == without == "0":
+        return "no pixel saturates"
+    same = f"{with_mask} pixels saturate with and without the mask"
+    return same if with_mask == without else f"{with_mask} pixels saturate with the mask, {without} without"
+
+
+def _number(value: float) -> str:
+    """Return a positive number as text with three digits or, from 1000 on, as a whole number with commas."""
+    return f"{value:.3g}" if value < 999.5 else f"{value:,.0f}"
