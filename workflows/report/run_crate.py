@@ -250,11 +250,13 @@ def _file(path: str, size: int, text: str) -> Entity:
     }
 
 
-def _inputs(rows: Iterable[Mapping[str, str]]) -> tuple[list[Entity], list[Entity]]:
+def _inputs(rows: Iterable[Any]) -> tuple[list[Entity], list[Entity]]:
     """Return an entity for each input file, which is not a part of the folder, and one for each known licence."""
     found: dict[str, Entity] = {}
     licences: list[Entity] = []
     for row in rows:
+        if not isinstance(row, Mapping) or not row.keys() >= {"file", "digest", "parameter"}:
+            continue  # the inputs of a study of uncertainty are parameters
         name, entry = f"#input-{row['digest']}", _sample(row["file"], row["digest"])
         users = [*found[name]["_users"], row["parameter"]] if name in found else [row["parameter"]]
         found[name] = {
