@@ -35,7 +35,7 @@ def report(found: RunComparison) -> StudyReport:
 def summary(found: RunComparison) -> list[str]:
     """Return sentences that count what differs between two runs."""
     differ = [each for each in found.numbers if each.relative > 0]
-    drawn = [each for each in found.figures if each.state != "same"]
+    drawn, data = ([each for each in files if each.state != "same"] for files in (found.figures, found.data))
     code = "The left or the right folder records no digests of code." if found.code is None else (
         f"{_counted(len(found.code), 'difference')} in the code." if found.code else "The code is the same."
     )  # fmt: skip
@@ -44,6 +44,7 @@ def summary(found: RunComparison) -> list[str]:
         if differ
         else f"All {_counted(len(found.numbers), 'number')} are the same.",
         f"{len(drawn)} of {_counted(len(found.figures), 'picture')} differ.",
+        f"{len(data)} of {_counted(len(found.data), 'data file')} and tensors differ.",
         f"{_counted(len(found.recipe), 'value')} of the recipe differ{'s' * (len(found.recipe) == 1)}."
         if found.recipe
         else "The recipe is the same.",

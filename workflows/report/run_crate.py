@@ -8,37 +8,27 @@ from __future__ import annotations
 
 import json
 import os
-import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
-from neusee import __version__
+from neusee.workflows.report.crate_sources import (
+    Entity,
+    inputs,
+    licence,
+    media_type,
+    person,
+    quoted,
+    reference,
+    references,
+    tools,
+)
 
 CRATE = "ro-crate-metadata.json"
-CREATOR = "NEUSEE_CREATOR"  #: name of the person who runs neusee, and in <> an address such as an ORCID
-LICENCE = "NEUSEE_LICENCE"  #: licence of the results: an address or a text
-
 _SPECIFICATION = "https://w3id.org/ro/crate/1.1"
 _PROFILE = "https://w3id.org/ro/wfrun/process/0.5"
 _COMPLETED, _FAILED = "http://schema.org/CompletedActionStatus", "http://schema.org/FailedActionStatus"
-_BYTES = "application/octet-stream"
-_FORMATS = {
-    ".csv": "text/csv",
-    ".exr": "image/x-exr",
-    ".html": "text/html",
-    ".json": "application/json",
-    ".jsonl": "application/jsonl",
-    ".md": "text/markdown",
-    ".nc": "application/x-netcdf",
-    ".png": "image/png",
-    ".txt": "text/plain",
-    ".yaml": "application/yaml",
-}
 _FILES = {
     "report.html": "The page with all results; it loads no other file.",
     "recipe.yaml": "The recipe as it was run: every final value, with its source. It can be run again.",
@@ -53,11 +43,6 @@ _FILES = {
     "losses.csv": "The losses of each iteration.",
     "mask.json": "The figures of merit of the designed mask.",
 }
-_ADDRESS = re.compile(r"https?://\S+")
-_PERSON = re.compile(r"(?P<name>[^<>]*[^<>\s])\s*<(?P<address>https?://[^<>\s]+)>")
-_LINK = re.compile(r"\[(?P<name>[^]]+)]\((?P<address>[^)]+)\)")
-
-Entity = dict[str, Any]
 
 
 def write_crate(folder: Path, name: str, said: Mapping[str, Any], ended: datetime | None = None) -> None:
@@ -88,7 +73,7 @@ def remove_crate(folder: Path) -> dict[str, Any] | None:
 
 def restore_crate(folder: Path, crate: Mapping[str, Any]) -> None:
     """Write a crate that `remove_crate` returned, with the present size of each file."""
-    sizes = {_quoted(name): str(size) for name, size in _sizes(folder)}
+    sizes = {quoted(name): str(size) for name, size in _sizes(folder)}
     for entity in crate["@graph"]:
         if entity.get("@id") in sizes and "contentSize" in entity:
             entity["contentSize"] = sizes[entity["@id"]]
@@ -107,34 +92,24 @@ def _graph(folder: Path, name: str, said: Mapping[str, Any], ended: datetime) ->
     figures = [row for row in said.get("figures") or () if isinstance(row, Mapping)]
     texts = {row["file"]: row["title"] for row in figures if "file" in row} | _FILES
     parts = [_file(path, size, texts.get(path, "")) for path, size in _sizes(folder)]
-    inputs, licences = _inputs(said.get("inputs") or ())
-    tools = _tools(said)
-    person, licence = _person(), _licence()
-    action = _action(name, said, ended, parts, inputs, tools, person)
+    given, licences = inputs(said.get("inputs") or ())
+    software = tools(said)
+    creator, terms = person(), licence()
+    action = _action(name, said, ended, parts, given, software, creator)
     root = {
         "@id": "./",
         "@type": "Dataset",
         "name": name,
         "description": _description(said),
         "datePublished": _time(ended),
-        "license": _at(licence),
+        "license": reference(terms),
         "conformsTo": {"@id": _PROFILE},
-        "hasPart": _ids(parts),
-        "mentions": _at(action),
-        **({"author": _at(person)} if person else {}),
+        "hasPart": references(parts),
+        "mentions": reference(action),
+        **({"author": reference(creator)} if creator else {}),
     }
-    found = [
-        _descriptor(),
-        root,
-        _profile(),
-        action,
-        licence,
-        *tools,
-        *parts,
-        *inputs,
-        *licences,
-        *filter(None, [person]),
-    ]
+    about = [_descriptor(), root, _profile(), action, terms]
+    found = [*about, *software, *parts, *given, *licences, *([creator] if creator else [])]
     return list({entity["@id"]: entity for entity in found}.values())
 
 
@@ -151,26 +126,26 @@ def _action(
     said: Mapping[str, Any],
     ended: datetime,
     parts: list[Entity],
-    inputs: list[Entity],
-    tools: list[Entity],
-    person: Entity | None,
+    given: list[Entity],
+    software: list[Entity],
+    creator: Entity | None,
 ) -> Entity:
     """Return the entity of the command that wrote the folder."""
     command = _command(said)
     recipe = [part for part in parts if part["@id"] == "recipe.yaml"]
     began = _began(said, ended)
     return {
-        "@id": f"#{_quoted(name)}",
+        "@id": f"#{quoted(name)}",
         "@type": "CreateAction",
         "name": command or name,
         **({"description": f"Computed on {said['device']}."} if said.get("device") else {}),
         **({"startTime": _time(began)} if began else {}),
         "endTime": _time(ended),
         "actionStatus": _FAILED if said.get("state") in ("stopped", "interrupted") else _COMPLETED,
-        "instrument": _at(tools[0]),
-        **({"agent": _at(person)} if person else {}),
-        **({"object": _ids([*recipe, *inputs])} if recipe or inputs else {}),
-        "result": _ids(part for part in parts if part not in recipe),
+        "instrument": reference(software[0]),
+        **({"agent": reference(creator)} if creator else {}),
+        **({"object": references([*recipe, *given])} if recipe or given else {}),
+        "result": references(part for part in parts if part not in recipe),
     }
 
 
@@ -193,37 +168,6 @@ def _description(said: Mapping[str, Any]) -> str:
     return f"{text} ({kind})" if kind else text
 
 
-def _tools(said: Mapping[str, Any]) -> list[Entity]:
-    """Return neusee and the libraries that it computed with; neusee is the first."""
-    known = dict(said.get("versions") or _of_facts(said.get("facts") or ()))
-    rest = [_library(*each) for each in known.items() if each[0] != "neusee" and each[1] != "none"]
-    ours = {
-        "@id": f"#neusee-{__version__}",
-        "@type": "SoftwareApplication",
-        "name": "neusee",
-        "softwareVersion": __version__,
-        "description": "A simulator of what a laser does to a camera.",
-        **({"softwareRequirements": _ids(rest)} if rest else {}),
-    }
-    return [ours, *rest]
-
-
-def _library(name: str, version: str) -> Entity:
-    """Return the entity of Python or of a package, whose address at the package index has no local version."""
-    home = f"https://pypi.org/project/{name}/{version.partition('+')[0]}/"
-    home = "https://www.python.org/" if name.lower() == "python" else home
-    about = {"name": name.capitalize() if name == "python" else name, "softwareVersion": version, "url": home}
-    return {"@id": home, "@type": "SoftwareApplication", **about}
-
-
-def _of_facts(facts: Iterable[Iterable[str]]) -> Iterator[tuple[str, str]]:
-    """Yield name and version of each library in the table of facts of a run, which ends with the machine."""
-    for name, value in facts:
-        if name == "machine":
-            return
-        yield name, value
-
-
 def _sizes(folder: Path) -> list[tuple[str, int]]:
     """Return the path and the size of each file of a folder, without hidden files and without the crate itself."""
     found, todo = [], [folder]
@@ -241,98 +185,13 @@ def _sizes(folder: Path) -> list[tuple[str, int]]:
 
 def _file(path: str, size: int, text: str) -> Entity:
     return {
-        "@id": _quoted(path),
+        "@id": quoted(path),
         "@type": "File",
         "name": path,
         **({"description": text} if text else {}),
-        "encodingFormat": _FORMATS.get(Path(path).suffix.lower(), _BYTES),
+        "encodingFormat": media_type(path),
         "contentSize": str(size),
     }
-
-
-def _inputs(rows: Iterable[Any]) -> tuple[list[Entity], list[Entity]]:
-    """Return an entity for each input file, which is not a part of the folder, and one for each known licence."""
-    found: dict[str, Entity] = {}
-    licences: list[Entity] = []
-    for row in rows:
-        if not isinstance(row, Mapping) or not row.keys() >= {"file", "digest", "parameter"}:
-            continue  # the inputs of a study of uncertainty are parameters
-        name, entry = f"#input-{row['digest']}", _sample(row["file"], row["digest"])
-        users = [*found[name]["_users"], row["parameter"]] if name in found else [row["parameter"]]
-        found[name] = {
-            "@id": name,
-            "@type": "CreativeWork",
-            "name": row["file"],
-            "description": f"Input file, the value of {', '.join(users)}"
-            + (f": {entry['what']}; by {entry['author']}." if entry else "."),
-            "identifier": f"xxh3_128:{row['digest']}",
-            "encodingFormat": _FORMATS.get(Path(row["file"]).suffix.lower(), _BYTES),
-            **({"license": {"@id": entry["address"]}} if entry else {}),
-            "_users": users,
-        }
-        if entry:
-            licences.append({"@id": entry["address"], "@type": "CreativeWork", "name": entry["licence"]})
-    return [{key: value for key, value in entity.items() if key != "_users"} for entity in found.values()], licences
-
-
-def _sample(file: str, digest: str) -> dict[str, str] | None:
-    """Return what is known of a file that neusee ships, or None for any other file."""
-    from neusee.workflows.keys.input_file_digest import file_digest
-
-    row = _samples().get(file)
-    try:
-        return row if row and file_digest(Path(str(files("neusee.recipes") / "samples" / file))) == digest else None
-    except OSError:
-        return None
-
-
-@cache
-def _samples() -> dict[str, dict[str, str]]:
-    """Return author and licence of each file that neusee ships, from the table in ``samples/LICENSE.md``."""
-    text = (files("neusee.recipes") / "samples" / "LICENSE.md").read_text(encoding="utf-8")
-    found = {}
-    for line in text.splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split(" | ")]
-        if len(cells) == 5 and (link := _LINK.fullmatch(cells[3])):
-            row = {"what": cells[1], "author": cells[2], "licence": link["name"], "address": link["address"]}
-            found.update({name: row for name in re.findall("`([^`]+)`", cells[0])})
-    return found
-
-
-def _person() -> Entity | None:
-    """Return the person that the variable ``NEUSEE_CREATOR`` names, or None."""
-    text = os.environ.get(CREATOR, "").strip()
-    if not text:
-        return None
-    found = _PERSON.fullmatch(text)
-    name, address = (found["name"], found["address"]) if found else (text, "#creator")
-    return {"@id": address, "@type": "Person", "name": name}
-
-
-def _licence() -> Entity:
-    """Return the licence of the results, from the variable ``NEUSEE_LICENCE``."""
-    text = os.environ.get(LICENCE, "").strip()
-    if _ADDRESS.fullmatch(text):
-        return {"@id": text, "@type": "CreativeWork", "name": text}
-    none = f"The owner of these results has stated no licence; set {LICENCE} to state one."
-    return {
-        "@id": "#licence",
-        "@type": "CreativeWork",
-        "name": text or "No licence stated",
-        "description": text or none,
-    }
-
-
-def _quoted(path: str) -> str:
-    return quote(path, safe="/")
-
-
-def _at(entity: Entity) -> dict[str, str]:
-    return {"@id": entity["@id"]}
-
-
-def _ids(entities: Iterable[Entity]) -> list[dict[str, str]]:
-    return [_at(entity) for entity in entities]
 
 
 def _time(moment: datetime) -> str:

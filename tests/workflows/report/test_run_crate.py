@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.report import run_crate
-from neusee.workflows.report.run_crate import CRATE, CREATOR, LICENCE, remove_crate, restore_crate, write_crate
+from neusee.workflows.report import crate_sources, run_crate
+from neusee.workflows.report.crate_sources import CREATOR, LICENCE
+from neusee.workflows.report.run_crate import CRATE, remove_crate, restore_crate, write_crate
 from neusee.workflows.report.run_folder import new_run
 from tests.workflows.crate_rules import faults
 
@@ -91,7 +92,7 @@ def test_a_photograph_that_ships_has_its_licence(folder):
 
 def test_every_sample_that_ships_has_a_licence():
     shipped = {path.name for path in SAMPLES.iterdir() if path.suffix in (".jpg", ".exr", ".png", ".safetensors")}
-    assert shipped <= run_crate._samples().keys()
+    assert shipped <= crate_sources._samples().keys()
 
 
 @pytest.mark.parametrize(
