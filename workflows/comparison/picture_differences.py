@@ -117,7 +117,7 @@ def _exr(name: str, left: Path, right: Path) -> FileDifference:
     if found.largest and len(one) <= _COLOURS:
         top = float(np.nanpercentile(np.maximum(np.abs(a), np.abs(b)), 99.9)) or 1.0
         one_view, other_view = (_viewed(x / top, list(one)) for x in (a, b))
-        text = f"difference, at most {found.largest:.3g}"
+        text = f"difference, at most {found.largest:.4g}"
         return replace(found, drawing=drawing(one_view, other_view, np.abs(a - b).max(0), text))
     return found
 
