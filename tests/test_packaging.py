@@ -59,7 +59,7 @@ def test_the_source_archive_holds_all_that_builds_and_checks_it(built):
     assert len(names) == len(set(names))
     package = {f".src/neusee/{name}" if "/" not in name else name for name in source()}
     tests = {str(p.relative_to(ROOT)) for p in (ROOT / "tests").rglob("*.py")}
-    whole = {"README.md", "LICENSE", "CHANGELOG.md", "pyproject.toml", ".ci/run", ".ci/source_links.py"}
+    whole = {"README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "pyproject.toml", ".ci/run", ".ci/source_links.py"}
     assert package | tests | whole <= set(names)
     assert [name for name in names if name.startswith(tuple(f".src/neusee/{room}" for room in ROOMS))] == []
 

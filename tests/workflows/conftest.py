@@ -74,3 +74,20 @@ def no_fault_in_any_figure(monkeypatch):
     monkeypatch.setattr(style, "png_of", saved)
     yield
     assert found == []
+
+
+@pytest.fixture(autouse=True)
+def no_fault_in_any_crate(monkeypatch):
+    """Every crate that the program writes in a test keeps the rules of RO-Crate."""
+    from neusee.workflows.report import run_crate
+    from tests.workflows.crate_rules import faults
+
+    write, found = run_crate._write, []
+
+    def written(folder, crate):
+        write(folder, crate)
+        found.extend(faults(folder))
+
+    monkeypatch.setattr(run_crate, "_write", written)
+    yield
+    assert found == []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,6 +20,7 @@ from neusee.workflows.engine.step_job import Executor
 from neusee.workflows.graph.recipe_graph import Recipe, needed, unknown_step
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.keys.code_memo import Parts
 from neusee.workflows.placement.heft_schedule import Schedule
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
@@ -44,6 +45,8 @@ class Result:
     schedule: Schedule | None = None  #: predicted times of the steps that ran
     proof: ErrorBounds = field(default_factory=ErrorBounds)  #: error bounds of the steps
     predicted_peak: float | None = None  #: predicted peak bytes of this process; None if another process computed
+    origins: Mapping[Key, Mapping[str, Any]] = field(default_factory=dict)  #: the parts of each key
+    code: Mapping[str, Parts] = field(default_factory=dict)  #: what each digest of code covers
 
     def value(self, step: str) -> Any:
         """Return the value of any step of the recipe; the value is read from the store or computed if necessary."""
@@ -145,4 +148,5 @@ def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:
         proved = proof(recipe, order, wanted, done.__getitem__, work.known_facts)
     device = ",".join(work.devices)
     expected = running_peak(work.schedule, work.own.lanes) if work.executor is work.own else None
-    return Result(values, done, work.keys, seconds, peak, recipe, store, device, work.schedule, proved, expected)
+    code = work.origins, work.code.parts
+    return Result(values, done, work.keys, seconds, peak, recipe, store, device, work.schedule, proved, expected, *code)

@@ -75,7 +75,8 @@ class Code:
         self._followed: dict[frozenset[str], Callable[[str], bool]] = {}
         self._origins: dict[tuple[str, frozenset[str]], Origin] = {}
         self._codes: dict[int, tuple[Node, str]] = {}  # digest of each node, by id
-        self._parts: dict[str, Parts] = {}  # by digest
+        self._parts: dict[str, Parts] = {}  # by digest, not saved yet
+        self.parts: dict[str, Parts] = {}  #: what each digest covers
 
     def of(self, node: Node, classes: tuple[tuple[str, str], ...] = ()) -> str:
         """Return the digest of the code of a node, with what the node declares and what its function holds.
@@ -164,7 +165,7 @@ class Code:
         """Return a digest, private to this process where the loaded code is not that of the files."""
         if private:
             return PRIVATE + digest(code, _THIS_PROCESS)
-        self._parts[code] = parts
+        self._parts[code] = self.parts[code] = parts
         return code
 
     def _refuse(self, whole: Whole, module: str, node: Node, own: set[str]) -> None:

@@ -9,10 +9,12 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
 from typing import Any
+
+from neusee.workflows.report.run_crate import write_crate
 
 _OTHER_FOLDER = "name another folder with --out"
 _ABANDONED = 3600.0  #: s without a change, after which an unfinished folder is removed
@@ -27,6 +29,7 @@ class RunFolder:
     """The folder of a run, which has a temporary path until all files are written, and then its final path."""
 
     path: Path
+    said: dict[str, Any] = field(default_factory=dict)  #: for the crate: command, recipe, inputs, versions, seconds
 
     def write(self, name: str, content: str | bytes) -> Path:
         """Write a file into the folder of a run, and return the path of the file."""
@@ -93,6 +96,7 @@ def _folder(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
     run.path.mkdir()
     try:
         yield run
+        write_crate(run.path, name, run.said)
         run.path = _rename(run.path, root / name)
     except BaseException:
         shutil.rmtree(run.path, ignore_errors=True)

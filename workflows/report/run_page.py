@@ -31,6 +31,7 @@ from neusee.workflows.recipe.paper_readings import consequences, in_force
 from neusee.workflows.report.contents import FIGURES, compared
 from neusee.workflows.report.mask_story import story
 from neusee.workflows.report.result_numbers import expected, metrics, table
+from neusee.workflows.report.run_crate import remove_crate, restore_crate
 from neusee.workflows.report.run_timing import said_of, timing
 from neusee.workflows.report.spectral_sampling import spectral_error
 from neusee.workflows.report.study_page import filled
@@ -133,7 +134,10 @@ def rebuild(folder: Path) -> Path:
     target = folder / "report.html"
     part = folder / ".report.html.part"
     part.write_text(page(doc, pictures), encoding="utf-8")
+    crate = remove_crate(folder)
     part.replace(target)
+    if crate is not None:
+        restore_crate(folder, crate)
     return target
 
 

@@ -87,6 +87,8 @@ class StudyRun:
         Without ``name``, the folder has the kind of the study in its name.
         """
         with new_run(runs, f"{self.recipe.name}_{name or self.kind.replace('-', '_')}", key) as folder:
+            folder.said = dict(document)
+            folder.write("recipe.yaml", document["config"])
             report.write(folder, document)
         return folder.path
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from neusee.workflows.engine.local_executor import memory_limit
 from neusee.workflows.engine.memory_watch import MemoryLimit, guarded, limited
+from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.engine.runner import Result, run
 from neusee.workflows.engine.step_job import Executor
 from neusee.workflows.explain.why_rerun import explained
@@ -21,6 +22,7 @@ from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report import run_page, run_timing
 from neusee.workflows.report.contents import wanted
 from neusee.workflows.report.data_exports import exports
+from neusee.workflows.report.run_code import code_text
 from neusee.workflows.report.run_folder import NotWritten, RunFolder, new_run
 from neusee.workflows.report.run_pictures import pictures, timeline
 from neusee.workflows.store.derived_files import DerivedFiles
@@ -53,6 +55,7 @@ def simulate(
 ) -> Simulation:
     """Run a recipe and write the folder ``runs/<date>_<recipe>_<key>/``; after an error no folder remains."""
     finished: dict[str, StepRecord] = {}
+    began = timestamp()
 
     def note(event: Event) -> None:
         if event.done is not None:
@@ -67,6 +70,7 @@ def simulate(
         result = replace(result, done={name: finished.get(name, done) for name, done in result.done.items()})
         key = digest([[name, result.keys[name]] for name in wanted(result.recipe)])
         with limited(memory_limit(memory)), _watched(), new_run(runs, recipe.name, key) as folder:
+            folder.said = {"began": began}
             doc = _write(result, folder, command, caught)
     return Simulation(folder.path, doc)
 
@@ -89,6 +93,8 @@ def _write(
     files, refused = exports(result, shelf)
     doc = run_page.document(result, command, (str(warning.message) for warning in caught), missing)
     doc["files"] = sorted(files)
+    folder.said |= doc
+    folder.write("code.json", code_text(result))
     doc["missing"] += [{"name": n, "title": f"data/{n}", "why": why} for n, why in refused.items()]
     shown = {name: path.read_bytes() for name, path in drawn.items()}
     for name, path in drawn.items():

@@ -132,8 +132,9 @@ def write_sweep(work: Sweeping, result: Sweep, again: Sequence[str], out: Path, 
     with new_run(out / "sweeps", name, key) as folder:
         folder.write_rows("sweep.csv", header(result.columns), (list(row.values()) for row in result.rows))
         title = f"{(result.title or result.recipe).rstrip('.')}: {counted(result)}"
-        account = _account(work, result, again, seconds).items()
-        folder.write("sweep.yaml", "".join([f"# {title}\n", *(f"{key}: {flow(value)}\n" for key, value in account)]))
+        account = folder.said = _account(work, result, again, seconds)
+        lines = [f"# {title}\n", *(f"{key}: {flow(value)}\n" for key, value in account.items())]
+        folder.write("sweep.yaml", "".join(lines))
         if netcdf:
             result.to_xarray().to_netcdf(folder.path / "sweep.nc", engine="h5netcdf")
     return folder.path

@@ -388,7 +388,11 @@ def test_a_page_of_before_there_was_an_account_of_time_is_still_written(done):
     del doc["timing"]
     doc["steps"] = [{k: v for k, v in s.items() if k != "predicted"} for s in doc["steps"]]
     path.write_text(json.dumps(doc))
-    assert "Time" in run_page.rebuild(done.folder).read_text()
+    page = run_page.rebuild(done.folder)
+    assert "Time" in page.read_text()
+    (entry,) = [e for e in json.loads((done.folder / "ro-crate-metadata.json").read_text())["@graph"]
+                if e["@id"] == "report.html"]  # fmt: skip
+    assert entry["contentSize"] == str(page.stat().st_size)
 
 
 def test_the_page_shows_what_each_step_was_expected_to_take(done):

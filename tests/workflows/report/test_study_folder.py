@@ -37,7 +37,7 @@ def test_a_folder_has_the_document_the_page_and_all_files(recipe, tmp_path):
     assert folder.name.endswith(f"_{recipe.name}_leave_out_01234567")
     names = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
     written = {"text.txt", "bytes.bin", "by_path.txt", "table.csv", "figures/drawn.png"}
-    assert names == {"report.html", "provenance.json"} | written
+    assert names == {"report.html", "provenance.json", "recipe.yaml", "ro-crate-metadata.json"} | written
     assert list(csv.reader((folder / "table.csv").read_text().splitlines())) == [["a", "b"], ["1", "2.5"]]
     found = json.loads((folder / "provenance.json").read_text())
     assert found == document

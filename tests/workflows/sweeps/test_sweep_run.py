@@ -17,6 +17,7 @@ from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps import sweep_files
 from neusee.workflows.sweeps.sweep_run import sweep
+from tests.workflows.crate_rules import faults
 
 RECIPE = """\
 # A camera of three steps
@@ -254,6 +255,7 @@ def test_the_account_can_be_read_as_yaml_and_says_how_to_run_it_again(command):
     assert (found["state"], found["points"], found["done"], found["failed"]) == ("complete", 4, 4, [])
     assert " 'sensor.read_noise=1 e-,2 e-' light.level=1,2 'light.colour=600 nm' --out " in found["again"]
     assert found["versions"]["torch"] == torch.__version__
+    assert list(faults(folder)) == []
 
 
 def test_a_second_sweep_never_overwrites_the_first(command, tmp_path):

@@ -27,6 +27,7 @@ from neusee.workflows.training.mask_design import design_page
 from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.run_training import frozen, train
 from neusee.workflows.training.training_pictures import TrainingStream
+from tests.workflows.crate_rules import faults
 
 ROOT = Path(__file__).parents[3]
 TINY = [
@@ -117,7 +118,9 @@ train(recipe, Store(here / "store"), here / "runs", [], print, watch=watch)
     env = {**os.environ, "PYTHONPATH": str(ROOT / ".src"), "OMP_NUM_THREADS": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False)
     assert done.returncode == -signal.SIGKILL, done.stderr
+    assert list((tmp_path / "killed" / "runs").rglob("ro-crate-metadata.json")) == []
     again = trained(tiny, tmp_path / "killed")
+    assert list(faults(again)) == []
     assert again.name == whole.name
     for name in ("mask.safetensors", "network.safetensors"):
         assert (again / name).read_bytes() == (whole / name).read_bytes(), name
@@ -304,6 +307,15 @@ def test_the_second_stage_needs_the_first(tmp_path, tiny):
         trained(tiny, tmp_path, [2])
 
 
+@pytest.mark.slow
+def test_a_training_that_goes_on_has_no_crate_until_it_ends(tmp_path, tiny):
+    folder = trained(tiny, tmp_path, [1])
+    assert list(faults(folder)) == []
+    seen = []
+    trained(tiny, tmp_path, [2], lambda *state: seen.append((folder / "ro-crate-metadata.json").exists()))
+    assert (set(seen), list(faults(folder))) == ({False}, [])
+
+
 def test_a_state_that_is_none_is_not_gone_on_from(tmp_path, tiny):
     folder = trained(tiny, tmp_path, [1])
     (folder / "state.pt").write_bytes(b"half")
@@ -417,6 +429,7 @@ def test_a_mask_is_designed_and_stage_2_learns_behind_it(command, tmp_path, phot
     assert made["fabrication"] == {"levels": 16, "max_height": 3e-6, "wrap_at": None, "feature": 3e-4}
     assert not (folder / "mask.state").exists()
     before = (folder / "mask.safetensors").stat().st_mtime_ns
+    assert list(faults(folder)) == []
     assert "the mask is already designed" in command(*words, "--stage", "mask")[1]
     for stage in ("1", "both"):
         code, _, err = command(*words, "--stage", stage)
@@ -425,6 +438,7 @@ def test_a_mask_is_designed_and_stage_2_learns_behind_it(command, tmp_path, phot
     code, out, err = command(*words, "--stage", "2", "--quiet")
     assert (code, Path(out.strip()), err) == (0, folder, "")
     assert (folder / "mask.safetensors").stat().st_mtime_ns == before
+    assert list(faults(folder)) == []
     assert [(row["stage"], row["iteration"]) for row in losses(folder)] == [("2", i) for i in "012"]
     assert json.loads((folder / "training.json").read_text())["mask"] == "designed without images"
     assert torch.equal(_element_of(words, folder), height)

@@ -12,9 +12,10 @@ from typing import Any, Generic, Protocol, TypeVar
 from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from neusee.workflows.engine.provenance import versions
+from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
+from neusee.workflows.report.run_crate import remove_crate, write_crate
 from neusee.workflows.training.loop.checkpoint import Rows, StateFile, write_whole
 
 Losses = dict[str, float]
@@ -50,7 +51,7 @@ class ResumableLoop(ABC, Generic[L]):
         self.folder, self.learner, self.progress, self.device = folder, learner, progress, device
         self.keep_every, self.show_every, self.watch, self.writes = settings.keep, settings.show, watch, writes
         self.rows, self.state = Rows(folder / "losses.csv", columns), StateFile(folder / "state.pt")
-        self.stage, self.iteration, self.batch = 0, 0, 1
+        self.stage, self.iteration, self.batch, self.began = 0, 0, 1, timestamp()
 
     @abstractmethod
     def iterate(self) -> Losses:
@@ -82,6 +83,8 @@ class ResumableLoop(ABC, Generic[L]):
     def run(self, iterations: int, batch: int) -> None:
         """Compute the remaining iterations of the present training stage; the caller saves the state at the end."""
         self.batch = batch
+        if self.writes and self.iteration < iterations:
+            remove_crate(self.folder)
         while self.iteration < iterations:
             began = time.perf_counter()
             try:
@@ -119,11 +122,13 @@ class ResumableLoop(ABC, Generic[L]):
 
     def close(self, curves: bytes, recipe: str, command: Sequence[str], **facts: Any) -> None:
         """Write the loss curves, and then the document with the settings and the results of the training."""
+        remove_crate(self.folder)
         write_whole(self.folder / "curves.png", curves)
         seconds = sum(float(row["seconds"]) for row in self.rows.rows)
         about = {"command": list(command), "recipe": recipe, **facts, "seconds": seconds, "versions": versions()}
         text = json.dumps(about, indent=1, ensure_ascii=False) + "\n"
         write_whole(self.folder / DOCUMENT, text.encode())
+        write_crate(self.folder, self.folder.name, about | {"began": self.began})
 
     def _packed(self, **about: Any) -> dict[str, Any]:
         parts = {name: part.state_dict() for name, part in self.learner.parts().items()}

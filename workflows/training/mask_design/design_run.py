@@ -29,6 +29,7 @@ from neusee.workflows.keys.input_file_digest import file_digest
 from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining, Weights, need_steps, state_file
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.report.run_crate import write_crate
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_folder import StudyReport
 from neusee.workflows.store.result_store import Store
@@ -95,8 +96,10 @@ def design_in(
     if (folder / "state.pt").exists():
         raise ValueError(f"training stage 1 has begun in {folder}: remove this folder, or change a value of train.mask")
     kept = StateFile(folder / "mask.state")
-    DesignedMask.of(recipe, training.design, store, kept, progress, device).write(RunFolder(folder), command)
+    files = RunFolder(folder, {"began": timestamp()})
+    DesignedMask.of(recipe, training.design, store, kept, progress, device).write(files, command)
     kept.path.unlink(missing_ok=True)
+    write_crate(folder, folder.name, files.said)
 
 
 @dataclass(frozen=True)
@@ -141,6 +144,7 @@ class DesignedMask:
             "settings": settings.model_dump(mode="json"),
             "versions": versions(),
         }
+        folder.said |= provenance
         self._report(tuple(provenance)).write(folder, provenance | {"config": recipe.config.to_yaml()})
         document = {"recipe": recipe.name, "kind": settings.kind, "loss": learnt.loss, **self.figures,
                     "fabrication": self.terms.fabrication.values, "numbers": learnt.numbers}  # fmt: skip

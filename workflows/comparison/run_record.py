@@ -1,0 +1,151 @@
+"""The folder of a run as it is read for a comparison, with one located error for a folder that cannot be compared."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+
+from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.final_values import flow
+from neusee.workflows.recipe.text.yaml_values import read
+from neusee.workflows.report.run_code import CODE
+from neusee.workflows.report.run_folder import find_run
+
+M = TypeVar("M", bound=BaseModel)
+
+_OTHER = {
+    "sweep.yaml": "a sweep: compare reads folders of `neusee run`; the results of each point are in sweep.csv",
+    "training.json": "a training: compare reads folders of `neusee run`, such as two runs with the trained weights",
+}
+_AGAIN = "the file is damaged, or of another version of neusee: run the recipe again"
+
+
+class NotComparable(ValueError):
+    """Error for a folder that is not the complete folder of a run; the text names the place and the way out."""
+
+
+class StepRow(BaseModel):
+    """What the document of a run says of one step."""
+
+    step: str
+    node: str
+    state: str
+    key: str
+
+
+class ResultTable(BaseModel):
+    """The result table of a run, as the page shows it."""
+
+    columns: list[str]
+    rows: list[dict[str, Any]]
+
+
+class RunDocument(BaseModel):
+    """The parts of ``provenance.json`` that a comparison needs."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    recipe: str
+    version: str
+    command: str
+    started: str
+    device: str
+    metrics: list[tuple[str, str, int | str, float | None]]
+    steps: list[StepRow]
+    table: ResultTable
+    facts: list[tuple[str, str]]
+
+
+class CodeDigests(BaseModel):
+    """The content of ``code.json``: digests of the code of each node, and of what the code uses."""
+
+    nodes: dict[str, str]
+    parts: dict[str, dict[str, str]]
+
+
+@dataclass(frozen=True)
+class FinalValue:
+    """A final value of a recipe as text, and the place where it was written."""
+
+    text: str
+    source: str
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """The folder of a run: its document, the final values of its recipe and its digests of code."""
+
+    folder: Path
+    document: RunDocument
+    values: Mapping[str, FinalValue]
+    code: CodeDigests | None  #: None for a folder of a version that recorded no digests
+
+    @property
+    def name(self) -> str:
+        return self.folder.name
+
+
+def read_record(where: str, root: Path) -> RunRecord:
+    """Return the record of a run; ``where`` is ``latest``, the name of a folder in ``root`` or a path.
+
+    Raises `NotComparable`, with the file and the place in the file, for a folder that is missing, damaged or of
+    something else than a run.
+    """
+    for path in (root / where, Path(where)):
+        for file, text in _OTHER.items():
+            if (path / file).is_file():
+                raise NotComparable(f"{path} is the folder of {text}")
+    try:
+        folder = find_run(where, root).resolve()
+    except FileNotFoundError as error:
+        raise NotComparable(str(error)) from None
+    found = _json(folder / "provenance.json")
+    kind = found.get("study") or found.get("stage") if isinstance(found, dict) else None
+    if kind:
+        text = f"{folder} is the folder of `{kind}`: compare reads folders of `neusee run`"
+        raise NotComparable(f"{text}; the numbers of this folder are in its tables and its page report.html")
+    document = _checked(folder / "provenance.json", RunDocument, found)
+    code = folder / CODE
+    digests = _checked(code, CodeDigests, _json(code)) if code.is_file() else None
+    return RunRecord(folder, document, _values(folder / "recipe.yaml"), digests)
+
+
+def _json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise NotComparable(f"{path}:{error.lineno}:{error.colno}: {error.msg}: {_AGAIN}") from None
+    except UnicodeDecodeError as error:
+        raise NotComparable(f"{path}: byte {error.start} is not UTF-8: {_AGAIN}") from None
+    except OSError as error:
+        raise NotComparable(f"{path} cannot be read: {error.strerror}") from None
+
+
+def _checked(path: Path, model: type[M], content: Any) -> M:
+    try:
+        return TypeAdapter(model).validate_python(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "the top"
+        raise NotComparable(f"{path}: {place}: {first['msg'].lower()}: {_AGAIN}") from None
+
+
+def _values(path: Path) -> dict[str, FinalValue]:
+    """Return the final values in the ``recipe.yaml`` of a run, each with its source from the comment behind it."""
+    try:
+        document = read(path, str(path))
+    except RecipeError as error:
+        raise NotComparable(str(error)) from None
+    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    sources = [line.rpartition(" # ")[::2] for line in lines]
+    found = {}
+    for leaf in document.root.leaves():
+        before, source = sources[leaf.key.line - 1]
+        if before:  # a block of which every value is a default has no source
+            found[leaf.name] = FinalValue(flow(leaf.plain), source.strip())
+    return found
