@@ -120,6 +120,18 @@ def test_small_chains_keep_the_pupil_and_know_what_a_case_touches(tmp_path):
     assert not {"scene_photons[mask]", "spot[mask,green]", "charge[mask]"} & same
 
 
+def test_a_mask_from_a_file_has_a_stand_in_of_its_depth_so_that_what_follows_is_tested(tmp_path):
+    recipe = load("demonstration", [])
+    chain = CaseRecipe.of(recipe, USUAL, Code(tmp_path / "code.json"))
+    (pupil,) = (step for step in chain.steps.values() if step.node.path == "optics.pupil" and "[mask]" in step.name)
+    mask = chain.inputs(pupil.name)[0]
+    assert mask.shape == (64, 64)
+    (depth,) = (step.params["depth"] for step in recipe.steps.values() if step.node.path == "doe.pixelwise")
+    assert 0.5 * depth < float(mask.max()) <= depth
+    assert judge_step(pupil, chain.inputs(pupil.name), USUAL, recipe.seed).mark == "pass"
+    assert "takes the\nplace of a mask from a file" in stability_study._HOW
+
+
 def _without_restoration(recipe):
     """It is half of the time, and what is tested is the study."""
     steps = {n: s for n, s in recipe.steps.items() if n not in ("deconvolved", "restored", "restored_quality")}
