@@ -12,7 +12,7 @@ from neusee.nodes.metrics._saturated_pixels import Saturated, saturated
 from neusee.nodes.metrics._spectral_error import _SAMPLES, _SIDE, spectral_error
 from neusee.nodes.metrics._suppression_ratios import bsr, light_outside, lsr, peak_bsr
 from neusee.nodes.shape_rules import double, scalars
-from neusee.nodes.values import Bands, LowRankCube, Psf, Pupil
+from neusee.nodes.values import Bands, Psf, Pupil
 
 quality.shape(scalars(Quality))
 peak_irradiance.shape(scalars(Peak))
@@ -38,14 +38,13 @@ def _(psf: Psf) -> Limits:
 
 
 @bsr.shape
-def _(psf: Psf, radiance: Tensor | LowRankCube | None = None) -> Tensor:
-    return double(*radiance.shape[:-2]) if isinstance(radiance, Tensor) else double(len(psf.intensity))
+def _(psf: Psf, radiance: Tensor | None = None) -> Tensor:
+    return double(len(psf.intensity)) if radiance is None else double(*radiance.shape[:-2])
 
 
 @bsr.work
-def _(result: Tensor, psf: Psf, radiance: Tensor | LowRankCube | None = None) -> tuple[float, float]:
-    read = psf.intensity if radiance is None else radiance.planes if isinstance(radiance, LowRankCube) else radiance
-    return 0.0, float(read.numel())
+def _(result: Tensor, psf: Psf, radiance: Tensor | None = None) -> tuple[float, float]:
+    return 0.0, float((psf.intensity if radiance is None else radiance).numel())
 
 
 @peak_bsr.shape

@@ -10,7 +10,7 @@ from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.metrics._mask_limits import least_lsr
 from neusee.nodes.optics._imaging._light_in_field import light_in_field
-from neusee.nodes.values import LowRankCube, Psf, Pupil
+from neusee.nodes.values import Psf, Pupil
 
 _DARK = 1e-30  #: light below which a band counts as dark
 _ROUNDED = 1e-4  #: excess of light that sampling and round-off explain
@@ -41,7 +41,7 @@ def _(result: Tensor, *inputs: Psf) -> list[Check]:
 
 
 @node(rtol=1e-6, bands={"psf": 0, "radiance": -3, "return": -1})
-def bsr(psf: Psf, radiance: Tensor | LowRankCube | None = None) -> Tensor:
+def bsr(psf: Psf, radiance: Tensor | None = None) -> Tensor:
     """Compute the background suppression ratio: the share of the scene's light that a mask leaves in the field.
 
     The scene's light is all light that the clear pupil takes from the scene inside the field, which an unbounded sensor
@@ -52,9 +52,9 @@ def bsr(psf: Psf, radiance: Tensor | LowRankCube | None = None) -> Tensor:
 
     Shapes: psf.intensity (band, any, any), radiance (..., band, y, x) -> (..., band) float64.
     Units:  none; 1 where all light stays in the field.
-    Error:  1e-6 in float32. Of a low-rank scene, at most its residual over the mean of the band. A band without light
-            (1e-30) has ratio 1. A PSF sampled at points holds more than all light where pixels are wider than
-            lambda f / D, or where the light reaches the edge of the alias-free field. Sharpness is not measured.
+    Error:  1e-6 in float32. A band without light (1e-30) has ratio 1. A PSF sampled at points holds more than all light
+            where pixels are wider than lambda f / D, or where the light reaches the edge of the alias-free field.
+            Sharpness is not measured.
     Raises: ValueError where scene and PSF have different bands.
     Source: NeuSee, section Sensor Image (BSR), as a ratio of energies; the border is left out.
     """
@@ -67,15 +67,12 @@ def bsr(psf: Psf, radiance: Tensor | LowRankCube | None = None) -> Tensor:
 
 
 @bsr.reference
-def _(psf: Psf, radiance: Tensor | LowRankCube | None = None) -> Tensor:
+def _(psf: Psf, radiance: Tensor | None = None) -> Tensor:
     """Form the image without border, with a margin that catches all light of the PSF, and compare sums of pixels."""
     kernel = psf.intensity.double()
     if radiance is None:
         return kernel.sum((-2, -1))
-    if isinstance(radiance, LowRankCube):
-        cube = torch.tensordot(radiance.basis.double(), radiance.planes.double(), 1)
-    else:
-        cube = radiance.double()
+    cube = radiance.double()
     scene = cube.reshape(-1, *cube.shape[-3:])
     (m, n), (y, x) = kernel.shape[-2:], scene.shape[-2:]
     around = (n - 1, n - 1, m - 1, m - 1)

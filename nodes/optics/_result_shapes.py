@@ -21,9 +21,11 @@ _SHORT, _FINE = 400e-9, 4e-6  #: m, wavelength and pupil pitch where no value is
 
 
 @pupil.shape
-def _(height: Any, index: Any, bands: Bands, stop: Stop, *others: Any, **params: Any) -> Pupil:
-    factor = blank(int(stop.samples), int(stop.samples))
-    return Pupil(factor, factor, factor, factor, double(len(bands.centres)), bands.centres, stop.pitch)
+def _(height: Tensor | None, index: Any, bands: Bands, stop: Stop, dirt: Any = None, **params: Any) -> Pupil:
+    side, dtype = int(stop.samples), torch.float32 if height is None else height.dtype
+    clear, amplitude, relief, path = (blank(side, side, dtype=dtype) for _ in range(4))
+    wave = double(len(bands.centres))
+    return Pupil(clear, clear if dirt is None else amplitude, relief, path, wave, bands.centres, stop.pitch)
 
 
 @psf.shape

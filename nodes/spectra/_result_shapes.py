@@ -50,8 +50,9 @@ def _mixture(rgb: Tensor, bands: Bands, **params: Any) -> LowRankCube:
 
 def _low_rank(planes: int, bands: int, like: Tensor) -> LowRankCube:
     dtype = torch.float64 if like.dtype == torch.float64 else torch.float32
-    whole, rest = blank(planes, *like.shape[-2:], dtype=dtype), double(planes + 1, bands)
-    return LowRankCube(whole, double(bands, planes), rest, rest, blank(*like.shape[-2:], dtype=dtype))
+    whole, off = (blank(*shape, *like.shape[-2:], dtype=dtype) for shape in ((planes,), ()))
+    most, spread = (double(planes + 1, bands) for _ in range(2))
+    return LowRankCube(whole, double(bands, planes), most, spread, off)
 
 
 for node in (lift_lmmse, lift_mallett, lift_mst_plus_plus):

@@ -37,11 +37,11 @@ def test_one_thread_at_a_time_changes_the_settings_of_cudnn():
         with exact_convolutions(ON_CUDA, deterministic=True):
             order.append(("first", cudnn.allow_tf32, cudnn.deterministic))
             inside.set()
-            ready.wait(10)
+            ready.wait(300)
         order.append(("first left",))
 
     def second():
-        inside.wait(10)
+        inside.wait(300)
         ready.set()
         with exact_convolutions(ON_CUDA):
             order.append(("second", cudnn.allow_tf32, cudnn.deterministic))
@@ -63,11 +63,11 @@ def test_the_key_reads_the_setting_outside_of_a_convolution():
     def convolve():
         with exact_convolutions(ON_CUDA):
             inside.set()
-            leave.wait(10)
+            leave.wait(300)
 
     with ThreadPoolExecutor(2) as pool:
         pool.submit(convolve)
-        inside.wait(10)
+        inside.wait(300)
         read = pool.submit(tf32_setting)
         leave.set()
         assert read.result() is True

@@ -49,7 +49,7 @@ WIDE = Psf(rand(4, 12, 12) / 200, rand(4))
 DISC = torch.ones(16, 16)
 HEIGHT = rand(16, 16, dtype=torch.float32) * 1e-6
 PUPIL = Pupil(DISC, DISC, HEIGHT, 0 * HEIGHT, INDEX, BANDS.centres, torch.tensor(5e-4, dtype=torch.float64))
-DIRT = Dirt(rand(16, 16, dtype=torch.float32), HEIGHT)
+DIRT = Dirt(rand(16, 16, dtype=torch.float32), HEIGHT.clone())
 LOW_RANK = LowRankCube(rand(2, 12, 12), rand(4, 2), torch.zeros(3, 4, dtype=torch.float64))
 ROWS = spectra.rows(BANDS, RESPONSES)
 CHANNELS = Channels(rand(3, 12, 12), rand(3, 4), torch.tensor(0.0, dtype=torch.float64))

@@ -32,14 +32,14 @@ class Child:
         except ProcessLookupError:
             assert how == signal.SIGKILL  # it was quicker
 
-    def wait(self, seconds: float = 60.0) -> None:
+    def wait(self, seconds: float = 300.0) -> None:
         """Until the process has ended."""
         end = time.monotonic() + seconds
         while _alive(self.pid):
             assert time.monotonic() < end, f"process {self.pid} hangs"
             time.sleep(0.002)
 
-    def result(self, seconds: float = 60.0) -> dict[str, Any]:
+    def result(self, seconds: float = 300.0) -> dict[str, Any]:
         """What the run gave, once the process has ended."""
         self.wait(seconds)
         found: dict[str, Any] = json.loads(self.out.read_text())

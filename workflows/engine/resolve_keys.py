@@ -39,9 +39,14 @@ class Resolved:
         return name
 
 
-def resolve(recipe: Recipe, order: Iterable[str], store: Store, device: str = "cpu") -> Resolved:
-    """Return the cache key of each step for a run on ``device``; ``order`` lists each step after its inputs."""
-    found, code, ledger = Resolved(), Code(store.code_memo), ErrorBudget(recipe)
+def resolve(
+    recipe: Recipe, order: Iterable[str], store: Store, device: str = "cpu", code: Code | None = None
+) -> Resolved:
+    """Return the cache key of each step for a run on ``device``; ``order`` lists each step after its inputs.
+
+    ``code`` has the digests of nodes that were read a moment ago, if there are any.
+    """
+    found, code, ledger = Resolved(), code or Code(store.code_memo), ErrorBudget(recipe)
 
     def facts_of(name: str) -> TensorStats | None:
         known = facts_in(store.about(found.keys[name]))

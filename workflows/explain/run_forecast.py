@@ -18,6 +18,7 @@ from neusee.workflows.explain.forecast_table import forecast_rows, seconds_text,
 from neusee.workflows.explain.report_memory import report_peak, shown_steps
 from neusee.workflows.graph.recipe_graph import Recipe, needed, nodes_of
 from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
 from neusee.workflows.report.contents import steps_of, wanted
 from neusee.workflows.store.byte_sizes import format_size
@@ -54,7 +55,8 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
     recipe = with_substitutions(recipe, wanted(recipe))
     order = steps_of(recipe)
     devices = [lane.device for lane in lanes.values()]
-    resolved = resolve(recipe, order, store, ",".join(devices))
+    code = Code(store.code_memo)
+    resolved = resolve(recipe, order, store, ",".join(devices), code)
     keys, left_out = resolved.keys, {name: resolved.left_out(name) for name in order}
     awake, loaded = _awake(recipe, keys, store, wanted(recipe))
     makers: dict[Key, str] = {}
@@ -73,15 +75,15 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
         return replace(empty, refused=str(error))
     where = {w.step.name: w.lane for w in found.works}
     plan = replace(empty, lanes=where, schedule=found.schedule, running=running_peak(found.schedule, lanes))
-    return _with_report(plan, store, costs, lanes)
+    return _with_report(plan, store, costs, lanes, code)
 
 
-def _with_report(plan: Plan, store: Store, costs: Costs, lanes: Mapping[str, Lane]) -> Plan:
+def _with_report(plan: Plan, store: Store, costs: Costs, lanes: Mapping[str, Lane], code: Code) -> Plan:
     """Return the plan with the memory of the report, and with the reason if the limit is too small for the report."""
     cpu = [lane for lane in lanes.values() if lane.kind == "cpu"]
     shown = shown_steps(plan.recipe)
     order = needed(plan.recipe, shown)
-    keys = resolve(plan.recipe, order, store, ",".join(lane.device for lane in lanes.values())).keys
+    keys = resolve(plan.recipe, order, store, ",".join(lane.device for lane in lanes.values()), code).keys
     there = {plan.keys[name] for name in plan.order}
     makers: dict[Key, str] = {}
     for name in _awake(plan.recipe, keys, store, shown, there)[0]:

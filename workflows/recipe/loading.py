@@ -7,15 +7,11 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.final_values import Config, Setting
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
-from neusee.workflows.recipe.blocks.train_block import KEY as TRAINING
-from neusee.workflows.recipe.blocks.train_block import read_training
-from neusee.workflows.recipe.blocks.train_lift_block import KEY as LIFTING
-from neusee.workflows.recipe.blocks.train_lift_block import read_lift_training
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
 from neusee.workflows.recipe.expected_numbers import unaffected_expectations
 from neusee.workflows.recipe.global_settings import expectations, outputs_of, seed_and_tolerance
@@ -32,6 +28,14 @@ from neusee.workflows.recipe.text.python_overrides import overrides_of
 from neusee.workflows.recipe.text.references import References
 from neusee.workflows.recipe.text.yaml_values import Value
 from neusee.workflows.recipe.wiring import Wiring, cycles
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from neusee.workflows.recipe.blocks.train_block import Training
+    from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
+
+TRAININGS = ("train", "train_lift")  #: keys of the blocks of a recipe that train something
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,13 +94,25 @@ def _checked(composed: Composed, graph: CachedGraph) -> Recipe:
     return check(composed)
 
 
+def _trainings(
+    composed: Composed, modules: Mapping[str, ModuleType]
+) -> tuple[Composed, Training | None, LiftTraining | None]:
+    """Return a recipe without its blocks of trainings, and their settings; few recipes need the import of these."""
+    from neusee.workflows.recipe.blocks.train_block import read_training
+    from neusee.workflows.recipe.blocks.train_lift_block import read_lift_training
+
+    composed, training = read_training(composed, class_context(modules))
+    composed, lifting = read_lift_training(composed)
+    return composed, training, lifting
+
+
 def check(composed: Composed) -> Recipe:
     """Return a composed recipe after a check of all its values; raise `RecipeError` with all mistakes."""
-    blocks = [composed.root.items[key] for key in (TRAINING, LIFTING) if key in composed.root.items]
+    blocks = [composed.root.items[key] for key in TRAININGS if key in composed.root.items]
     mistakes: list[Diagnostic] = []
     own = read_own_families(composed.root, mistakes)
-    composed, training = read_training(composed.with_problems(mistakes), class_context(own.modules))
-    composed, lifting = read_lift_training(composed)
+    composed = composed.with_problems(mistakes)
+    composed, training, lifting = _trainings(composed, own.modules) if blocks else (composed, None, None)
     composed, uncertain = settle(composed)
     diagnostics = list(composed.diagnostics)
     root, references = composed.root, References(composed.root, diagnostics, dict(composed.replaced))

@@ -1,4 +1,4 @@
-"""The check of a file of raw frames before the run, which reads no pixels but those that are fractions."""
+"""The check of a file of raw frames before the run, which reads the pixels only if their type has other than counts."""
 
 import math
 import warnings
@@ -36,6 +36,8 @@ def _picture(file: Path) -> str:
                 image.verify()
             elif (last := max(map(sum, ends), default=0)) > file.stat().st_size:
                 return f"{file} is damaged (its pixels end at byte {last}, after its end): copy the file again"
+            elif image.mode in ("I", "F"):
+                read(file)
     except UnidentifiedImageError:
         return f"{file} is not a readable picture: save the frame as 16-bit grey PNG"
     except Image.DecompressionBombError:
@@ -51,17 +53,18 @@ def _numpy(file: Path) -> str:
     head = np.load(file, mmap_mode="r", allow_pickle=False)
     if head.dtype.kind not in "uif":
         return f"{file} holds values of type {head.dtype}: save raw frames as whole numbers"
-    return _too_large(file, head.shape) or _wrong_numbers(file, head.shape, head.dtype.kind == "f")
+    doubtful = head.dtype.kind != "u" or head.dtype.itemsize > 2
+    return _too_large(file, head.shape) or _wrong_numbers(file, head.shape, doubtful)
 
 
 def _fits(file: Path) -> str:
     """Return a message for a FITS file without an image, cut short, too large, or with other than whole numbers."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # astropy warns of a file that is cut short, which is refused here
-        shape, fractions, end = fits_image(file)
+        shape, end, doubtful = fits_image(file)
     if end > (size := file.stat().st_size):
         return f"{file} is damaged (its image ends at byte {end}, after its end at {size}): copy the file again"
-    return _too_large(file, shape) or _wrong_numbers(file, shape, fractions)
+    return _too_large(file, shape) or _wrong_numbers(file, shape, doubtful)
 
 
 def _too_large(file: Path, shape: tuple[int, ...]) -> str:
@@ -71,12 +74,12 @@ def _too_large(file: Path, shape: tuple[int, ...]) -> str:
     return f"{file} has {count} values, more than the limit of {VALUES}: divide the frames among several files"
 
 
-def _wrong_numbers(file: Path, shape: tuple[int, ...], fractions: bool) -> str:
+def _wrong_numbers(file: Path, shape: tuple[int, ...], doubtful: bool) -> str:
     """Return a message for an array that is no stack of frames, or holds no digital numbers, else an empty text.
 
-    Numbers of a type without fractions are not read before the run.
+    Numbers of a type that has counts of a converter alone, such as uint16, are not read before the run.
     """
-    if fractions or len(shape) not in (2, 3) or not math.prod(shape):
+    if doubtful or len(shape) not in (2, 3) or not math.prod(shape):
         try:
             read(file)
         except ValueError as error:

@@ -88,8 +88,10 @@ def _fits(file: Path) -> NDArray[Any]:
         return np.array(_first_image(file, opened).data)
 
 
-def fits_image(file: Path) -> tuple[tuple[int, ...], bool, int]:
-    """Return the shape of the first image of a FITS file, True if its numbers may be fractions, and its last byte.
+def fits_image(file: Path) -> tuple[tuple[int, ...], int, bool]:
+    """Return the shape of the first image of a FITS file, its last byte, and True if it may hold other than counts.
+
+    The type of the numbers and their scale tell whether they may be fractions, negative or too large for a converter.
 
     Only headers are read. Raises ValueError for a file without an image.
     """
@@ -98,11 +100,13 @@ def fits_image(file: Path) -> tuple[tuple[int, ...], bool, int]:
     with fits.open(file) as opened:
         image = _first_image(file, opened)
         header, about = image.header, image.fileinfo()
-        scaled = float(header.get("BSCALE", 1)) != 1 or float(header.get("BZERO", 0)) % 1 != 0 or "BLANK" in header
-        fractions = scaled or int(header["BITPIX"]) < 0
+        bits, zero = int(header["BITPIX"]), float(header.get("BZERO", 0))
+        least = zero - (2 ** (bits - 1) if bits > 8 else 0)  # eight bits have no sign
+        scaled = float(header.get("BSCALE", 1)) != 1 or zero % 1 != 0 or "BLANK" in header
+        doubtful = scaled or bits < 0 or least < 0 or least + 2**bits > _TOP
         packed = isinstance(image, fits.CompImageHDU)  # its blocks of 2880 bytes, of which the last one may be short
-        size = about["datSpan"] - 2879 if packed else math.prod(image.shape) * abs(int(header["BITPIX"])) // 8
-        return tuple(image.shape), fractions, int(about["datLoc"] + size)
+        size = about["datSpan"] - 2879 if packed else math.prod(image.shape) * abs(bits) // 8
+        return tuple(image.shape), int(about["datLoc"] + size), doubtful
 
 
 def _first_image(file: Path, opened: Any) -> Any:

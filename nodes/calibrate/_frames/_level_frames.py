@@ -23,8 +23,8 @@ def frames(*, files: DataFiles) -> Tensor:
     Shapes: -> (frame, y, x) int32, the frames of all files in order.
     Units:  DN.
     Error:  exact.
-    Raises: ParameterError before the run for an unknown kind of file, for a damaged file and for colour; ValueError for
-            numbers that are not whole, and for frames that differ in size.
+    Raises: ParameterError before the run for an unknown kind of file, for a damaged file, for colour, and for numbers
+            that are negative or not whole; ValueError for frames that differ in size.
     Source: EMVA Standard 1288, release 4.0 Linear, section 6.5 (raw frames, without corrections).
     """
     return torch.from_numpy(stack(files))

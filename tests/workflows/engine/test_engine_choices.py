@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from neusee.nodes import node
+from neusee.workflows.engine import step_job
 from neusee.workflows.engine.local_executor import program_memory
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
@@ -19,6 +20,19 @@ from neusee.workflows.store.result_store import Store
 BIG = 1 << 20
 CALLS = []
 LANES = []
+
+
+class Ticks:
+    """A clock by which every step takes 0.3 s, however long it takes."""
+
+    now = 1.9e9
+
+    def time(self):
+        return self.now
+
+    def perf_counter(self):
+        self.now += 0.3
+        return self.now
 
 
 @node()
@@ -119,7 +133,9 @@ def test_a_value_that_was_not_kept_is_computed_again_and_says_why(store):
     assert again.keys["b"] == first.keys["b"]
 
 
-def test_cheap_steps_after_one_another_are_kept_once_together_they_are_dear(store):
+def test_cheap_steps_after_one_another_are_kept_once_together_they_are_dear(store, monkeypatch):
+    monkeypatch.setattr(step_job, "time", Ticks())
+
     class Slow(Store):
         def write_seconds(self, size):
             return 0.5
@@ -127,8 +143,8 @@ def test_cheap_steps_after_one_another_are_kept_once_together_they_are_dear(stor
         def read_seconds(self, size):
             return 0.0
 
-    steps = {"s0": (slow, {}, {"seconds": 0.3})}
-    steps |= {f"s{i}": (slow, {"x": f"s{i - 1}"}, {"seconds": 0.3}) for i in range(1, 4)}
+    steps = {"s0": (slow, {}, {"seconds": 0.0})}
+    steps |= {f"s{i}": (slow, {"x": f"s{i - 1}"}, {"seconds": 0.0}) for i in range(1, 4)}
     done = run(recipe("m", **steps, m=(mean, {"x": "s3"}, {})), Slow(store.root)).done
     assert [done[f"s{i}"].kept for i in range(4)] == [False, True] * 2
 
@@ -148,14 +164,17 @@ def test_a_stored_value_is_computed_again_where_reading_takes_longer(store):
     assert states(run(recipe("m", **changed, n=(mean, {"x": "b"}, {})), Store(store.root)))["m"] == "cached"
 
 
-def test_branches_run_side_by_side_on_two_lanes_and_give_the_same_bits(store, tmp_path):
+def test_branches_run_side_by_side_on_two_lanes_and_give_the_same_bits(store, tmp_path, monkeypatch):
     steps = {
-        "a": (slow, {}, {"seconds": 0.4}),
-        "b": (slow, {}, {"seconds": 0.401}),
+        "a": (slow, {}, {"seconds": 0.05}),
+        "b": (slow, {}, {"seconds": 0.051}),
         "n": (noise, {"x": "a"}, {}),
         "m": (mean, {"x": "n", "y": "b"}, {}),
     }
-    both = run(recipe("n m", **steps), store, device="cpu:0,cpu:1")
+    both_sleep = threading.Barrier(2, timeout=300)
+    with monkeypatch.context() as patch:
+        patch.setattr(time, "sleep", lambda seconds: both_sleep.wait())
+        both = run(recipe("n m", **steps), store, device="cpu:0,cpu:1")
     assert len(set(LANES)) == 2
     spans = [(d.began, d.began + d.seconds) for d in (both.done["a"], both.done["b"])]
     assert max(s for s, _ in spans) < min(e for _, e in spans), "they overlap in time"
@@ -189,11 +208,12 @@ def test_memory_that_cannot_do_is_refused_before_anything_runs(store):
     assert run(recipe("m", **other), Store(store.root), memory=enough).values["m"] == 2
 
 
-def test_the_account_says_what_was_expected(store):
+def test_the_account_says_what_was_expected(store, monkeypatch):
+    monkeypatch.setattr(step_job, "time", Ticks())
     run(recipe("m", **DEAR), store)
     other = {**DEAR, "a": (slow, {}, {"seconds": 0.25})}
     result = run(recipe("m", **other), Store(store.root))
-    assert result.done["a"].predicted == pytest.approx(0.3, rel=0.3)
+    assert result.done["a"].predicted == pytest.approx(0.3)
     assert [slot.task for slot in result.schedule.slots] == ["a", "b", "m"]
     assert result.done["b"].began >= result.done["a"].began + result.done["a"].seconds - 1e-3
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from neusee.nodes import node
+from neusee.workflows.engine import memory_watch
 from neusee.workflows.engine.local_executor import program_memory
 from neusee.workflows.engine.memory_use import PeakMemory, free_memory, process_memory, process_peak
 from neusee.workflows.engine.memory_watch import MemoryLimit, guarded, limited
@@ -17,6 +18,7 @@ from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 
 MB = 10**6
+LOOKED = threading.Event()  #: is set whenever the memory is looked at
 
 
 @node()
@@ -31,14 +33,13 @@ def _():
 
 @node()
 def hoard(x: torch.Tensor) -> torch.Tensor:
-    """Take memory in small pieces until told to stop; far more than the rule of its shape makes one expect."""
+    """Take far more memory than the rule of its shape tells, one piece after each look at it, until told to stop."""
     held = []
-    for _ in range(10_000):
-        held.append(torch.ones(250_000))
-        threading.Event().wait(1e-3)
-        if len(held) > 3000:
-            raise AssertionError("nobody stopped it")
-    return x
+    for _ in range(150):
+        held.append(torch.ones(5_000_000))
+        LOOKED.clear()
+        LOOKED.wait(300)
+    raise AssertionError("nobody stopped it")
 
 
 @hoard.shape
@@ -52,13 +53,18 @@ def recipe():
     return Recipe("t", "", 1, 0.0, ("b",), steps)
 
 
-def test_a_step_that_takes_more_than_the_limit_is_stopped_by_name_and_the_finished_work_stays(tmp_path):
+def test_a_step_that_takes_more_than_the_limit_is_stopped_by_name_and_the_finished_work_stays(tmp_path, monkeypatch):
+    def look():
+        LOOKED.set()
+        return process_memory()
+
+    monkeypatch.setattr(memory_watch, "process_memory", look)
     store = Store(tmp_path)
     limit = program_memory() + 300 * MB
     with pytest.raises(RunError, match=r"b \(.*hoard\): MemoryLimit: the process holds .* the limit is ") as caught:
         run(recipe(), store, memory=limit)
     assert caught.value.step == "b"
-    assert process_peak() < limit + 400 * MB
+    assert process_peak() < limit + 100 * MB  # of pieces of 20 MB
     done = run(recipe(), Store(tmp_path), ("a",)).done
     assert done["a"].state == "cached"
 
@@ -74,11 +80,17 @@ def test_without_a_limit_nothing_is_watched():
         assert not [t for t in threading.enumerate() if t.name == "neusee memory" and not t.daemon]
 
 
+def stay(pauses):
+    """Be a step that computes nothing for ``pauses`` hundredths of a second."""
+    for _ in range(pauses):
+        threading.Event().wait(0.01)
+
+
 def test_an_error_that_comes_too_late_for_the_step_is_raised_at_its_end():
     with limited(1.0), pytest.raises(MemoryLimit), guarded():
-        threading.Event().wait(0.5)
+        stay(30_000)
     with limited(1e15), guarded():
-        threading.Event().wait(0.05)
+        stay(5)
 
 
 def test_the_peak_of_the_process_is_not_forgotten_when_a_step_is_measured():

@@ -520,9 +520,9 @@ def chain(n):
 def test_a_chain_of_ten_thousand_steps_runs(store):
     steps = chain(10_000)
     assert run(steps, store).values["s10000"][0] == 10_001
-    began = time.perf_counter()
+    began = time.process_time()
     assert run(steps, again(store)).values["s10000"][0] == 10_001
-    assert time.perf_counter() - began < 5
+    assert time.process_time() - began < 5
 
 
 def test_the_result_says_how_much_memory_and_time(store):

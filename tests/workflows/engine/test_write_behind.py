@@ -28,7 +28,7 @@ N = 1 << 19
 class Slow(Store):
     """A store that takes its time to write, and says when."""
 
-    def __init__(self, root, seconds=0.5):
+    def __init__(self, root, seconds=0.2):
         super().__init__(root)
         self.seconds, self.threads, self.claims = seconds, [], []
 
@@ -40,7 +40,7 @@ class Slow(Store):
         return super().put(key, value, about)
 
 
-STEPS = {"a": (make, {}, {"n": N}), "b": (slow, {"x": "a"}, {"seconds": 0.5}), "m": (mean, {"x": "b"}, {})}
+STEPS = {"a": (make, {}, {"n": N}), "b": (slow, {"x": "a"}, {"seconds": 0.1}), "m": (mean, {"x": "b"}, {})}
 
 
 def niceness():
@@ -82,9 +82,19 @@ def test_what_waits_keeps_its_lease(tmp_path):
 
 
 def test_writing_and_computing_overlap(tmp_path):
-    store = Slow(tmp_path)
-    done = run(recipe("a b m", **STEPS), store).done
-    assert done["b"].began < done["a"].began + done["a"].seconds + 0.4, "b began before a was written"
+    class Patient(Slow):
+        """A store that writes nothing before the second step has begun."""
+
+        def put(self, key, value, about):
+            until = time.monotonic() + 300
+            while "slow" not in toys.CALLS:
+                assert time.monotonic() < until, "b waits until a is written"
+                time.sleep(0.001)
+            return super().put(key, value, about)
+
+    toys.CALLS.clear()
+    done = run(recipe("a b m", **STEPS), Patient(tmp_path, 0.0)).done
+    assert {d.state for d in done.values()} == {"run"}
 
 
 def test_what_waits_is_not_computed_again(tmp_path):
@@ -124,12 +134,17 @@ def test_an_error_of_the_writer_is_an_error_of_the_run(tmp_path):
 
 def test_no_more_waits_than_there_is_room_for(monkeypatch):
     monkeypatch.setattr(write_behind, "_ROOM", 100)
-    later, gate, most = WriteBehind(), threading.Event(), []
-    later.add("a", 80, lambda: gate.wait(10))
-    threading.Timer(0.2, gate.set).start()
-    began = time.monotonic()
+    later, gate, most, order = WriteBehind(), threading.Event(), [], []
+
+    def finish():
+        order.append("a is written")
+        gate.set()
+
+    later.add("a", 80, lambda: gate.wait(300))
+    threading.Timer(0.2, finish).start()
     later.add("b", 80, lambda: most.append("a" in later))
-    assert time.monotonic() - began > 0.1
+    order.append("b waits to be written")
     later.finish()
+    assert order == ["a is written", "b waits to be written"]
     assert most == [False]
     assert "b" not in later

@@ -71,10 +71,10 @@ def _chain(toy, last):
 def test_a_chain_of_10000_steps_is_bound_and_ordered(toy):
     from neusee.workflows.recipe.loading import check
 
-    start = time.perf_counter()
+    start = time.process_time()
     recipe = check(_chain(toy, {"node": "toy.height"}))
     assert len(needed(recipe, recipe.outputs)) == CHAIN
-    assert time.perf_counter() - start < 20
+    assert time.process_time() - start < 20
 
 
 def test_a_loop_of_10000_steps_is_found_and_told_in_short(toy):

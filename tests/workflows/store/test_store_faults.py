@@ -44,6 +44,8 @@ def ran(name):
     os.write(file, f"{name} {os.getpid()}\\n".encode())
     os.close(file)
     time.sleep(float(os.environ.get("FAULT_PAUSE", "0.003")))
+    while os.path.exists(os.environ.get("FAULT_GATE", "")):
+        time.sleep(0.005)
     if os.environ.get("FAULT_FAILS"):
         raise ValueError("it was told to fail")
 
@@ -93,8 +95,9 @@ class Ward:
         steps.append(["total", "total", {}, {"x": "three"}])
         return {**self._common(first, pause), "steps": steps, "outputs": STEPS}
 
-    def whose(self, first: str = "", pause: float = 0.003) -> dict[str, Any]:
-        """A job whose value tells which process has computed it."""
+    def whose(self, pause: float = 0.003, gate: Path | str = "") -> dict[str, Any]:
+        """A job whose value tells which process has computed it, which takes as long as there is a file ``gate``."""
+        first = f"os.environ['FAULT_GATE'] = {str(gate)!r}"
         return {**self._common(first, pause), "steps": [["whose", "whose", {}, {}]], "outputs": ["whose"]}
 
     def _common(self, first: str, pause: float) -> dict[str, Any]:
@@ -247,7 +250,9 @@ def test_damage_is_seen_and_mended(ward, suffix, damage):
 
 
 @pytest.mark.slow
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 @given(
     which=st.integers(0, 4), suffix=st.sampled_from(["json", "safetensors"]), at=st.floats(0, 1), bit=st.integers(0, 7)
 )
@@ -380,10 +385,11 @@ def test_a_failed_step_lets_the_next_one_try(ward):
     assert ward.run() == ([], ALL)
 
 
-def waiting(ward: Ward, pause: float) -> Any:
-    """A process in the midst of computing for ``pause`` s."""
-    child = ward.server.start(**ward.whose(pause=pause))
-    end = time.monotonic() + 30
+def waiting(ward: Ward, gate: Path) -> Any:
+    """A process in the midst of computing, which it does until somebody removes the file ``gate``."""
+    gate.touch()
+    child = ward.server.start(**ward.whose(gate=gate))
+    end = time.monotonic() + 300
     while not ward.lines():
         assert time.monotonic() < end
         time.sleep(0.005)
@@ -391,23 +397,25 @@ def waiting(ward: Ward, pause: float) -> Any:
 
 
 def test_a_killed_owner_is_followed_at_once(ward):
-    child = waiting(ward, 60.0)
+    child = waiting(ward, ward.folder / "gate")
     child.kill()
     child.wait()
-    found = ward.server.start(**ward.whose()).result(10)
+    found = ward.server.start(**ward.whose()).result()
     assert found.get("error") is None
     assert found["warnings"] == []
     assert len(ward.lines()) == 2
 
 
 def test_a_stopped_owner_is_followed_and_does_no_harm_when_it_wakes(ward):
-    child = waiting(ward, pause=1.0)
+    gate = ward.folder / "gate"
+    child = waiting(ward, gate)
     child.kill(signal.SIGSTOP)
-    found = ward.server.start(**ward.whose()).result(30)
+    found = ward.server.start(**ward.whose()).result()
     assert found.get("error") is None
     assert len(ward.lines()) == 2
+    gate.unlink()
     child.kill(signal.SIGCONT)
-    late = child.result(30)
+    late = child.result()
     assert late.get("error") is None
     assert ward.server.run(**ward.whose())["values"] == found["values"]
     assert len(ward.lines()) == 2

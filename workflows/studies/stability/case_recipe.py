@@ -57,6 +57,10 @@ def _smaller(step: Step, size: Size, part: float) -> dict[str, Any]:
         params["samples"] = size.samples
     if step.node.path == "spectra.bands":
         params["count"] = size.bands
+    if step.node.path == "doe.pixelwise":
+        params["file"] = (
+            None  # its samples do not fit the small pupil: a random height map of its depth takes its place
+        )
     if params.get("angle"):
         params["angle"] = tuple(a * min(part, 1.0) for a in params["angle"])
     return params | {k: min(v, params[k]) for k, v in _SMALLER.items() if step.node.random and k in params}

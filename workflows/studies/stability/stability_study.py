@@ -27,7 +27,8 @@ from neusee.workflows.studies.stability.stability_figures import grid_picture
 
 _COLUMNS = ("case", "step", "node", "mark", "error", "bound", "gradient error", "gradient bound", "note")
 _HOW = """Each step has the inputs of the recipe, at a small size, with one change: a parameter of the recipe, the
-result of an earlier step, or the pictures among the inputs of the step. The result is compared with the node's own
+result of an earlier step, or the pictures among the inputs of the step. A random height map of the same depth takes the
+place of a mask from a file, whose samples do not fit the small pupil. The result is compared with the node's own
 reference, or with the same function on the same inputs in float64. The error is the largest difference over the
 largest element, and the bound is the node's rtol (at least 1.2e-7, the rounding of single precision).
 

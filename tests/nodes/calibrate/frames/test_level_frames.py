@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from neusee.nodes import ParameterError
 from neusee.nodes.calibrate import frames
+from neusee.nodes.calibrate._frames import _damaged_frames
 
 NUMBERS = np.array([[0, 1, 255, 256], [32767, 32768, 65534, 65535]], np.uint16)
 
@@ -134,6 +135,43 @@ def test_colour_and_loss_are_refused(tmp_path):
 def test_numbers_that_no_converter_gives_are_refused(tmp_path, bad):
     with pytest.raises(ValueError, match=r"a\.npy holds .*not a digital number"):
         read(npy(tmp_path / "a.npy", np.array([[1.0, bad]])))
+
+
+def signed_fits(path, numbers):
+    return fits(path, numbers.astype(np.int16))
+
+
+def packed_fits(path, numbers):
+    from astropy.io import fits as astropy
+
+    astropy.HDUList([astropy.PrimaryHDU(), astropy.CompImageHDU(numbers.astype(np.int16))]).writeto(path)
+    return path
+
+
+@pytest.mark.parametrize("write", [fits, signed_fits, packed_fits, npy, tiff])
+@pytest.mark.parametrize("bad", [-1, -32768, 2**24])
+def test_whole_numbers_that_no_converter_gives_are_found_before_the_run(tmp_path, write, bad):
+    """Types with a sign, and those of 32 bits, may hold such numbers; the numbers of other types are not read."""
+    if "fits" in write.__name__:
+        pytest.importorskip("astropy")
+        if bad > 0 and write is not fits:
+            pytest.skip("16 bits do not hold this number")
+    kind = {npy: "npy", tiff: "tif"}.get(write, "fits")
+    numbers = np.full((4, 5), 7, np.int32)
+    numbers[2, 3] = bad
+    with pytest.raises(ParameterError, match=rf"a\.{kind} holds {bad}(\.0)?, not a digital number: give raw frames"):
+        frames.hooks.preflight(files=(write(tmp_path / f"a.{kind}", numbers),))
+    numbers[2, 3] = 7
+    assert frames.hooks.preflight(files=(write(tmp_path / f"b.{kind}", numbers),)) == []
+
+
+@pytest.mark.parametrize("write", [fits, npy, tiff])
+def test_numbers_of_a_type_that_only_counts_are_not_read_before_the_run(tmp_path, write, monkeypatch):
+    if write is fits:
+        pytest.importorskip("astropy")
+    monkeypatch.setattr(_damaged_frames, "read", lambda file: pytest.fail(f"{file} is read"))
+    kind = {npy: "npy", tiff: "tif", fits: "fits"}[write]
+    assert frames.hooks.preflight(files=(write(tmp_path / f"a.{kind}", NUMBERS),)) == []
 
 
 @pytest.mark.parametrize("shape", [(4,), (0, 4), (1, 2, 3, 4)])
