@@ -13,7 +13,8 @@ from neusee.nodes import ParameterError
 from neusee.nodes.scene import choose_photograph, crop_photograph, list_photographs
 from neusee.workflows.engine.node_call import call
 from neusee.workflows.engine.runner import run
-from neusee.workflows.evaluation.pipelines import BEAM, CASES, EvaluationRefused
+from neusee.workflows.evaluation.pipelines import BEAM, CASES, NONE, EvaluationRefused, PipelineRecipes, one_line
+from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
@@ -96,6 +97,25 @@ def scenes(recipe: Recipe, store: Store, root: Path | None, count: int) -> tuple
         name = own.node.path if path is None else path.relative_to(root).as_posix() if root else path.name
         shown.append(Scene(i, cases[i % len(cases)], name, path, shape, recipe, store))
     return shown, broken
+
+
+def refuse_directions(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> None:
+    """Raise `EvaluationRefused` if the laser of a scene comes from where the pupil of the recipe does not reach.
+
+    Of each laser only the scenes with the largest angles along y and x are tried.
+    """
+    wrong: dict[str, None] = {}
+    for case in dict.fromkeys(scene.case for scene in shown if scene.case != NONE):
+        lit = [(scene, scene.angle(pipeline.recipe(case))) for scene in shown if scene.case == case]
+        for axis in (0, 1):
+            scene, direction = max(lit, key=lambda pair: abs(pair[1][axis]))
+            try:
+                pipeline.recipe(case, direction)
+            except RecipeError as error:
+                wrong |= dict.fromkeys(f"scene {scene.number + 1} ({case}): {one_line(p)}" for p in error.diagnostics)
+    if wrong:
+        text = "\n".join(wrong)
+        raise EvaluationRefused(f"{text}\nThe directions are drawn over the sensor: choose a smaller sensor.shape")
 
 
 def _shape(recipe: Recipe) -> tuple[int, int]:

@@ -79,7 +79,7 @@ class PipelineRecipes:
     """A pipeline (mask and restorer) with one recipe for each laser, which differ only in the laser wavelength."""
 
     pipeline: Pipeline
-    recipe: Callable[[str], Recipe]  #: returns the recipe of a laser by name
+    recipe: Callable[..., Recipe]  #: returns the recipe of a laser by name, and by its direction if one is given
 
     @property
     def name(self) -> str:
@@ -122,7 +122,7 @@ def compose_pipelines(
                 _check(recipe_of(case), pipeline)
             found.append(PipelineRecipes(pipeline, recipe_of))
         except RecipeError as error:
-            wrong |= dict.fromkeys(f"{pipeline.name}: {_one_line(problem)}" for problem in error.diagnostics)
+            wrong |= dict.fromkeys(f"{pipeline.name}: {one_line(problem)}" for problem in error.diagnostics)
         except EvaluationRefused as error:
             wrong[f"{pipeline.name}: {error}"] = None
     if wrong:
@@ -130,7 +130,8 @@ def compose_pipelines(
     return found
 
 
-def _one_line(problem: Diagnostic) -> str:
+def one_line(problem: Diagnostic) -> str:
+    """Return a mistake in a recipe as one line of text."""
     return " ".join(str(RecipeError([problem])).split())
 
 
@@ -161,12 +162,20 @@ def _takes(recipe: str, changes: Sequence[str | Override], folder: Path, group: 
     raise EvaluationRefused(f"{option} takes no file: remove @ and the file name")
 
 
-def _with_laser(recipe: str, words: Sequence[str | Override], fwhm: float, folder: Path, case: str) -> Recipe:
-    """Load a recipe with the laser ``case``; strength and direction are set later for each evaluation point."""
+def _with_laser(
+    recipe: str,
+    words: Sequence[str | Override],
+    fwhm: float,
+    folder: Path,
+    case: str,
+    direction: tuple[float, float] | None = None,
+) -> Recipe:
+    """Load a recipe with the laser ``case``; its strength, and usually its direction, is set later for each point."""
     laser = ""
     if (metres := CASES[case]) is not None:
         line = f"wavelength: {metres * 1e9:g} nm, fwhm: {fwhm * 1e9:g} nm"
-        laser = f"{BEAM}: {{{line}, strength: 1, angle: null}}"
+        angle = "null" if direction is None else f"[{direction[0]!r} rad, {direction[1]!r} rad]"
+        laser = f"{BEAM}: {{{line}, strength: 1, angle: {angle}}}"
     return load(recipe, [*words, f"lasers={{{laser}}}"], folder)
 
 
@@ -175,7 +184,7 @@ def _fwhm(recipe: str, changes: Sequence[str | Override], folder: Path) -> float
     try:
         steps = load(recipe, changes, folder).steps
     except RecipeError as error:
-        raise EvaluationRefused("\n".join(dict.fromkeys(map(_one_line, error.diagnostics)))) from None
+        raise EvaluationRefused("\n".join(dict.fromkeys(map(one_line, error.diagnostics)))) from None
     widths = [step.params["fwhm"] for name, step in steps.items() if name.startswith("line[")]
     return float(widths[0]) if widths else 10e-9
 

@@ -20,7 +20,7 @@ from neusee.workflows.evaluation.comparison_pictures import panels
 from neusee.workflows.evaluation.confidence_intervals import METRICS, compare_with, metric_table
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointNumbers, PointRequest
 from neusee.workflows.evaluation.evaluation_result import EvaluationResult
-from neusee.workflows.evaluation.evaluation_scenes import Scene, scenes
+from neusee.workflows.evaluation.evaluation_scenes import Scene, refuse_directions, scenes
 from neusee.workflows.evaluation.mask_optics import masks
 from neusee.workflows.evaluation.pipelines import (
     NONE,
@@ -73,6 +73,7 @@ def evaluate(
     base = load(recipe, changes, place)
     study_run = StudyRun("evaluate", base, command)
     shown, broken = scenes(base, store, data, count)
+    refuse_directions(each[0], shown)
     names = ", ".join(pipeline.name for pipeline in pipelines)
     progress(f"{len(shown)} scenes, {len(strengths)} strengths, {len(pipelines)} pipelines: {names}")
     _report_broken(broken, progress)

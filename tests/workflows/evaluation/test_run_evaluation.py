@@ -20,7 +20,7 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.evaluation import evaluation_points
 from neusee.workflows.evaluation.confidence_intervals import gain, mean, metric_table
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
-from neusee.workflows.evaluation.evaluation_scenes import scenes
+from neusee.workflows.evaluation.evaluation_scenes import refuse_directions, scenes
 from neusee.workflows.evaluation.pipelines import CASES, EvaluationRefused, compose_pipelines, read_pipelines
 from neusee.workflows.evaluation.run_evaluation import evaluate
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
@@ -327,3 +327,16 @@ def test_a_scene_keeps_its_picture_no_longer_than_it_is_used(store):
     alone = replace(shown[0])
     assert alone.picture.shape == (3, 32, 32)
     assert "picture" not in vars(shown[0])
+
+
+def test_a_drawn_direction_beyond_the_reach_of_the_pupil_is_refused_before_work(store):
+    """Before, the evaluation of `first_light` as shipped ended in its second scene."""
+    shown, _ = scenes(load("first_light"), store, None, 3)
+    first, *_ = compose_pipelines("first_light", [], read_pipelines("flat+none", HERE), HERE)
+    with pytest.raises(
+        EvaluationRefused, match=r"scene 2 \(blue\): .*carries only 1.61 mm.*\n.*smaller sensor.shape"
+    ):
+        refuse_directions(first, shown)
+    room = ["sensor.shape=[512,512]", "scene.shape=[576,576]"]
+    fitting, *_ = compose_pipelines("first_light", room, read_pipelines("flat+none", HERE), HERE)
+    refuse_directions(fitting, scenes(load("first_light", room), store, None, 3)[0])
