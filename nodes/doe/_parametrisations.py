@@ -17,7 +17,7 @@ from neusee.nodes.doe._analytic_masks import axicon, cubic, half_rings, spiral_a
 from neusee.nodes.doe._height_from_phase import height_from_phase
 from neusee.nodes.doe._minimum_feature import smooth
 from neusee.nodes.doe._refractive_index import Material
-from neusee.nodes.doe._sampled_height_map import pixelwise
+from neusee.nodes.doe._sampled_height_map import height_range, pixelwise
 from neusee.nodes.doe._unet_height_map import HeightNet, fresh, height_of
 from neusee.nodes.network_weights import loaded
 from neusee.nodes.optics._phase_screen import screen
@@ -149,7 +149,8 @@ class Written(nn.Module):
 
 def _pixels(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
     start: Tensor = pixelwise(stop, **params, rng=rng)
-    return Pixels(int(stop.samples), params["depth"], params["scale"], rng, start.to(rng.device))
+    highest = height_range(params["file"], params["depth"])
+    return Pixels(int(stop.samples), highest, params["scale"], rng, start.to(rng.device))
 
 
 def _freed(mask: Callable[..., Tensor]) -> Start:

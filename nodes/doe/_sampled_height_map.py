@@ -55,7 +55,7 @@ def pixelwise(
     """
     if file is None:
         noise = screen(grid_of(stop), scale, rng)
-        return ((_DEPTH if depth is None else depth) * torch.sigmoid(1.5 * noise)).to(torch.float32)
+        return (height_range(None, depth) * torch.sigmoid(1.5 * noise)).to(torch.float32)
     lengths = _lengths(file, depth, unit, pitch)
     own = _fits(file, map_header(file).shape, grid_of(stop), lengths["pitch"])
     height = read_height_map(file, lengths["depth"], lengths["unit"])
@@ -73,6 +73,14 @@ def height_map(
     """
     lengths = _lengths(file, depth, unit, pitch)
     return read_height_map(file, lengths["depth"], lengths["unit"]), lengths["pitch"]
+
+
+def height_range(file: Path | None, depth: float | None) -> float:
+    """Return the largest height in m that `doe.pixelwise` draws or learns: that stated, or 1.2 um."""
+    if file is None:
+        return _DEPTH if depth is None else depth
+    found: float = _lengths(file, depth, None, None)["depth"]
+    return found
 
 
 def _lengths(file: Path, depth: float | None, unit: float | None, pitch: float | None) -> dict[str, Any]:

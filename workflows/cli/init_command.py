@@ -17,6 +17,8 @@ FILES: dict[str, tuple[str, str]] = {
     ".gitignore": ("project/gitignore.txt", ""),
     "my_camera.yaml": ("project/my_camera.yaml.txt", ""),
     "sensor/my_sensor.yaml": ("sensor.yaml.txt", "my_sensor"),
+    "sensor/my_sensor_colour.csv": ("sensor_colour.csv.txt", "my_sensor"),
+    "sensor/my_sensor_mono.csv": ("sensor_mono.csv.txt", "my_sensor"),
     "nodes/blooming.py": ("node.py.txt", "blooming"),
     "nodes/test_blooming.py": ("test_node.py.txt", "blooming"),
     "tests/test_my_camera.py": ("project/test_my_camera.py.txt", ""),

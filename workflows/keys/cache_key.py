@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neusee.nodes.network_classes import Architecture
 from neusee.workflows.keys.input_file_digest import file_digest
 
 if TYPE_CHECKING:
@@ -52,8 +52,14 @@ def key_of(
 
 def code_of(step: Step, code: Code) -> str:
     """Return the digest of the code of a step: of its node, and of the network classes that its parameters name."""
-    classes = [value.network for value in step.params.values() if isinstance(value, Architecture)]
+    classes = [network for value in step.params.values() if (network := _network_of(value))]
     return code.of(step.node, tuple(dict.fromkeys((each.__module__, each.__qualname__) for each in classes)))
+
+
+def _network_of(value: Any) -> type[Any] | None:
+    """Return the network class that a parameter names, or None for another value, without an import of torch."""
+    module = sys.modules.get("neusee.nodes.network_classes")  # imported where there is such a value
+    return value.network if module and isinstance(value, module.Architecture) else None
 
 
 def is_private(key: Key) -> bool:
@@ -89,8 +95,8 @@ def plain(value: Any) -> Any:
         return {"items": sorted(([plain(k), plain(v)] for k, v in value.items()), key=repr)}
     if isinstance(value, tuple | list):
         return [plain(v) for v in value]
-    if isinstance(value, Architecture):
-        return {"class": f"{value.network.__module__}.{value.network.__qualname__}"}
+    if network := _network_of(value):
+        return {"class": f"{network.__module__}.{network.__qualname__}"}
     if isinstance(value, complex):
         return {"complex": [value.real, value.imag]}
     raise TypeError(f"a parameter must be a number, a string, a file or a collection of these, not {value!r}")

@@ -29,7 +29,7 @@ def test_the_recipe_of_a_new_folder_has_no_mistake(tmp_path):
     assert not [path for path in folder.rglob("*.*") if "NAME" in path.read_text()]
     recipe = load(folder / "my_camera.yaml")
     assert recipe.steps["bloomed[mask]"].node.path == "blooming.blooming"
-    assert recipe.config["sensor.bits"].source.endswith("sensor/my_sensor.yaml:7:9")
+    assert recipe.config["sensor.bits"].source.endswith("sensor/my_sensor.yaml:9:9")
 
 
 def test_every_command_of_the_readme_parses(tmp_path):

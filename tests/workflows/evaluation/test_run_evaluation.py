@@ -333,9 +333,7 @@ def test_a_drawn_direction_beyond_the_reach_of_the_pupil_is_refused_before_work(
     """Before, the evaluation of `first_light` as shipped ended in its second scene."""
     shown, _ = scenes(load("first_light"), store, None, 3)
     first, *_ = compose_pipelines("first_light", [], read_pipelines("flat+none", HERE), HERE)
-    with pytest.raises(
-        EvaluationRefused, match=r"scene 2 \(blue\): .*carries only 1.61 mm.*\n.*smaller sensor.shape"
-    ):
+    with pytest.raises(EvaluationRefused, match=r"scene 2 \(blue\): .*carries only 1.61 mm.*\n.*smaller sensor.shape"):
         refuse_directions(first, shown)
     room = ["sensor.shape=[512,512]", "scene.shape=[576,576]"]
     fitting, *_ = compose_pipelines("first_light", room, read_pipelines("flat+none", HERE), HERE)
