@@ -229,6 +229,7 @@ print(t.CALLS, flush=True)
 """
 
 
+@pytest.mark.slow
 def test_of_two_processes_one_computes_and_the_other_waits(store):
     from pathlib import Path
 

@@ -59,6 +59,7 @@ print(json.dumps([result.metrics(), result.numpy("raw[mask]").tolist(), float(re
 """
 
 
+@pytest.mark.slow
 def test_a_fresh_process_reads_a_result(result, tmp_path):
     (tmp_path / "result.pickle").write_bytes(pickle.dumps(result))
     command = [sys.executable, "-c", READER, str(tmp_path / "result.pickle")]

@@ -217,6 +217,7 @@ def others(tmp_path_factory):
         server.close()
 
 
+@pytest.mark.slow
 def test_processes_agree_on_keys_and_share_results(lab, others):
     keys = lab.last["keys"]
     for server in others:

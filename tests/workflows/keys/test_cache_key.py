@@ -292,6 +292,7 @@ print(*keys.values())
 """
 
 
+@pytest.mark.slow
 def test_two_processes_make_the_same_keys(trial, tmp_path):
     def keys(hash_seed: str) -> str:
         command = [sys.executable, "-B", "-c", SCRIPT, str(trial.folder), str(tmp_path / f"memo{hash_seed}")]

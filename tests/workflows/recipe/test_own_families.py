@@ -184,6 +184,7 @@ def test_a_helper_of_another_folder_is_not_taken_for_the_one_beside(write, tmp_p
     assert f"the name helper_d is that of {tmp_path / 'a' / 'helper_d.py'}: rename {tmp_path / 'b'}" in problem
 
 
+@pytest.mark.slow
 def test_no_code_refuses_before_anything_is_run(mine, tmp_path, monkeypatch):
     recipe = mine("bloom_e")
     monkeypatch.chdir(tmp_path)

@@ -376,6 +376,7 @@ def test_a_recipe_shows_its_changes_its_steps_and_where_values_stand(given):
     assert "where" in page.words  # the steps that ask for a device
 
 
+@pytest.mark.slow
 def test_pictures_weigh_less_than_a_megabyte_and_are_small(store):
     noise = torch.rand(3, 2000, 1500, generator=torch.Generator().manual_seed(1))
     for count in (1, 2, 4, 6):

@@ -128,6 +128,7 @@ def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
     assert "measured" not in said_of_economies(before)
 
 
+@pytest.mark.slow
 def test_the_command_line_shows_what_stands_in(tmp_path, monkeypatch):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
     done = CliRunner().invoke(app, ["run", "first_light", *SMALL, "--out", str(tmp_path / "runs")])

@@ -312,6 +312,7 @@ for i in range(40):
 """
 
 
+@pytest.mark.slow
 def test_users_who_make_room_at_once_do_no_harm(tmp_path):
     command = [sys.executable, "-c", EVICTOR, str(tmp_path), str(8 * SIZE)]
     users = [subprocess.Popen([*command, str(5 * i)], stderr=subprocess.PIPE, text=True) for i in range(2)]

@@ -374,6 +374,7 @@ def check_kept(root: Path) -> int:
     return len(found)
 
 
+@pytest.mark.slow
 def test_killed_writers_leave_no_wrong_entry(tmp_path):
     killed_writers(tmp_path, 3, [0.03, 0.05, 0.08])
     assert check_kept(tmp_path) > 0

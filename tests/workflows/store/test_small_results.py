@@ -115,6 +115,7 @@ for i in range(first, first + 120):
 """
 
 
+@pytest.mark.slow
 def test_two_processes_that_write_at_once_lose_nothing(tmp_path):
     words = [sys.executable, "-c", WRITER, str(tmp_path)]
     both = [subprocess.Popen([*words, str(start)]) for start in (0, 120)]

@@ -356,6 +356,7 @@ def test_netcdf_is_read_back_as_it_was(command, recipe, store):
 # --- many points ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_fifty_sweeps_leave_nothing_behind(recipe, tmp_path):
     def once(level):
         store = Store(tmp_path / "cache")  # one of its own: a store remembers what it has seen

@@ -262,6 +262,7 @@ def studied(tmp_path, count=20, sampler=resampled, overrides=SEEN, store="store"
                 tmp_path / "runs", simulations=count, pixels=32, sampler=sampler)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_study_has_a_page_and_goes_on(tmp_path, monkeypatch, quick):
     folder = studied(tmp_path)
     page, doc = (folder / "report.html").read_text(), json.loads((folder / "provenance.json").read_text())

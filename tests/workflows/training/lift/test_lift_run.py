@@ -64,6 +64,7 @@ def same(again, whole):
     assert losses(again) == losses(whole)
 
 
+@pytest.mark.slow
 def test_a_training_that_is_stopped_goes_on_to_the_same_weights(tmp_path, whole):
     def watch(stage, done, found):
         if done == 3:

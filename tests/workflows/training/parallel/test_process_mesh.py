@@ -95,6 +95,7 @@ def same(found, expected):
         assert found["losses"][name] == pytest.approx(value, rel=1e-12), name
 
 
+@pytest.mark.slow
 def test_two_processes_find_the_gradients_of_one(done):
     one, data, band = (stepped(done["every", mesh]) for mesh in ("1x1", "2x1", "1x2"))
     same(data, one)
@@ -113,6 +114,7 @@ def test_what_is_imaged_in_a_few_planes_needs_the_gathered_psf(tmp_path):
     assert band["shared"] == {"steps": ["bsr[mask]", "psf[mask]", "radiance"], "cut": ["bsr[mask]"], "sums": []}
 
 
+@pytest.mark.slow
 def test_one_that_fails_ends_all(done):
     broken = done["broken", "2x1"]
     assert codes(broken) == [1, 1], "each ends by itself, and with an error"
