@@ -282,7 +282,7 @@ def test_a_study_that_was_stopped_goes_on_and_writes_its_folder(nodes, recipe, s
 
 
 def _look_at(folder):
-    names = {"figures", "provenance.json", "recipe.yaml", "report.html", "table.csv"}
+    names = {"figures", "provenance.json", "recipe.yaml", "report.html", "ro-crate-metadata.json", "table.csv"}
     assert {p.name for p in folder.iterdir()} == names
     assert {p.stem for p in (folder / "figures").iterdir()} == {"work_precision", "promises", "steps"}
     assert json.loads((folder / "provenance.json").read_text())["command"] == "neusee study"
