@@ -14,6 +14,7 @@ from neusee.nodes.units import Shape
 
 _LARGE = 4_000_000  #: pixels above which a picture is converted and scaled in bands
 _BAND = 1 << 20  #: pixels of a band
+_SMALL_BAND = 1 << 17  #: pixels of a band beside a whole picture, so that its conversion adds little to the peak memory
 
 Linear = Callable[[NDArray[Any]], Tensor]  #: from code values (y, x, channel) to linear light (channel, y, x)
 
@@ -37,7 +38,7 @@ def _in_bands(codes: NDArray[Any], linear: Linear, shape: Shape | None) -> Tenso
     size = (codes.shape[0], codes.shape[1])
     if shape is None or size == tuple(shape):
         whole = torch.empty(3, *size)
-        for rows in bands_of(size):
+        for rows in bands_of(size, _SMALL_BAND):
             whole[:, rows] = linear(codes[rows])
         return whole
     scaled = covering(size, shape)
@@ -57,9 +58,9 @@ def _in_bands(codes: NDArray[Any], linear: Linear, shape: Shape | None) -> Tenso
     return torch.from_numpy(result)
 
 
-def bands_of(size: tuple[int, int]) -> list[slice]:
-    """Return the rows of each band of a picture of ``size`` rows and columns."""
-    step = max(1, _BAND // size[1])
+def bands_of(size: tuple[int, int], pixels: int | None = None) -> list[slice]:
+    """Return the rows of each band of a picture of ``size`` rows and columns, of at most ``pixels`` pixels a band."""
+    step = max(1, (pixels or _BAND) // size[1])
     return [slice(start, start + step) for start in range(0, size[0], step)]
 
 

@@ -55,7 +55,7 @@ def test_a_file_gives_the_same_light_in_bands(monkeypatch, tmp_path, node, name)
 
 
 @pytest.mark.slow
-def test_a_picture_at_the_limit_takes_half_the_memory_it_took(tmp_path):
+def test_a_picture_at_the_limit_takes_less_than_one_and_a_half_gigabytes(tmp_path):
     """64 million pixels, at the size of the file and for a scene of 8 x 8 pixels: 3.4 GB and minutes before."""
     side = 8000
     assert side * side == input_files.PIXELS
@@ -75,7 +75,7 @@ assert float((picture[:, :8, :8] - photograph(file=file, shape=(8, 8))).abs().ma
         words = [sys.executable, "-c", code, tmp_path / "a.png", size]
         done = subprocess.run(words, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
-        assert float(done.stdout) < 1.7e9  # 1.35 to 1.52 seen: the allocator keeps more or less of what was freed
+        assert float(done.stdout) < 1.5e9
     Image.new("RGB", (side + 1, side), (90, 120, 200)).save(tmp_path / "b.png", compress_level=1)
     with pytest.raises(ParameterError, match=r"b\.png has 8001 x 8000 pixels, more than the limit of 64 million"):
         photograph.hooks.preflight(file=tmp_path / "b.png")
