@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -16,17 +16,26 @@ _LARGE = 4_000_000  #: pixels above which a picture is converted and scaled in b
 _BAND = 1 << 20  #: pixels of a band
 _SMALL_BAND = 1 << 17  #: pixels of a band beside a whole picture, so that its conversion adds little to the peak memory
 
+
+class Codes(Protocol):
+    """Code values (y, x, channel) of a picture: an array, or what reads rows of one when they are asked for."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+    def __getitem__(self, rows: slice, /) -> NDArray[Any]: ...
+
+
 Linear = Callable[[NDArray[Any]], Tensor]  #: from code values (y, x, channel) to linear light (channel, y, x)
 
 
-def linear_light(codes: NDArray[Any], linear: Linear, shape: Shape | None) -> Tensor:
+def linear_light(codes: Codes, linear: Linear, shape: Shape | None) -> Tensor:
     """Return linear light (3, y, x) of the code values (y, x, channel) of a picture, scaled and cropped by `framed`.
 
     For a large picture the result equals that of `framed` within the round-off of float32.
     """
     if is_large(codes.shape[0] * codes.shape[1]):
         return _in_bands(codes, linear, shape)
-    return framed(linear(codes), shape)
+    return framed(linear(codes[:]), shape)
 
 
 def is_large(pixels: float) -> bool:
@@ -34,7 +43,7 @@ def is_large(pixels: float) -> bool:
     return pixels > _LARGE
 
 
-def _in_bands(codes: NDArray[Any], linear: Linear, shape: Shape | None) -> Tensor:
+def _in_bands(codes: Codes, linear: Linear, shape: Shape | None) -> Tensor:
     size = (codes.shape[0], codes.shape[1])
     if shape is None or size == tuple(shape):
         whole = torch.empty(3, *size)

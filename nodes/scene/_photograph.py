@@ -11,7 +11,7 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.input_files import once_per_version, refuse_large_picture
 from neusee.nodes.scene._crop_to_frame import enlarged, framed
-from neusee.nodes.scene._large_picture import linear_light
+from neusee.nodes.scene._large_picture import Codes, linear_light
 from neusee.nodes.units import DataFile, Shape
 
 _MODES = ("RGB", "L", "P", "1", "I", "I;16", "I;16B")
@@ -140,13 +140,34 @@ def _linear(codes: NDArray[Any]) -> Tensor:
     return light
 
 
-def _scaled(codes: NDArray[Any]) -> Tensor:
+class _Rows:
+    """Code values (y, x, 3) of a decoded picture, copied when rows are asked for.
+
+    A whole copy beside the result adds up to 0.5 GB to the peak of 64 million pixels: the copy itself, and the memory
+    of the decoded picture, which the C library keeps or gives back as it likes.
+    """
+
+    def __init__(self, image: Any) -> None:
+        image.load()
+        self._image = image
+        self.shape = (image.height, image.width, 3)
+
+    def __getitem__(self, rows: slice) -> NDArray[Any]:
+        start, stop, _ = rows.indices(self._image.height)
+        band = self._image.crop((0, start, self._image.width, stop))
+        plain = band.mode.startswith("I") or band.mode == "RGB"
+        values = np.asarray(band if plain else band.convert("RGB"))
+        return values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2)
+
+
+def _scaled(codes: Codes) -> Tensor:
     """Return code values (y, x, 3) as (3, y, x) float32 in [0, 1]."""
+    codes = codes[:]
     scale = 255.0 if codes.dtype == np.uint8 else 65535.0
     return torch.from_numpy(np.ascontiguousarray(codes.transpose(2, 0, 1), dtype=np.float32)) / scale
 
 
-def _codes(file: Path) -> NDArray[Any]:
+def _codes(file: Path) -> Codes:
     """Read the sRGB code values (y, x, 3) of a photograph, turned upright.
 
     Kornia_rs reads 16-bit colour, of which Pillow would keep 8 bits.
@@ -158,10 +179,7 @@ def _codes(file: Path) -> NDArray[Any]:
         turned = image.getexif().get(_ORIENTATION, 1)
         if image.mode == "RGB" and _depth(file) == 16:
             return _words(file, turned)
-        upright = ImageOps.exif_transpose(image) if turned != 1 else image  # a copy
-        plain = upright.mode.startswith("I") or upright.mode == "RGB"
-        values = np.asarray(upright if plain else upright.convert("RGB"))
-    return values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2)
+        return _Rows(ImageOps.exif_transpose(image) if turned != 1 else image)  # a copy
 
 
 def _depth(file: Path) -> int:
