@@ -1,0 +1,244 @@
+"""The Gaussian beam of a laser: its width, its irradiance on the axis, and its power through an aperture.
+
+Every width is a radius at which the irradiance is 1/e2 of that on the axis (ISO 11146 for a Gaussian beam), and a
+divergence is the full angle between two such radii far away. Laser safety (IEC 60825-1) uses 1/e instead, which is
+smaller by the square root of 2: `beam` converts with ``convention="1/e"``. Distances are numbers or tensors in m.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import ParameterError
+
+Number = TypeVar("Number", float, Tensor)
+Convention = Literal["1/e2", "1/e"]
+
+_AGREE = 0.02  #: largest relative difference of two statements of one quantity, because data sheets round
+_SMALL = 1e-4  #: argument below which a series replaces a quotient of two small numbers
+
+
+class Beam(NamedTuple):
+    """A laser beam as it leaves the laser; `beam` makes and checks a beam. Quantities are in SI units."""
+
+    wavelength: float  #: m
+    power: float | None  #: W, mean over the pulses; None for a single pulse
+    pulse_energy: float | None  #: J; None for a continuous laser
+    pulse_duration: float | None  #: s; None for a continuous laser
+    repetition_rate: float | None  #: Hz; None for a continuous laser or a single pulse
+    waist: float  #: m, 1/e2 radius of the beam where it leaves the laser
+    divergence: float  #: rad, full angle at 1/e2
+    m_squared: float  #: beam quality factor, 1 for a perfect Gaussian beam
+
+    @property
+    def is_pulsed(self) -> bool:
+        """Return True if the laser emits pulses."""
+        return self.pulse_energy is not None
+
+    @property
+    def peak_power(self) -> float | None:
+        """Return the power in W during a pulse, or the power of a continuous laser."""
+        if self.pulse_energy is None or self.pulse_duration is None:
+            return self.power
+        return self.pulse_energy / self.pulse_duration
+
+
+def beam(
+    wavelength: float,
+    *,
+    power: float | None = None,
+    pulse_energy: float | None = None,
+    pulse_duration: float | None = None,
+    repetition_rate: float | None = None,
+    waist: float | None = None,
+    divergence: float | None = None,
+    m_squared: float | None = None,
+    convention: Convention = "1/e2",
+) -> Beam:
+    """Make a beam from what a data sheet states, and derive the missing quantities.
+
+    Waist w0, full divergence theta and M2 obey theta = 2 M2 wavelength / (pi w0): two of them give the third, and one
+    alone is completed with M2 = 1. A pulse train obeys power = pulse energy x repetition rate. ``convention`` is that
+    of `waist` and `divergence`; the result always has 1/e2.
+
+    Raises ParameterError, with the name of the quantity, for negative values and for statements that differ by more
+    than 2 %.
+    """
+    given = {"wavelength": wavelength, "power": power, "pulse_energy": pulse_energy, "pulse_duration": pulse_duration,
+             "repetition_rate": repetition_rate, "waist": waist, "divergence": divergence,
+             "m_squared": m_squared}  # fmt: skip
+    for name, value in given.items():
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ParameterError(name, f"{value:g} is no {name.replace('_', ' ')}: give a finite number above 0")
+    wider = math.sqrt(2) if convention == "1/e" else 1.0
+    shape = _shape(wavelength, waist and waist * wider, divergence and divergence * wider, m_squared)
+    return Beam(wavelength, *_emission(power, pulse_energy, pulse_duration, repetition_rate), *shape)
+
+
+def _emission(
+    power: float | None, energy: float | None, duration: float | None, rate: float | None
+) -> tuple[float | None, float | None, float | None, float | None]:
+    """Return power, pulse energy, pulse duration and repetition rate, with the power or the energy of a train."""
+    if power is None and energy is None:
+        raise ParameterError("power", "no power: give power, or pulse_energy with pulse_duration")
+    if energy is None and duration is None and rate is None:
+        return power, None, None, None
+    if duration is None:
+        name = "repetition_rate" if energy is None else "pulse_energy"
+        raise ParameterError(name, "a pulse needs its duration: give pulse_duration")
+    if energy is None and rate is None:
+        text = "the power of a pulse is not known: give pulse_energy, or repetition_rate with the mean power"
+        raise ParameterError("pulse_duration", text)
+    if rate is None:
+        if power is not None:
+            text = "a single pulse has no mean power: give repetition_rate for a pulse train, or leave power out"
+            raise ParameterError("power", text)
+        return None, energy, duration, None
+    _refuse_long_pulse(duration, rate)
+    if energy is None and power is not None:
+        return power, power / rate, duration, rate
+    assert energy is not None
+    mean = energy * rate
+    if power is not None and not math.isclose(power, mean, rel_tol=_AGREE):
+        text = f"pulse energy {energy:.4g} J x repetition rate {rate:.4g} Hz = {mean:.4g} W, not power {power:.4g} W"
+        raise ParameterError("power", f"{text}: leave one of the three out")
+    return mean, energy, duration, rate
+
+
+def _refuse_long_pulse(duration: float, rate: float) -> None:
+    """Raise ParameterError if the pulses of a train would overlap."""
+    if duration * rate >= 1:
+        text = f"a pulse of {duration:.4g} s does not fit into the period of {1 / rate:.4g} s: give a shorter pulse"
+        raise ParameterError("pulse_duration", f"{text}, or a lower repetition_rate")
+
+
+def _shape(
+    wavelength: float, waist: float | None, divergence: float | None, m_squared: float | None
+) -> tuple[float, float, float]:
+    """Return waist, divergence and M2 of a beam at 1/e2 from two or three of them, or from the first or second."""
+    least = 2 * wavelength / math.pi  # waist x divergence of a perfect Gaussian beam
+    if m_squared is not None and m_squared < 1:
+        raise ParameterError("m_squared", f"M2 = {m_squared:g} is below 1, the M2 of a perfect Gaussian beam")
+    quality = 1.0 if m_squared is None else m_squared
+    if waist is None and divergence is None:
+        raise ParameterError("divergence", "the width of the beam is not known: give divergence, or waist")
+    if waist is None and divergence is not None:
+        return quality * least / divergence, divergence, quality
+    assert waist is not None
+    if divergence is None:
+        return waist, quality * least / waist, quality
+    found = waist * divergence / least
+    said = f"waist {waist:.4g} m and divergence {divergence:.4g} rad (1/e2) have M2 = {found:.4g}"
+    if found < 1 - _AGREE:
+        text = f"{said}, but no beam has less than 1: at this waist the divergence is at least {least / waist:.4g} rad"
+        raise ParameterError("divergence", text)
+    if m_squared is not None and not math.isclose(found, m_squared, rel_tol=_AGREE):
+        raise ParameterError("m_squared", f"{said}, not {m_squared:g}: leave one of the three out")
+    return waist, divergence, max(found, 1.0)
+
+
+# --- the beam at a distance -------------------------------------------------------------------------------------------
+
+
+def beam_radius(beam: Beam, distance: Number) -> Number:
+    """Return the 1/e2 radius in m of a beam at a distance from the laser: w^2 = w0^2 + (theta R / 2)^2."""
+    squared = _radius_squared(beam, distance)
+    return torch.sqrt(squared) if isinstance(squared, Tensor) else math.sqrt(squared)
+
+
+def curvature_radius(beam: Beam, distance: Number) -> Number:
+    """Return the radius in m of the wavefront of a beam at a distance: R + (2 w0 / theta)^2 / R.
+
+    Far from the laser the radius is the distance. The wavefront at the laser itself is plane.
+    """
+    return distance + (2 * beam.waist / beam.divergence) ** 2 / distance
+
+
+def axis_density(beam: Beam, distance: Number, transmittance: float = 1.0) -> Number:
+    """Return the share of a beam's power per m2 on the axis at a distance: 2 T / (pi w^2).
+
+    Times the power it is the irradiance; times the energy of a pulse it is the radiant exposure of one pulse.
+    """
+    return 2 * transmittance / (math.pi * _radius_squared(beam, distance))
+
+
+def axis_irradiance(beam: Beam, distance: Number, transmittance: float = 1.0) -> Number:
+    """Return the irradiance in W/m2 on the axis of a beam: 2 P T / (pi w^2), mean over the pulses.
+
+    Raises ValueError for a single pulse, which has no mean power.
+    """
+    return _mean_power(beam) * axis_density(beam, distance, transmittance)
+
+
+def share_through(beam: Beam, distance: Number, diameter: float, transmittance: float = 1.0) -> Number:
+    """Return the share of a beam's power that passes a round aperture on the axis: T (1 - exp(-D^2 / (2 w^2)))."""
+    return -transmittance * _expm1(-(diameter**2) / (2 * _radius_squared(beam, distance)))
+
+
+def power_through(beam: Beam, distance: Number, diameter: float, transmittance: float = 1.0) -> Number:
+    """Return the power in W that passes a round aperture on the axis of a beam, mean over the pulses.
+
+    Raises ValueError for a single pulse, which has no mean power.
+    """
+    return _mean_power(beam) * share_through(beam, distance, diameter, transmittance)
+
+
+def sensor_density(
+    beam: Beam,
+    distance: Number,
+    diameter: float,
+    focal_length: float,
+    lens_transmittance: float,
+    transmittance: float = 1.0,
+) -> Number:
+    """Return the share of a beam's power per m2 at the peak behind a clear, focused, diffraction-limited lens.
+
+    P_in / P x tau (pi D^2 / 4) / (lambda f)^2 x (2 / x) tanh(x / 2), with x = D^2 / (4 w^2). The last factor is 1 for
+    a beam that overfills the aperture. Times the power it is the peak irradiance; times the energy of a pulse it is
+    the radiant exposure of one pulse.
+    """
+    share = share_through(beam, distance, diameter, transmittance)
+    clear = math.pi * diameter**2 / 4 / (beam.wavelength * focal_length) ** 2
+    return lens_transmittance * clear * share * underfilled(diameter**2 / (4 * _radius_squared(beam, distance)))
+
+
+def peak_on_sensor(
+    beam: Beam,
+    distance: Number,
+    diameter: float,
+    focal_length: float,
+    lens_transmittance: float,
+    transmittance: float = 1.0,
+) -> Number:
+    """Return the peak irradiance in W/m2 behind a clear, focused, diffraction-limited lens, mean over the pulses.
+
+    ``transmittance`` is that of the air. Raises ValueError for a single pulse, which has no mean power.
+    """
+    share = sensor_density(beam, distance, diameter, focal_length, lens_transmittance, transmittance)
+    return _mean_power(beam) * share
+
+
+def underfilled(x: Number) -> Number:
+    """Return (2 / x) tanh(x / 2), the relative peak of a Gaussian beam behind an aperture with x = (D / (2 w))^2."""
+    if isinstance(x, Tensor):
+        safe = x.where(x > _SMALL, 1.0)
+        return torch.where(x > _SMALL, 2 / safe * torch.tanh(safe / 2), 1 - x * x / 12)
+    return 2 / x * math.tanh(x / 2) if x > _SMALL else 1 - x * x / 12
+
+
+def _radius_squared(beam: Beam, distance: Number) -> Number:
+    return beam.waist**2 + (beam.divergence / 2 * distance) ** 2
+
+
+def _mean_power(beam: Beam) -> float:
+    if beam.power is None:
+        raise ValueError("a single pulse has no mean power: give repetition_rate, or use its energy with axis_density")
+    return beam.power
+
+
+def _expm1(x: Number) -> Number:
+    return torch.expm1(x) if isinstance(x, Tensor) else math.expm1(x)
