@@ -1,5 +1,6 @@
 """Laser beams in absolute units: power, pulses, divergence, distance and air."""
 
+from neusee.nodes.laser import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.laser._air import Law, air_transmittance, size_exponent
 from neusee.nodes.laser._beam import (
     Beam,
@@ -15,6 +16,7 @@ from neusee.nodes.laser._beam import (
     share_through,
     underfilled,
 )
+from neusee.nodes.laser._light import light, pulses_within, wavefront
 
 __all__ = [
     "Beam",
@@ -26,10 +28,13 @@ __all__ = [
     "beam",
     "beam_radius",
     "curvature_radius",
+    "light",
     "peak_on_sensor",
     "power_through",
+    "pulses_within",
     "sensor_density",
     "share_through",
     "size_exponent",
     "underfilled",
+    "wavefront",
 ]
