@@ -16,6 +16,7 @@ from neusee.nodes.values import Bands, LaserLight, Psf
 Meaning = Literal["first_channel", "irradiance"]
 
 _LSR = 2.2  #: largest laser suppression ratio of a pupil that only absorbs and delays; derived in the bound
+_SQUARE = 4 / math.pi  #: largest area of the samples of a coarse pupil grid, relative to their disc
 _UNSEEN = 1e-3  #: relative response below which a channel does not see a line
 
 
@@ -123,7 +124,7 @@ def _(
     A channel of small response needs more irradiance to saturate; light in watts has its peak at the mean wavelength.
     """
     if strength is None:
-        return math.inf if light is None else _LSR * light.max * (bands.max / bands.min) ** 2
+        return math.inf if light is None else _LSR * _SQUARE * light.max * (bands.max / bands.min) ** 2
     if strength == 0:
         return 0.0
     least = 1.0
