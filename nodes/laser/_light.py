@@ -15,6 +15,7 @@ from neusee.nodes.laser._beam import (
     beam,
     beam_radius,
     curvature_radius,
+    plain,
     sensor_density,
     share_through,
 )
@@ -155,7 +156,7 @@ def pulses_within(beam: Beam, exposure: float, delay: float) -> float:
         assert beam.pulse_duration is not None
         if beam.repetition_rate is None:
             return min(max(time / beam.pulse_duration, 0.0), 1.0)
-        whole = math.floor(time * beam.repetition_rate)
+        whole = math.floor(plain(time * beam.repetition_rate))
         return whole + min(max(time - whole / beam.repetition_rate, 0.0) / beam.pulse_duration, 1.0)
 
     return begun(exposure - delay) - begun(-delay)

@@ -77,7 +77,7 @@ def unit(clear_peak: Tensor, bands: Bands, wells: Tensor, responses: Tensor | No
     if responses is None or responses.shape[-1] != len(each):
         raise ValueError("strength counts the channel that saturates first: give `responses` for the bands of the line")
     most = (responses.to(each) * each).sum(-1).amax()
-    if not float(most) > 0:
+    if not bool(most > 0):
         raise ValueError(_no_channel(bands))
     return most
 

@@ -125,7 +125,7 @@ def level(
     Source: NeuSee, Eq. (peak_irrad_coded).
     """
     if strength is None:
-        if white is None or not float(white) > 0:
+        if white is None or not bool(white > 0):
             raise ParameterError("strength", _DARK)
         return white.double().expand(len(bands.centres)).clone()
     if rule == "per_band":
