@@ -38,6 +38,30 @@ class Dirt(NamedTuple):
     path: Tensor  #: (v, u) added optical path, m
 
 
+class Wavefront(NamedTuple):
+    """The light of a laser across the pupil, which is uneven and curved if the laser is near or its beam narrow.
+
+    A laser that fills the pupil evenly from a great distance has the value 0 in both fields.
+    """
+
+    taper: Tensor  #: () float64, 1/m2; the amplitude falls as exp(-taper r^2) with the distance r from the axis
+    curvature: Tensor  #: () float64, 1/m, of the diverging wavefront: the added path is curvature r^2 / 2
+
+
+class LaserLight(NamedTuple):
+    """The light of a laser in absolute units, mean over one exposure; 0 for a laser that is given by its strength."""
+
+    even_peak: (
+        Tensor  #: () float64, W/m2 at the peak on the sensor, if the axis irradiance filled a clear, focused lens
+    )
+    flux: Tensor  #: () float64, W behind the lens, if the axis irradiance filled the clear aperture
+    irradiance: Tensor  #: () float64, W/m2 at the lens, on the axis of the beam
+    power: Tensor  #: () float64, W into the aperture of the lens
+    peak: Tensor  #: () float64, W/m2 at the peak on the sensor behind the clear, focused lens
+    pulses: Tensor  #: () float64, pulses within the exposure; 0 for a continuous laser
+    pulse_fluence: Tensor  #: () float64, J/m2 of one pulse at the peak on the sensor; 0 for a continuous laser
+
+
 class Pupil(NamedTuple):
     """The complex pupil function of each band, stored as real factors.
 

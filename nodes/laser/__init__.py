@@ -24,6 +24,7 @@ from neusee.nodes.laser._damage_distances import (
     sensor_gain,
 )
 from neusee.nodes.laser._damage_laws import (
+    KINDS,
     Damage,
     DamageLaw,
     damage_at,
@@ -31,7 +32,10 @@ from neusee.nodes.laser._damage_laws import (
     matching_laws,
     spot_reach,
 )
+from neusee.nodes.laser._damage_pixels import damaged_pixels
 from neusee.nodes.laser._damage_published import PUBLISHED_DAMAGE
+from neusee.nodes.laser._damage_spot import SpotDamage, damage
+from neusee.nodes.laser._damage_table import read_damage_laws
 from neusee.nodes.laser._dazzle_area import (
     counted_pixels,
     dazzle_exposure_limit,
@@ -40,6 +44,8 @@ from neusee.nodes.laser._dazzle_area import (
     pixel_share,
     veil_limit,
 )
+from neusee.nodes.laser._dazzle_curve import DazzleCurve, dazzle_curve
+from neusee.nodes.laser._dazzle_picture import Dazzle, dazzle
 from neusee.nodes.laser._eye_limits import (
     eye_aperture,
     eye_limit,
@@ -50,12 +56,16 @@ from neusee.nodes.laser._eye_limits import (
 )
 
 __all__ = [
+    "KINDS",
     "PUBLISHED_DAMAGE",
     "Beam",
     "Convention",
     "Damage",
     "DamageLaw",
+    "Dazzle",
+    "DazzleCurve",
     "Law",
+    "SpotDamage",
     "air_transmittance",
     "airy_diameter",
     "axis_density",
@@ -64,8 +74,12 @@ __all__ = [
     "beam_radius",
     "counted_pixels",
     "curvature_radius",
+    "damage",
     "damage_at",
     "damage_threshold",
+    "damaged_pixels",
+    "dazzle",
+    "dazzle_curve",
     "dazzle_exposure_limit",
     "dazzle_strength",
     "dazzled_pixels",
@@ -83,6 +97,7 @@ __all__ = [
     "peak_on_sensor",
     "pixel_share",
     "power_through",
+    "read_damage_laws",
     "sensor_density",
     "sensor_gain",
     "share_through",
