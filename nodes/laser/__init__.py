@@ -1,5 +1,6 @@
 """Laser beams in absolute units, and what they do: damage and dazzle of a sensor, exposure of an eye."""
 
+from neusee.nodes.laser import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.laser._air import Law, air_transmittance, size_exponent
 from neusee.nodes.laser._beam import (
     Beam,
@@ -54,6 +55,7 @@ from neusee.nodes.laser._eye_limits import (
     hazard_distance,
     nominal_ocular_hazard_distance,
 )
+from neusee.nodes.laser._light import light, pulses_within, wavefront
 
 __all__ = [
     "KINDS",
@@ -92,11 +94,13 @@ __all__ = [
     "eye_mpe",
     "eye_mpe_train",
     "hazard_distance",
+    "light",
     "matching_laws",
     "nominal_ocular_hazard_distance",
     "peak_on_sensor",
     "pixel_share",
     "power_through",
+    "pulses_within",
     "read_damage_laws",
     "sensor_density",
     "sensor_gain",
@@ -105,4 +109,5 @@ __all__ = [
     "spot_reach",
     "underfilled",
     "veil_limit",
+    "wavefront",
 ]

@@ -13,7 +13,7 @@ from neusee.nodes import Check, node
 from neusee.nodes.values import Bands, Psf
 
 Strengths = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...], Field(min_length=1)]
-_DECADES = tuple(10 ** (k / 4) for k in range(4, 25))  #: 10 to 1e6
+DECADES = tuple(10 ** (k / 4) for k in range(4, 25))  #: 10 to 1e6
 
 
 class DazzleCurve(NamedTuple):
@@ -30,7 +30,7 @@ def dazzle_curve(
     psf: Psf,
     bands: Bands,
     *,
-    strengths: Strengths = _DECADES,
+    strengths: Strengths = DECADES,
     level: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
 ) -> DazzleCurve:
     """Count the pixels in which a laser exceeds saturation, for each of several strengths.
