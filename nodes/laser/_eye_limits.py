@@ -1,0 +1,167 @@
+"""Exposure limits of the human eye for a small source, and the distance where a laser meets them.
+
+The limits are those of IEC 60825-1:2014, Table A.1 (ICNIRP 2013, ANSI Z136.1-2014): a source that the eye sees under
+less than 1.5 mrad. They are written out here from the formulas, and are an estimate, no certificate. Ultraviolet light,
+pulses below 10 ps and extended sources are refused.
+"""
+
+from __future__ import annotations
+
+import math
+
+from neusee.nodes import ParameterError
+from neusee.nodes.laser._beam import Beam
+
+BLINK = 0.25  #: s, in which the eye turns away from visible light
+_SHORTEST, _LONGEST = 1e-11, 3e4  #: s, of an exposure
+_FIRST, _LAST = 400e-9, 100e-6  #: m
+
+
+def eye_mpe(wavelength: float, duration: float) -> float:
+    """Return the largest permissible radiant exposure of the eye in J/m2 for one exposure of a duration in s.
+
+    Divided by the duration it is the largest permissible irradiance. It is compared with the mean over the limiting
+    aperture of `eye_aperture`.
+
+    400 to 1400 nm (retina, small source): 2e-3 C_A J/m2 up to 5 us and 18 C_A t^0.75 up to 10 s below 1050 nm;
+    2e-2 C_C up to 13 us and 90 C_C t^0.75 up to 10 s from 1050 nm; 10 C_A C_C W/m2 beyond 10 s. C_A = 10^(0.002
+    (nm - 700)) from 700 nm and 5 from 1050 nm; C_C = 10^(0.018 (nm - 1150)) from 1150 nm and 8 + 10^(0.04 (nm - 1250))
+    from 1200 nm. Below 500 nm and beyond 10 s at most 100 C_3 J/m2 up to 100 s, then C_3 W/m2, with C_3 = 10^(0.02 (nm
+    - 450)) from 450 nm (photochemical). From 700 nm at most the limit of the skin, which protects cornea and lens.
+    From 1400 nm (cornea): 1e3 J/m2 up to 1 ms (1500 to 1800 nm 1e4 J/m2 up to 10 s; from 2600 nm 100 J/m2 up to 0.1
+    us), then 5600 t^0.25 up to 10 s and 1000 W/m2.
+
+    Raises ParameterError for a wavelength or a duration beyond these formulas.
+    Source: IEC 60825-1:2014, Tables A.1 and A.5; ICNIRP, Health Phys. 105, 271 (2013).
+    """
+    _refuse(wavelength, duration)
+    nm = wavelength * 1e9
+    if nm >= 1400:
+        return _cornea(nm, duration)
+    retina = _retina(nm, duration)
+    return retina if nm < 700 else min(retina, _skin(nm, duration))
+
+
+def _refuse(wavelength: float, duration: float) -> None:
+    """Raise ParameterError where this module has no formula."""
+    if not _FIRST <= wavelength <= _LAST:
+        text = f"no exposure limit of the eye at {wavelength * 1e9:g} nm: 400 nm to 100 um are known here"
+        raise ParameterError("wavelength", f"{text}; take the limit from the standard")
+    if not _SHORTEST <= duration <= _LONGEST:
+        text = f"no exposure limit of the eye for {duration:g} s: 10 ps to 30 000 s are known here"
+        raise ParameterError("duration", f"{text}; take the limit from the standard")
+
+
+def _near_infrared(nm: float) -> tuple[float, float]:
+    """Return the factors C_A and C_C, which let more of the infrared pass than of visible light."""
+    absorbed = 1.0 if nm < 700 else math.pow(10, 0.002 * (nm - 700)) if nm < 1050 else 5.0
+    if nm < 1150:
+        return absorbed, 1.0
+    return absorbed, math.pow(10, 0.018 * (nm - 1150)) if nm < 1200 else 8 + math.pow(10, 0.04 * (nm - 1250))
+
+
+def _retina(nm: float, duration: float) -> float:
+    """Return the limit in J/m2 from 400 to 1400 nm for a small source: heat, and photochemistry below 500 nm."""
+    absorbed, spread = _near_infrared(nm)
+    if duration >= 10:
+        heat = 10 * absorbed * spread * duration
+        blue = math.pow(10, 0.02 * max(0.0, nm - 450))
+        return heat if nm >= 500 else min(heat, blue * max(100.0, duration))
+    if nm < 1050:
+        return absorbed * (2e-3 if duration <= 5e-6 else 18 * math.pow(duration, 0.75))
+    return spread * (2e-2 if duration <= 13e-6 else 90 * math.pow(duration, 0.75))
+
+
+def _skin(nm: float, duration: float) -> float:
+    """Return the limit of the skin in J/m2 from 700 to 1400 nm."""
+    absorbed, _ = _near_infrared(nm)
+    if duration >= 10:
+        return 2000 * absorbed * duration
+    if duration >= 1e-7:
+        return 1.1e4 * absorbed * math.pow(duration, 0.25)
+    return 200 * absorbed * min(1.0, duration / 1e-9)
+
+
+def _cornea(nm: float, duration: float) -> float:
+    """Return the limit in J/m2 from 1400 nm on."""
+    if duration >= 10:
+        return 1000 * duration
+    flat, until = (1e4, 10.0) if 1500 <= nm < 1800 else (100.0, 1e-7) if nm >= 2600 else (1e3, 1e-3)
+    if duration <= until:
+        return flat * min(1.0, duration / 1e-9)
+    return 5600 * math.pow(duration, 0.25)
+
+
+def eye_aperture(wavelength: float, duration: float) -> float:
+    """Return the diameter in m of the aperture over which an exposure of the eye is averaged.
+
+    7 mm, the widest pupil, from 400 to 1400 nm; beyond, 1 mm up to 0.35 s, 1.5 t^(3/8) mm up to 10 s, then 3.5 mm.
+    Source: IEC 60825-1:2014, Table A.6.
+    """
+    _refuse(wavelength, duration)
+    if wavelength < 1400e-9:
+        return 7e-3
+    return 1e-3 if duration <= 0.35 else 1e-3 * min(3.5, 1.5 * math.pow(duration, 0.375))
+
+
+def eye_mpe_train(wavelength: float, pulse_duration: float, repetition_rate: float, duration: float) -> float:
+    """Return the largest permissible radiant exposure of the eye in J/m2 by each pulse of a train.
+
+    It is the least of three: that of one pulse, that of the whole exposure over the number of pulses, and, up to 1400
+    nm, that of one pulse times N^(-1/4). Pulses that follow within 5 us (13 us from 1050 nm) count as one. The standard
+    of 2014 lets the third rule go for many small sources; it is kept here, because no limit is less strict with it.
+
+    Raises ParameterError for a pulse that is longer than the exposure or the period.
+    Source: IEC 60825-1:2014, A.3; the factor N^(-1/4) for every train as in IEC 60825-1:2007.
+    """
+    if not pulse_duration < min(duration, 1 / repetition_rate):
+        text = f"a pulse of {pulse_duration:g} s, every {1 / repetition_rate:g} s, in an exposure of {duration:g} s"
+        raise ParameterError("pulse_duration", f"{text}: the pulse is too long")
+    count = max(1.0, duration * repetition_rate)
+    least = min(eye_mpe(wavelength, pulse_duration), eye_mpe(wavelength, duration) / count)
+    if wavelength >= 1400e-9:
+        return least
+    together = 5e-6 if wavelength < 1050e-9 else 13e-6
+    grouped = min(count, max(1.0, together * repetition_rate))
+    group = together if grouped > 1 else pulse_duration
+    return min(least, eye_mpe(wavelength, max(group, pulse_duration)) / grouped * math.pow(count / grouped, -0.25))
+
+
+def hazard_distance(beam: Beam, limit: float, aperture: float = 0.0, transmittance: float = 1.0) -> float:
+    """Return the distance in m beyond which the exposure on the axis of a beam is below a limit, or 0 for none.
+
+    ``limit`` is in W/m2 for a continuous beam and in J/m2 for each pulse of a pulsed one. The exposure is the mean over
+    a round ``aperture`` in m, or that on the axis for 0. Both have a closed inverse: w^2 = 2 P T / (pi limit) on the
+    axis, and w^2 = -(d^2 / 2) / ln(1 - pi d^2 limit / (4 P T)) through an aperture d, then R = 2 sqrt(w^2 - w0^2) /
+    theta. ``transmittance`` is that of the optics or of air, the same at every distance.
+    """
+    emitted = beam.power if beam.pulse_energy is None else beam.pulse_energy
+    assert emitted is not None  # `beam` has made the one or the other
+    emitted *= transmittance
+    if aperture == 0:
+        squared = 2 * emitted / (math.pi * limit)
+    else:
+        share = math.pi * aperture**2 / 4 * limit / emitted
+        if share >= 1:
+            return 0.0
+        squared = -(aperture**2) / 2 / math.log1p(-share)
+    return 2 * math.sqrt(max(0.0, squared - beam.waist**2)) / beam.divergence
+
+
+def eye_limit(beam: Beam, duration: float) -> float:
+    """Return the limit of the eye for a beam: W/m2 if it is continuous, J/m2 for each pulse if it is pulsed."""
+    if beam.pulse_energy is None or beam.pulse_duration is None:
+        return eye_mpe(beam.wavelength, duration) / duration
+    if beam.repetition_rate is None or duration * beam.repetition_rate <= 1:
+        return eye_mpe(beam.wavelength, beam.pulse_duration)
+    return eye_mpe_train(beam.wavelength, beam.pulse_duration, beam.repetition_rate, duration)
+
+
+def nominal_ocular_hazard_distance(beam: Beam, duration: float = BLINK, transmittance: float = 1.0) -> float:
+    """Return the distance in m beyond which a beam does not exceed the limit of the unaided eye for an exposure in s.
+
+    The exposure is averaged over the limiting aperture. Use 0.25 s for visible light that a person turns away from,
+    and 10 s or 100 s for invisible light. Optical instruments such as binoculars are not part of it.
+    """
+    averaged = duration if beam.pulse_duration is None else beam.pulse_duration
+    return hazard_distance(beam, eye_limit(beam, duration), eye_aperture(beam.wavelength, averaged), transmittance)

@@ -1,0 +1,200 @@
+"""Damage by the light on a sensor: heat by a direct sum, verdicts that no camera setting moves, dead pixels."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+
+from neusee.nodes import ParameterError
+from neusee.nodes.laser import KINDS, PUBLISHED_DAMAGE, SpotDamage, airy_diameter, damage, damaged_pixels
+from neusee.nodes.laser._damage_spot import steady_heat
+from neusee.nodes.values import Bands, LaserLight
+
+PITCH, SHAPE = 2.9e-6, (64, 80)
+SENSOR = {"pixel_pitch": PITCH, "exposure": 0.1, "dwell": 0.1}
+CMOS = next(law for law in PUBLISHED_DAMAGE if law.device == "CMOS" and law.quantity == "irradiance")
+HEADER = (
+    "device,damage,wavelength from (nm),wavelength to (nm),duration from (ns),duration to (ns),"
+    "threshold (J/cm2),factor,median factor,spot (um),source\n"
+)
+INFRARED = "CMOS,point,1500,1600,1,100,0.5,1.6,1.2,20,own test\nCMOS,line,1500,1600,1,100,1.5,,,20,own test\n"
+
+
+def line(nm=532.0):
+    return Bands(*(torch.tensor([x], dtype=torch.float64) for x in (nm * 1e-9, 1e-9, 1.0)))
+
+
+def radii(shape=SHAPE):
+    y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in shape)
+    return torch.hypot(y[:, None], x) * PITCH
+
+
+def gaussian(peak, diameter, shape=SHAPE):
+    return (peak * torch.exp(-8 * (radii(shape) / diameter) ** 2))[None]
+
+
+def train(pulses):
+    return LaserLight(*(torch.tensor(x, dtype=torch.float64) for x in (0, 0, 0, 0, 0, pulses, 1)))
+
+
+def test_the_heat_is_the_direct_sum_over_all_pixels():
+    image = torch.rand(6, 8, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    expected = np.zeros((6, 8))
+    inside = (np.arange(400) + 0.5) / 400 - 0.5  # the mean of 1 / r over a pixel by many points
+    near = {(y, x): (1 / np.hypot(inside[:, None] + y, inside + x)).mean() for y in range(6) for x in range(8)}
+    for y in range(6):
+        for x in range(8):
+            for j in range(6):
+                for i in range(8):
+                    expected[y, x] += float(image[j, i]) * PITCH / (2 * np.pi) * near[abs(y - j), abs(x - i)]
+    np.testing.assert_allclose(steady_heat(image, PITCH).numpy(), expected, rtol=5e-4)
+
+
+@pytest.mark.parametrize("diameter", [15e-6, 25.7e-6, 40e-6])
+def test_a_gaussian_spot_of_any_size_is_at_the_threshold_where_it_heats_as_the_published_one(diameter):
+    found = damage(gaussian(1e8, diameter), line(), **SENSOR)
+    assert float(found.ratio[0]) == pytest.approx(1e8 / CMOS.median * diameter / CMOS.spot, rel=0.015)
+    assert float(found.threshold[0]) == pytest.approx(CMOS.median * CMOS.spot / diameter, rel=0.015)
+    assert float(found.peak[0]) == pytest.approx(1e8)
+
+
+def test_an_airy_spot_is_judged_by_its_equivalent_diameter():
+    number = 8.0
+    reach = math.pi * radii((256, 256)) / (532e-9 * number)
+    airy = torch.where(reach > 0, (2 * torch.special.bessel_j1(reach) / reach).square(), 1.0)
+    found = damage(1e8 * airy[None], line(), **SENSOR)
+    expected = 1e8 / CMOS.median * airy_diameter(532e-9, number) / CMOS.spot
+    assert float(found.ratio[0]) == pytest.approx(expected, rel=0.03)
+
+
+def test_the_probability_and_its_interval_follow_the_law():
+    found = damage(gaussian(2e8, CMOS.spot), line(), **SENSOR)
+    away = math.log(float(found.ratio[0])) / math.log(CMOS.factor)
+    for column, shift in ((found.probability, 0.0), (found.low, -1.6449), (found.high, 1.6449)):
+        assert float(column[0]) == pytest.approx(norm.cdf(away + shift), rel=1e-3)
+
+
+def test_the_verdict_is_the_same_for_every_exposure_of_a_continuous_laser():
+    every = [damage(gaussian(2e8, 20e-6), line(), **{**SENSOR, "exposure": t}) for t in (1e-6, 1e-3, 1.0)]
+    for other in every[1:]:
+        for one, same in zip(every[0], other, strict=True):
+            assert torch.equal(one, same)
+
+
+@pytest.mark.parametrize("exposure", [1e-6, 1e-3, 1.0])
+@pytest.mark.parametrize("pulses", [1.0, 0.5, 20.0])
+def test_the_fluence_of_a_pulse_is_the_same_for_every_exposure(exposure, pulses):
+    """The spot is the mean over the exposure, of which the shutter catches some pulses, or a part of one."""
+    fluence = 900.0
+    mean = gaussian(fluence * pulses / exposure, 12e-6)
+    choice = {**SENSOR, "exposure": exposure, "pulse_duration": 10e-9}
+    found = damage(mean, line(), train(pulses), **choice)
+    laws = [law for law in PUBLISHED_DAMAGE if law.device == "CMOS" and law.quantity == "fluence"]
+    expected = [fluence / law.median for law in laws]
+    assert found.ratio[-len(laws) :].tolist() == pytest.approx(expected)
+    assert len(found.ratio) == len(laws) + (pulses > 1)  # the mean irradiance of a train counts too
+    assert found.probability[-len(laws) :].tolist() == found.high[-len(laws) :].tolist() == [-1.0] * len(laws)
+    if pulses == 1:
+        assert torch.equal(damage(mean, line(), **choice).ratio, found.ratio)
+
+
+def test_a_pulse_that_the_shutter_misses_still_hits_the_sensor():
+    with pytest.raises(ValueError, match="every pulse hits the sensor: give the laser a pulse_delay of 0"):
+        damage(gaussian(0.0, 12e-6), line(), train(0.0), **SENSOR, pulse_duration=10e-9)
+
+
+def test_at_1550_nm_own_thresholds_are_judged_without_any_response_of_the_sensor(tmp_path):
+    own = tmp_path / "own.csv"
+    own.write_text(HEADER + INFRARED)
+    choice = {**SENSOR, "pulse_duration": 5e-9, "thresholds": own}
+    found = damage(gaussian(1e4 / 0.1, 15e-6), line(1550), **choice)
+    assert found.ratio.tolist() == pytest.approx([2.0, 2 / 3])
+    assert float(found.probability[0]) == pytest.approx(norm.cdf(math.log(2) / math.log(1.6)))
+    assert float(found.probability[1]) == -1.0
+    notes = damage.hooks.preflight(line=line(1550), **choice)
+    assert notes == ["point of a CMOS: 0.5 J/cm2, own test", "line of a CMOS: 1.5 J/cm2, own test"]
+
+
+@pytest.mark.parametrize(("nm", "change", "parameter", "message"), [
+    (1550, {}, "thresholds", "for the device CMOS at 1550 nm and light that stays 0.1 s .*500 to 560 nm"),
+    (532, {"dwell": 1e-6}, "thresholds", "light that stays 1e-06 s"),
+    (905, {"pulse_duration": 5e-9}, "thresholds", "pulses of 5e-09 s .*: give a file of your own thresholds"),
+    (532, {"device": "InGaAs"}, "device", "for the device InGaAs at 532 nm .*: there are laws for CCD, CMOS"),
+    (532, {"pulse_duration": 1e-3}, "thresholds", "pulses of 0.001 s"),
+])  # fmt: skip
+def test_a_laser_that_no_law_covers_is_refused_before_the_run(nm, change, parameter, message):
+    with pytest.raises(ParameterError, match=message) as raised:
+        damage.hooks.preflight(line=line(nm), light=train(50.0), **SENSOR | change)
+    assert raised.value.parameter == parameter
+
+
+def test_a_mistake_in_the_file_of_thresholds_is_told_before_the_run(tmp_path):
+    own = tmp_path / "own.csv"
+    own.write_text(HEADER + INFRARED.replace("0.5", "half"))
+    with pytest.raises(ParameterError, match=r"own.csv:2, column 7, threshold \(J/cm2\): 'half'") as raised:
+        damage.hooks.preflight(dwell=0.1, thresholds=own)
+    assert raised.value.parameter == "thresholds"
+
+
+def test_each_law_has_a_sentence_with_its_numbers():
+    spot = gaussian(2e3 / 0.1, 12e-6)
+    choice = {**SENSOR, "pulse_duration": 10e-9}
+    checks = damage.hooks.check(damage(spot, line(), **choice), spot, line(), **choice)
+    assert checks[0].text == (
+        "point damage: 0.2 of 0.1 J/cm2, 2 times the threshold; no probability, because the source states no spread"
+    )
+    assert [check.ok for check in checks] == [False, True, False, True, True]
+    bright = gaussian(CMOS.median, CMOS.spot)
+    (check,) = damage.hooks.check(damage(bright, line(), **SENSOR), bright, line(), **SENSOR)
+    assert "of devices damaged (90 % interval" in check.text
+
+
+def pattern(**places):
+    found = torch.zeros(7, 9, dtype=torch.uint8)
+    for kind, (y, x) in places.items():
+        found[y, x] += 1 << KINDS.index(kind)
+    empty = torch.zeros(0, dtype=torch.float64)
+    return SpotDamage(empty, empty, empty, empty, empty, empty, pattern=found)
+
+
+def test_the_pattern_has_the_pixels_beyond_the_threshold_of_the_device():
+    spot = gaussian(3e3 / 0.1, 20e-6)
+    choice = {**SENSOR, "pulse_duration": 10e-9}
+    for resilience in (0.5, 1.0, 2.0):
+        found = damage(spot, line(), **choice, resilience=resilience).pattern
+        for kind, threshold in (("point", 789.0), ("cross", 2419.0), ("frame", 20054.0), ("destruction", 1e6)):
+            marked = (found >> KINDS.index(kind)) % 2 == 1
+            assert torch.equal(marked, spot[0] * 0.1 >= threshold * resilience), kind
+
+
+@pytest.mark.parametrize(("places", "device", "white", "black"), [
+    ({}, "CMOS", [], []),
+    ({"point": (2, 3)}, "CMOS", np.s_[2:3, 3:4], []),
+    ({"destruction": (2, 3)}, "CMOS", [], np.s_[2:3, 3:4]),
+    ({"line": (2, 3)}, "CMOS", [], np.s_[2:3, :]),
+    ({"line": (2, 3)}, "CCD", np.s_[:, 3:4], []),
+    ({"frame": (2, 3), "point": (4, 4)}, "CMOS", [], np.s_[:, :]),
+])  # fmt: skip
+def test_each_kind_of_damage_has_its_pattern_in_the_frame(places, device, white, black):
+    raw = torch.full((3, 5, 7), 100.0)
+    expected = np.full((5, 7), 100.0)
+    for where, value in ((white, 999.0), (black, 0.0)):  # the sensor is the middle of the scene
+        if where:
+            inside = tuple(slice(s.start and s.start - 1, s.stop and s.stop - 1) for s in where)
+            expected[inside] = value
+    found = damaged_pixels(raw, [pattern(**places)], full_well=1000.0, gain=1.0, device=device)
+    for channel in found:
+        np.testing.assert_array_equal(channel.numpy(), expected)
+
+
+def test_a_cross_is_a_row_and_a_column_and_lasers_add_up():
+    raw = torch.full((1, 5, 7), 100.0)
+    found = damaged_pixels(raw, [pattern(cross=(2, 3)), pattern(point=(4, 5))], full_well=1e6, gain=1.0, bits=8)[0]
+    expected = torch.full((5, 7), 100.0)
+    expected[3, 4] = 255.0
+    expected[1, :], expected[:, 2] = 0.0, 0.0
+    assert torch.equal(found, expected)
+    assert torch.equal(damaged_pixels(raw, full_well=1e6, gain=1.0), raw)
+    assert not damaged_pixels.hooks.check(found[None], raw)[0].ok
