@@ -16,15 +16,19 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BeforeValidator, Field
 
 _SCALE: dict[str, dict[str, float]] = {
-    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9},
-    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9, "km": 1e3},
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "ps": 1e-12, "fs": 1e-15},
     "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180.0},
     "K": {"K": 1.0},
     "e-": {"e-": 1.0, "ke-": 1e3},
+    "W": {"W": 1.0, "kW": 1e3, "mW": 1e-3, "uW": 1e-6, "µW": 1e-6, "nW": 1e-9},
+    "J": {"J": 1.0, "mJ": 1e-3, "uJ": 1e-6, "µJ": 1e-6, "nJ": 1e-9},
+    "Hz": {"Hz": 1.0, "kHz": 1e3, "MHz": 1e6},
     "waves": {"waves": 1.0, "wave": 1.0},
     "DN/e-": {"DN/e-": 1.0, "e-/DN": 1.0},
 }
-_USUAL = {"m": "um", "s": "ms", "rad": "mrad"}  #: the unit that messages suggest for an SI unit
+#: the unit that messages suggest for an SI unit
+_USUAL = {"m": "um", "s": "ms", "rad": "mrad", "W": "mW", "J": "uJ", "Hz": "kHz"}
 _RECIPROCAL = {"e-/DN"}  #: units of the reciprocal of the quantity
 _NUMBER = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
 
@@ -99,6 +103,10 @@ PositiveLength = Annotated[float, Field(gt=0), _reader("m")]  #: metre
 Wavelength = Annotated[float, Field(ge=100e-9, le=20e-6), _reader("m")]  #: metre, 100 nm to 20 µm
 Time = Annotated[float, Field(gt=0), _reader("s")]  #: second
 Angle = Annotated[float, _reader("rad")]  #: radian
+PositiveAngle = Annotated[float, Field(gt=0), _reader("rad")]  #: radian
+Power = Annotated[float, Field(gt=0), _reader("W")]  #: watt
+Energy = Annotated[float, Field(gt=0), _reader("J")]  #: joule
+Frequency = Annotated[float, Field(gt=0), _reader("Hz")]  #: hertz
 Temperature = Annotated[float, Field(gt=0), _reader("K")]  #: kelvin
 Electrons = Annotated[float, Field(ge=0), _reader("e-")]  #: electron
 Waves = Annotated[float, _reader("waves")]  #: optical path in wavelengths

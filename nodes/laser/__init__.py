@@ -54,6 +54,7 @@ from neusee.nodes.laser._eye_limits import (
     hazard_distance,
     nominal_ocular_hazard_distance,
 )
+from neusee.nodes.laser._spot_on_sensor import frame_power, heated_diameter, spot_in_pixels
 
 __all__ = [
     "KINDS",
@@ -91,7 +92,9 @@ __all__ = [
     "eye_limit",
     "eye_mpe",
     "eye_mpe_train",
+    "frame_power",
     "hazard_distance",
+    "heated_diameter",
     "matching_laws",
     "nominal_ocular_hazard_distance",
     "peak_on_sensor",
@@ -102,6 +105,7 @@ __all__ = [
     "sensor_gain",
     "share_through",
     "size_exponent",
+    "spot_in_pixels",
     "spot_reach",
     "underfilled",
     "veil_limit",
