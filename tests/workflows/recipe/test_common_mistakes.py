@@ -85,13 +85,13 @@ def test_4_a_misspelt_step(refused):
 
 def test_5_a_wrong_unit(refused):
     assert refused("sensor.pixel_pitch=3 s") == [
-        "argument 1 | sensor.pixel_pitch = 3 s | has the wrong unit 's': write one of m, cm, mm, um, µm, μm, nm"
+        "argument 1 | sensor.pixel_pitch = 3 s | has the wrong unit 's': write one of m, cm, mm, um, µm, μm, nm, km"
     ]
 
 
 def test_6_no_unit(refused):
     assert refused(more="sensor: {pixel_pitch: 2.9}\n") == [
-        "mine.yaml:15:23 | sensor.pixel_pitch = 2.9 | needs a unit: write 2.9 um (one of m, cm, mm, um, µm, μm, nm)"
+        "mine.yaml:15:23 | sensor.pixel_pitch = 2.9 | needs a unit: write 2.9 um (one of m, cm, mm, um, µm, μm, nm, km)"
     ]
 
 
