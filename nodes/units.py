@@ -11,7 +11,7 @@ import math
 import re
 from glob import glob
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
@@ -21,14 +21,23 @@ _SCALE: dict[str, dict[str, float]] = {
     "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180.0},
     "K": {"K": 1.0},
     "e-": {"e-": 1.0, "ke-": 1e3},
+    "e-/s": {"e-/s": 1.0, "ke-/s": 1e3},
     "W": {"W": 1.0, "kW": 1e3, "mW": 1e-3, "uW": 1e-6, "µW": 1e-6, "nW": 1e-9},
     "J": {"J": 1.0, "mJ": 1e-3, "uJ": 1e-6, "µJ": 1e-6, "nJ": 1e-9},
     "Hz": {"Hz": 1.0, "kHz": 1e3, "MHz": 1e6},
+    "lx": {"lx": 1.0, "klx": 1e3},
+    "cd/m2": {"cd/m2": 1.0, "kcd/m2": 1e3},
     "waves": {"waves": 1.0, "wave": 1.0},
     "DN/e-": {"DN/e-": 1.0, "e-/DN": 1.0},
 }
-#: the unit that messages suggest for an SI unit
-_USUAL = {"m": "um", "s": "ms", "rad": "mrad", "W": "mW", "J": "uJ", "Hz": "kHz"}
+_USUAL = {
+    "m": "um",
+    "s": "ms",
+    "rad": "mrad",
+    "W": "mW",
+    "J": "uJ",
+    "Hz": "kHz",
+}  #: the unit that messages suggest for an SI unit
 _RECIPROCAL = {"e-/DN"}  #: units of the reciprocal of the quantity
 _NUMBER = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
 
@@ -98,20 +107,42 @@ def _finite(value: float) -> float:
     return value
 
 
+class ElectronsPerSecond(NamedTuple):
+    """A dark current by time; a dark current of one exposure is a plain number of electrons."""
+
+    rate: float  #: e-/s
+
+
+def _read_dark_current(value: Any) -> float | ElectronsPerSecond:
+    number, unit = str(value).strip(), "e-/s"
+    by_time = not isinstance(value, bool) and number.endswith(tuple(_SCALE[unit]))
+    found = read_quantity(value, unit) if by_time else read_quantity(value, "e-")
+    if found < 0:
+        raise ValueError("the dark current must be 0 or more")
+    return ElectronsPerSecond(found) if by_time else found
+
+
+#: electrons of one exposure, or electrons per second
+DarkCurrent = Annotated[float | ElectronsPerSecond, BeforeValidator(_read_dark_current, json_schema_input_type=str)]
 Length = Annotated[float, _reader("m")]  #: metre, any sign
 PositiveLength = Annotated[float, Field(gt=0), _reader("m")]  #: metre
 Wavelength = Annotated[float, Field(ge=100e-9, le=20e-6), _reader("m")]  #: metre, 100 nm to 20 µm
 Time = Annotated[float, Field(gt=0), _reader("s")]  #: second
 Angle = Annotated[float, _reader("rad")]  #: radian
+Temperature = Annotated[float, Field(gt=0), _reader("K")]  #: kelvin
+Electrons = Annotated[float, Field(ge=0), _reader("e-")]  #: electron
 PositiveAngle = Annotated[float, Field(gt=0), _reader("rad")]  #: radian
 Power = Annotated[float, Field(gt=0), _reader("W")]  #: watt
 Energy = Annotated[float, Field(gt=0), _reader("J")]  #: joule
 Frequency = Annotated[float, Field(gt=0), _reader("Hz")]  #: hertz
-Temperature = Annotated[float, Field(gt=0), _reader("K")]  #: kelvin
-Electrons = Annotated[float, Field(ge=0), _reader("e-")]  #: electron
+Delay = Annotated[float, Field(ge=0), _reader("s")]  #: second, from 0
+Illuminance = Annotated[float, Field(ge=0), _reader("lx")]  #: lux
+Luminance = Annotated[float, Field(ge=0), _reader("cd/m2")]  #: candela per square metre
 Waves = Annotated[float, _reader("waves")]  #: optical path in wavelengths
 Gain = Annotated[float, Field(gt=0, allow_inf_nan=False), _reader("DN/e-")]  #: K of EMVA 1288, DN per electron
 Fraction = Annotated[float, Field(ge=0, le=1)]  #: number in [0, 1]
+Transmittance = Annotated[float, Field(gt=0, le=1)]  #: share of the light that passes, above 0
+Efficiency = Annotated[float, Field(gt=0, le=1)]  #: electrons per photon
 Count = Annotated[int, Field(ge=1)]  #: whole number from 1
 Real = Annotated[float, AfterValidator(_finite)]  #: finite number
 Shape = tuple[Count, Count]  #: (y, x) in pixels

@@ -1,5 +1,6 @@
 """Laser beams in absolute units, and what they do: damage and dazzle of a sensor, exposure of an eye."""
 
+from neusee.nodes.laser import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.laser._air import Law, air_transmittance, size_exponent
 from neusee.nodes.laser._beam import (
     Beam,
@@ -54,6 +55,7 @@ from neusee.nodes.laser._eye_limits import (
     hazard_distance,
     nominal_ocular_hazard_distance,
 )
+from neusee.nodes.laser._light import light, pulses_within, wavefront
 from neusee.nodes.laser._spot_on_sensor import frame_power, heated_diameter, spot_in_pixels
 
 __all__ = [
@@ -95,11 +97,13 @@ __all__ = [
     "frame_power",
     "hazard_distance",
     "heated_diameter",
+    "light",
     "matching_laws",
     "nominal_ocular_hazard_distance",
     "peak_on_sensor",
     "pixel_share",
     "power_through",
+    "pulses_within",
     "read_damage_laws",
     "sensor_density",
     "sensor_gain",
@@ -109,4 +113,5 @@ __all__ = [
     "spot_reach",
     "underfilled",
     "veil_limit",
+    "wavefront",
 ]

@@ -1,16 +1,23 @@
 """Transmittance of air on the way from a laser to a camera, from the visibility (meteorological range)."""
 
 import math
-from typing import Literal
+from typing import Literal, TypeVar
+
+import torch
+from torch import Tensor
 
 from neusee.nodes import ParameterError
+
+Number = TypeVar("Number", float, Tensor)
 
 Law = Literal["kruse", "kim"]
 _KOSCHMIEDER = 3.912  #: -ln 0.02: at the visibility a black object has 2 % of its contrast left
 _AT = 550e-9  #: m, wavelength of the visibility
 
 
-def air_transmittance(distance: float, visibility: float | None, wavelength: float, law: Law = "kim") -> float:
+def air_transmittance(
+    distance: Number, visibility: float | None, wavelength: float, law: Law = "kim"
+) -> Number | float:
     """Return the transmittance of air of a given visibility: exp(-(3.912 / V) (lambda / 550 nm)^-q R).
 
     ``law`` names the exponent q as a function of the visibility: `kruse` has q = 0.585 V^(1/3) below 6 km, `kim` lets q
@@ -28,7 +35,8 @@ def air_transmittance(distance: float, visibility: float | None, wavelength: flo
     if not visibility > 0:
         raise ParameterError("visibility", f"{visibility:g} m is no visibility: give a number above 0")
     exponent = size_exponent(visibility, law)
-    return math.exp(-_KOSCHMIEDER / visibility * math.pow(wavelength / _AT, -exponent) * distance)
+    depth = _KOSCHMIEDER / visibility * math.pow(wavelength / _AT, -exponent) * distance
+    return torch.exp(-depth) if isinstance(depth, Tensor) else math.exp(-depth)
 
 
 def size_exponent(visibility: float, law: Law) -> float:

@@ -9,6 +9,7 @@ from neusee.nodes.optics._phase_steps import mask_turns, pupil_has_large_steps
 from neusee.nodes.optics._psf import psf
 from neusee.nodes.optics._pupil import pupil
 from neusee.nodes.optics._stop import stop
+from neusee.nodes.optics._white_irradiance import white_irradiance
 
 __all__ = [
     "direction",
@@ -21,4 +22,5 @@ __all__ = [
     "pupil",
     "pupil_has_large_steps",
     "stop",
+    "white_irradiance",
 ]

@@ -1,27 +1,33 @@
-"""The laser spot on the sensor: a PSF scaled by the irradiance that saturates a pixel behind the clear lens."""
+"""The laser spot on the sensor: a PSF scaled by the strength of a laser, or by its light in watts."""
 
 import math
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from neusee.nodes import Check, TensorStats, node
+from neusee.nodes import Check, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
 from neusee.nodes.units import PositiveLength, Time
-from neusee.nodes.values import Bands, Psf
+from neusee.nodes.values import Bands, LaserLight, Psf
+
+Meaning = Literal["first_channel", "irradiance"]
 
 _LSR = 2.2  #: largest laser suppression ratio of a pupil that only absorbs and delays; derived in the bound
+_UNSEEN = 1e-3  #: relative response below which a channel does not see a line
 
 
 @node()
 def laser_irradiance(
     psf: Psf,
     bands: Bands,
+    responses: Tensor | None = None,
+    light: LaserLight | None = None,
     *,
-    strength: Annotated[float, Field(ge=0, allow_inf_nan=False)],
+    strength: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None,
+    meaning: Meaning = "irradiance",
     full_well: Well,
     quantum_efficiency: Efficiency,
     pixel_pitch: PositiveLength,
@@ -29,46 +35,124 @@ def laser_irradiance(
 ) -> Tensor:
     """Scale the PSF of a laser so that its peak behind the clear lens, on axis, is ``strength`` times saturation.
 
-    That peak is the sum of I / I_sat over the wavelengths of the line. Each wavelength sends its share of the energy
-    (``bands.weights``) through the pupil. The spot is added to the image of the scene and is not convolved.
+    By the meaning `first_channel` a laser of strength 1 fills the pixel at that peak in the channel that it fills
+    first, at the nominal exposure. By the meaning `irradiance` of the paper that peak is the sum of I / I_sat over the
+    wavelengths of the line, before the channels. Without a strength the irradiance is that of the `light` in watts.
+    Each wavelength sends its share of the energy (``bands.weights``) through the pupil. The spot is added to the image
+    of the scene and is not convolved.
 
-    Shapes: psf.intensity (band, y, x), bands (band,) -> (band, y, x).
-    Units:  result W/m2 of each sub-band; strength is a plain multiple.
+    Shapes: psf.intensity (band, y, x), bands (band,), responses (channel, band) -> (band, y, x).
+    Units:  result W/m2 of each sub-band, mean over the exposure; strength is a plain multiple.
     Error:  float32 of the PSF, 1e-6 of its peak; the scale is exact.
-    Raises: ValueError where PSF and line have different bands.
-    Source: NeuSee, Eq. (peak_irrad_laser_coded).
+    Raises: ParameterError before the run for a strength at a wavelength that no channel sees; ValueError where PSF,
+            line and responses have different bands, and without strength and light.
+    Source: NeuSee, Eq. (peak_irrad_laser_coded); in watts by definition of the PSF.
     """
     if psf.intensity.shape[0] != len(bands.centres):
         raise ValueError(
             f"PSF of {psf.intensity.shape[0]} bands and line of {len(bands.centres)} bands: "
             "the numbers of bands differ, so compute both from one `line` step"
         )
-    sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency, "pixel_pitch": pixel_pitch}
-    saturating: Tensor = saturation(bands, **sensor, exposure=exposure)
-    unit = (bands.weights * psf.clear_peak / saturating).sum()
-    energy = strength * bands.weights / unit
+    if strength is not None:
+        sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency, "pixel_pitch": pixel_pitch}
+        wells = 1.0 / saturation(bands, **sensor, exposure=exposure)
+        energy = strength * bands.weights / unit(psf.clear_peak, bands, wells, responses, meaning)
+    elif light is not None:
+        energy = light.flux / pixel_pitch**2 * bands.weights
+    else:
+        raise ValueError("a laser needs a strength, or its light in watts: give strength, or the input light")
     intensity = single(psf.intensity)
     return intensity * energy.to(intensity)[:, None, None]
 
 
+def unit(clear_peak: Tensor, bands: Bands, wells: Tensor, responses: Tensor | None, meaning: Meaning) -> Tensor:
+    """Return the saturated pixels of one W/m2 per unit of the PSF at the peak of the clear lens: () float64.
+
+    ``wells`` are the full wells of one W/m2 in each band.
+    """
+    each = bands.weights * clear_peak * wells
+    if meaning == "irradiance":
+        return each.sum()
+    if responses is None or responses.shape[-1] != len(each):
+        raise ValueError("strength counts the channel that saturates first: give `responses` for the bands of the line")
+    most = (responses.to(each) * each).sum(-1).amax()
+    if not float(most) > 0:
+        raise ValueError(_no_channel(bands))
+    return most
+
+
+@laser_irradiance.preflight
+def _(
+    *,
+    bands: Bands | None = None,
+    responses: Tensor | None = None,
+    strength: float | None = None,
+    meaning: Meaning = "irradiance",
+    **sensor: float,
+) -> list[str]:
+    if not strength or meaning == "irradiance" or bands is None or responses is None or responses.is_meta:
+        return []
+    if float((responses * bands.weights).sum(-1).amax() / bands.weights.sum()) < _UNSEEN:
+        raise ParameterError("strength", _no_channel(bands))
+    return []
+
+
+def _no_channel(bands: Bands) -> str:
+    nm = float((bands.centres * bands.weights).sum() / bands.weights.sum()) * 1e9
+    text = f"no channel of the camera sees {nm:.5g} nm, so no strength can saturate one"
+    return f"{text}: give power with distance and divergence, or reading.strength=irradiance"
+
+
 @laser_irradiance.zero_bound
-def _(psf: TensorStats, bands: TensorStats, *, strength: float, **sensor: float) -> float:
+def _(
+    psf: TensorStats,
+    bands: TensorStats,
+    responses: TensorStats | None = None,
+    light: TensorStats | None = None,
+    *,
+    strength: float | None = None,
+    meaning: Meaning = "irradiance",
+    **sensor: float,
+) -> float:
     """Return an upper bound of the spot's irradiance: saturation x strength x largest laser suppression ratio (LSR).
 
     The bound needs no PSF, so no PSF is computed for it. A pixel that samples a point is at most as bright as the clear
     peak, where all of the pupil is in phase. The same holds for a pixel that averages over a width up to lambda f / D,
     because within that width all pairs of pupil points still add up. A wider pixel within the alias-free field holds at
     least 1 / 2.2 of the clear pupil's light on axis, and no other pixel holds more than all of that light.
+    A channel of small response needs more irradiance to saturate; light in watts has its peak at the mean wavelength.
     """
+    if strength is None:
+        return math.inf if light is None else _LSR * light.max * (bands.max / bands.min) ** 2
     if strength == 0:
         return 0.0
+    least = 1.0
+    if meaning == "first_channel":
+        least = responses.min if responses else 0.0
     ends = torch.tensor([bands.min], dtype=torch.float64)  # the saturation irradiance falls with wavelength
     saturating: Tensor = saturation(Bands(ends, ends, ends), **sensor)
-    return _LSR * strength * float(saturating)
+    return _LSR * strength * float(saturating) / least if least > 0 else math.inf
 
 
 @laser_irradiance.check
-def _(result: Tensor, psf: Psf, bands: Bands, *, strength: float, **sensor: float) -> list[Check]:
-    share = 1.0 / saturation(bands, **sensor)
-    peak = float(torch.tensordot(share.to(result), result, 1).max())
-    return [Check(f"peak of the spot {peak:.3g} I_sat, strength {strength:g} I_sat", math.isfinite(peak))]
+def _(
+    result: Tensor,
+    psf: Psf,
+    bands: Bands,
+    responses: Tensor | None = None,
+    light: LaserLight | None = None,
+    *,
+    strength: float | None = None,
+    meaning: Meaning = "irradiance",
+    **sensor: float,
+) -> list[Check]:
+    wells = 1.0 / saturation(bands, **sensor)
+    peak = float(torch.tensordot(wells.to(result), result, 1).max())
+    if strength is not None:
+        return [Check(f"peak of the spot {peak:.3g} I_sat, strength {strength:g} I_sat", math.isfinite(peak))]
+    watts = f"peak of the spot {float(result.sum(0).max()):.4g} W/m2, {peak:.3g} I_sat"
+    if light is None or (meaning == "first_channel" and (responses is None or not float(responses.max()) > 0)):
+        return [Check(watts, math.isfinite(peak))]
+    clear = light.peak / light.even_peak.clamp_min(1e-300) * light.flux / sensor["pixel_pitch"] ** 2
+    strength = float(clear * unit(psf.clear_peak, bands, wells, responses, meaning))
+    return [Check(f"{watts}, which is a strength of {strength:.4g}", math.isfinite(peak))]

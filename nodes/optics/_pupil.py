@@ -12,7 +12,7 @@ from neusee.nodes.optics._phase_steps import LARGE_STEPS, phase_steps
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, inside, opening, refuse_other_grid, stripes
 from neusee.nodes.optics._zernike import surface
 from neusee.nodes.units import Count, Length, Waves
-from neusee.nodes.values import Bands, Dirt, Pupil, Stop
+from neusee.nodes.values import Bands, Dirt, Pupil, Stop, Wavefront
 
 DEFOCUS_WAVELENGTH = 550e-9  #: m; the wavelength in which waves of defocus are counted
 _ROWS = 512  #: least number of pupil rows in which phase steps are measured
@@ -25,6 +25,7 @@ def pupil(
     bands: Bands,
     stop: Stop,
     dirt: Dirt | None = None,
+    wavefront: Wavefront | None = None,
     *,
     defocus: Waves = 0.0,
     aberrations: dict[Count, Length] = {},  # noqa: B006 (read only)
@@ -32,7 +33,8 @@ def pupil(
     """Build the pupil function from stop, mask, defocus, aberrations and dirt, all in one plane.
 
     Field of band b: amplitude * exp(2 pi i (index[b] * height + path) / wavelength[b]). Defocus adds the path
-    W * 550 nm * r**2 with r = 1 at the rim, so W is the peak-to-valley defocus in waves at 550 nm. The stop passes a
+    W * 550 nm * r**2 with r = 1 at the rim, so W is the peak-to-valley defocus in waves at 550 nm. A `wavefront` adds
+    the taper and the curvature of a laser beam; the lens without defocus is focused at infinity. The stop passes a
     sample if the centre of the sample lies inside the stop.
 
     Shapes: height (v, u), index (band,), bands, stop, dirt (v, u) -> Pupil.
@@ -44,24 +46,40 @@ def pupil(
     grid = grid_of(stop)
     _shapes(height, index, bands, grid, dirt)
     clear = opening(grid, height.dtype, height.device)
-    path = _lens_path(grid, defocus, aberrations, height)
+    sag: float | Tensor = defocus * DEFOCUS_WAVELENGTH
+    if wavefront is not None and bool(wavefront.curvature):
+        sag = sag + wavefront.curvature.to(height.device) * grid.diameter**2 / 8
+    path = _lens_path(grid, sag, aberrations, height)
     if dirt is not None:
         path = dirt.path if path is None else path + dirt.path
     if path is None:
         path = torch.zeros_like(height)
     amplitude = clear if dirt is None else clear * dirt.amplitude
+    if wavefront is not None and bool(wavefront.taper):
+        amplitude = amplitude * _taper(grid, wavefront.taper.to(height.device) * grid.diameter**2 / 4, height)
     return Pupil(clear, amplitude, height, path, index, bands.centres, stop.pitch.to(height.device))
 
 
-def _lens_path(grid: PupilGrid, defocus: float, aberrations: Mapping[int, float], like: Tensor) -> Tensor | None:
-    """Return the optical path of defocus and aberrations, or None for a lens without defocus and aberrations."""
-    if not defocus and not any(aberrations.values()):
+def _taper(grid: PupilGrid, exponent: Tensor, like: Tensor) -> Tensor:
+    """Return the amplitude exp(-exponent r^2) of a Gaussian beam, with r = 1 at the rim of the stop."""
+    amplitude = torch.empty_like(like)
+    v, u = axes(grid, like.device)
+    for rows in stripes(grid):
+        amplitude[rows] = torch.exp(-exponent * (v[rows].square() + u.square()))
+    return amplitude
+
+
+def _lens_path(
+    grid: PupilGrid, defocus: float | Tensor, aberrations: Mapping[int, float], like: Tensor
+) -> Tensor | None:
+    """Return the optical path of defocus and aberrations, or None for a lens without both; ``defocus`` is in m."""
+    if not bool(defocus) and not any(aberrations.values()):
         return None
     path, device = torch.empty_like(like), like.device
     v, u = axes(grid, device)
     for rows in stripes(grid):
         bowl = torch.where(inside(grid, device, rows), v[rows].square() + u.square(), 0.0)
-        path[rows] = defocus * DEFOCUS_WAVELENGTH * bowl + surface(aberrations, grid, device, rows)
+        path[rows] = defocus * bowl + surface(aberrations, grid, device, rows)
     return path
 
 

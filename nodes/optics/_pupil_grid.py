@@ -46,6 +46,17 @@ def pupil_grid(samples: int, pitch: float, diameter: float, aperture: Aperture =
     return PupilGrid(samples, pitch, diameter if aperture == "clipped" else min(diameter, samples * pitch))
 
 
+def clear_area(stop: Stop) -> float:
+    """Return the area of the clear pupil in m2: a disc, cut by the square of the grid where the disc is wider."""
+    radius, half = float(stop.diameter) / 2, float(stop.samples * stop.pitch) / 2
+    if half >= radius:
+        return math.pi * radius**2
+    if half <= radius * math.sqrt(0.5):
+        return 4 * half**2
+    angle = math.acos(half / radius)
+    return math.pi * radius**2 - 4 * (radius**2 * angle - half * math.sqrt(radius**2 - half**2))
+
+
 def axes(grid: PupilGrid, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
     """Return the coordinates v (samples, 1) and u (1, samples) in units of the stop's radius, float64."""
     steps = torch.arange(grid.samples, dtype=torch.float64, device=device) - (grid.samples - 1) / 2

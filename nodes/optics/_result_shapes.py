@@ -13,19 +13,29 @@ from neusee.nodes.optics._psf import _nodes, psf
 from neusee.nodes.optics._pupil import pupil
 from neusee.nodes.optics._transform._sample_axis import Axis
 from neusee.nodes.optics._transform._scaled_transform import _expected_seconds
+from neusee.nodes.optics._white_irradiance import white_irradiance
 from neusee.nodes.shape_rules import at_least_single, blank, double, known, transform_operations
-from neusee.nodes.values import Bands, Channels, LowRankCube, Psf, Pupil, Stop
+from neusee.nodes.values import Bands, Channels, LowRankCube, Psf, Pupil, Stop, Wavefront
 
 _WAVE, _SQUARE = 10.0, 8.0  #: operations for the wave at a sample of the pupil, and for its square at a pixel
 _SHORT, _FINE = 400e-9, 4e-6  #: m, wavelength and pupil pitch where no value is known
 
 
 @pupil.shape
-def _(height: Tensor | None, index: Any, bands: Bands, stop: Stop, dirt: Any = None, **params: Any) -> Pupil:
+def _(
+    height: Tensor | None,
+    index: Any,
+    bands: Bands,
+    stop: Stop,
+    dirt: Any = None,
+    wavefront: Wavefront | None = None,
+    **params: Any,
+) -> Pupil:
     side, dtype = int(stop.samples), torch.float32 if height is None else height.dtype
     clear, amplitude, relief, path = (blank(side, side, dtype=dtype) for _ in range(4))
     wave = double(len(bands.centres))
-    return Pupil(clear, clear if dirt is None else amplitude, relief, path, wave, bands.centres, stop.pitch)
+    even = wavefront is None or (known(wavefront.taper) and not float(wavefront.taper))
+    return Pupil(clear, clear if dirt is None and even else amplitude, relief, path, wave, bands.centres, stop.pitch)
 
 
 @psf.shape
@@ -84,8 +94,14 @@ def _(
 
 
 @laser_irradiance.shape
-def _(psf: Psf, bands: Bands, **params: Any) -> Tensor:
+def _(psf: Psf, bands: Bands, *others: Any, **params: Any) -> Tensor:
     return blank(*psf.intensity.shape, dtype=at_least_single(psf.intensity))
+
+
+@white_irradiance.shape
+def _(bands: Bands, stop: Stop, *, illuminance: Any = None, luminance: Any = None, **params: Any) -> Tensor:
+    """Return 0 for a scene without a brightness in lux or cd/m2, because this needs no table of an illuminant."""
+    return torch.zeros((), dtype=torch.float64) if illuminance is None and luminance is None else double()
 
 
 @direction.shape

@@ -9,7 +9,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from neusee.nodes import Check, ErrorBound, TensorStats, node
+from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import refuse_not_finite, single
 from neusee.nodes.sensor._channel_sums import weighted
 from neusee.nodes.sensor._saturation import Efficiency, Well, photons_per_joule, photons_that_fill, saturation
@@ -100,8 +100,9 @@ def level(
     plain_image: Tensor | Channels,
     bands: Bands,
     responses: Tensor,
+    white: Tensor | None = None,
     *,
-    strength: Strength,
+    strength: Strength | None = None,
     full_well: Well,
     quantum_efficiency: Efficiency,
     pixel_pitch: PositiveLength,
@@ -114,14 +115,19 @@ def level(
 
     `channel_sum`: the brightest pixel of the brightest channel holds strength x full well, summed over bands.
     `per_band`: each band alone peaks at strength x I_sat, as the paper prints; the sum of 31 bands overexposes.
+    Without a strength the factor is ``white``, the irradiance of a white surface in lux or cd/m2.
 
-    Shapes: plain_image (..., band, y, x), responses (channel, band) -> (band,) float64.
+    Shapes: plain_image (..., band, y, x), responses (channel, band), white () -> (band,) float64.
     Units:  result W/m2 per unit of the image.
     Error:  exact; a scene without light has level 0.
-    Raises: ValueError for `per_band` if the image has been summed over its bands, and for an image that is not
-            finite.
+    Raises: ParameterError before the run where strength and white are both given, or neither; ValueError for `per_band`
+            if the image has been summed over its bands, and for an image that is not finite.
     Source: NeuSee, Eq. (peak_irrad_coded).
     """
+    if strength is None:
+        if white is None or not float(white) > 0:
+            raise ParameterError("strength", _DARK)
+        return white.double().expand(len(bands.centres)).clone()
     if rule == "per_band":
         if isinstance(plain_image, Channels):
             raise ValueError("rule per_band needs the peak of each band, but this image is summed over its bands: "
@@ -138,6 +144,9 @@ def level(
     return torch.where(lit, strength * top.to(peaks) / peaks.where(lit, 1.0), 0.0)
 
 
+_DARK = "the brightness of the scene is not known: give sensor.background, scene.illuminance or scene.luminance"
+
+
 @level.band_invariant
 def _(params: Mapping[str, Any]) -> bool:
     return bool(params.get("rule", "channel_sum") == "channel_sum")
@@ -146,12 +155,26 @@ def _(params: Mapping[str, Any]) -> bool:
 @level.propagate_error
 def _(plain_image: ErrorBound, *others: object, result: TensorStats, **params: Any) -> float:
     """Return an error bound of the scale factor `level` from the error of the brightest pixel of the image."""
+    if params["strength"] is None:
+        return 0.0
     share = plain_image.largest
     return result.max * share / (1.0 - share) if share < 1.0 else math.inf
 
 
 @level.preflight
-def _(*, strength: float, rule: str = "channel_sum", **params: object) -> list[str]:
+def _(
+    *, white: Tensor | None = None, strength: float | None = None, rule: str = "channel_sum", **params: object
+) -> list[str]:
+    absolute = white is not None and (white.is_meta or float(white) > 0)
+    if strength is None:
+        if not absolute:
+            raise ParameterError("strength", _DARK)
+        if rule == "per_band":
+            raise ParameterError("rule", "lux and cd/m2 are sums over the bands: use rule channel_sum")
+        return []
+    if absolute:
+        text = "the brightness of the scene is stated twice, here and in lux or cd/m2: write sensor.background=null"
+        raise ParameterError("strength", f"{text}, or leave scene.illuminance and scene.luminance out")
     notes = (
         [f"background of {strength:g} full wells saturates the plain lens without any laser"] if strength > 1 else []
     )

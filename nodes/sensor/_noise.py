@@ -9,11 +9,11 @@ import torch
 from pydantic import Field
 from torch import Generator, Tensor
 
-from neusee.nodes import Check, ErrorBound, TensorStats, node
+from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.torch_func import transformed
-from neusee.nodes.units import Electrons, Fraction
+from neusee.nodes.units import DarkCurrent, Electrons, ElectronsPerSecond, Fraction, Time
 
 Distribution = Literal["gaussian", "poisson"]
 _PART = 1 << 15  #: elements; torch splits larger arrays among threads, which is slow on a busy machine
@@ -130,12 +130,15 @@ def normal(like: Tensor, rng: Generator) -> Tensor:
 def dark_current(
     electrons: Tensor,
     *,
-    mean: Electrons,
+    mean: DarkCurrent,
+    exposure: Time | None = None,
     full_well: Well | None = None,
     mean_of: Literal["sensor", "exposure"] = "sensor",
     rng: Generator,
 ) -> Tensor:
     """Add the thermal electrons of one exposure, sampled from a Poisson distribution.
+
+    A mean in e-/s is multiplied by ``exposure``.
 
     The mean of the distribution is ``mean``, for ``mean_of`` sensor. For ``mean_of`` exposure the mean is sampled once
     for each exposure from a normal distribution with mean ``mean`` and half of it as standard deviation, as the paper
@@ -145,12 +148,14 @@ def dark_current(
     with the signal up to the well, because a later step cuts off the signal of a laser above the well.
 
     Shapes: electrons (..., y, x) -> (..., y, x).
-    Units:  e-; mean e- per exposure.
+    Units:  e-; mean e- per exposure, or e-/s; exposure s.
     Error:  one mean for all pixels: hot pixels are left out.
+    Raises: ParameterError before the run for a mean in e-/s without an exposure.
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 (dark current).
     """
 
-    expected = mean if mean_of == "sensor" else _sampled_mean(mean, rng)
+    total = dark_electrons(mean, exposure)
+    expected = total if mean_of == "sensor" else _sampled_mean(total, rng)
 
     def with_dark_current(part: Tensor) -> Tensor:
         rate = torch.full(part.shape, expected, dtype=part.dtype, device=rng.device)
@@ -159,14 +164,40 @@ def dark_current(
     return _by_parts(with_dark_current, single(electrons), rng)
 
 
+def dark_electrons(mean: float | ElectronsPerSecond, exposure: float | None) -> float:
+    """Return the mean dark electrons of one exposure, from electrons of an exposure or electrons per second.
+
+    Raises ParameterError for electrons per second without an exposure.
+    """
+    if not isinstance(mean, ElectronsPerSecond):
+        return mean
+    if exposure is None:
+        raise ParameterError("mean", f"{mean.rate:g} e-/s needs the exposure: give `exposure` to the step, or use e-")
+    return mean.rate * exposure
+
+
+@dark_current.preflight
+def _(*, mean: float | ElectronsPerSecond, exposure: float | None, **params: object) -> list[str]:
+    dark_electrons(mean, exposure)
+    return []
+
+
 def _sampled_mean(mean: float, rng: Generator) -> float:
     drawn = torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)
     return mean * max(0.0, min(_MOST, 1.0 + 0.5 * float(drawn)))
 
 
 @dark_current.skip_bound
-def _(electrons: TensorStats, *, mean: float, full_well: float | None, mean_of: str = "sensor") -> float:
-    most = mean if mean_of == "sensor" else _MOST * mean
+def _(
+    electrons: TensorStats,
+    *,
+    mean: float | ElectronsPerSecond,
+    full_well: float | None,
+    exposure: float | None = None,
+    mean_of: str = "sensor",
+) -> float:
+    total = dark_electrons(mean, exposure)
+    most = total if mean_of == "sensor" else _MOST * total
     return _share(most, math.sqrt(most), electrons, full_well)
 
 

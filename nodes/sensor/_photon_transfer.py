@@ -7,9 +7,9 @@ from torch import Generator, Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.sensor._digitization import Bits, Rounding, digitize, full_well
-from neusee.nodes.sensor._noise import Distribution, dark_current, photon_noise, read_noise
+from neusee.nodes.sensor._noise import Distribution, dark_current, dark_electrons, photon_noise, read_noise
 from neusee.nodes.sensor._saturation import Efficiency, Well
-from neusee.nodes.units import Count, Electrons, Gain
+from neusee.nodes.units import Count, DarkCurrent, Electrons, Gain, Time
 
 well_of, read_of = full_well, read_noise  # parameters below have the same names
 
@@ -24,7 +24,8 @@ def photon_transfer(
     bits: Bits = 16,
     offset: Electrons,
     read_noise: Electrons,
-    dark: Electrons,
+    dark: DarkCurrent,
+    exposure: Time | None = None,
     distribution: Distribution = "gaussian",
     levels: Count = 24,
     pixels: Count = 16384,
@@ -37,16 +38,18 @@ def photon_transfer(
     the dark mean. The prediction is K^2 sigma_d^2 + sigma_q^2 + K (mean - dark mean).
 
     Shapes: -> (level, 3) float64.
-    Units:  gain K, DN/e-; result DN, DN2, DN2.
+    Units:  gain K, DN/e-; dark e- of one exposure, or e-/s times exposure; result DN, DN2, DN2.
     Error:  sampling: the variance of a pair has a relative deviation of sqrt(2 / pixels), 1.1 % at 16384. The
             prediction includes neither the full well nor the end of the converter, so the variances differ there.
     Source: EMVA Standard 1288, release 4.0 Linear (photon transfer method, difference of two frames).
     """
 
+    expected = dark_electrons(dark, exposure)
+
     def frame(photons: float) -> Tensor:
         flat = torch.full((pixels,), photons, dtype=torch.float64, device=rng.device)
         e = photon_noise(flat, quantum_efficiency=quantum_efficiency, distribution=distribution, rng=rng)
-        e = read_of(dark_current(e, mean=dark, rng=rng), offset=offset, read_noise=read_noise, rng=rng)
+        e = read_of(dark_current(e, mean=expected, rng=rng), offset=offset, read_noise=read_noise, rng=rng)
         e = well_of(e, capacity=full_well)
         dn: Tensor = digitize(e, gain=gain, rounding=rounding, bits=bits, rng=rng)
         return dn
@@ -54,7 +57,7 @@ def photon_transfer(
     light = _rise(full_well / quantum_efficiency, 1.0 / quantum_efficiency, levels)
     measured = torch.tensor([_pair(frame(p), frame(p)) for p in light], dtype=torch.float64)
     signal = measured[:, 0] - measured[0, 0]
-    floor = gain**2 * (read_noise**2 + dark) + (1.0 / 12.0 if rounding == "nearest" else 1.0 / 6.0)
+    floor = gain**2 * (read_noise**2 + expected) + (1.0 / 12.0 if rounding == "nearest" else 1.0 / 6.0)
     return torch.stack([signal, measured[:, 1], floor + gain * signal], 1)
 
 

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.constants import PLANCK, SPEED_OF_LIGHT
+from neusee.nodes.units import Efficiency as Efficiency
 from neusee.nodes.units import Electrons, PositiveLength, Time
 from neusee.nodes.values import Bands
 
-Efficiency = Annotated[float, Field(gt=0, le=1)]  #: electrons per photon
 Well = Annotated[Electrons, Field(gt=0)]  #: electrons that fill a pixel
 
 

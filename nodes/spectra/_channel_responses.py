@@ -11,7 +11,7 @@ from neusee.nodes.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
 from neusee.nodes.input_files import once_per_version
 from neusee.nodes.spectra._spectral_tables import Table, measured_camera, observer
 from neusee.nodes.spectra._table_files import Curves, curves, refused
-from neusee.nodes.units import DataFile
+from neusee.nodes.units import DataFile, Efficiency
 from neusee.nodes.values import Bands
 
 Camera = Literal["CIE 1931", "Nikon 5100", "Sigma SDMerill"]
@@ -29,7 +29,9 @@ _ELECTRON_VOLT_METRES = PLANCK * SPEED_OF_LIGHT / ELEMENTARY_CHARGE  #: V m; res
 
 
 @node(rtol=1e-9)
-def responses(bands: Bands, *, camera: Camera | DataFile = "CIE 1931") -> Tensor:
+def responses(
+    bands: Bands, *, camera: Camera | DataFile = "CIE 1931", quantum_efficiency: Efficiency | None = None
+) -> Tensor:
     """Average the sensitivity of each colour channel over each band, for the CIE observer or a measured camera.
 
     ``camera`` is one of three names, or a CSV file of your own camera: a header such as ``wavelength (nm),QE (%)``,
@@ -37,8 +39,12 @@ def responses(bands: Bands, *, camera: Camera | DataFile = "CIE 1931") -> Tensor
     is a quantum efficiency (QE, in 1 or %), a responsivity in A/W, or a relative sensitivity in any unit common to the
     channels. A header without units means nm and relative sensitivities.
 
+    An absolute table, of a quantum efficiency or a responsivity, is relative to ``quantum_efficiency`` if that is
+    given, so that a sensor that multiplies by ``quantum_efficiency`` later has the electrons of the table.
+
     Shapes: -> (channel, band) float64, with 3 channels or 1.
-    Units:  relative to the largest sensitivity of any channel at any wavelength; no response is negative.
+    Units:  relative to the largest sensitivity of any channel at any wavelength, or, of an absolute table, to
+            ``quantum_efficiency``; no response is negative.
     Error:  linear interpolation between the samples of the table (1, 5 and 10 nm); 0 beyond the table, whose ends are
             below 6e-3 of the peak (CIE 360-830 nm, Nikon 380-780 nm, Sigma 400-680 nm; except that the blue of Sigma
             is still 0.16 at 400 nm).
@@ -47,13 +53,18 @@ def responses(bands: Bands, *, camera: Camera | DataFile = "CIE 1931") -> Tensor
     Source: CIE 1931 2 degree observer; NPL measurements of the Nikon 5100 and Sigma SD Merrill in colour-science.
     """
     table = _table(camera)
-    return (table.over(bands) / table.values.max()).clamp_min(0).to(bands.centres.device)
+    largest = table.values.max()
+    if quantum_efficiency is not None and isinstance(camera, Path) and camera_curves(camera)[1]:
+        largest = largest.new_tensor(quantum_efficiency)
+    return (table.over(bands) / largest).clamp_min(0).to(bands.centres.device)
 
 
 @responses.preflight
-def _(*, bands: Bands | None = None, camera: Camera | Path = "CIE 1931") -> list[str]:
-    low, high = _seen(camera)
-    notes = _peak_note(camera) if isinstance(camera, Path) else []
+def _(
+    *, bands: Bands | None = None, camera: Camera | Path = "CIE 1931", quantum_efficiency: float | None = None
+) -> list[str]:
+    low, high = seen_range(camera)
+    notes = _peak_note(camera, quantum_efficiency) if isinstance(camera, Path) else []
     if bands is None or bands.centres.is_meta:
         return notes
     centres = bands.centres * 1e9
@@ -74,7 +85,7 @@ def _(*, bands: Bands | None = None, camera: Camera | Path = "CIE 1931") -> list
 
 
 @responses.check
-def _(result: Tensor, bands: Bands, *, camera: Camera | Path = "CIE 1931") -> list[Check]:
+def _(result: Tensor, bands: Bands, *, camera: Camera | Path = "CIE 1931", **params: object) -> list[Check]:
     peaks = [float(bands.centres[int(row.argmax())]) * 1e9 for row in result]
     lit = bool((result.amax(1) > 0).all())
     text = f"{_name(camera)}: peak{'s' * (len(peaks) > 1)} at {', '.join(f'{peak:.4g}' for peak in peaks)} nm"
@@ -135,16 +146,23 @@ def _above_one(value: float, unit: str) -> str:
     return f"{value:g} {unit} is more than one electron for each photon: {fix}"
 
 
-def _peak_note(file: Path) -> list[str]:
-    """Return a note on the largest QE of a file, because responses are relative to it."""
+def _peak_note(file: Path, quantum_efficiency: float | None) -> list[str]:
+    """Return a note on the largest QE of a file: responses are relative to it, or the QE of the sensor does not count.
+
+    Without a quantum efficiency of the sensor, responses are relative.
+    """
     found, absolute = camera_curves(file)
     if not absolute:
         return []
     largest = found.values.max()
     at = found.wavelengths[found.values.max(0).argmax()] * 1e9
+    peak = f"{file.name}: the largest QE is {largest:.4g}, at {at:g} nm"
+    if quantum_efficiency is not None:
+        told = f"sensor.quantum_efficiency={quantum_efficiency:.4g}"
+        same = abs(quantum_efficiency / largest - 1) < 1e-3
+        return [] if same else [f"{peak}, and the QE of the table counts for electrons, not {told}"]
     return [
-        f"{file.name}: the largest QE is {largest:.4g}, at {at:g} nm, and responses are relative to it: "
-        f"electrons are right with sensor.quantum_efficiency={largest:.4g}"
+        f"{peak}, and responses are relative to it: electrons are right with sensor.quantum_efficiency={largest:.4g}"
     ]
 
 
@@ -158,7 +176,7 @@ def _table(camera: str | Path) -> Table:
     return observer() if camera == "CIE 1931" else measured_camera(camera)
 
 
-def _seen(camera: str | Path) -> tuple[float, float]:
+def seen_range(camera: str | Path) -> tuple[float, float]:
     """Return the wavelengths in nm between which some channel sees more than a thousandth of the largest value."""
     if not isinstance(camera, Path):
         return _SEEN[camera]

@@ -10,7 +10,7 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.input_files import once_per_version
-from neusee.nodes.spectra._spectral_tables import Table, daylight, light, require_range
+from neusee.nodes.spectra._spectral_tables import Table, daylight, light, observer, require_range
 from neusee.nodes.spectra._table_files import Curves, curves, refused
 from neusee.nodes.units import DataFile, Temperature
 from neusee.nodes.values import Bands, LowRankCube
@@ -20,6 +20,8 @@ Kind = Literal[
     "LED-B1", "LED-B2", "LED-B3", "LED-B4", "LED-B5", "LED-BH1", "LED-RGB1", "LED-V1", "LED-V2",
 ]  # fmt: skip
 _COLUMNS = "write a header such as wavelength (nm),power (W/nm), then two columns"
+_VISIBLE = 0.99  #: share of the luminous efficiency that a table of light must hold, for lux
+_LUMENS_PER_WATT = 683.0  #: lm/W at 555 nm
 _LONGER = "give a longer table, or choose bands inside that range"
 
 
@@ -75,6 +77,26 @@ def _(result: Tensor, bands: Bands, *, kind: str | Path = "daylight", temperatur
             f"{name}: relative power {float(result.min()):.2f} to {float(result.max()):.2f}, largest at {peak:.4g} nm"
         )
     ]
+
+
+def luminous_share(bands: Bands | None, kind: str | Path, temperature: float) -> float:
+    """Return the mean radiance in one band of a light of 1 cd/m2, in W/(m2 sr).
+
+    Raises ParameterError for a table of light that does not hold 99 % of the luminous efficiency, and 0 for no bands.
+    """
+    table, eye = _light(kind, temperature), observer()
+    seen = (eye.wavelengths >= table.wavelengths[0]) & (eye.wavelengths <= table.wavelengths[-1])
+    curve = eye.values[1] * seen
+    if float(curve.sum() / eye.values[1].sum()) < _VISIBLE:
+        low, high = float(table.wavelengths[0]) * 1e9, float(table.wavelengths[-1]) * 1e9
+        text = f"{_name(kind)} is tabulated from {low:.4g} to {high:.4g} nm, which does not reach over the visible"
+        raise ParameterError("kind", f"{text} wavelengths: lux and cd/m2 need light from 430 to 680 nm")
+    lumens = _LUMENS_PER_WATT * float(torch.trapezoid(curve * table.at(eye.wavelengths)[0], eye.wavelengths))
+    if bands is None or bands.centres.is_meta:
+        return 0.0
+    if not lumens > 0:
+        raise ParameterError("kind", f"{_name(kind)} gives no visible light: state sensor.background in place of lux")
+    return float((table.over(bands)[0] * bands.widths.cpu()).mean()) / lumens
 
 
 def light_curve(file: Path) -> Curves:

@@ -6,9 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neusee.nodes.shape_rules import at_least_single, blank, double, like_first
+from neusee.nodes.shape_rules import at_least_single, blank, double, known, like_first
 from neusee.nodes.spectra._camera_colour import grain, render
-from neusee.nodes.spectra._channel_responses import channel_count, responses
+from neusee.nodes.spectra._channel_responses import channel_count, responses, seen_range
 from neusee.nodes.spectra._dead_leaves import _FINE, leaves
 from neusee.nodes.spectra._distinct_band_sums import rows
 from neusee.nodes.spectra._illuminant import illuminant, illuminate
@@ -18,6 +18,8 @@ from neusee.nodes.spectra._metamers import metamers
 from neusee.nodes.spectra._mst_lift_node import lift_mst_plus_plus
 from neusee.nodes.values import Bands, LowRankCube
 
+_FEW = 20  #: bands of a laser line, at most
+
 
 @illuminant.shape
 def _(bands: Bands, **params: Any) -> Tensor:
@@ -25,8 +27,18 @@ def _(bands: Bands, **params: Any) -> Tensor:
 
 
 @responses.shape
-def _(bands: Bands, *, camera: str | Path = "CIE 1931") -> Tensor:
+def _(bands: Bands, *, camera: str | Path = "CIE 1931", **params: Any) -> Tensor:
+    """Return the responses to bands that no channel sees, which a laser must know before the run, or their shape."""
+    if known(bands.centres) and _beyond(bands, camera):
+        found: Tensor = responses(bands, camera=camera, **params)
+        return found
     return double(channel_count(camera), len(bands.centres))
+
+
+def _beyond(bands: Bands, camera: str | Path) -> bool:
+    """Return True for the few bands of a laser if some channel may not see them; no table is read for others."""
+    low, high = seen_range(camera)
+    return len(bands.centres) < _FEW and not low <= float(bands.centres.mean()) * 1e9 <= high
 
 
 @rows.shape

@@ -113,6 +113,8 @@ def _networks(folder):
     }
 
 
+BEAM = {"divergence": 1e-3, "distance": 100.0}
+
 CASES = {
     "calibrate.camera": Case(
         "gain",
@@ -135,6 +137,8 @@ CASES = {
     "doe.zernike": Case("coefficients.4", (STOP,), {"coefficients": {4: number(0.3), 6: number(0.1)}}),
     "flare.dirt": Case("grease", (STOP,), {"grease": number(1e-7), "dust": 3.0}),
     "flare.ghosts": Case("0", (rand(3, 12, 12), LINE, DIRECTION), {**LENS, "count": 3, "radius": 3e-5}),
+    "laser.light": Case("power", (LINE, STOP), {**BEAM, "power": number(5e-3), "focal_length": 0.11, "exposure": 0.1}),
+    "laser.wavefront": Case("distance", (LINE,), {**BEAM, "distance": number(100.0)}),
     "losses.background_loss": Case("0.intensity", (PSF, SCENE)),
     "losses.charbonnier": Case("0", (PICTURE, OTHER)),
     "losses.contrast": Case("0.intensity", (WIDE,)),
@@ -160,6 +164,7 @@ CASES = {
     "optics.psf": Case("0.height", (PUPIL,), {**LENS, "shape": (9, 9)}),
     "optics.pupil": Case("0", (HEIGHT, INDEX, BANDS, STOP, DIRT)),
     "optics.laser_irradiance": Case("0.intensity", (Psf(rand(3, 9, 9), rand(3)), LINE), {"strength": 10.0, **WELL}),
+    "optics.white_irradiance": Case("illuminance", (BANDS, STOP), {"illuminance": number(1e3), "focal_length": 0.11}),
     "restore.clipped": Case("0", (RAW,), ADC),
     "restore.colour": Case("0", (PICTURE, rand(3, 3))),
     "restore.colour_matrix": Case("1", (BANDS, LIGHT, RESPONSES, LEVEL), {**SHUTTER, "quantum_efficiency": 0.56}),

@@ -216,7 +216,7 @@ def _readings_of(step: Any) -> Iterator[str]:
     """Yield each recipe key that chooses an interpretation of the paper and to which a parameter of ``step`` refers."""
     known = {row.path for row in READINGS}
     for value in (step.get("with") or {}).values():
-        match = re.fullmatch(r"\$\{(\w+\.\w+)\}", str(value))
+        match = re.fullmatch(r"\$\{(\w+\.\w+)\??\}", str(value))
         if match and (match[1].startswith("reading.") or match[1] in known):
             yield match[1]
 

@@ -56,16 +56,22 @@ class References:
         self.open: list[Where] = []  #: values that are being resolved
         self.lacking: list[tuple[Where, Diagnostic]] = []  #: targets that do not exist
         self.spare: set[Where] = set()  #: unused values of packaged options
+        self.offered: set[Where] = set()  #: values to which an optional reference refers and that nobody gave
         self.followed = 0  #: references followed since the last value of a step was begun
         self.weights: dict[int, tuple[int, Any]] = {}  #: number of values in each list or mapping, by identity
 
     def resolve(self, value: Value, scope: Scope) -> Value:
-        """Return a recipe value with its references resolved; report a failed reference and return `BROKEN` for it."""
+        """Return a recipe value with its references resolved; report a failed reference and return `BROKEN` for it.
+
+        An optional reference, ``${scene.illuminance?}``, leaves its key out of the mapping if the value does not exist.
+        """
         if isinstance(value.data, dict):
-            children = ((key, child, self.resolve(child, scope)) for key, child in value.data.items())
-            return replace(value, data={key: replace(resolved, key=child.key) for key, child, resolved in children})
+            children = [(key, child, self.resolve(child, scope)) for key, child in value.data.items()]
+            kept = [each for each in children if each[2].data is not ABSENT]
+            return replace(value, data={key: replace(resolved, key=child.key) for key, child, resolved in kept})
         if isinstance(value.data, list):
-            return replace(value, data=[self.resolve(child, scope) for child in value.data])
+            items = (self.resolve(child, scope) for child in value.data)
+            return replace(value, data=[item for item in items if item.data is not ABSENT])
         if not isinstance(value.data, str) or "${" not in value.data:
             return value
         return self._text(value, scope)
@@ -79,6 +85,8 @@ class References:
                 return replace(value, data=BROKEN)
             if match[0] == text:
                 return target
+            if target.data is ABSENT:
+                return self._fail(value, f"the optional reference ${{{match[1]}}} must be the whole value")
             if target.data is BROKEN:
                 return target
             if isinstance(target.data, dict | list):
@@ -91,7 +99,8 @@ class References:
         return replace(value, data=text)
 
     def _target(self, text: str, origin: Value, scope: Scope) -> Value | None:
-        parts, start = text.strip().split("."), self.root
+        optional = text.rstrip().endswith("?")
+        parts, start = text.strip().removesuffix("?").split("."), self.root
         if parts[0] in ("item", "each") and parts[0] not in self.root.items:
             item, parts, fault = scope.find(parts)
             if item is None:
@@ -99,6 +108,9 @@ class References:
                 return None
             start = item
         target = start.below(parts)
+        if target is None and optional:
+            self.offered.add((*start.path, *parts))
+            return replace(origin, data=ABSENT)
         if target is None:
             self._missing(start, parts, origin, scope)
             return None
@@ -165,7 +177,7 @@ class References:
         """Mark the values to which a step without copies refers as used, so that they are not reported as unused."""
         for text in _texts(value):
             for match in _REFERENCE.finditer(text.data):
-                parts = match[1].strip().split(".")
+                parts = match[1].strip().removesuffix("?").split(".")
                 if parts[0] not in ("item", "each"):
                     self._target(match[1], text, Scope({}, ""))
                     continue
@@ -229,7 +241,7 @@ class References:
         """Return the path that a user probably meant by an unused path: its new name, or a similar path in use."""
         if now := new_name(leaf.name):
             return tuple(now.split("."))
-        known = {*self.used, *(path for path, _ in self.lacking)}
+        known = {*self.used, *self.offered, *(path for path, _ in self.lacking)}
         known |= {(name,) for name in (*RESERVED, "defaults")} if len(leaf.path) == 1 else set()
         return _nearest(leaf.path, known)
 
@@ -259,6 +271,7 @@ def _nearest(path: Where, known: set[Where]) -> Where | None:
 
 
 BROKEN = type("Broken", (), {"__repr__": lambda self: "?", "__doc__": "Value of a failed reference."})()
+ABSENT = type("Absent", (), {"__repr__": lambda self: "-", "__doc__": "Value of an optional reference to nothing."})()
 
 
 def broken(value: Value) -> bool:

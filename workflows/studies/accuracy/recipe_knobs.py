@@ -16,7 +16,7 @@ from neusee.nodes.values import Bands, Psf
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.recipe.changed_recipe import changed
 
-_REFERENCE = re.compile(r"\$\{([\w.-]+)\}")
+_REFERENCE = re.compile(r"\$\{([\w.-]+)\??\}")
 _ONE_BY_ONE = ("item", "each")  #: first names of paths whose value differs from item to item
 _FACTORS = (0.2, 1 / 3, 0.5, 2.0)  #: factors on the number of intervals between bands
 _FEWER = (1 / 3, 2.0)

@@ -1,0 +1,241 @@
+"""A laser in absolute units at the lens of a camera: its wavefront in the pupil, and its light in one exposure."""
+
+import math
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from pydantic import Field
+
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.laser._air import Law, air_transmittance
+from neusee.nodes.laser._beam import (
+    Beam,
+    Convention,
+    axis_density,
+    beam,
+    beam_radius,
+    curvature_radius,
+    sensor_density,
+    share_through,
+)
+from neusee.nodes.optics._pupil_grid import clear_area
+from neusee.nodes.spectra._bands import mean_wavelength
+from neusee.nodes.units import Delay, Energy, Frequency, PositiveAngle, PositiveLength, Power, Time, Transmittance
+from neusee.nodes.values import Bands, LaserLight, Stop, Wavefront
+
+Quality = Annotated[float, Field(ge=1, allow_inf_nan=False)]  #: M2 of a beam
+Multiple = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_NEAR = 1e-3  #: part of a wave of defocus from which a finite distance is worth a note
+
+
+class _Geometry(NamedTuple):
+    """What decides the wavefront of a laser: width, divergence, quality and distance."""
+
+    waist: float | None
+    divergence: float | None
+    m_squared: float | None
+    convention: Convention
+    distance: float | None
+
+
+@node(rtol=1e-12)
+def wavefront(
+    line: Bands,
+    *,
+    waist: PositiveLength | None = None,
+    divergence: PositiveAngle | None = None,
+    m_squared: Quality | None = None,
+    convention: Convention = "1/e2",
+    distance: PositiveLength | None = None,
+) -> Wavefront:
+    """Compute the taper and the curvature of a Gaussian beam in the pupil of a lens at a distance from the laser.
+
+    The beam has the 1/e2 radius w and the curvature radius R + (2 w0 / divergence)^2 / R at the distance R, and hits
+    the middle of the lens. Without a distance the light fills the pupil evenly as a plane wave.
+
+    Shapes: -> taper, curvature ().
+    Units:  taper 1/m2; curvature 1/m.
+    Error:  exact for one Gaussian beam; a beam with M2 above 1 is taken as a wider Gaussian beam of one mode.
+    Raises: ParameterError for a waist, a divergence and an M2 that disagree, and for a distance without a width.
+    Source: Siegman, Lasers (1986), chapter 17; ISO 11146-1 (beam of any M2).
+    """
+    if distance is None:
+        return Wavefront(*torch.zeros(2, dtype=torch.float64))
+    found = _shaped(line, _Geometry(waist, divergence, m_squared, convention, distance))
+    values = beam_radius(found, distance) ** -2, 1 / curvature_radius(found, distance)
+    return Wavefront(*(torch.as_tensor(value, dtype=torch.float64) for value in values))
+
+
+@wavefront.check
+def _(result: Wavefront, line: Bands, *, distance: float | None, **params: Any) -> list[Check]:
+    if distance is None:
+        return [Check("plane wave, even over the pupil")]
+    width = float(result.taper) ** -0.5
+    return [
+        Check(f"beam of 1/e2 radius {width:.4g} m at {distance:g} m, curvature radius {1 / result.curvature:.4g} m")
+    ]
+
+
+@node(rtol=1e-12)
+def light(
+    line: Bands,
+    stop: Stop,
+    *,
+    focal_length: PositiveLength,
+    exposure: Time,
+    lens_transmittance: Transmittance = 1.0,
+    strength: Multiple | None = None,
+    power: Power | None = None,
+    pulse_energy: Energy | None = None,
+    pulse_duration: Time | None = None,
+    repetition_rate: Frequency | None = None,
+    pulse_delay: Delay = 0.0,
+    waist: PositiveLength | None = None,
+    divergence: PositiveAngle | None = None,
+    m_squared: Quality | None = None,
+    convention: Convention = "1/e2",
+    distance: PositiveLength | None = None,
+    air_transmittance: Transmittance | None = None,
+    visibility: PositiveLength | None = None,
+    haze: Law | None = None,
+) -> LaserLight:
+    """Compute the light that a laser in watts or joules sends through a lens, and its peak on the sensor.
+
+    The beam hits the middle of the lens. All irradiances are means over one exposure. The shutter is global and opens
+    at the time 0; the pulses begin at `pulse_delay` and then every period, before the exposure too, and a pulse that
+    the shutter cuts counts in part. With the delay 0 an exposure catches as many pulses as it can.
+    `waist` and `divergence` are the 1/e2 radius and full angle, or those at 1/e by `convention`. The air is clear, or
+    has `air_transmittance`, or the `visibility` with the law `haze`. A laser that has a `strength` gives zeros.
+
+    Shapes: -> LaserLight of scalars ().
+    Units:  W/m2, W, J/m2; lengths m; times s.
+    Error:  peak of a diffraction-limited lens in focus at the mean wavelength of the line; the rim of the pupil grid
+            adds 2 / samples at most.
+    Raises: ParameterError before the run for a strength beside a power, a missing power, width or distance, and for
+            statements that disagree.
+    Source: Siegman, Lasers (1986), section 17.1; Goodman, Introduction to Fourier Optics, 3rd ed., section 4.4.
+    """
+    if strength is not None:
+        return LaserLight(*torch.zeros(7, dtype=torch.float64))
+    if distance is None:
+        raise ParameterError("distance", "the distance of the laser is not known: give distance")
+    geometry = _Geometry(waist, divergence, m_squared, convention, distance)
+    found = _shaped(line, geometry, power, pulse_energy, pulse_duration, repetition_rate)
+    air = _air(found.wavelength, distance, air_transmittance, visibility, haze)
+    pulses = pulses_within(found, exposure, pulse_delay)
+    mean = found.power if found.pulse_energy is None else found.pulse_energy * pulses / exposure
+    assert mean is not None
+    diameter = min(float(stop.diameter), float(stop.samples * stop.pitch))
+    irradiance = mean * axis_density(found, distance, air)
+    flux = irradiance * clear_area(stop) * lens_transmittance
+    even = flux * clear_area(stop) / (found.wavelength * focal_length) ** 2
+    peak = sensor_density(found, distance, diameter, focal_length, lens_transmittance, air)
+    through = mean * share_through(found, distance, diameter, air)
+    values = (even, flux, irradiance, through, mean * peak, pulses, (found.pulse_energy or 0.0) * peak)
+    return LaserLight(*(torch.as_tensor(value, dtype=torch.float64) for value in values))
+
+
+@light.check
+def _(result: LaserLight, line: Bands, stop: Stop, *, strength: float | None, **params: Any) -> list[Check]:
+    if strength is not None:
+        return [Check(f"given by its strength, {strength:g}")]
+    pulses = f", {float(result.pulses):.4g} pulses in the exposure" if float(result.pulse_fluence) > 0 else ""
+    text = f"{float(result.power):.4g} W into the lens ({float(result.irradiance):.4g} W/m2 on the axis of the beam)"
+    peak = f"peak {float(result.peak):.4g} W/m2 on the sensor behind the clear lens in focus"
+    return [Check(f"{text}, {peak}{pulses}", math.isfinite(float(result.peak)))]
+
+
+def pulses_within(beam: Beam, exposure: float, delay: float) -> float:
+    """Return the number of pulses that a shutter lets through, with parts of pulses; 0 for a continuous laser."""
+    if beam.pulse_duration is None:
+        return 0.0
+
+    def begun(time: float) -> float:
+        """Return the pulses from the delay to a time after the delay; a time before the delay counts back."""
+        assert beam.pulse_duration is not None
+        if beam.repetition_rate is None:
+            return min(max(time / beam.pulse_duration, 0.0), 1.0)
+        whole = math.floor(time * beam.repetition_rate)
+        return whole + min(max(time - whole / beam.repetition_rate, 0.0) / beam.pulse_duration, 1.0)
+
+    return begun(exposure - delay) - begun(-delay)
+
+
+def _shaped(line: Bands, shape: _Geometry, *emission: float | None) -> Beam:
+    """Return the beam of a laser line; without power and pulses its power is 1 W."""
+    power, energy, duration, rate = emission or (1.0, None, None, None)
+    return beam(
+        mean_wavelength(line),
+        power=power,
+        pulse_energy=energy,
+        pulse_duration=duration,
+        repetition_rate=rate,
+        waist=shape.waist,
+        divergence=shape.divergence,
+        m_squared=shape.m_squared,
+        convention=shape.convention,
+    )
+
+
+def _air(wavelength: float, distance: float, share: float | None, visibility: float | None, haze: Law | None) -> float:
+    """Return the transmittance of the air between a laser and a lens."""
+    if share is not None or visibility is None:
+        return 1.0 if share is None else share
+    if haze is None:
+        text = "laws of haze differ twentyfold in fog at 1550 nm: name one, haze: kruse or haze: kim"
+        raise ParameterError("visibility", text)
+    return air_transmittance(distance, visibility, wavelength, haze)
+
+
+# --- what is refused before the run -----------------------------------------------------------------------------------
+
+_BEAM = ("waist", "divergence", "m_squared")
+_PULSE = ("pulse_energy", "pulse_duration", "repetition_rate")
+_AIR = ("air_transmittance", "visibility", "haze")
+
+
+@light.preflight
+def _(*, line: Bands | None = None, stop: Stop | None = None, **params: Any) -> list[str]:
+    given = [name for name in ("power", *_PULSE, *_BEAM, "distance", *_AIR) if params[name] is not None]
+    strength = params["strength"]
+    if strength is not None:
+        _refuse_beside_strength(given)
+        return []
+    if "power" not in given and "pulse_energy" not in given:
+        text = "the light of this laser is not known: give strength, or power (or pulse_energy) with distance"
+        raise ParameterError(given[0] if given else "line.wavelength", text)
+    if "distance" not in given:
+        raise ParameterError(given[0], "a laser in watts needs its distance from the camera, such as distance: 100 m")
+    _refuse_air(given)
+    if line is None or stop is None or line.centres.is_meta or stop.diameter.is_meta:
+        return []
+    try:
+        return _notes(light(line, stop, **params), params)
+    except ParameterError as error:
+        name = error.parameter if error.parameter in given else given[0]
+        raise ParameterError(name, str(error)) from None
+
+
+def _refuse_beside_strength(given: list[str]) -> None:
+    """Raise ParameterError for a laser that has a strength and statements in absolute units."""
+    if given:
+        other = f"{', '.join(given)} state{'s' * (len(given) == 1)} its light in absolute units"
+        text = f"a strength states the light of the laser at the sensor, but {other}: leave strength or the rest out"
+        raise ParameterError("strength", text)
+
+
+def _refuse_air(given: list[str]) -> None:
+    """Raise ParameterError for air that is stated twice, or by a law without a visibility."""
+    if "air_transmittance" in given and ("visibility" in given or "haze" in given):
+        raise ParameterError("air_transmittance", "the air is stated twice: leave air_transmittance or visibility out")
+    if "haze" in given and "visibility" not in given:
+        raise ParameterError("haze", "a law of haze needs the visibility, such as visibility: 5 km")
+
+
+def _notes(found: LaserLight, params: dict[str, Any]) -> list[str]:
+    """Return what a user must know of the light of a laser before the run."""
+    if not params["pulse_duration"]:
+        return []
+    count = float(found.pulses)
+    missed = "no pulse falls into the exposure" if count == 0 else f"{count:.4g} pulses fall into the exposure"
+    return [f"{missed} of {params['exposure']:g} s, for a global shutter and pulse_delay {params['pulse_delay']:g} s"]
