@@ -37,7 +37,18 @@ CONTRIBUTING = ROOT / "CONTRIBUTING.md"
 PAGES = sorted(GUIDE.glob("*.md"))
 WRITTEN = [README, CONTRIBUTING, *PAGES]
 COMMANDS = get_command(app.app)
-LOADS = {"run", "validate", "plan", "why", "config", "train", "calibrate", "evaluate", "study"}  #: a recipe in words
+LOADS = {
+    "run",
+    "validate",
+    "plan",
+    "why",
+    "config",
+    "train",
+    "calibrate",
+    "evaluate",
+    "study",
+    "safety",
+}  #: a recipe in words
 SPOKEN = re.compile(r"(?:torchrun .* --no-python )?neusee (?P<words>[^#\n]*)")
 TERM = re.compile(r"- \*\*(?P<term>[^*]+)\*\*(?: \([^)]*(?:\([^)]*\))?[^)]*\))?: .+\. [^.].*\.")
 
@@ -273,7 +284,7 @@ def test_the_gallery_has_a_section_with_command_picture_and_time_for_each_recipe
     sections = dict(re.findall(r"^## `(\w+)`\n(.*?)(?=^## )", text, re.MULTILINE | re.DOTALL))
     assert sorted(sections) == sorted(path.stem for path in (ROOT / "recipes").glob("*.yaml"))
     for name, section in sections.items():
-        assert re.search(rf"^    neusee (run|train) {name}\b", section, re.MULTILINE), name
+        assert re.search(rf"^    neusee (run|train|safety) {name}\b", section, re.MULTILINE), name
         assert "<!-- picture " in section, name
         assert re.search(r"^Time: (\d+ s\b|half an hour|hours|days)", section, re.MULTILINE), name
 

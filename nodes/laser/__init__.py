@@ -56,6 +56,7 @@ from neusee.nodes.laser._eye_limits import (
     nominal_ocular_hazard_distance,
 )
 from neusee.nodes.laser._light import light, pulses_within, wavefront
+from neusee.nodes.laser._spot_on_sensor import frame_power, heated_diameter, spot_in_pixels
 
 __all__ = [
     "KINDS",
@@ -93,7 +94,9 @@ __all__ = [
     "eye_limit",
     "eye_mpe",
     "eye_mpe_train",
+    "frame_power",
     "hazard_distance",
+    "heated_diameter",
     "light",
     "matching_laws",
     "nominal_ocular_hazard_distance",
@@ -106,6 +109,7 @@ __all__ = [
     "sensor_gain",
     "share_through",
     "size_exponent",
+    "spot_in_pixels",
     "spot_reach",
     "underfilled",
     "veil_limit",

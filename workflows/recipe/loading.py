@@ -26,16 +26,18 @@ from neusee.workflows.recipe.text.option_groups import groups_of, shared_folders
 from neusee.workflows.recipe.text.overrides import Override, arguments_in
 from neusee.workflows.recipe.text.python_overrides import overrides_of
 from neusee.workflows.recipe.text.references import References
-from neusee.workflows.recipe.text.yaml_values import Value
+from neusee.workflows.recipe.text.yaml_values import Value, Where
 from neusee.workflows.recipe.wiring import Wiring, cycles
 
 if TYPE_CHECKING:
     from types import ModuleType
 
+    from neusee.workflows.recipe.blocks.safety_block import Safety
     from neusee.workflows.recipe.blocks.train_block import Training
     from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 
 TRAININGS = ("train", "train_lift")  #: keys of the blocks of a recipe that train something
+SAFETY = "safety"  #: key of the block that an estimate of damage and dazzle reads
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +130,7 @@ def check(composed: Composed) -> Recipe:
     outputs = outputs_of(root, wiring)
     check_steps(checked, checker, None if loops else outputs)
     expect = expectations(root, wiring)
+    safety = _safety(root, references, diagnostics, checker.files)
     references.finish()
     if not composed.whole:  # a missing group causes further errors
         diagnostics = list(composed.diagnostics)
@@ -139,7 +142,18 @@ def check(composed: Composed) -> Recipe:
     nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
     notes = (*composed.notes, *own.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
     parts = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
-    return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting)
+    return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting, safety=safety)
+
+
+def _safety(
+    root: Value, references: References, diagnostics: list[Diagnostic], files: dict[Where, Any]
+) -> Safety | None:
+    """Return the settings in the block ``safety`` of a recipe, or None; few recipes need the import of these."""
+    if SAFETY not in root.items:
+        return None
+    from neusee.workflows.recipe.blocks.safety_block import read_safety
+
+    return read_safety(root, references, diagnostics, files)
 
 
 def _causes(problems: list[Diagnostic], own: OwnFamilies) -> list[Diagnostic]:

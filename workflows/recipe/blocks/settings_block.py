@@ -40,10 +40,10 @@ def read_block(
     try:
         return rest, model.model_validate(plain, context=context)
     except ValidationError as error:
-        return rest.with_problems(_problem(block, model, each) for each in error.errors()), None
+        return rest.with_problems(located(block, model, each) for each in error.errors()), None
 
 
-def _problem(block: Value, model: type[BaseModel], error: Any) -> Diagnostic:
+def located(block: Value, model: type[BaseModel], error: Any) -> Diagnostic:
     """Return the diagnostic for a pydantic error, with the location of the innermost value that the error names."""
     value = block
     for key in error["loc"]:

@@ -1,0 +1,40 @@
+"""Spot of a laser on the sensor: its size, and the mean power of a frame in which at least one pulse falls."""
+
+from typing import TypeVar
+
+from torch import Tensor
+
+from neusee.nodes.laser._beam import Beam, beam_radius, underfilled
+from neusee.nodes.laser._damage_distances import airy_diameter
+
+Number = TypeVar("Number", float, Tensor)
+
+
+def frame_power(beam: Beam, exposure: float) -> float:
+    """Return the mean power in W of a laser during an exposure in s, in which at least one pulse falls.
+
+    A continuous laser has its power, a single pulse its energy over the exposure. A pulse train has its mean power, or
+    that of one pulse if the exposure is shorter than the period: the frame that catches a pulse is the one that counts.
+    """
+    if beam.pulse_energy is None:
+        assert beam.power is not None
+        return beam.power
+    return max(beam.power or 0.0, beam.pulse_energy / exposure)
+
+
+def spot_in_pixels(wavelength: float, focal_length: float, diameter: float, pixel_pitch: float) -> float:
+    """Return the size of a diffraction-limited spot in pixels: wavelength times f-number over pixel pitch."""
+    return wavelength * focal_length / diameter / pixel_pitch
+
+
+def heated_diameter(beam: Beam, distance: Number, diameter: Number, focal_length: Number) -> Number:
+    """Return the 1/e2 diameter in m of the Gaussian spot that heats a sensor as the focused spot of a beam.
+
+    It is `airy_diameter` for a beam that overfills the lens. A narrower beam has a wider spot: for equal power the peak
+    is inversely proportional to the area of the spot, so that the diameter grows as the peak's factor `underfilled`
+    to the power of -1/2. In the limit of a narrow beam it is 4 % below the diameter of the Gaussian spot.
+    """
+    filled = diameter**2 / (4 * beam_radius(beam, distance) ** 2)
+    overfilled: Number = airy_diameter(beam.wavelength, focal_length / diameter)  # type: ignore[assignment,arg-type]
+    wider: Number = underfilled(filled) ** -0.5
+    return overfilled * wider

@@ -1,0 +1,223 @@
+"""Estimate of damage, dazzle and eye exposure by a laser: limits, exposures and intervals of distance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from neusee.nodes import ParameterError
+from neusee.nodes.laser import eye_limit, frame_power, nominal_ocular_hazard_distance
+from neusee.workflows.engine.runner import run
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
+from neusee.workflows.graph.recipe_graph import Recipe, unknown_step
+from neusee.workflows.recipe.blocks.safety_block import SATURATION, Safety
+from neusee.workflows.recipe.distributions.scalar import FloatArray
+from neusee.workflows.safety.distance_zones import QUANTILES, Spread, Zones, zones_of
+from neusee.workflows.safety.exposures import (
+    Emission,
+    Exposures,
+    Option,
+    compute_exposures,
+    emission_of,
+    options_of,
+)
+from neusee.workflows.safety.sensor_limits import Limit, damage_limits, dazzle_limits, veil_level
+from neusee.workflows.safety.uncertain_values import SettingDraws, draw_settings
+from neusee.workflows.store.result_store import Store
+
+CERTIFICATE = "An estimate, no certificate: neusee decides nothing about eyes or sensors."
+EYE_SOURCE = "IEC 60825-1:2014, small source, as written out in neusee (nodes.laser.eye_mpe)"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one limit says behind one option: the limit at the lens, the exposure, and the zones of distance."""
+
+    option: str
+    limit: Limit
+    at_sensor: Spread  #: the limit at the peak on the sensor
+    at_lens: Spread  #: the limit at the lens at the distance of the recipe: MPE_S or MDE_S
+    exposure: Spread  #: at the peak on the sensor at the distance of the recipe, in the quantity of the limit
+    ratio: float  #: nominal exposure over the nominal limit
+    probability: Spread | None  #: of damage to a device drawn from all; None where the spread of devices is unknown
+    zones: Zones
+    curve: FloatArray  #: (3, distance) of the limit at the lens: nominal, 5 % and 95 %
+
+
+@dataclass(frozen=True)
+class EyeFinding:
+    """The exposure limit of the eye, and the distance beyond which the laser does not exceed it."""
+
+    duration: float  #: s
+    limit: float  #: W/m2, or J/m2 of each pulse
+    quantity: str
+    exposure: Spread  #: at the distance of the recipe, on the axis
+    distance: Spread  #: nominal ocular hazard distance, m
+    source: str = EYE_SOURCE
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Everything that `neusee safety` says of a recipe."""
+
+    recipe: Recipe
+    safety: Safety
+    emission: Emission
+    options: tuple[Option, ...]
+    draws: SettingDraws
+    exposures: Exposures
+    findings: tuple[Finding, ...]
+    eye: EyeFinding | None
+    unsaid: tuple[str, ...]  #: what the estimate does not say, with the reason
+
+    @property
+    def at(self) -> int:
+        """Return the index of the distance of the recipe among all distances."""
+        return self.exposures.at(self.safety.laser.distance)
+
+
+def estimate(recipe: Recipe, store: Store | None = None) -> Estimate:
+    """Return the estimate of a recipe with a block ``safety``; the peak behind the mask comes from the store if it can.
+
+    Raises `RecipeError` for a recipe without the block, for a distribution with values that are not allowed and for a
+    step that does not exist, all before anything is computed, and `RunError` if a step of the mask fails.
+    """
+    safety = settings_of(recipe)
+    draws = draw_settings(recipe, safety)
+    options = options_of(safety, _mask_peak(recipe, safety, store))
+    exposures = compute_exposures(safety, draws, options)
+    findings = tuple(_findings(safety, draws, options, exposures))
+    eye, faults = _eye(safety, exposures)
+    unsaid = (*_unsaid(safety, findings), *faults)
+    return Estimate(recipe, safety, emission_of(safety.laser.beam()), options, draws, exposures, findings, eye, unsaid)
+
+
+def settings_of(recipe: Recipe) -> Safety:
+    """Return the settings of a recipe's block ``safety``; raise `RecipeError` for a recipe without them."""
+    if recipe.safety is None:
+        text = "the recipe does not say what to estimate: add the block safety, as in the recipe safety_pointer"
+        raise RecipeError([Diagnostic(Location(recipe.name), "safety", text)])
+    return recipe.safety
+
+
+def _mask_peak(recipe: Recipe, safety: Safety, store: Store | None) -> float | None:
+    """Return the largest laser suppression ratio that the step of the mask gives, or None without such a step."""
+    step = safety.settings.protection.mask
+    if step is None:
+        return None
+    if step not in recipe.steps:
+        value = safety.values["protection.mask"]
+        raise RecipeError([Diagnostic(value.mark, value.name, unknown_step(step, recipe.steps))])
+    return float(run(recipe, store, [step])[step].max())
+
+
+def _findings(
+    safety: Safety, draws: SettingDraws, options: tuple[Option, ...], exposures: Exposures
+) -> Iterator[Finding]:
+    """Yield what each limit says behind each option."""
+    for option in options:
+        for limit in (*damage_limits(safety, option, exposures, draws), *dazzle_limits(safety, option, draws)):
+            yield _finding(safety, option, limit, exposures)
+
+
+def _finding(safety: Safety, option: Option, limit: Limit, exposures: Exposures) -> Finding:
+    per_power, at = exposures.sensor[option.name], exposures.at(safety.laser.distance)
+    emitted = _emitted(safety, limit, exposures)
+    limits = limit.values * limit.devices * np.ones_like(per_power)
+    ratio, at_lens = emitted * per_power / limits, limits * exposures.lens / per_power
+    here = emitted[:, 0] * per_power[:, at]
+    return Finding(
+        option.name,
+        limit,
+        _spread(limits[:, at]),
+        _spread(at_lens[:, at]),
+        _spread(here),
+        float(ratio[0, at]),
+        _probability(limit, ratio[1:, at] * limit.devices[1:, 0]),
+        zones_of(exposures.distances, ratio[0], ratio[1:], safety.laser.distance),
+        np.stack([at_lens[0], *np.quantile(at_lens[1:], QUANTILES, axis=0)]),
+    )
+
+
+def _spread(values: FloatArray) -> Spread:
+    """Return the nominal value, which comes first, with the interval of the draws after it."""
+    return Spread.of(float(values[0]), values[1:])
+
+
+def _emitted(safety: Safety, limit: Limit, exposures: Exposures) -> FloatArray:
+    """Return power or pulse energy (1 + draw, 1); for dazzle the mean power of the light that reaches one frame."""
+    if limit.effect == "damage":
+        return exposures.emitted(limit.quantity)
+    return mean_in_frame(exposures, safety.settings.sensor.exposure or 1.0)
+
+
+def mean_in_frame(exposures: Exposures, exposure: float) -> FloatArray:
+    """Return the mean power in W during an exposure in which at least one pulse of a pulsed laser falls."""
+    rows = [frame_power(beam, exposure) for beam in exposures.beams]
+    return np.array(rows, np.float64)[:, None]
+
+
+def _probability(limit: Limit, ratio: FloatArray) -> Spread | None:
+    """Return the share of devices that are damaged, with the interval from everything but the device.
+
+    ``ratio`` (draw,) is that of the exposure to the limit of the median device.
+    """
+    if limit.effect != "damage" or limit.factor is None:
+        return None
+    from scipy.special import ndtr
+
+    shares = ndtr(np.log(ratio) / np.log(limit.factor))
+    return Spread.of(float(shares.mean()), shares)
+
+
+def _eye(safety: Safety, exposures: Exposures) -> tuple[EyeFinding | None, tuple[str, ...]]:
+    """Return the finding of the eye, or the reason why there is none."""
+    beam, at = exposures.beams[0], exposures.at(safety.laser.distance)
+    duration = safety.settings.eye.exposure or (0.25 if beam.wavelength <= 700e-9 else 10.0)
+    try:
+        limit = eye_limit(beam, duration)
+        reach = np.array([nominal_ocular_hazard_distance(each, duration) for each in exposures.beams])
+    except ParameterError as error:
+        return None, (f"Nothing is said of the eye: {error}.",)
+    quantity = "fluence" if beam.is_pulsed else "irradiance"
+    here = exposures.emitted("fluence" if beam.is_pulsed else "irradiance")[:, 0] * exposures.lens[:, at]
+    return EyeFinding(
+        duration, limit, quantity, Spread.of(float(here[0]), here[1:]), Spread.of(float(reach[0]), reach[1:])
+    ), ()
+
+
+def _unsaid(safety: Safety, findings: tuple[Finding, ...]) -> tuple[str, ...]:
+    """Return sentences on what the estimate does not say."""
+    laser, damage = safety.laser, safety.settings.damage
+    said = () if any(each.limit.effect == "damage" for each in findings) else (
+        f"Nothing is said of damage: no threshold is known for {damage.device} at {laser.wavelength * 1e9:.4g} nm and "
+        "this exposure. Give a table of your own: safety.damage.file.",
+    )  # fmt: skip
+    return (*said, *_unsaid_of_dazzle(safety))
+
+
+def _unsaid_of_dazzle(safety: Safety) -> Iterator[str]:
+    """Yield sentences on what the estimate does not say of dazzle."""
+    dazzle, sensor = safety.settings.dazzle, safety.settings.sensor
+    if dazzle is None:
+        lacking = [name.replace("_", " ") for name in SATURATION if getattr(sensor, name) is None]
+        reason = "the recipe does not ask for it (safety.dazzle)"
+        if lacking:
+            reason = f"the recipe gives no {', '.join(lacking)} of the sensor at this wavelength"
+        yield f"Nothing is said of dazzle: {reason}."
+        return
+    if safety.settings.protection.mask is not None:
+        yield (
+            "Nothing is said of dazzle behind the mask: a mask spreads the light over more pixels, and the closed form "
+            "of the dazzled area holds for a clear pupil only."
+        )
+    level = veil_level(dazzle)
+    if level <= 0:
+        yield "The feature of safety.dazzle is lost without any laser, so that no veil is stated."
+    elif level >= (sensor.full_well or 0.0):
+        yield (
+            f"The feature of safety.dazzle is seen through {level:.3g} e- of veiling light a pixel, more than the full "
+            "well: a pixel is lost when it saturates, and no veil is stated."
+        )
