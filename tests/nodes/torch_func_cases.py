@@ -130,6 +130,7 @@ CASES = {
     "doe.fabricate": Case("0", (HEIGHT,), {"wrap_at": 550e-9, "levels": 4}),
     "doe.half_rings": Case("waves.0", (STOP,), {"waves": [number(2.0), number(1.0)]}),
     "doe.material": Case("0.centres", (BANDS,)),
+    "doe.shade": Case("transmittance", (STOP,), {"transmittance": number(0.3), "diameter": 0.8}),
     "doe.smooth": Case("0", (HEIGHT, STOP), {"feature": 1e-3}),
     "doe.spiral_axicon": Case("waves", (STOP,), {"waves": number(2.0), "charge": 1}),
     "doe.zernike": Case("coefficients.4", (STOP,), {"coefficients": {4: number(0.3), 6: number(0.1)}}),
