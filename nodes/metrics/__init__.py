@@ -20,6 +20,7 @@ from neusee.nodes.metrics._picture_spectrum import (
     information_bits,
     mean_log_neq,
     picture_spectrum,
+    radial_contrast,
     remaining_error,
 )
 from neusee.nodes.metrics._protection_bounds import ProtectionBounds, largest_glare, protection_bounds
@@ -70,6 +71,7 @@ __all__ = [
     "picture_spectrum",
     "protection_bounds",
     "quality",
+    "radial_contrast",
     "remaining_error",
     "saturated",
     "scattered_light",

@@ -89,3 +89,21 @@ def information_bits(spectrum: PictureSpectrum, amplitude: float, noise: Tensor)
 def mean_log_neq(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) -> Tensor:
     """Return the mean of log(NEQ) over low frequencies, (noise, channel)."""
     return spectrum.contrast + torch.log(amplitude**2 / noise)
+
+
+def radial_contrast(
+    psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, rings: int = 40
+) -> tuple[Tensor, Tensor]:
+    """Return frequencies up to 1/2 cycle per pixel, and the mean of |OTF|**2 in a ring about each: (ring,) each.
+
+    The mean is over directions and channels, and the square of the light that passes is included.
+    """
+    square = torch.fft.fft2(channel_psf(psf, illuminant, responses, bands)).abs().square().mean(0)
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in square.shape)
+    radius = torch.hypot(fy[:, None], fx)
+    inside = (radius > 0) & (radius < 0.5)
+    at = (radius[inside] * 2 * rings).long()
+    empty = torch.zeros(rings, dtype=torch.float64)
+    count = empty.index_add(0, at, torch.ones_like(radius[inside])).clamp_min(1)
+    middle = (torch.arange(rings, dtype=torch.float64) + 0.5) / (2 * rings)
+    return middle, empty.index_add(0, at, square[inside]) / count

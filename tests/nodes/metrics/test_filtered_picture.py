@@ -86,7 +86,7 @@ def test_a_mask_against_stops_and_filters_agrees_with_numpy_and_with_the_table()
 
 @pytest.mark.slow
 def test_the_table_of_six_masks_is_found_by_both_codes():
-    found, other, ratios = compared(list(TABLE), np.linspace(0.2, 1, 41).tolist())
+    found, other, ratios = compared(list(TABLE), np.linspace(0.2, 1, 31).tolist())
     assert found == pytest.approx(other, abs=0.02)
     assert ratios == pytest.approx([row[0] for row in TABLE.values()], rel=0.03)
     wanted = np.array([row[1:] for row in TABLE.values()])

@@ -107,11 +107,11 @@ def test_the_bounds_hold_for_thirty_masks_and_for_one_that_nears_them():
 
 @pytest.mark.slow
 def test_the_bounds_hold_for_three_hundred_masks_and_for_those_optimised_towards_them():
-    assert len(share := nearest(many_heights(290, seed=5))) == 290
+    assert len(share := nearest(many_heights(295, seed=5))) == 295
     starts = [doe.zernike(STOP, coefficients={4: a * 1e-9, 11: b * 1e-9}).double() for a, b in
-              ((300, 60), (550, 150), (800, 200), (400, -80), (700, 0))]  # fmt: skip
-    starts += [smooth_height(torch.Generator().manual_seed(n), 0.3 * n, 6) for n in range(1, 6)]
-    near = nearest(towards_the_bound(start, 150) for start in starts)
+              ((300, 60), (400, -80), (700, 0))]  # fmt: skip
+    starts += [smooth_height(torch.Generator().manual_seed(n), 0.3 * n, 6) for n in (1, 3)]
+    near = nearest(towards_the_bound(start, 90) for start in starts)
     assert max(share) < max(near) < 1
     assert max(near) > 0.75  # 0.787: a flat spot of light: its sum of squares is nearly its peak
 
