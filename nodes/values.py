@@ -60,6 +60,11 @@ class LaserLight(NamedTuple):
     peak: Tensor  #: () float64, W/m2 at the peak on the sensor behind the clear, focused lens
     pulses: Tensor  #: () float64, pulses within the exposure; 0 for a continuous laser
     pulse_fluence: Tensor  #: () float64, J/m2 of one pulse at the peak on the sensor; 0 for a continuous laser
+class Shade(NamedTuple):
+    """The light that a grey filter, a smaller stop and notch filters in the pupil of one arm let through."""
+
+    amplitude: Tensor  #: (v, u) transmission of the field in [0, 1], the same at every wavelength
+    notches: Tensor  #: (notch, 3) float64: centre in m, full width at half maximum in m, depth in [0, 1]
 
 
 class Pupil(NamedTuple):
@@ -70,13 +75,14 @@ class Pupil(NamedTuple):
     """
 
     aperture: Tensor  #: (v, u) clear aperture: 1 inside, 0 outside
-    amplitude: Tensor  #: (v, u) aperture times dirt
+    amplitude: Tensor  #: (v, u) aperture times dirt and shade
     height: Tensor  #: (v, u) height map of the mask, m
     path: Tensor  #: (v, u) aberrations and dirt, m of optical path
     index: Tensor  # type: ignore[assignment]  # hides tuple.index, which no caller uses
     #: (band,) float64, refractive index of the mask minus the index of air
     wavelengths: Tensor  #: (band,) float64, m
     pitch: Tensor  #: () float64, m between samples, both axes
+    notches: Tensor = torch.zeros(0, 3, dtype=torch.float64)  #: (notch, 3) of `Shade`; no row: no notch filter
 
 
 class Psf(NamedTuple):

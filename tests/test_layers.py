@@ -29,7 +29,8 @@ ROOMS = (
     "tolerance", "engine", "report.figures", "report", "contract", "explain", "simulation", "comparison", "safety",
     "sweeps", "training.loop",
     "training.parallel", "training.mask_design", "training", "training.lift", "evaluation", "calibration", "studies",
-    "studies.accuracy", "studies.stability", "studies.leave_out", "studies.uncertainty", "studies.calibration", "api",
+    "studies.accuracy", "studies.stability", "studies.leave_out", "studies.uncertainty", "studies.calibration",
+    "studies.protection", "api",
     "handbook", "cli",
 )  # fmt: skip
 DOOR = ""  #: neusee.workflows itself, which offers names of all rooms: no room imports it

@@ -9,6 +9,7 @@ from neusee.nodes.doe._minimum_feature import smooth
 from neusee.nodes.doe._parametrisations import PARAMETRISATIONS, Drawn, Modes, Pixels, Rings, Written
 from neusee.nodes.doe._refractive_index import Glass, Material, index_curve, material, wave_height
 from neusee.nodes.doe._sampled_height_map import height_map, pixelwise
+from neusee.nodes.doe._shade import shade
 from neusee.nodes.doe._unet_height_map import unet
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "material",
     "pixelwise",
     "read_height_map",
+    "shade",
     "smooth",
     "spiral_axicon",
     "unet",

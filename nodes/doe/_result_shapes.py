@@ -9,9 +9,10 @@ from neusee.nodes.doe._fabrication_limits import fabricate
 from neusee.nodes.doe._minimum_feature import smooth
 from neusee.nodes.doe._refractive_index import material
 from neusee.nodes.doe._sampled_height_map import pixelwise
+from neusee.nodes.doe._shade import shade
 from neusee.nodes.doe._unet_height_map import unet
 from neusee.nodes.shape_rules import blank, double, like_first
-from neusee.nodes.values import Bands, Stop
+from neusee.nodes.values import Bands, Shade, Stop
 
 fabricate.shape(like_first)
 smooth.shape(like_first)
@@ -29,6 +30,11 @@ for node in (flat, vortex, axicon, spiral_axicon, cubic, half_rings, zernike, pi
 def _(result: Tensor, *inputs: Any, grid: int = 270, width: int = 32, **params: Any) -> tuple[float, float]:
     side = min(grid, len(result))
     return 4.0 * width * side**2, float(width * side) ** 2 + result.numel()
+
+
+@shade.shape
+def _(stop: Stop, *, notches: tuple[float, ...] = (), **params: Any) -> Shade:
+    return Shade(blank(int(stop.samples), int(stop.samples)), double(len(notches), 3))
 
 
 @material.shape

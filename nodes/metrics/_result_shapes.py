@@ -4,9 +4,12 @@ from typing import Any
 
 from torch import Tensor
 
+from neusee.nodes.metrics._filtered_picture import Filtered, filtered_picture
+from neusee.nodes.metrics._heat_ratio import heat_ratio
 from neusee.nodes.metrics._mask_limits import Limits, limits
 from neusee.nodes.metrics._peak_irradiance import Peak, peak_irradiance
 from neusee.nodes.metrics._picture_quality import Quality, quality
+from neusee.nodes.metrics._protection_bounds import ProtectionBounds, protection_bounds
 from neusee.nodes.metrics._psf_contrast import Mtf, encircled, mtf
 from neusee.nodes.metrics._saturated_pixels import Saturated, saturated
 from neusee.nodes.metrics._spectral_error import _SAMPLES, _SIDE, spectral_error
@@ -24,6 +27,7 @@ def _each_band(psf: Psf, *others: Any, **params: Any) -> Tensor:
 
 
 lsr.shape(_each_band)
+heat_ratio.shape(_each_band)
 encircled.shape(_each_band)
 
 
@@ -35,6 +39,16 @@ def _(psf: Psf) -> Mtf:
 @limits.shape
 def _(psf: Psf) -> Limits:
     return Limits(*(_each_band(psf) for _ in Limits._fields))
+
+
+@protection_bounds.shape
+def _(psf: Psf, **params: Any) -> ProtectionBounds:
+    return ProtectionBounds(*(_each_band(psf) for _ in ProtectionBounds._fields))
+
+
+@filtered_picture.shape
+def _(psf: Psf, illuminant: Any, responses: Tensor, *others: Any, **params: Any) -> Filtered:
+    return Filtered(*(double(len(responses)) for _ in Filtered._fields))
 
 
 @bsr.shape

@@ -10,6 +10,7 @@ from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.metrics._mask_limits import least_lsr
 from neusee.nodes.optics._imaging._light_in_field import light_in_field
+from neusee.nodes.optics._notch import passed_by_notches
 from neusee.nodes.values import Psf, Pupil
 
 _DARK = 1e-30  #: light below which a band counts as dark
@@ -125,7 +126,7 @@ def light_outside(psf: Psf, pupil: Pupil) -> Tensor:
     Source: conservation of energy: Goodman, Introduction to Fourier Optics, 3rd ed., section 2.1.5 (Parseval).
     """
     passed, clear = (x.double().square().sum() for x in (pupil.amplitude, pupil.aperture))
-    through = passed / clear
+    through = passed / clear * passed_by_notches(pupil).to(passed.device)
     inside = torch.stack([band.sum(dtype=torch.float64) for band in single(psf.intensity)])  # a copy of one band
     dark = through <= _DARK  # false for NaN, so that NaN reaches the result
     outside: Tensor = torch.where(dark, 0.0, 1.0 - inside / through.where(~dark, 1.0))

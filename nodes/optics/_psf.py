@@ -10,6 +10,7 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes._half_precision import refuse_half, refuse_not_finite
 from neusee.nodes.optics._laser_direction import angle_notes
+from neusee.nodes.optics._notch import passed_by_notches
 from neusee.nodes.optics._psf_definition import Geometry, by_definition
 from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
 from neusee.nodes.optics._transform._pupil_field import View
@@ -105,8 +106,9 @@ def _focus(pupil: Pupil, camera: _Camera, dtype: torch.dtype, method: Method) ->
     if not area > 0:
         raise ValueError("the aperture is closed everywhere: there is no light to normalise the PSF by")
     peaks: list[float] = []
+    passed = passed_by_notches(pupil).tolist()
     for band in range(pupil.wavelengths.numel()):
-        views += _views(pupil, camera, band, 1 / area, dtype)
+        views += _views(pupil, camera, band, passed[band] / area, dtype)
         peaks.append(_clear_peak(pupil, camera, band, area, total))
     sampling = Sampling(tuple(views), dtype, method)
     intensity = intensity_of(pupil.amplitude, pupil.height, pupil.path, sampling)

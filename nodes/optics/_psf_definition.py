@@ -26,7 +26,8 @@ class Geometry(NamedTuple):
 
 def by_definition(pupil: Pupil, camera: Geometry) -> Psf:
     """Return the PSF of a pupil in float64, by one matrix of phases for each axis, band by band."""
-    clear = pupil._replace(amplitude=pupil.aperture, height=pupil.height.new_zeros(()), path=pupil.path.new_zeros(()))
+    screens = {"height": pupil.height.new_zeros(()), "path": pupil.path.new_zeros(())}
+    clear = pupil._replace(amplitude=pupil.aperture, notches=pupil.notches[:0], **screens)
     centre = camera._replace(shape=(1, 1), angle=(0.0, 0.0))
     count = range(len(pupil.wavelengths))
     peaks = [_intensity(clear, centre, band)[0, 0] for band in count]
@@ -47,6 +48,8 @@ def _intensity(pupil: Pupil, camera: Geometry, band: int) -> Tensor:
             rows, columns = (_axis(camera, axis, shift, field.shape[axis], reach) for axis, shift in ((0, y), (1, x)))
             total = total + weight_y * weight_x * (rows @ field @ columns.T).abs().square()
     light: Tensor = total * (reach**2 / pupil.aperture.detach().double().square().sum())
+    for centre, width, depth in pupil.notches.tolist():
+        light = light * (1.0 - depth * 2.0 ** (-((2.0 * (wavelength - centre) / width) ** 2)))
     return light
 
 

@@ -1,4 +1,4 @@
-"""The pupil function, stored as factors: stop, mask, aberrations and dirt."""
+"""The pupil function, stored as factors: stop, mask, aberrations, dirt and shade."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,6 +13,7 @@ from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, inside, op
 from neusee.nodes.optics._zernike import surface
 from neusee.nodes.units import Count, Length, Waves
 from neusee.nodes.values import Bands, Dirt, Pupil, Stop, Wavefront
+from neusee.nodes.values import Bands, Dirt, Pupil, Shade, Stop
 
 DEFOCUS_WAVELENGTH = 550e-9  #: m; the wavelength in which waves of defocus are counted
 _ROWS = 512  #: least number of pupil rows in which phase steps are measured
@@ -26,25 +27,29 @@ def pupil(
     stop: Stop,
     dirt: Dirt | None = None,
     wavefront: Wavefront | None = None,
+    shade: Shade | None = None,
     *,
     defocus: Waves = 0.0,
     aberrations: dict[Count, Length] = {},  # noqa: B006 (read only)
 ) -> Pupil:
-    """Build the pupil function from stop, mask, defocus, aberrations and dirt, all in one plane.
+    """Build the pupil function from stop, mask, defocus, aberrations, dirt and shade, all in one plane.
 
     Field of band b: amplitude * exp(2 pi i (index[b] * height + path) / wavelength[b]). Defocus adds the path
     W * 550 nm * r**2 with r = 1 at the rim, so W is the peak-to-valley defocus in waves at 550 nm. A `wavefront` adds
     the taper and the curvature of a laser beam; the lens without defocus is focused at infinity. The stop passes a
     sample if the centre of the sample lies inside the stop.
+    W * 550 nm * r**2 with r = 1 at the rim, so W is the peak-to-valley defocus in waves at 550 nm. The stop passes a
+    sample if the centre of the sample lies inside the stop. A shade is a grey filter, a smaller stop or a notch filter.
+    The aperture stays that of the lens, so that the PSF and the laser suppression ratio count the light that is lost.
 
-    Shapes: height (v, u), index (band,), bands, stop, dirt (v, u) -> Pupil.
+    Shapes: height (v, u), index (band,), bands, stop, dirt (v, u), shade (v, u) -> Pupil.
     Units:  height m; defocus waves at 550 nm; aberrations m of path, root mean square, by Noll index.
     Error:  path 1e-7 relative (float32); area of the staircase rim 2 / samples.
     Raises: ValueError where the shapes do not belong together, and for a height in half precision.
     Source: Goodman, Introduction to Fourier Optics, 3rd ed., section 6.4; Noll, J. Opt. Soc. Am. 66, 207 (1976).
     """
     grid = grid_of(stop)
-    _shapes(height, index, bands, grid, dirt)
+    _shapes(height, index, bands, grid, dirt, shade)
     clear = opening(grid, height.dtype, height.device)
     sag: float | Tensor = defocus * DEFOCUS_WAVELENGTH
     if wavefront is not None and bool(wavefront.curvature):
@@ -58,6 +63,11 @@ def pupil(
     if wavefront is not None and bool(wavefront.taper):
         amplitude = amplitude * _taper(grid, wavefront.taper.to(height.device) * grid.diameter**2 / 4, height)
     return Pupil(clear, amplitude, height, path, index, bands.centres, stop.pitch.to(height.device))
+    if shade is not None:
+        amplitude = amplitude * shade.amplitude
+    notches = torch.zeros(0, 3, dtype=torch.float64) if shade is None else shade.notches
+    there = (each.to(height.device) for each in (stop.pitch, notches))
+    return Pupil(clear, amplitude, height, path, index, bands.centres, *there)
 
 
 def _taper(grid: PupilGrid, exponent: Tensor, like: Tensor) -> Tensor:
@@ -83,7 +93,9 @@ def _lens_path(
     return path
 
 
-def _shapes(height: Tensor, index: Tensor, bands: Bands, grid: PupilGrid, dirt: Dirt | None) -> None:
+def _shapes(
+    height: Tensor, index: Tensor, bands: Bands, grid: PupilGrid, dirt: Dirt | None, shade: Shade | None
+) -> None:
     refuse_half(height=height)
     refuse_other_grid(height, grid)
     if index.shape != bands.centres.shape:
@@ -91,9 +103,10 @@ def _shapes(height: Tensor, index: Tensor, bands: Bands, grid: PupilGrid, dirt: 
             f"index {tuple(index.shape)} and bands {tuple(bands.centres.shape)}: "
             "compute both from one `bands` or `line` step"
         )
-    if dirt is not None and dirt.amplitude.shape != height.shape:
-        found, wanted = tuple(dirt.amplitude.shape), tuple(height.shape)
-        raise ValueError(f"dirt is {found} and height is {wanted}: compute both from one `stop` step")
+    for name, screen in (("dirt", dirt), ("shade", shade)):
+        if screen is not None and screen.amplitude.shape != height.shape:
+            found, wanted = tuple(screen.amplitude.shape), tuple(height.shape)
+            raise ValueError(f"{name} is {found} and height is {wanted}: compute both from one `stop` step")
 
 
 @pupil.check

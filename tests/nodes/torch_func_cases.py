@@ -45,6 +45,7 @@ PICTURE, OTHER, SCENE, PLAIN = rand(3, 12, 12), rand(3, 12, 12, seed=1), rand(4,
 RAW = 2000 * rand(3, 12, 12)
 WIDE_RAW = 2000 * rand(3, 48, 48)  # no longer solved exactly
 PSF = Psf(rand(4, 9, 9) / 100, rand(4))
+OTHER_PSF = Psf(rand(4, 9, 9) / 50, rand(4))
 WIDE = Psf(rand(4, 12, 12) / 200, rand(4))
 DISC = torch.ones(16, 16)
 HEIGHT = rand(16, 16, dtype=torch.float32) * 1e-6
@@ -132,6 +133,7 @@ CASES = {
     "doe.fabricate": Case("0", (HEIGHT,), {"wrap_at": 550e-9, "levels": 4}),
     "doe.half_rings": Case("waves.0", (STOP,), {"waves": [number(2.0), number(1.0)]}),
     "doe.material": Case("0.centres", (BANDS,)),
+    "doe.shade": Case("transmittance", (STOP,), {"transmittance": number(0.3), "diameter": 0.8}),
     "doe.smooth": Case("0", (HEIGHT, STOP), {"feature": 1e-3}),
     "doe.spiral_axicon": Case("waves", (STOP,), {"waves": number(2.0), "charge": 1}),
     "doe.zernike": Case("coefficients.4", (STOP,), {"coefficients": {4: number(0.3), 6: number(0.1)}}),
@@ -155,12 +157,17 @@ CASES = {
     "losses.wiener": Case("0.intensity", (WIDE, LIGHT, RESPONSES, BANDS)),
     "metrics.bsr": Case("0.intensity", (PSF, SCENE)),
     "metrics.encircled": Case("0.intensity", (PSF,), {"pixel_pitch": 2.9e-6, "radius": 8e-6}),
+    "metrics.filtered_picture": Case(
+        "0.intensity", (PSF, LIGHT, RESPONSES, BANDS), {"electrons": 50.0, "read_noise": 3.0}
+    ),
+    "metrics.heat_ratio": Case("0.intensity", (PSF, OTHER_PSF), {"pixel_pitch": 2.9e-6, "dwell": 1e-3}),
     "metrics.light_outside": Case("0.intensity", (PSF, PUPIL)),
     "metrics.limits": Case("0.clear_peak", (PSF,)),
     "metrics.lsr": Case("0.intensity", (PSF,)),
     "metrics.mtf": Case("0.intensity", (WIDE,)),
     "metrics.peak_bsr": Case("0", (SCENE, PLAIN)),
     "metrics.peak_irradiance": Case("0", (SCENE, BANDS, LEVEL), WELL),
+    "metrics.protection_bounds": Case("0.intensity", (WIDE,), {"electrons": 50.0, "read_noise": 3.0}),
     "metrics.quality": Case("0", (PICTURE.float(), OTHER.float())),
     "metrics.saturated": Case("0", (RAW,), ADC),
     "metrics.spectral_error": Case("0.height", (PUPIL, BANDS, LIGHT, RESPONSES), LENS),

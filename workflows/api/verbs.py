@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 Named = str | os.PathLike[str]  #: the name of a packaged recipe, or the path of a file
 Changes = Mapping[str, Any] | Sequence[str]
-Kind = Literal["accuracy", "stability", "leave-out", "calibration", "uncertainty"]
+Kind = Literal["accuracy", "stability", "leave-out", "calibration", "uncertainty", "protection"]
 
 __all__ = ["calibrate", "evaluate", "run", "study", "sweep", "train"]
 
@@ -196,8 +196,8 @@ def study(
 ) -> Path:
     """Study how accurate the numbers of a recipe are, or continue a stopped study, and return the folder of results.
 
-    Args: kind: ``"accuracy"``, ``"stability"``, ``"leave-out"``, ``"calibration"`` or ``"uncertainty"``. options: the
-    options of this kind, as ``neusee study KIND --help`` lists them.
+    Args: kind: ``"accuracy"``, ``"stability"``, ``"leave-out"``, ``"calibration"``, ``"uncertainty"`` or
+    ``"protection"``. options: the options of this kind, as ``neusee study KIND --help`` lists them.
     Raises: ValueError for an unknown kind or an unsuitable recipe, `RunError` if a step fails.
     """
     from neusee.workflows.studies import run_study

@@ -1,4 +1,4 @@
-"""The commands of ``neusee study``: accuracy, stability, leave-out, calibration and uncertainty."""
+"""The commands of ``neusee study``: accuracy, stability, leave-out, calibration, uncertainty and protection."""
 
 from __future__ import annotations
 
@@ -45,6 +45,13 @@ class Points(StrEnum):
 
     DRAWS = "draws"
     SOBOL = "sobol"
+
+
+class Light(StrEnum):
+    """The choices of ``--light``: what of a laser harms the sensor, and so must be equal behind all rivals."""
+
+    PULSE = "pulse"
+    CONTINUOUS = "continuous"
 
 
 @study.command()
@@ -146,6 +153,37 @@ def uncertainty(
     check_device(device)
     how = {"error": error, "most": most, "points": points.value, "workers": workers, "device": device}
     _run("uncertainty", words, quiet, as_json, out, **how)
+
+
+@study.command()
+def protection(
+    words: Words = None,
+    draws: Annotated[
+        int, typer.Option("--draws", min=2, help="Number of draws of wavelength, direction, defocus, dirt and scatter.")
+    ] = 12,
+    bands: Annotated[int, typer.Option("--bands", min=1, help="Number of the recipe's bands in use.")] = 7,
+    light: Annotated[
+        Light, typer.Option("--light", help="Equal peak for a pulse, or equal heat for continuous light.")
+    ] = Light.PULSE,
+    size: Annotated[float, typer.Option("--size", min=5.0, help="Height of the targets in pixels.")] = 14.0,
+    prnu: Annotated[
+        float, typer.Option("--prnu", min=0.0, max=1.0, help="Relative spread of the sensitivity of pixels.")
+    ] = 0.01,
+    residual: Annotated[
+        float, typer.Option("--residual", min=0.0, max=1.0, help="Share of the glare that is subtracted wrongly.")
+    ] = 0.02,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    out: Out = Path("runs"),
+) -> None:
+    """Compare a mask with a grey filter and a smaller stop of equal protection.
+
+    For a quiet frame and under attack: error of the filtered picture, information, NEQ, and detection of details, over
+    scene light and protection, with the bounds of every mask. The page begins with a paragraph to quote.
+    """
+    how = {"draws": draws, "bands": bands, "light": light.value, "size": size, "prnu": prnu, "residual": residual}
+    _run("protection", words, quiet, as_json, out, **how)
 
 
 def _run(kind: Kind, words: list[str] | None, quiet: bool, as_json: bool, out: Path, **options: Any) -> None:

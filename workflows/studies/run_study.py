@@ -1,10 +1,11 @@
-"""Studies of a recipe: accuracy, stability, left-out steps, calibration and uncertainty.
+"""Studies of a recipe: accuracy, stability, left-out steps, calibration, uncertainty and equal protection.
 
     study_recipe("accuracy", load("first_light"))       error against run time, over tolerances and settings
     study_recipe("stability", load("first_light"))      stiff and extreme cases against float64
     study_recipe("leave-out", load("first_light"))      each omission against the full computation
     study_recipe("calibration", load("calibrate"))      the posterior of simulated sensors against the truth
     study_recipe("uncertainty", load("first_light", ["sensor.read_noise=normal(10.5 e-, 0.5 e-)"]))  scatter of outputs
+    study_recipe("protection", load("five_half_rings"))  a mask against filters and stops of equal protection
 
 Each study writes a folder with a page, a table and pictures, and continues after an interruption.
 """
@@ -21,7 +22,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 
-KINDS = ("accuracy", "stability", "leave-out", "calibration", "uncertainty")
+KINDS = ("accuracy", "stability", "leave-out", "calibration", "uncertainty", "protection")
 
 
 def study_recipe(

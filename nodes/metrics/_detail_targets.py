@@ -1,0 +1,89 @@
+"""Detail: how well a tri-bar, an edge and a line of text are detected, by the ideal observer."""
+
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.metrics._filtered_picture import channel_psf
+from neusee.nodes.values import Bands, Psf
+
+_FINE = 8  #: samples of a target along each axis of a pixel, whose mean the pixel takes
+_LETTERS = {
+    "S": ("01110", "10001", "10000", "01110", "00001", "10001", "01110"),
+    "T": ("11111", "00100", "00100", "00100", "00100", "00100", "00100"),
+    "O": ("01110", "10001", "10001", "10001", "10001", "10001", "01110"),
+    "P": ("11110", "10001", "10001", "11110", "10000", "10000", "10000"),
+}  #: five by seven dots, as on a display
+TEXT = "STOP"  #: the line of text
+TARGETS = ("tri-bar", "edge", "text")
+
+
+def detail_targets(size: float) -> dict[str, Tensor]:
+    """Return the targets (y, x) of a height of ``size`` pixels as relative contrasts with mean 0, bright 1 above dark.
+
+    tri-bar: three bars in place of the grey square that holds as much light. edge: a square that is bright on one
+    half. text: the word "STOP" in letters of five by seven dots in place of an even grey line.
+    """
+    drawn: Mapping[str, Callable[[float], Tensor]] = {"tri-bar": _bars, "edge": _edge, "text": _text}
+    return {name: _in_pixels(drawn[name](size)) for name in TARGETS}
+
+
+def _bars(size: float) -> Tensor:
+    fine = round(size * _FINE)
+    across = torch.arange(fine, dtype=torch.float64)
+    light = (torch.floor(5 * across / fine) % 2 == 0).double()
+    return light.expand(fine, fine) - light.mean()
+
+
+def _edge(size: float) -> Tensor:
+    fine = round(size * _FINE)
+    side = torch.where(torch.arange(fine) < fine // 2, -0.5, 0.5).double()
+    return side.expand(fine, fine) - side.mean()
+
+
+def _text(size: float) -> Tensor:
+    columns = [[[int(dot) for dot in row] + [0] for row in _LETTERS[letter]] for letter in TEXT]
+    dots = torch.cat([torch.tensor(rows, dtype=torch.float64) for rows in columns], 1)[:, :-1]
+    tall = round(size * _FINE)
+    wide = round(size * _FINE * dots.shape[1] / 7)
+    rows, across = (torch.arange(n) * k // n for n, k in ((tall, 7), (wide, dots.shape[1])))
+    drawn = dots[rows][:, across]
+    return drawn - drawn.mean()
+
+
+def _in_pixels(fine: Tensor) -> Tensor:
+    """Return the mean of the fine samples of each pixel, with zeros around a target that ends within a pixel."""
+    sides = [-(-n // _FINE) * _FINE for n in fine.shape]
+    padded = torch.zeros(*sides, dtype=torch.float64)
+    padded[: fine.shape[0], : fine.shape[1]] = fine
+    pixels: Tensor = padded.reshape(sides[0] // _FINE, _FINE, sides[1] // _FINE, _FINE).mean((1, 3))
+    return pixels
+
+
+def detail_energy(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, size: float) -> dict[str, Tensor]:
+    """Return the sum over pixels of the squared picture of each target, by channel: (channel,) float64.
+
+    The picture of a target is the target behind the PSF. The window of the PSF must hold the target.
+    """
+    otf = torch.fft.fft2(channel_psf(psf, illuminant, responses, bands))
+    found = {}
+    for name, target in detail_targets(size).items():
+        if max(target.shape) > min(otf.shape[-2:]):
+            text = f"{name} of {tuple(target.shape)} pixels does not fit the PSF window {tuple(otf.shape[-2:])}"
+            raise ValueError(f"{text}: choose smaller targets, or a wider window")
+        seen = otf.abs() * torch.fft.fft2(target, s=otf.shape[-2:]).abs()
+        found[name] = seen.square().mean((-2, -1))  # Parseval
+    return found
+
+
+def detection_snr(energy: Tensor, amplitude: float, contrast: float, noise: Tensor) -> Tensor:
+    """Return the signal-to-noise ratio d' of the ideal observer, all channels together: the square sums over pixels.
+
+    ``amplitude`` is the scene light in e- times the transmittance of a filter; ``noise`` (noise, channel) in e-**2. The
+    observer knows target and place; d' is the distance of the two answers in standard deviations.
+
+    Source: Barrett and Myers, Foundations of Image Science, section 13.2.8 (ideal observer for a known signal).
+    """
+    seen = (amplitude * contrast) ** 2 * energy / noise
+    return seen.sum(-1).sqrt()

@@ -1,0 +1,100 @@
+"""Bounds on what any mask can gain over a grey filter, or over a smaller stop, of the same peak."""
+
+import math
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.metrics._filtered_picture import Light
+from neusee.nodes.units import Electrons
+from neusee.nodes.values import Psf
+
+CLEAR = 0.45962  #: integral of the squared MTF of a round pupil over all frequencies, divided by the peak of its PSF
+_ROUNDING = 1e-3  #: relative; the sampled lens band and float32
+
+
+class ProtectionBounds(NamedTuple):
+    """Values of a mask and their bounds, by band: each value is at most the bound beside it."""
+
+    power: Tensor  #: (band,) mean of |OTF|**2 over the sampled frequencies
+    power_bound: Tensor  #: (band,) LSR times the peak of the clear lens
+    contrast: Tensor  #: (band,) mean of |OTF|**2 over the lens band, relative to the clear lens
+    contrast_bound: Tensor  #: (band,) LSR / 0.4596
+    over_filter: Tensor  #: (band,) mean NEQ over the lens band, relative to a grey filter of the same peak
+    over_filter_bound: Tensor  #: (band,)
+    over_both: Tensor  #: (band,) the same, relative to the better of the filter and the stop of the same peak
+    over_both_bound: Tensor  #: (band,)
+    log_neq: Tensor  #: (band,) mean over the lens band of the logarithm of the NEQ
+    log_neq_bound: Tensor  #: (band,) logarithm of the largest mean NEQ
+
+    def broken(self) -> list[str]:
+        """Return the names of the values that exceed their bounds by more than sampling and rounding explain."""
+        pairs = [(name, getattr(self, name), getattr(self, f"{name}_bound")) for name in self._fields[::2]]
+        return [name for name, value, bound in pairs if bool((value - bound > _ROUNDING * (1 + bound.abs())).any())]
+
+
+@node(rtol=1e-6)
+def protection_bounds(
+    psf: Psf,
+    *,
+    electrons: Light,
+    read_noise: Electrons,
+    glare: Annotated[Electrons, Field(ge=0)] = 0.0,
+) -> ProtectionBounds:
+    """Compare a mask with the largest gain that any mask of its peak can have over a filter and a stop.
+
+    The mean of |OTF|**2 over all frequencies is the sum of PSF**2, at most the peak L p0. A round pupil has c p0, with
+    c = 0.4596. A mask therefore has at most L / c of the clear lens's mean MTF**2 over the whole lens band. Its mean
+    NEQ over that band is at most (L n + s**2) / (c L (n + g + s**2)) times that of a grey filter of the same peak,
+    with n electrons of the scene, g of glare and the read noise s. A stop of the diameter L**(1/4) has another such
+    bound. The mean of a logarithm is at most the logarithm of the mean.
+
+    Shapes: psf.intensity (band, y, x) -> ten of (band,) float64.
+    Units:  electrons, read_noise and glare e- a pixel.
+    Error:  1e-3: the lens band in whole frequencies. Assumed: one wavelength a band, PSF as shares of the light of the
+            clear pupil (not renormalised within its window), a lens band that the pixels resolve, and means over the
+            whole lens band. A part of the band has no such bound.
+    Source: Parseval's theorem and Jensen's inequality; c by numerical integration of the MTF of a round pupil.
+    """
+    p0 = psf.clear_peak.double().cpu()
+    peak = psf.intensity.amax((-2, -1)).double().cpu()
+    rows = [_contrast(one.double(), float(p)) for one, p in zip(psf.intensity.cpu(), p0, strict=True)]
+    power, whole, logs = (torch.stack(column) for column in zip(*rows, strict=True))
+    lsr, noise = peak / p0, electrons + glare + read_noise**2
+    grey = _rival(lsr**2, lsr, electrons, read_noise)
+    stop = _rival(lsr**1.5, lsr.sqrt(), electrons, read_noise)
+    mask, most = electrons**2 * whole / noise, electrons**2 * lsr / (4 * noise)
+    better = torch.maximum(grey, stop)
+    contrast = 4 * whole / CLEAR
+    scale = math.log(electrons**2 / noise)
+    each = (power, peak, contrast, lsr / CLEAR, mask / grey, most / grey, mask / better, most / better)
+    return ProtectionBounds(*each, logs + scale, most.log())
+
+
+def _rival(power: Tensor, passed: Tensor, electrons: float, read_noise: float) -> Tensor:
+    """Return the mean NEQ over the lens band of a clear pupil with the given mean |OTF|**2, relative to c / 4."""
+    return electrons**2 * power * (CLEAR / 4) / (electrons * passed + read_noise**2)
+
+
+def _contrast(kernel: Tensor, clear_peak: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the mean of |OTF|**2 over all frequencies and over the lens band, and the mean of its logarithm there."""
+    square = torch.fft.fft2(kernel).abs().square()
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in kernel.shape)
+    inside = torch.hypot(fy[:, None], fx) <= math.sqrt(4 * clear_peak / math.pi)
+    return square.mean(), square[inside].mean(), square[inside].clamp_min(1e-30).log().mean()
+
+
+def largest_glare(lsr: float, electrons: float, read_noise: float) -> float:
+    """Return the glare in e- a pixel above which no mask of an LSR has a higher mean NEQ than a filter of its peak."""
+    noise = read_noise**2
+    return (lsr * electrons + noise) / (CLEAR * lsr) - electrons - noise
+
+
+@protection_bounds.check
+def _(result: ProtectionBounds, *inputs: Any, **params: Any) -> list[Check]:
+    broken = result.broken()
+    gain, most = float(result.over_both.mean()), float(result.over_both_bound.mean())
+    return [Check(f"mean NEQ {gain:.3g} times that of the better of filter and stop, at most {most:.3g}", not broken)]

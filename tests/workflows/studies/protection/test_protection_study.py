@@ -1,0 +1,193 @@
+"""The study of equal protection: equal peaks, gains of best rivals, pictures under attack, and what is refused."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from neusee.nodes import metrics
+from neusee.workflows import load
+from neusee.workflows.cli.app import app
+from neusee.workflows.recipe.distributions.unknown_conditions import draw_conditions, usual_condition
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.studies.protection import front_optics
+from neusee.workflows.studies.protection.camera_parts import NotComparable, ProtectionCamera
+from neusee.workflows.studies.protection.equal_rivals import MEASURES, Candidate, best, quiet_picture
+from neusee.workflows.studies.protection.front_optics import Front, FrontBench, FrontSettings
+from neusee.workflows.studies.protection.protection_page import crossing
+from neusee.workflows.studies.protection.protection_result import LIGHTS
+from neusee.workflows.studies.run_study import study_recipe
+
+SMALL = ["optics.samples=128", "optics.pitch=63.125 um", "optics.bands=3", "optics.window=[64, 64]"]
+SMALL += ["scene.shape=[64, 64]", "sensor.shape=[48, 48]", "doe.waves=5"]
+SETTINGS = FrontSettings(0.1, 0.12, 12.0, (64,), None)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """Fronts are measured once for all tests."""
+    return Store(tmp_path_factory.mktemp("protection"))
+
+
+@pytest.fixture(scope="module")
+def bench(store):
+    return FrontBench(ProtectionCamera.of(load("axicon", SMALL), store, 3), store, SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def folder(store, tmp_path_factory):
+    """A finished study of two draws."""
+    return study_recipe("protection", load("axicon", SMALL), store, tmp_path_factory.mktemp("runs"), draws=2, bands=3)
+
+
+def found(folder):
+    return json.loads((folder / "provenance.json").read_text())
+
+
+def test_every_rival_has_the_peak_of_the_mask(bench):
+    usual = usual_condition()
+    own = bench.measure(Front(True), usual).peak
+    psf = bench.camera.psf(True, 1.0, bench.camera.bands)
+    assert own == pytest.approx(float(metrics.lsr(psf).max()), rel=1e-6)
+    for diameter in (1.0, 0.7, 0.5):
+        one = bench.measure(Front(False, diameter), usual)
+        grey = Candidate(Front(False, diameter), one, one.peak).transmittance(own)
+        dimmed = bench.camera.psf(False, diameter, bench.camera.bands)
+        peak = grey * metrics.lsr(dimmed).max()
+        assert float(peak) == pytest.approx(own, rel=1e-6)
+        assert one.peak == pytest.approx(diameter**4, rel=0.06)
+
+
+def test_a_quiet_picture_is_that_of_the_nodes(bench):
+    front, usual = Front(True, 1.0), usual_condition()
+    pixel = bench.camera.pixel(0.01, 0.02)
+    psf = bench.camera.psf(True, 1.0, bench.camera.bands)
+    light = bench.camera.illuminant, bench.camera.responses, bench.camera.bands
+    for grey, n in ((1.0, 100.0), (0.1, 3000.0)):
+        dim = psf._replace(intensity=psf.intensity * grey)
+        exact = metrics.filtered_picture(dim, *light, electrons=n, read_noise=10.5, prnu=0.01)
+        values = quiet_picture(bench.measure(front, usual), grey, n, pixel)
+        assert values["error"] == pytest.approx(-10 * math.log10(float(exact.error.mean())), abs=2e-3)
+        assert values["information"] == pytest.approx(10 * math.log10(float(exact.information.mean())), abs=2e-3)
+        assert values["NEQ"] == pytest.approx(10 / math.log(10) * float(exact.log_neq.mean()), abs=1e-3)
+
+
+def test_the_best_rival_is_the_best_of_the_candidates_at_the_wanted_protection(bench):
+    usual, pixel = usual_condition(), bench.camera.pixel(0.0, 0.0)
+    fronts = [Front(False, d) for d in (1.0, 0.7, 0.5)]
+    measured = [Candidate(f, bench.measure(f, usual), bench.measure(f, usual).peak) for f in fronts]
+    chosen = best(measured, 0.03, 100.0, pixel)
+    for measure in MEASURES:
+        each = [quiet_picture(c.found, min(1, 0.03 / c.protection), 100.0, pixel)[measure] for c in measured]
+        assert chosen[measure][0] == max(each)
+        assert chosen[measure][1].front == fronts[int(np.argmax(each))]
+
+
+def test_dirt_and_defocus_cost_the_filter_that_does_not_know_them(bench):
+    calm, pixel = usual_condition(), bench.camera.pixel(0.01, 0.02)
+    (rough,) = draw_conditions(1, 3)
+    for front in (Front(True), Front(False)):
+        one, other = (quiet_picture(bench.measure(front, c), 1.0, 1e4, pixel)["error"] for c in (calm, rough))
+        assert other < one
+
+
+@pytest.mark.slow
+def test_the_study_writes_page_table_figures_and_a_paragraph(folder):
+    assert (folder / "report.html").stat().st_size > 10_000
+    assert {path.stem for path in (folder / "figures").glob("*.png")} == {"region", "gain", "neq", "attack"}
+    rows = (folder / "table.csv").read_text().splitlines()
+    assert len(rows) == 1 + 8 * len(LIGHTS) * len(MEASURES)
+    said = (folder / "paragraph.txt").read_text()
+    assert "by the error of the filtered picture it" in said
+    assert "Under attack" in said
+    assert said.strip() in found(folder)["paragraph"]
+
+
+@pytest.mark.slow
+def test_the_gains_of_the_document_are_mask_less_rival_and_stay_below_the_bounds(folder):
+    document = found(folder)
+    for n, pair in document["bound"].items():
+        assert pair["gain"] <= pair["bound"] * 1.001, n
+    for n in ("10", "300", "10000"):
+        gain, quiet = document["gain"][n], document["quiet"]
+        assert gain["error"] >= quiet["mask"][n]["error"] - quiet["best stop and filter"][n]["error"] - 1e-9
+        for rival in ("grey filter", "smaller stop"):
+            assert quiet["best stop and filter"][n]["error"] >= quiet[rival][n]["error"]
+        assert quiet["open lens"][n]["error"] >= quiet["best stop and filter"][n]["error"]
+    assert document["gain"]["10"]["NEQ"] > document["gain"]["10000"]["NEQ"]  # masks lead in the dark
+
+
+@pytest.mark.slow
+def test_under_attack_the_mask_fills_more_pixels_than_the_filter(folder):
+    lost = found(folder)["lost"]
+    assert set(lost) >= {"open lens", "grey filter", "stop and filter", "mask"}
+    assert all(len(values) == 2 for values in lost.values())
+    assert np.median(lost["mask"]) < np.median(lost["grey filter"])
+
+
+@pytest.mark.slow
+def test_a_finished_study_measures_nothing_again(folder, store, tmp_path, monkeypatch):
+    def refuse(*args, **more):
+        raise AssertionError("a front was measured again")
+
+    monkeypatch.setattr(front_optics.FrontBench, "_measure", refuse)
+    again = study_recipe("protection", load("axicon", SMALL), store, tmp_path, draws=2, bands=3)
+    assert found(again)["gain"] == found(folder)["gain"]
+
+
+def test_another_mask_is_another_result(bench, store):
+    other = FrontBench(ProtectionCamera.of(load("axicon", [*SMALL, "doe.waves=3"]), store, 3), store, SETTINGS)
+    steep, gentle = (one.measure(Front(True), usual_condition()).peak for one in (bench, other))
+    assert gentle > 1.2 * steep
+
+
+def test_the_light_at_which_a_gain_ends():
+    assert crossing([-1.0] * 7) == 0.0
+    assert math.isinf(crossing([1.0] * 7))
+    assert crossing([1.0, -1.0, -1, -1, -1, -1, -1]) == pytest.approx(math.sqrt(10 * 30))
+
+
+@pytest.mark.parametrize(
+    ("recipe", "changes", "options", "said"),
+    [
+        ("plain_lens", ["doe=flat"], {}, "choose a mask, such as doe=axicon"),
+        ("axicon", ["doe=axicon_and_filter"], {}, "shaded already: choose the mask alone"),
+        ("axicon", [], {"size": 40.0}, "give a smaller --size"),
+        ("calibrate", None, {}, "has no step psf\\[mask\\]: study a recipe of the camera"),
+    ],
+)
+def test_an_unsuitable_recipe_is_refused_with_the_fix(recipe, changes, options, said, store, tmp_path):
+    words = [] if changes is None else [*changes, *(w for w in SMALL if recipe == "axicon" or "doe." not in w)]
+    with pytest.raises(NotComparable, match=said):
+        study_recipe("protection", load(recipe, words), store, tmp_path, draws=2, bands=3, **options)
+
+
+def test_a_wrong_option_is_refused_by_the_command():
+    for words in (["--draws", "1"], ["--light", "moon"], ["--prnu", "2"], ["--size", "1"]):
+        done = CliRunner().invoke(app, ["study", "protection", "axicon", *words])
+        assert done.exit_code == 2
+
+
+@pytest.mark.slow
+def test_equal_heat_asks_for_a_darker_rival_than_equal_peak(store, tmp_path):
+    """A mask widens the spot, which then cools less: its heat falls less than its peak."""
+    camera = ProtectionCamera.of(load("axicon", SMALL), store, 3)
+    heated = FrontBench(camera, store, FrontSettings(0.1, 0.12, 12.0, (64,), 0.1))
+    one = heated.measure(Front(True), usual_condition())
+    assert one.heat > 2 * one.peak
+    stop = heated.measure(Front(False, 0.5), usual_condition())
+    assert stop.heat == pytest.approx(0.5**3, rel=0.2)
+    folder = study_recipe("protection", load("axicon", SMALL), store, tmp_path, draws=2, bands=3, light="continuous")
+    assert found(folder)["protection"] == pytest.approx(one.heat, rel=1e-6)
+    assert "heat of a laser" in found(folder)["paragraph"]
+
+
+def test_the_colour_of_a_laser_is_relative_to_the_channel_that_responds_most(bench):
+    colour = bench.camera.laser_colour(bench.camera.laser_line(532e-9))
+    assert float(colour.max()) == 1.0
+    assert int(colour.argmax()) == 1
+    at = bench.camera.laser_colour(bench.camera.laser_line(usual_condition().wavelength))
+    assert torch.equal(bench.measure(Front(False), usual_condition()).colour, at)

@@ -1,0 +1,69 @@
+"""What nobody knows of an attack before it comes, as probability distributions, and one sampler of all of them.
+
+Studies and trainings draw the same conditions for the same seed: the wavelength and the direction of the laser, the
+defocus of the lens, the grease on the window, and the light that the lens scatters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from neusee.workflows.recipe.distributions.scalar import read_law
+
+
+@dataclass(frozen=True)
+class UnknownLaws:
+    """The distributions of the unknown conditions, each as text such as ``normal(0 waves, 0.25 waves)``."""
+
+    wavelength: str = "uniform(400 nm, 700 nm)"  #: of the laser
+    direction_y: str = "uniform(-0.25, 0.25)"  #: of the laser, in fields from the middle
+    direction_x: str = "uniform(-0.25, 0.25)"
+    defocus: str = "normal(0 waves, 0.25 waves)"  #: of the lens, peak to valley at 550 nm
+    grease: str = "loguniform(0.005 waves, 0.05 waves)"  #: on the window, root mean square at 550 nm
+    scatter: str = "lognormal(0.005, 2)"  #: share of the light that the lens scatters
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One draw of the unknown conditions, in SI units."""
+
+    wavelength: float  #: m
+    direction: tuple[float, float]  #: fields from the middle, (y, x)
+    defocus: float  #: waves at 550 nm
+    grease: float  #: waves at 550 nm
+    scatter: float  #: share of the light
+    seed: int  #: of the pattern of the grease
+
+    @property
+    def plain(self) -> dict[str, float | list[float]]:
+        """Return the condition as a JSON value."""
+        return {**asdict(self), "direction": list(self.direction)}
+
+
+def draw_conditions(count: int, seed: int, laws: UnknownLaws | None = None) -> list[Condition]:
+    """Return ``count`` independent draws of the conditions; a larger ``count`` begins with the same draws."""
+    given: Mapping[str, str] = asdict(laws or UnknownLaws())
+    read = {name: read_law(text) for name, text in given.items()}
+    z = np.random.default_rng([seed, 4]).standard_normal((count, len(read)))
+    columns = {name: law.at(z[:, i]).tolist() for i, (name, law) in enumerate(read.items())}
+    return [
+        Condition(
+            wavelength=columns["wavelength"][i],
+            direction=(columns["direction_y"][i], columns["direction_x"][i]),
+            defocus=columns["defocus"][i],
+            grease=columns["grease"][i],
+            scatter=min(columns["scatter"][i], 1.0),
+            seed=seed + i,
+        )
+        for i in range(count)
+    ]
+
+
+def usual_condition(laws: UnknownLaws | None = None) -> Condition:
+    """Return the condition with every value at its median, and a clean window."""
+    given: Mapping[str, str] = asdict(laws or UnknownLaws())
+    middle = {name: read_law(text).median for name, text in given.items()}
+    return Condition(middle["wavelength"], (0.0, 0.0), 0.0, 0.0, middle["scatter"], 0)

@@ -1,0 +1,132 @@
+"""The parts of a recipe's camera that the protection study needs: lens, mask, sensor, light, and their nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Node, metrics, optics
+from neusee.nodes.doe import shade
+from neusee.nodes.flare import dirt
+from neusee.nodes.metrics import PixelNoise
+from neusee.nodes.values import Bands, Psf, Stop
+from neusee.workflows.engine.runner import run
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.recipe.distributions.unknown_conditions import Condition
+from neusee.workflows.store.result_store import Store
+
+_NEEDED = ("psf[mask]", "pupil[mask]", "pupil[plain]", "illuminant", "responses", "read[mask]", "well[mask]")
+_LEAST_MASK = 0.9  #: laser suppression ratio above which a recipe has no mask to compare
+
+
+class NotComparable(ValueError):
+    """A recipe whose mask cannot be compared with filters and stops; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class ProtectionCamera:
+    """Lens, mask and sensor of a recipe, as values and parameters from which PSFs of any shade are computed."""
+
+    recipe: Recipe
+    height: Tensor
+    flat: Tensor
+    stop: Stop
+    bands: Bands  #: a few bands of the recipe, from end to end
+    illuminant: Tensor
+    responses: Tensor
+    keys: tuple[str, ...]  #: cache keys of these values
+
+    @classmethod
+    def of(cls, recipe: Recipe, store: Store, count: int) -> ProtectionCamera:
+        """Return the camera of a recipe with ``count`` of its bands; raise `NotComparable` for an unsuitable recipe."""
+        _refuse_unsuitable(recipe)
+        pupil, plain = (recipe.steps[f"pupil[{arm}]"].wires for arm in ("mask", "plain"))
+        names = [str(w) for w in (pupil["height"], plain["height"], pupil["stop"], pupil["bands"])]
+        names += ["illuminant", "responses"]
+        result = run(recipe, store, dict.fromkeys(names))
+        height, flat, stop, bands, illuminant, responses = (result.values[name] for name in names)
+        which = torch.linspace(0, len(bands.centres) - 1, min(count, len(bands.centres))).round().long()
+        few = Bands(*(one[which] for one in bands))
+        keys = tuple(result.keys[name] for name in names)
+        return cls(recipe, height, flat, stop, few, illuminant[which], responses[:, which], keys)
+
+    @property
+    def lens(self) -> Mapping[str, Any]:
+        """Return the parameters of the recipe's PSF."""
+        return self.recipe.steps["psf[mask]"].params
+
+    @property
+    def noise(self) -> Mapping[str, float]:
+        """Return the read noise and the full well of the recipe's sensor, in e-."""
+        read, well = (self.recipe.steps[name].params for name in ("read[mask]", "well[mask]"))
+        return {"read_noise": float(read["read_noise"]), "full_well": float(well["capacity"])}
+
+    def pixel(self, prnu: float, residual_glare: float) -> PixelNoise:
+        """Return the noise of a pixel of the recipe's sensor."""
+        return PixelNoise(**self.noise, prnu=prnu, residual_glare=residual_glare)
+
+    def psf(self, masked: bool, diameter: float, bands: Bands, condition: Condition | None = None, **more: Any) -> Psf:
+        """Return the PSF with or without the mask, in a stop of a relative ``diameter``, under a condition."""
+        notches = {"notches": more.pop("notches", ()), "depth": more.pop("depth", 0.99)}
+        pupil = self.recipe.steps["pupil[mask]"]
+        index = self.recipe.steps[str(pupil.wires["index"])]
+        height = self.height if masked else self.flat
+        given = dict(pupil.params)
+        film = None
+        if condition is not None:
+            given["defocus"] = float(given.get("defocus", 0.0)) + condition.defocus
+            film = self._film(condition)
+        shaded = shade(self.stop, diameter=diameter, **notches)
+        front = optics.pupil(height, index.node(bands, **index.params), bands, self.stop, film, shaded, **given)
+        found: Psf = optics.psf(front, **{**self.lens, **more})
+        return found
+
+    def _film(self, condition: Condition) -> Any:
+        if not condition.grease:
+            return None
+        return dirt(self.stop, grease=condition.grease, rng=torch.Generator().manual_seed(condition.seed))
+
+    def laser_line(self, wavelength: float) -> Bands:
+        """Return one narrow band at the wavelength of a laser."""
+        one = torch.ones(1, dtype=torch.float64)
+        return Bands(one * wavelength, one * 1e-9, one)
+
+    def laser_colour(self, line: Bands) -> Tensor:
+        """Return the response of each channel to a laser relative to the channel that responds most: (channel,)."""
+        step = self.recipe.steps["responses"]
+        found: Tensor = step.node(line, **step.params)[:, 0].double()
+        return found / found.max() if float(found.max()) > 0 else torch.ones_like(found)
+
+    @property
+    def nodes(self) -> tuple[Node, ...]:
+        """Return the nodes whose code determines a PSF, or a measure of it."""
+        index = self.recipe.steps[str(self.recipe.steps["pupil[mask]"].wires["index"])].node
+        own = (optics.psf, optics.pupil, shade, dirt, metrics.lsr, metrics.heat_ratio, metrics.filtered_picture)
+        return (*own, index, self.recipe.steps["responses"].node)
+
+
+def _refuse_unsuitable(recipe: Recipe) -> None:
+    """Raise `NotComparable` where the recipe lacks a step, or its mask is shaded already."""
+    missing = [name for name in _NEEDED if name not in recipe.steps]
+    if missing:
+        raise NotComparable(
+            f"the recipe {recipe.name} has no step {missing[0]}: study a recipe of the camera with the arms plain and "
+            "mask, such as five_half_rings"
+        )
+    if recipe.steps["pupil[mask]"].wires.get("shade"):
+        raise NotComparable(
+            "the mask of this recipe is shaded already: choose the mask alone, such as doe=axicon, because the study "
+            "adds filters and stops itself"
+        )
+
+
+def refuse_no_mask(lsr: float) -> None:
+    """Raise `NotComparable` for a mask that lowers the peak too little to compare."""
+    if lsr > _LEAST_MASK:
+        raise NotComparable(
+            f"the mask of this recipe lowers the peak of a laser to {lsr:.3g} only: choose a mask, such as doe=axicon"
+        )
