@@ -13,6 +13,7 @@ from neusee.nodes.restore._inverse._conjugate_gradients import LOWEST
 from neusee.nodes.restore._inverse._fft_grid import halvings, torus
 from neusee.nodes.restore._inverse._hidden_pixels import MOST, STEPS
 from neusee.nodes.restore._inverse._lowest_frequencies import MODES, SHARE
+from neusee.nodes.restore._inverse._nearby_glare import nearby_glare
 from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
 from neusee.nodes.restore._inverse._wiener import wiener
 from neusee.nodes.restore._networks._fft_mamba import fft_mamba
@@ -47,6 +48,11 @@ def _(channels: Tensor, matrix: Tensor) -> Tensor:
 @colour_matrix.shape
 def _(bands: Any, illuminant: Any, responses: Tensor, *inputs: Any, **params: Any) -> Tensor:
     return double(3, len(responses))
+
+
+@nearby_glare.shape
+def _(glare: Tensor, *inputs: Any, patterns: int = 12, **params: Any) -> Tensor:
+    return blank(patterns, *glare.shape, dtype=at_least_single(glare))
 
 
 @wiener.work
