@@ -46,7 +46,8 @@ def values(side, mask, strength, changes, names, store):
     """The results of some steps of the camera."""
     small = [f"scene.shape=[{side + 96},{side + 96}]", f"sensor.shape=[{side},{side}]", "optics.window=[512,512]"]
     recipe = load("first_light", [f"doe={mask}", f"lasers.green.strength={strength:g}", *small, *changes], Path())
-    return run(recipe, store, names)
+    found = run(recipe, store, names)
+    return {name: found[name] for name in names}
 
 
 def patterns_of(told, count):
@@ -101,7 +102,7 @@ def main(side):
     for mask in ("flat", "five_half_rings"):
         for strength in (1e3, 1e5, 1e6):
             seen = values(side, mask, strength, [], SEEN, store)
-            told = {name: dict(values(side, mask, strength, changes, TOLD, store)) for name, changes in ERRORS.items()}
+            told = {name: values(side, mask, strength, changes, TOLD, store) for name, changes in ERRORS.items()}
             for each in told.values():
                 each["nearby"] = patterns_of(each, 24)
             for name, how in FILTERS.items():

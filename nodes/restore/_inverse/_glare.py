@@ -63,7 +63,8 @@ def _estimated(electrons: Tensor, weights: Tensor, glare: Glare, doubt: float) -
     modes = [
         strength * (other - pattern) / len(others) ** 0.5
         for strength, pattern, others in zip(fit, glare.patterns, glare.nearby, strict=True)
-        for other in (() if others is None else others)
+        if others is not None
+        for other in others
     ]
     return Light(sum(parts, dark), own, modes)
 
@@ -92,4 +93,5 @@ def strengths(electrons: Tensor, weights: Tensor, glare: Sequence[Tensor]) -> Te
             weight = weights[at].flatten()
             every = torch.stack([*flat, electrons[at].flatten()]).double()
             products += (every[:-1] * weight) @ every.T
-    return (torch.linalg.pinv(products[:, :-1], hermitian=True) @ products[:, -1]).to(electrons)
+    fit: Tensor = torch.linalg.pinv(products[:, :-1], hermitian=True) @ products[:, -1]
+    return fit.to(electrons)

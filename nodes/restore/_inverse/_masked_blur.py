@@ -90,7 +90,7 @@ def _apart(weighted: Tensor, products: Tensor) -> Tensor:
     even = scale[:, None] * products * scale
     even = even + _ALIKE * torch.eye(len(even), dtype=even.dtype, device=even.device)
     lower = torch.linalg.cholesky(even)
-    pieces = (scale[:, None] * part.double() for part in weighted.split(_PIECE, 1))
+    pieces = (scale[:, None] * part.double() for part in torch.split(weighted, _PIECE, 1))
     return torch.cat([torch.linalg.solve_triangular(lower, part, upper=False).to(weighted) for part in pieces], 1)
 
 

@@ -38,9 +38,8 @@ def nearby_glare(
     """Draw patterns that the glare of a laser may have, if its direction, wavelength and focus are known roughly.
 
     Each pattern has its own direction, wavelength and defocus, drawn from normal distributions around those of the
-    laser; ``pixels`` (along each axis, of the spot), ``wavelength`` and ``defocus`` are standard deviations. The points
-    are a scrambled Sobol sequence, which fills the four dimensions evenly. `restore.wiener` takes the patterns as
-    ``nearby``.
+    laser; ``pixels`` (along each axis, of the spot), ``wavelength`` and ``defocus`` are standard deviations. A Latin
+    hypercube spreads the draws evenly over each law. `restore.wiener` takes the patterns as ``nearby``.
 
     Shapes: glare (channel, y, x), pupil (band,), direction (2,), line (band,), responses (channel, band)
             -> (pattern, channel, y, x).
@@ -50,7 +49,7 @@ def nearby_glare(
             phase for 2 nm of fused silica, and so is the change of the response.
     Raises: ValueError where pupil and line differ in the number of bands, or responses and glare in the channels.
     Source: sampled prior of a nuisance parameter as in Kaipio and Somersalo, Statistical and Computational Inverse
-            Problems, 2005, ch. 5 (approximation error); Sobol, USSR Comp. Math. 7, 86 (1967).
+            Problems, 2005, ch. 5 (approximation error); McKay et al., Technometrics 21, 239 (1979).
     """
     _agree(glare, pupil, line, responses)
     share = (responses.double() * (line.weights * line.centres)).to(single(glare))
@@ -58,7 +57,8 @@ def nearby_glare(
     camera["shape"] = (glare.shape[-2], glare.shape[-1])
 
     def seen(around: Pupil, towards: Tensor) -> Tensor:
-        return torch.tensordot(share, focus(around, towards, **camera).intensity.to(share), 1)
+        channels: Tensor = torch.tensordot(share, focus(around, towards, **camera).intensity.to(share), 1)
+        return channels
 
     own = seen(pupil, direction).sum(dtype=torch.float64)
     unit = (glare.sum(dtype=torch.float64) / own.where(own > 0, 1.0)).to(share)
@@ -94,7 +94,9 @@ def _bowl(pupil: Pupil) -> Tensor:
 
 
 def _normal(count: int, rng: Generator) -> Tensor:
-    """Return (count, 4) numbers of a normal distribution that fill the four dimensions evenly."""
-    seed = int(torch.randint(2**31 - 1, (), generator=rng, device=rng.device))
-    even = torch.quasirandom.SobolEngine(4, scramble=True, seed=seed).draw(count, dtype=torch.float64)
-    return torch.special.ndtri(even.clamp(1e-9, 1 - 1e-9))
+    """Return (count, 4) normal numbers, one in each of ``count`` equally likely parts of each of the four axes."""
+    shape = (4, count)
+    order = torch.rand(shape, generator=rng, device=rng.device, dtype=torch.float64).argsort(-1)
+    even = (order + torch.rand(shape, generator=rng, device=rng.device, dtype=torch.float64)) / count
+    numbers: Tensor = torch.special.ndtri(even.clamp(1e-9, 1 - 1e-9)).T
+    return numbers
