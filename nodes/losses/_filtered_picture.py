@@ -14,7 +14,7 @@ from torch import Tensor
 from neusee.nodes.restore._inverse._masked_blur import times
 
 _DARK = 1e-30  #: ratio of light below which a band counts as dark
-STOPS = 256  #: stops that are tried between the widest and the narrowest
+_RADII = 8192  #: of a table of contrast by frequency, up to the corner of the spectrum
 
 
 class Exposure(NamedTuple):
@@ -87,15 +87,14 @@ def filter_of(peak: Tensor, limit: float | None) -> Tensor:
     return (limit / peak.clamp_min(_DARK)).clamp_max(1.0)
 
 
-def round_mtf(at: Tensor, cut: Tensor) -> Tensor:
-    """Return the MTF of a round aperture whose cut-off is ``cut``, at the frequencies ``at``."""
-    share = (at / cut).clamp_max(1.0)
-    return (torch.acos(share) - share * (1 - share.square()).sqrt()) * (2 / math.pi)
+def round_mtf(at: Tensor, cuts: Tensor, shares: Tensor) -> Tensor:
+    """Return the MTF of a round aperture for each channel, at the frequencies ``at``, from the cut-offs of its bands.
 
-
-def stops(limit: float | None) -> Tensor:
-    """Return the diameters of round stops worth a trial, over that of the clear aperture.
-
-    A stop narrower than the fourth root of the limit loses light and contrast, and protects more than is asked.
+    ``shares`` (channel, band) are those of the bands in the channels. Between radii of a fine table it is linear.
     """
-    return torch.linspace(1.0, (limit or 1.0) ** 0.25, STOPS, dtype=torch.float64)
+    radii = torch.linspace(0.0, 0.75, _RADII, dtype=torch.float64)
+    share = (radii / cuts[:, None]).clamp_max(1.0)
+    table = shares @ ((torch.acos(share) - share * (1 - share.square()).sqrt()) * (2 / math.pi))
+    place = at * ((_RADII - 1) / 0.75)
+    below = place.long().clamp_max(_RADII - 2)
+    return torch.lerp(table[:, below], table[:, below + 1], (place - below).expand(len(shares), *at.shape))

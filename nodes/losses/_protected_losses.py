@@ -1,8 +1,8 @@
 """Losses of a mask with a grey filter that holds the peak of a laser at a limit: error and information of a picture."""
 
 import math
-from collections.abc import Callable, Iterator
-from typing import Annotated, Any
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
@@ -21,7 +21,6 @@ from neusee.nodes.losses._filtered_picture import (
     peak_share,
     quanta,
     round_mtf,
-    stops,
 )  # fmt: skip
 from neusee.nodes.restore._inverse._wiener import effective_psf, grey_shares
 from neusee.nodes.units import Electrons, Fraction
@@ -30,6 +29,7 @@ from neusee.nodes.values import Bands, Psf
 PeakLimit = Annotated[float, Field(gt=0, le=1)]  #: of the LSR
 ContrastVariance = Annotated[float, Field(gt=0, le=1)]
 SceneLight = Annotated[Electrons, Field(gt=0, allow_inf_nan=False)]
+_STOPS = 24  #: diameters that are tried, and again on each side of the best
 NormPower = Annotated[float, Field(ge=8, le=256)]
 
 
@@ -193,26 +193,29 @@ def best_stop(
     limit: float | None = None,
     contrast: float = 0.1,
     up_to: float | None = None,
-    measure: str = "filtered_error",
+    measure: Literal["filtered_error", "information"] = "filtered_error",
 ) -> tuple[float, float, float]:
     """Return the least loss of a round stop with a grey filter at the same limit, its diameter and transmittance.
 
     The diameter is a share of that of the clear aperture, whose cut-off follows from ``plain.clear_peak``. The peak of
-    a stop falls with the fourth power of its diameter and its light with the second power. ``measure`` names the loss.
+    a stop falls with the fourth power of its diameter and its light with the second power. ``measure`` names the loss:
+    ``filtered_error`` or ``information``.
     """
     size, grey = _size(plain), grey_shares(illuminant, responses, bands)
     cuts = (4 * plain.clear_peak.double().cpu() / math.pi).sqrt()
     spectrum = natural_spectrum(size, contrast, cuts)
     counted, at = _counted(size, up_to, cuts), frequencies(size, cuts)
-    loss_of: dict[str, Callable[[Tensor], Tensor]] = {
-        "filtered_error": lambda snr: error_share(snr, spectrum, size, counted).clamp_min(1e-30).log(),
-        "information": lambda snr: -bits(snr, size, counted),
-    }
-    found = []
-    for width in stops(limit):
-        mtf = torch.tensordot(grey, torch.stack([round_mtf(at, width * cut) for cut in cuts]), 1)
-        filtered, area = filter_of(width**4, limit), float(width**2)
-        exposure = Exposure(light, read_noise, veil, area)
-        loss = loss_of[measure](quanta((area * mtf).square(), exposure, filtered) * spectrum).mean()
-        found.append((float(loss), float(width), float(filtered)))
-    return min(found)
+
+    def loss_of(width: float) -> tuple[float, float, float]:
+        filtered = filter_of(torch.tensor(width, dtype=torch.float64) ** 4, limit)
+        exposure = Exposure(light, read_noise, veil, width**2)
+        snr = quanta((width**2 * round_mtf(at, width * cuts, grey)).square(), exposure, filtered) * spectrum
+        lost = error_share(snr, spectrum, size, counted).clamp_min(1e-30).log()
+        loss = lost if measure == "filtered_error" else -bits(snr, size, counted)
+        return float(loss.mean()), width, float(filtered)
+
+    narrowest = (limit or 1.0) ** 0.25  # a narrower stop loses light and contrast, and protects more than is asked
+    coarse = min(loss_of(1.0 + i / (_STOPS - 1) * (narrowest - 1.0)) for i in range(_STOPS))
+    step = (1.0 - narrowest) / (_STOPS - 1)
+    near = (coarse[1] + i / (_STOPS - 1) * step for i in range(1 - _STOPS, _STOPS))
+    return min([coarse, *(loss_of(width) for width in near if narrowest <= width <= 1.0)])
