@@ -41,6 +41,7 @@ _MEANINGS = {
     "posterior": "Joint distribution of several values.",
     "train": "Settings of `neusee train`.",
     "train_lift": "Settings of the training of a network from RGB to spectra.",
+    "evaluate": "Settings of `neusee evaluate`.",
     "expect": "Numbers from an independent source, which each run checks.",
 }
 #: types of values that a reference may replace
@@ -76,6 +77,7 @@ def _keys() -> dict[str, Schema]:
         "posterior": {"anyOf": [{"type": "string"}, {"type": "object"}, {"type": "null"}]},
         "train": {"anyOf": [{"$ref": "#/$defs/train"}, {"type": "null"}]},
         "train_lift": {"type": ["object", "null"]},
+        "evaluate": {"type": ["object", "null"]},
         "expect": {"type": "object", "additionalProperties": {"$ref": "#/$defs/expectation"}},
     }
 
