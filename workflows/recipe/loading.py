@@ -115,8 +115,8 @@ def check(composed: Composed) -> Recipe:
     mistakes: list[Diagnostic] = []
     own = read_own_families(composed.root, mistakes)
     composed = composed.with_problems(mistakes)
-    composed, *settings = _settings_blocks(composed, own.modules) if blocks else (composed, None, None, None)
-    training, lifting, evaluation = settings
+    read = _settings_blocks(composed, own.modules) if blocks else (composed, None, None, None)
+    composed, training, lifting, evaluation = read
     composed, uncertain = settle(composed)
     diagnostics = list(composed.diagnostics)
     root, references = composed.root, References(composed.root, diagnostics, dict(composed.replaced))

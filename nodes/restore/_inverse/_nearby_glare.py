@@ -44,9 +44,9 @@ def nearby_glare(
     Shapes: glare (channel, y, x), pupil (band,), direction (2,), line (band,), responses (channel, band)
             -> (pattern, channel, y, x).
     Units:  result as glare; pixels on the sensor; wavelength m; defocus waves at 550 nm, peak to valley.
-    Error:  that of `optics.psf`, 3e-6 of the brightest pixel. The covariance of the patterns has the relative error
-            sqrt(2 / patterns), and at most ``patterns`` dimensions. Dispersion of the mask is neglected: 1e-4 of its
-            phase for 2 nm of fused silica, and so is the change of the response.
+    Error:  that of `optics.psf`, 3e-6 of the brightest pixel, and 1 / samples of the defocus. The covariance of the
+            patterns has the relative error sqrt(2 / patterns), and at most ``patterns`` dimensions. Dispersion of the
+            mask is neglected, 1e-4 of its phase for 2 nm of fused silica, and so is the change of the response.
     Raises: ValueError where pupil and line differ in the number of bands, or responses and glare in the channels.
     Source: sampled prior of a nuisance parameter as in Kaipio and Somersalo, Statistical and Computational Inverse
             Problems, 2005, ch. 5 (approximation error); McKay et al., Technometrics 21, 239 (1979).
@@ -86,11 +86,11 @@ def _agree(glare: Tensor, pupil: Pupil, line: Bands, responses: Tensor) -> None:
 
 
 def _bowl(pupil: Pupil) -> Tensor:
-    """Return the square of the distance from the axis, 1 at the rim of the clear aperture and 0 beyond."""
+    """Return the square of the distance from the axis, 1 at the rim of the disc with the area of the clear aperture."""
     side = pupil.aperture.shape[-1]
     at = torch.arange(side, dtype=torch.float64, device=pupil.path.device) - (side - 1) / 2
-    square = (at[:, None].square() + at.square()) * (pupil.aperture > 0)
-    return (square / square.max().clamp_min(1.0)).to(pupil.path)
+    rim = pupil.aperture.sum(dtype=torch.float64).clamp_min(1.0) / math.pi
+    return ((at[:, None].square() + at.square()) * (pupil.aperture > 0) / rim).to(pupil.path)
 
 
 def _normal(count: int, rng: Generator) -> Tensor:
