@@ -3,6 +3,7 @@
 from neusee.nodes.restore import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.restore._colour_matrix import colour_matrix
 from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons
+from neusee.nodes.restore._inverse._nearby_glare import nearby_glare
 from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
 from neusee.nodes.restore._inverse._wiener import wiener
 from neusee.nodes.restore._networks._critic import critic_slopes, critics, skip_critic_draws
@@ -27,6 +28,7 @@ __all__ = [
     "electrons",
     "fft_mamba",
     "nafnet",
+    "nearby_glare",
     "network",
     "own_network",
     "parameter_groups",

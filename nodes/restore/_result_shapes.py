@@ -13,6 +13,7 @@ from neusee.nodes.restore._inverse._conjugate_gradients import LOWEST
 from neusee.nodes.restore._inverse._fft_grid import halvings, torus
 from neusee.nodes.restore._inverse._hidden_pixels import MOST, STEPS
 from neusee.nodes.restore._inverse._lowest_frequencies import MODES, SHARE
+from neusee.nodes.restore._inverse._nearby_glare import nearby_glare
 from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
 from neusee.nodes.restore._inverse._wiener import wiener
 from neusee.nodes.restore._networks._fft_mamba import fft_mamba
@@ -21,12 +22,14 @@ from neusee.nodes.restore._networks._network_node import network
 from neusee.nodes.restore._networks._own_network import tried
 from neusee.nodes.restore._networks._unet import unet
 from neusee.nodes.shape_rules import at_least_single, blank, double, like_first, transform_operations
-from neusee.nodes.values import Psf
+from neusee.nodes.values import Psf, Pupil
 
 _SYSTEM = 35.0  #: bytes for each element of a dense system: the matrix, its factors and copies
 _INVERTED = 0.30  #: operations of a transform that take as long as one of the cube of the side of an inverted matrix
 _WHITENED = 0.94  #: side of a dense system that needs as much memory as an inverted matrix of side 1
 _FILLED = 790.0  #: operations of a transform that take as long as an element of a matrix of covariances
+_FOCUS = 2.0  #: transforms, of the size of pupil and window together, that take as long as a band of a PSF
+_MODE = 24.0  #: bytes for each pixel of a pattern that the glare may have: its copies, scaled and weighted
 _KEPT = 1 / 8  #: bytes of inner results of a network that need as much memory as a byte of the usual work of a node
 _LAYER = 1e-3  #: operations of a transform that take as long as one of a layer
 
@@ -49,6 +52,18 @@ def _(bands: Any, illuminant: Any, responses: Tensor, *inputs: Any, **params: An
     return double(3, len(responses))
 
 
+@nearby_glare.shape
+def _(glare: Tensor, *inputs: Any, patterns: int = 12, **params: Any) -> Tensor:
+    return blank(patterns, *glare.shape, dtype=at_least_single(glare))
+
+
+@nearby_glare.work
+def _(result: Tensor, glare: Tensor, pupil: Pupil, *others: Any, **params: Any) -> tuple[float, float]:
+    y, x = (n + k for n, k in zip(glare.shape[-2:], pupil.height.shape, strict=True))
+    times = (len(result) + 1) * len(pupil.wavelengths)
+    return 16.0 * (pupil.height.numel() + y * x), _FOCUS * times * transform_operations(y, x)
+
+
 @wiener.work
 def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any) -> tuple[float, float]:
     y, x = _torus(electrons, psf)
@@ -57,7 +72,8 @@ def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any) 
     steps, side = _descent(electrons, psf)
     operations = steps + _FILLED * unknowns**2
     largest = max(unknowns, _WHITENED * side)
-    return max(31.0 * len(electrons) * y * x, _SYSTEM * largest**2), operations
+    nearby = _MODE * sum(len(each) for each in (others[5] if len(others) > 5 else None) or ()) * electrons.numel()
+    return max(31.0 * len(electrons) * y * x, _SYSTEM * largest**2) + nearby, operations
 
 
 def _descent(electrons: Tensor, psf: Psf) -> tuple[float, float]:

@@ -195,6 +195,29 @@ def p_norm(psf, *, power, log):
     return np.log(peaks + L(1e-30)).sum() if log else peaks.sum()
 
 
+def seen_behind(psf, illuminant, responses, bands, *, light, read_noise, veil, limit, transmittance, contrast, up_to):
+    """Yield NEQ x S of each channel behind mask and grey filter, and S, at the frequencies that count."""
+    kernel = exact(psf.intensity)
+    square = sum(np.abs(f) ** 2 for f in frequencies(kernel.shape[1:]))
+    power = np.divide(1, square, out=np.zeros_like(square), where=square > 0)
+    power *= L(contrast) / power.mean()
+    passed = min(L(1), L(limit) / (kernel / exact(psf.clear_peak)[:, None, None]).max())
+    counted = (square > 0) & (square <= L(up_to) ** 2)
+    seen = exact(responses) * exact(illuminant) * exact(bands.centres)
+    for part in seen / seen.sum(1, keepdims=True):
+        otf = dft(np.tensordot(part, kernel, 1))
+        noise = passed * (L(light) * L(transmittance) + L(veil)) + L(read_noise) ** 2
+        yield ((passed * L(light) * np.abs(otf)) ** 2 / noise * power)[counted], power[counted]
+
+
+def filtered_error(*inputs, **how):
+    return np.mean([np.log((s / (1 + snr)).sum() / s.sum()) for snr, s in seen_behind(*inputs, **how)])
+
+
+def information(*inputs, **how):
+    return -np.mean([np.log2(1 + snr).mean() for snr, _ in seen_behind(*inputs, **how)])
+
+
 def wiener_loss(psf, illuminant, responses, bands, *, noise, colour, up_to):
     kernel = exact(psf.intensity)
     y, x = kernel.shape[1:]
@@ -287,6 +310,8 @@ def rng():
     return torch.Generator().manual_seed(5)
 
 
+PROTECTED = {"light": 70.0, "read_noise": 3.7, "veil": 11.0, "limit": 0.03, "transmittance": 0.9, "contrast": 0.2,
+             "up_to": 0.41}  # fmt: skip
 CASES = [
     case(doe.fabricate, (HEIGHT,), wrapped, {"wrap_at": 550e-9}),
     case(doe.fabricate, (HEIGHT,), stepped, {"max_height": 9.1e-5, "levels": 5}),
@@ -297,7 +322,9 @@ CASES = [
     case(losses.charbonnier, (PICTURE, TRUTH), lambda a, b: np.sqrt((exact(a) - exact(b)) ** 2 + L(1e-6)).mean()),
     case(losses.contrast, (WIDE,), contrast_loss, {"floor": 1e-3, "up_to": 0.31}),
     case(losses.fft_l1, (PICTURE, TRUTH), spectrum_difference),
+    case(losses.filtered_error, (WIDE, ILLUMINANT, RESPONSES, BANDS), filtered_error, PROTECTED),
     case(losses.gradient_penalty, (draw(3, 4, 5),), slopes_penalty),
+    case(losses.information, (WIDE, ILLUMINANT, RESPONSES, BANDS), information, PROTECTED),
     case(losses.mrae, (PICTURE, TRUTH),
          lambda a, b: (np.abs(exact(a) - exact(b)) / np.maximum(np.abs(exact(b)), L(0.02))).mean()),
     case(losses.suppression_loss, (PSF,), p_norm, {"power": 16.0, "log": False}),
@@ -367,7 +394,8 @@ _ELSEWHERE = {
     "computes float64 numbers from parameters": ("laser.light", "laser.wavefront"),
     "is a fit or a likelihood, with tests of its own": ("calibrate.camera", "calibrate.camera_prior",
         "calibrate.density", "calibrate.least_squares", "calibrate.levels", "calibrate.prior", "calibrate.reduce",
-        "calibrate.sufficient", "restore.richardson_lucy", "restore.wiener", "spectra.compress"),
+        "calibrate.sufficient", "restore.nearby_glare", "restore.richardson_lucy", "restore.wiener",
+        "spectra.compress"),
     "copies, counts or states": ("metrics.saturated", "optics.stop", "restore.clipped", "sensor.crop", "sensor.limits",
         "spectra.filters"),
     "has a stated error above 1e-11": ("metrics.quality", "metrics.spectral_error"),

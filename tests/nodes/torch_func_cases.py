@@ -55,6 +55,7 @@ LOW_RANK = LowRankCube(rand(2, 12, 12), rand(4, 2), torch.zeros(3, 4, dtype=torc
 ROWS = spectra.rows(BANDS, RESPONSES)
 CHANNELS = Channels(rand(3, 12, 12), rand(3, 4), torch.tensor(0.0, dtype=torch.float64))
 LEVEL = 1e3 * rand(4)
+LASER_PUPIL = PUPIL._replace(index=INDEX[:3], wavelengths=LINE.centres)
 DIRECTION = torch.tensor([1e-4, -2e-4], dtype=torch.float64)
 
 STOP = optics.stop(samples=16, pitch=5e-4, diameter=8e-3)
@@ -63,6 +64,7 @@ WELL = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pixel_pitch": 2.9e-6,
 SHUTTER = {"pixel_pitch": 2.9e-6, "exposure": 0.1}
 ADC = {"full_well": 25500.0, "gain": 1 / 0.37}
 NOISE = {"quantum_efficiency": 0.56, "dark_current": 2.0, "dark_exposure": 0.1, "offset": 50.0, "full_well": 5e4}
+SEEN = {"light": 70.0, "read_noise": 3.7, "limit": 0.03}
 CAMERA = {"gain": 0.5, **NOISE, "read_noise": 3.0, "bits": 12}
 
 
@@ -151,7 +153,9 @@ CASES = {
     "losses.charbonnier": Case("0", (PICTURE, OTHER)),
     "losses.contrast": Case("0.intensity", (WIDE,)),
     "losses.fft_l1": Case("0", (PICTURE, OTHER)),
+    "losses.filtered_error": Case("0.intensity", (WIDE, LIGHT, RESPONSES, BANDS), SEEN),
     "losses.gradient_penalty": Case("0", (rand(2, 3, 5),)),
+    "losses.information": Case("0.intensity", (WIDE, LIGHT, RESPONSES, BANDS), SEEN),
     "losses.suppression_loss": Case("0.intensity", (PSF,)),
     "losses.mrae": Case("0", (SCENE, PLAIN)),
     "losses.wiener": Case("0.intensity", (WIDE, LIGHT, RESPONSES, BANDS)),
@@ -182,6 +186,11 @@ CASES = {
     "restore.colour": Case("0", (PICTURE, rand(3, 3))),
     "restore.colour_matrix": Case("1", (BANDS, LIGHT, RESPONSES, LEVEL), {**SHUTTER, "quantum_efficiency": 0.56}),
     "restore.electrons": Case("0", (RAW,), {"gain": 1 / 0.37, "offset": 50.0}),
+    "restore.nearby_glare": Case(
+        "1.height",
+        (rand(3, 9, 9), LASER_PUPIL, DIRECTION, LINE, spectra.responses(LINE)),
+        {**LENS, "patterns": 2},
+    ),
     "restore.richardson_lucy": Case(
         "0",
         (WIDE_RAW, PSF, LIGHT, RESPONSES, BANDS, torch.zeros(3, 48, 48, dtype=torch.bool)),

@@ -17,6 +17,7 @@ from neusee.nodes.metrics import quality
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import call, place
 from neusee.workflows.evaluation.evaluation_scenes import Scene
+from neusee.workflows.evaluation.mistold_filter import TOLD, shifted
 from neusee.workflows.evaluation.pipelines import BEAM, NONE, PipelineRecipes
 from neusee.workflows.graph.recipe_graph import Recipe, Step, dependents, needed
 from neusee.workflows.keys.cache_key import device_kind, digest, key_of
@@ -77,7 +78,7 @@ class EvaluationPoints:
         function = self._function(pipeline, point.lit, outputs)
         self._kept.turn(point)
         with torch.no_grad():
-            changed = self._changed(pipeline.recipe(point.lit), point, outputs)
+            changed = self._changed(pipeline, point, outputs)
             known = {name: value for name, value in changed.items() if name in function.free}
             values: dict[str, Any] = function({"scene": point.scene.picture, **known})
         return values
@@ -93,7 +94,7 @@ class EvaluationPoints:
         """Return the cache key of an evaluation point from the keys of its steps and the settings of the comparison."""
         recipe, outputs = pipeline.recipe(point.lit), pipeline.pipeline.outputs
         params: dict[str, dict[str, Any]] = {}
-        for name, value in self._changed(recipe, point, outputs).items():
+        for name, value in self._changed(pipeline, point, outputs).items():
             step, _, param = name.rpartition(".")
             params.setdefault(step, {})[param] = value
         steps = {
@@ -126,20 +127,28 @@ class EvaluationPoints:
             free = ["scene", *(r for r in (inputs.readers if inputs else ()) if r.rpartition(".")[0] in steps)]
             if case != NONE:
                 free += [f"direction[{BEAM}].angle", *(f"{spot}.strength" for spot in _spots(recipe, outputs))]
-            caller = self._kept.caller(dependents(whole, [n for n in whole.steps if n.partition("[")[0] in _MOVED]))
+            free += [TOLD + name for name in free if TOLD + name.rpartition(".")[0] in steps]
+            caller = self._kept.caller(dependents(whole, list(filter(_is_moved, whole.steps))))
             ways: dict[str, Any] = {"store": self.store, "device": self.device, "caller": caller}
             self._functions[name] = as_function(whole, *free, outputs=outputs, **ways)
             self._share(self._functions[name], whole)
         return self._functions[name]
 
-    def _changed(self, recipe: Recipe, point: PointRequest, outputs: Sequence[str]) -> dict[str, Any]:
-        """Return the parameters that an evaluation point sets: sampled values, laser direction and laser strength."""
+    def _changed(self, pipeline: PipelineRecipes, point: PointRequest, outputs: Sequence[str]) -> dict[str, Any]:
+        """Return the parameters that an evaluation point sets: sampled values, laser direction and laser strength.
+
+        A copy of a step from which the restorer is told gets the same values, with the error of the pipeline.
+        """
+        recipe = pipeline.recipe(point.lit)
         inputs = self._inputs(recipe, outputs)
         changed = inputs.theta(point.scene.draw(inputs)) if inputs else {}
         if point.lit != NONE:
             changed[f"direction[{BEAM}].angle"] = point.scene.angle(recipe)
             changed |= {f"{spot}.strength": point.strength for spot in _spots(recipe, outputs)}
-        return changed
+        copies = {name: value for name, value in changed.items() if TOLD + name.rpartition(".")[0] in recipe.steps}
+        wrong = {name: value for name, value in pipeline.error.items() if value is not None}
+        told = {TOLD + name: shifted(x, wrong[name]) if name in wrong else x for name, x in copies.items()}
+        return changed | told
 
     def _inputs(self, recipe: Recipe, outputs: Sequence[str]) -> Inputs | None:
         """Return the uncertain inputs of a recipe, or None if no output depends on an uncertain input."""
@@ -215,6 +224,11 @@ class _SharedResults:
             return kept[key][1]
 
         return compute
+
+
+def _is_moved(step: str) -> bool:
+    """Return True for the first steps that depend on the laser strength, and for their copies."""
+    return step.partition("[")[0].removeprefix(TOLD) in _MOVED
 
 
 def _spots(recipe: Recipe, outputs: Sequence[str]) -> list[str]:

@@ -16,6 +16,18 @@ from neusee.workflows.graph.recipe_graph import Recipe
 
 
 @dataclass(frozen=True)
+class MistoldPoint:
+    """The metrics of one scene whose restorer was told the truth, and told optics or laser with one error."""
+
+    pipeline: str
+    error: str
+    scene: Scene
+    strength: float
+    true: PointNumbers
+    wrong: PointNumbers
+
+
+@dataclass(frozen=True)
 class EvaluationResult:
     """The result of an evaluation: scenes, metrics by scene, statistics over scenes, masks and pictures."""
 
@@ -31,3 +43,4 @@ class EvaluationResult:
     masks: dict[str, MaskOptics]  #: by mask
     panels: Sequence[Panel]
     pipelines: Sequence[Pipeline]
+    mistold: Sequence[MistoldPoint] = ()

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
@@ -80,10 +81,12 @@ class PipelineRecipes:
 
     pipeline: Pipeline
     recipe: Callable[..., Recipe]  #: returns the recipe of a laser by name, and by its direction if one is given
+    told: str = ""  #: the error in what the restorer is told, as text
+    error: Mapping[str, Any] = field(default_factory=dict)  #: what is added to which parameters of what it is told
 
     @property
     def name(self) -> str:
-        return self.pipeline.name
+        return self.pipeline.name + (f", {self.told}" if self.told else "")
 
 
 def read_pipelines(text: str, folder: Path) -> list[Pipeline]:

@@ -22,6 +22,7 @@ from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, Poin
 from neusee.workflows.evaluation.evaluation_result import EvaluationResult
 from neusee.workflows.evaluation.evaluation_scenes import Scene, refuse_directions, scenes
 from neusee.workflows.evaluation.mask_optics import masks
+from neusee.workflows.evaluation.mistold_points import mistold_points, mistold_rows
 from neusee.workflows.evaluation.pipelines import (
     NONE,
     EvaluationRefused,
@@ -79,12 +80,13 @@ def evaluate(
     _report_broken(broken, progress)
     bench = EvaluationPoints(store, small, device)
     points = _points(bench, each, shown, strengths, progress)
+    mistold = mistold_points(bench, each, shown, strengths, progress)
     optics = masks(each, store, device, points)
     drawn = panels(bench, each, shown[0], strengths)
     tables = {name: metric_table(own, strengths) for name, own in points.items()}
     least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
     more = {name: compare_with(own, tables[reference], base.seed) for name, own in tables.items()}
-    rest = (reference, points, tables, more, optics, drawn, list(pipelines))
+    rest = (reference, points, tables, more, optics, drawn, list(pipelines), mistold)
     result = EvaluationResult(base, shown, broken, strengths, least, *rest)
     document = study_run.document(_document(result, bench))
     return study_run.write(runs, digest(document["summary"]), document, _report(result))
@@ -159,6 +161,7 @@ def _report(result: EvaluationResult) -> StudyReport:
     tables: dict[str, CsvTable] = {
         "points.csv": ((*_POINT, *METRICS), _point_rows(result)),
         "table.csv": (COLUMNS, rows(result)),
+        "mistold.csv": ((*_POINT[:1], "told", *_POINT[3:], *METRICS), mistold_rows(result.mistold)),
         "suppression.csv": (("mask", "wavelength (nm)", "lsr", "bsr", "floor"), _curve_rows(result)),
     }
     shown = ("command", "date", "seconds", "computed", "seconds a point", "reference", "versions")

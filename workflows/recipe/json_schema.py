@@ -42,6 +42,7 @@ _MEANINGS = {
     "train": "Settings of `neusee train`.",
     "train_lift": "Settings of the training of a network from RGB to spectra.",
     "safety": "Settings of `neusee safety`.",
+    "evaluate": "Settings of `neusee evaluate`.",
     "expect": "Numbers from an independent source, which each run checks.",
 }
 #: types of values that a reference may replace
@@ -78,6 +79,7 @@ def _keys() -> dict[str, Schema]:
         "train": {"anyOf": [{"$ref": "#/$defs/train"}, {"type": "null"}]},
         "train_lift": {"type": ["object", "null"]},
         "safety": {"type": ["object", "null"]},
+        "evaluate": {"type": ["object", "null"]},
         "expect": {"type": "object", "additionalProperties": {"$ref": "#/$defs/expectation"}},
     }
 

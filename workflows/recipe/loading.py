@@ -38,6 +38,11 @@ if TYPE_CHECKING:
 
 TRAININGS = ("train", "train_lift")  #: keys of the blocks of a recipe that train something
 SAFETY = "safety"  #: key of the block that an estimate of damage and dazzle reads
+    from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
+    from neusee.workflows.recipe.blocks.train_block import Training
+    from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
+
+BLOCKS = ("train", "train_lift", "evaluate")  #: keys of the blocks of settings in a recipe
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,25 +101,28 @@ def _checked(composed: Composed, graph: CachedGraph) -> Recipe:
     return check(composed)
 
 
-def _trainings(
+def _settings_blocks(
     composed: Composed, modules: Mapping[str, ModuleType]
-) -> tuple[Composed, Training | None, LiftTraining | None]:
-    """Return a recipe without its blocks of trainings, and their settings; few recipes need the import of these."""
+) -> tuple[Composed, Training | None, LiftTraining | None, EvaluateSettings | None]:
+    """Return a recipe without its blocks of settings, and these; few recipes need the import of their models."""
+    from neusee.workflows.recipe.blocks.evaluate_block import read_evaluate
     from neusee.workflows.recipe.blocks.train_block import read_training
     from neusee.workflows.recipe.blocks.train_lift_block import read_lift_training
 
     composed, training = read_training(composed, class_context(modules))
     composed, lifting = read_lift_training(composed)
-    return composed, training, lifting
+    composed, evaluation = read_evaluate(composed)
+    return composed, training, lifting, evaluation
 
 
 def check(composed: Composed) -> Recipe:
     """Return a composed recipe after a check of all its values; raise `RecipeError` with all mistakes."""
-    blocks = [composed.root.items[key] for key in TRAININGS if key in composed.root.items]
+    blocks = [composed.root.items[key] for key in BLOCKS if key in composed.root.items]
     mistakes: list[Diagnostic] = []
     own = read_own_families(composed.root, mistakes)
     composed = composed.with_problems(mistakes)
-    composed, training, lifting = _trainings(composed, own.modules) if blocks else (composed, None, None)
+    read = _settings_blocks(composed, own.modules) if blocks else (composed, None, None, None)
+    composed, training, lifting, evaluation = read
     composed, uncertain = settle(composed)
     diagnostics = list(composed.diagnostics)
     root, references = composed.root, References(composed.root, diagnostics, dict(composed.replaced))
@@ -154,6 +162,7 @@ def _safety(
     from neusee.workflows.recipe.blocks.safety_block import read_safety
 
     return read_safety(root, references, diagnostics, files)
+    return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting, evaluation=evaluation)
 
 
 def _causes(problems: list[Diagnostic], own: OwnFamilies) -> list[Diagnostic]:

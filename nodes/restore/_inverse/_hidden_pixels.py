@@ -32,17 +32,18 @@ CAREFUL = 8.0  #: factor by which the tolerance falls with each coarser grid, wh
 
 def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH) -> Tensor:
     """Return half the spectrum of the most likely picture before the blur, given the seen pixels and the prior."""
-    if not halvings(_size(seen)):
-        return _exact(seen)
     tensors = (seen.picture, seen.weight, seen.transfer, *seen.glare)
     with torch.no_grad():
-        x = _nested(_fixed(seen), steps, enough * float((seen.weight > 0).sum()))
+        alone = _fixed(seen)
+        lower = seen.picture.new_empty(0) if halvings(_size(seen)) else _factor(alone)
+        x = _solved(alone, lower, steps, enough * float((seen.weight > 0).sum()))
     followed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     if not (followed or transformed()):
         return x
     rest = torch.fft.irfft2(seen.slope(x), s=seen.torus)
-    frame, fixed = _Frame(seen.torus, seen.grey, steps), (seen.weight, seen.transfer, seen.power, *seen.glare)
-    pixels: Tensor = _Followed.apply(torch.fft.irfft2(x, s=seen.torus), rest, frame, *map(Tensor.detach, fixed))  # type: ignore[no-untyped-call]
+    frame = _Frame(seen.torus, seen.grey, steps, seen.bounded)
+    fixed = (lower, *map(Tensor.detach, (seen.weight, seen.transfer, seen.power, *seen.glare)))
+    pixels: Tensor = _Followed.apply(torch.fft.irfft2(x, s=seen.torus), rest, frame, *fixed)  # type: ignore[no-untyped-call]
     spectrum: Tensor = torch.fft.rfft2(pixels)
     return spectrum
 
@@ -59,6 +60,7 @@ class _Frame(NamedTuple):
     torus: Size
     grey: float
     steps: int
+    bounded: int
 
 
 class _Followed(torch.autograd.Function):
@@ -89,11 +91,11 @@ class _Solved(torch.autograd.Function):
 
     @staticmethod
     def forward(right: Tensor, frame: _Frame, *fixed: Tensor) -> Tensor:
-        weight, transfer, power, *glare = fixed
+        lower, weight, transfer, power, *glare = fixed
         pull, nothing = torch.fft.rfft2(right), torch.zeros_like(weight)
-        seen = Blurred(nothing, weight, transfer, power, frame.torus, frame.grey, tuple(glare), pull)
+        seen = Blurred(nothing, weight, transfer, power, frame.torus, frame.grey, tuple(glare), pull, frame.bounded)
         enough = 1e-10 * float(inner(pull, _spread(seen, pull), seen.torus))
-        solution: Tensor = torch.fft.irfft2(_nested(seen, frame.steps, enough), s=seen.torus)
+        solution: Tensor = torch.fft.irfft2(_solved(seen, lower, frame.steps, enough), s=seen.torus)
         return solution
 
     @staticmethod
@@ -109,9 +111,14 @@ class _Solved(torch.autograd.Function):
         raise RuntimeError(_ONCE)
 
 
+def _solved(seen: Blurred, lower: Tensor, steps: int, enough: float) -> Tensor:
+    """Solve a small problem exactly with the Cholesky factor `lower` of its matrix, and a larger problem by steps."""
+    return _by_factor(seen, lower) if lower.numel() else _nested(seen, steps, enough)
+
+
 def _nested(seen: Blurred, steps: int, enough: float) -> Tensor:
     if not halvings(_size(seen)):
-        return _exact(seen)
+        return _by_factor(seen, _factor(seen))
     coarse = halved(seen)
     start = widened(_nested(coarse, min(4 * steps, MOST), enough / CAREFUL), coarse.torus, seen.torus)
     return descend(seen, start, steps, enough)
@@ -158,24 +165,39 @@ def _pooling(size: int, like: Tensor) -> Tensor:
     return ((1.0 + torch.exp(2j * math.pi * turns)) / 2.0).to(like)
 
 
-def _exact(seen: Blurred) -> Tensor:
-    """Return the exact deconvolution of a small picture, by Cholesky decomposition in float64."""
-    channels = len(seen.picture)
-    fine = replace(seen, transfer=seen.transfer.to(torch.complex128), power=seen.power.double())
-    weight = seen.weight.double().flatten()
-    root = weight.where(weight > 0, 1.0).sqrt().where(weight > 0, 0.0)  # the gradient of sqrt is infinite at 0
+def _factor(seen: Blurred) -> Tensor:
+    """Return the Cholesky factor, in float64, of the whitened covariance of the seen pixels of a small picture."""
+    channels, fine, root = len(seen.picture), _fine(seen), _root(seen)
     colours = torch.full((channels, channels), seen.grey, dtype=torch.float64, device=root.device).fill_diagonal_(1.0)
     rows = [torch.cat([colours[i, j] * _covariance(fine, a * b.conj()) for j, b in enumerate(fine.transfer)], 1)
             for i, a in enumerate(fine.transfer)]  # fmt: skip
     matrix = root[:, None] * torch.cat(rows) * root
-    for pattern in seen.glare:
+    for number, pattern in enumerate(seen.glare):
         shape = root * pattern.double().flatten()
-        matrix = matrix + 1e8 * torch.outer(shape, shape) / shape.square().sum().clamp_min(1e-30)
+        free = number < len(seen.glare) - seen.bounded
+        spread = 1e8 / shape.square().sum().clamp_min(1e-30) if free else 1.0
+        matrix = matrix + spread * torch.outer(shape, shape)
     matrix.diagonal().add_(1.0)
+    lower: Tensor = torch.linalg.cholesky(matrix)
+    return lower
+
+
+def _by_factor(seen: Blurred, lower: Tensor) -> Tensor:
+    """Return the exact deconvolution of a small picture, given the factor of its matrix that `_factor` returns."""
+    fine, root = _fine(seen), _root(seen)
     before = torch.zeros_like(fine.transfer) if seen.pull is None else _spread(fine, seen.pull.to(torch.complex128))
     residual = (root * (seen.picture.double() - fine.blur(before)).flatten())[:, None]
-    answer = root * torch.cholesky_solve(residual, torch.linalg.cholesky(matrix))[:, 0]
+    answer = root * torch.cholesky_solve(residual, lower)[:, 0]
     return (before + _spread(fine, fine.gathered(answer.reshape(seen.picture.shape)))).to(seen.transfer)
+
+
+def _fine(seen: Blurred) -> Blurred:
+    return replace(seen, transfer=seen.transfer.to(torch.complex128), power=seen.power.double())
+
+
+def _root(seen: Blurred) -> Tensor:
+    weight = seen.weight.double().flatten()
+    return weight.where(weight > 0, 1.0).sqrt().where(weight > 0, 0.0)  # the gradient of sqrt is infinite at 0
 
 
 def _covariance(seen: Blurred, passed: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, inverse_colour
+from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, inverse_colour, with_bounds
 
 _LEAST = 1e-11  #: times the largest diagonal number of the matrix: its round-off in float64
 MODES = 1000  #: real unknowns of each channel for up to three channels; more channels share the total of three
@@ -95,7 +95,8 @@ class Lowest:
             return matrix
         flat = torch.stack(seen.glare).double().flatten(1)
         weighted = seen.weight.double().flatten() * flat
-        inverse = torch.linalg.pinv(weighted @ flat.T, hermitian=True) * (2.0 / (self.torus[0] * self.torus[1]))
+        products = with_bounds(weighted @ flat.T, seen.bounded)
+        inverse = torch.linalg.pinv(products, hermitian=True) * (2.0 / (self.torus[0] * self.torus[1]))
         shapes = weighted.reshape(-1, *seen.picture.shape)
         spectra = (torch.fft.rfft2(shape, s=seen.torus)[:, self.fy, self.fx] for shape in shapes)
         rows = torch.stack([_real(transfer.conj() * s) for s in spectra])

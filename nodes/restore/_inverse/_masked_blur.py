@@ -14,6 +14,9 @@ from torch import Tensor
 Size = tuple[int, int]
 Map = Callable[[Tensor], Tensor]
 
+_ALIKE = 1e-13  #: added to products of patterns of norm 1, so that equal patterns have a Cholesky factor
+_PIECE = 2**18  #: pixels of all patterns that are converted to float64 at a time
+
 
 @dataclass(frozen=True)
 class Blurred:
@@ -27,6 +30,7 @@ class Blurred:
     grey: float  #: correlation of any two channels of x, below 1
     glare: tuple[Tensor, ...] = ()  #: (channel, y, x) patterns of unknown strength that are added to the picture
     pull: Tensor | None = None  #: (channel, fy, fx), a further term of the log posterior's gradient
+    bounded: int = 0  #: how many patterns, the last ones, have strengths of mean 0 and variance 1, not any strength
 
     def blur(self, spectrum: Tensor) -> Tensor:
         """Return the blurred picture, given half the spectrum of x."""
@@ -53,15 +57,41 @@ def weighing(seen: Blurred) -> Map:
         return lambda residual: seen.weight * residual
     flat = torch.stack(seen.glare).flatten(1)
     weighted = seen.weight.flatten() * flat
-    inverse = torch.linalg.pinv((weighted.double() @ flat.double().T), hermitian=True).to(flat)
+    products = with_bounds(weighted.double() @ flat.double().T, seen.bounded)
+    if seen.bounded:  # similar patterns: differences of large sums would lose digits in float32
+        weighted, inverse = _apart(weighted, products), None
+    else:
+        inverse = torch.linalg.pinv(products, hermitian=True).to(flat)
 
     def weigh(residual: Tensor) -> Tensor:
-        rest = seen.weight * residual
-        for strength, pattern in zip(inverse @ (weighted @ residual.flatten()), weighted, strict=True):
+        rest, found = seen.weight * residual, weighted @ residual.flatten()
+        for strength, pattern in zip(found if inverse is None else inverse @ found, weighted, strict=True):
             rest.addcmul_(strength, pattern.view_as(rest), value=-1.0)
         return rest
 
     return weigh
+
+
+def with_bounds(products: Tensor, bounded: int) -> Tensor:
+    """Return the products of all pairs of glare patterns, plus the precisions of their strengths: 1 if bounded."""
+    if not bounded:
+        return products
+    certain = torch.zeros(len(products), dtype=products.dtype, device=products.device)
+    certain[-bounded:] = 1.0
+    return products + certain.diag()
+
+
+def _apart(weighted: Tensor, products: Tensor) -> Tensor:
+    """Return combinations of patterns whose outer products add up to those of the patterns through inverse products.
+
+    The combinations are the rows of L^-1 for the Cholesky factor L of the products, computed in float64 piece by piece.
+    """
+    scale = products.diagonal().detach().clamp_min(1e-300).rsqrt()
+    even = scale[:, None] * products * scale
+    even = even + _ALIKE * torch.eye(len(even), dtype=even.dtype, device=even.device)
+    lower = torch.linalg.cholesky(even)
+    pieces = (scale[:, None] * part.double() for part in torch.split(weighted, _PIECE, 1))
+    return torch.cat([torch.linalg.solve_triangular(lower, part, upper=False).to(weighted) for part in pieces], 1)
 
 
 def mixed(spectrum: Tensor, own: float, shared: float) -> Tensor:

@@ -12,6 +12,7 @@ from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_not_finite, single
 from neusee.nodes.restore._inverse._conjugate_gradients import pieces
 from neusee.nodes.restore._inverse._fft_grid import torus
+from neusee.nodes.restore._inverse._glare import Glare, average, doubted, visible
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred, variance
 from neusee.nodes.sensor._digitization import crop
@@ -20,14 +21,16 @@ from neusee.nodes.values import Bands, Psf
 
 _FALL = 3.0  #: the power spectrum of pictures falls with frequency to this power, like that of edges
 _GREY = 0.95  #: correlation between the channels of pictures
-_ROWS = 64  #: rows of a picture at a time, so that their float64 copies fit in the cache
 _PRECISE = (
     256  #: pixels a side, up to which all is computed in float64: the dense float64 algebra takes most time there
 )
 _LIGHT = 0.999  #: share of the light that the unknown border around the picture is wide enough for
 
 
-@node(rtol=1e-5, additive_inputs=[("glare",)])
+Doubt = Annotated[float, Field(ge=0, le=10)]  #: standard deviation of a glare pattern over its value
+
+
+@node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])
 def wiener(
     electrons: Tensor,
     psf: Psf,
@@ -36,8 +39,11 @@ def wiener(
     bands: Bands,
     clipped: Tensor,
     glare: list[Tensor] | None = None,
+    nearby: list[Tensor] | None = None,
+    ghosts: list[Tensor] | None = None,
     *,
     balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
+    doubt: Doubt = 0.0,
     read_noise: Electrons,
 ) -> Tensor:
     """Deconvolve a picture with a known PSF: compute the most likely scene, given the pixels that are not clipped.
@@ -45,12 +51,18 @@ def wiener(
     Least squares with a Gaussian prior, which for a picture without edges is the Wiener filter. Each channel has the
     PSF that it sees of a grey scene: the mean over bands, weighted by illuminant x response x wavelength. The power
     spectrum of the prior falls as 1 / frequency^3, like that of edges, with the variance of this picture; channels have
-    a correlation of 0.95. Clipped pixels and pixels beyond the edge are unknown. The patterns of `glare`, wide as the
-    scene, are removed with unknown strength: direction and wavelength of the lasers are then assumed to be known.
+    a correlation of 0.95. Clipped pixels and pixels beyond the edge are unknown. The patterns of `glare` and `ghosts`,
+    wide as the scene, are removed, each with its own unknown strength. By default their shapes count as known exactly.
+    `doubt` is the standard deviation of a pattern in each pixel over its value there: the variance of the noise grows
+    by (doubt x glare)^2. `nearby` has other possible patterns of each glare, as `restore.nearby_glare` computes them:
+    their differences from the glare, averaged over the patterns, are its covariance. The glare in a variance is a
+    least-squares estimate, in which uncertain pixels count less.
 
     Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses (channel, band),
-            each glare (channel, at least y, at least x), cropped to the centre -> (channel, y, x).
-    Units:  e-; glare any; the result as behind a perfect lens without losses. `balance` multiplies the noise variance.
+            each glare and ghost (channel, at least y, at least x), cropped to the centre, each nearby
+            (pattern, channel, y, x) -> (channel, y, x).
+    Units:  e-; glare any, nearby as its glare; the result as behind a perfect lens without losses. `balance` multiplies
+            the noise variance, without that of the glare; doubt none.
     Error:  a grey scene is assumed, and noise in the dark no smaller than that of the mean picture. Without `glare` a
             laser that does not clip is taken for scene. The result may be negative: beside lamps hundreds of
             times as bright as the scene it rings. The iteration ends by its residual, or after 20 steps on the finest
@@ -63,13 +75,15 @@ def wiener(
             prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.
     """
     electrons = single(electrons)
-    refuse_other_pictures(electrons, psf, responses, clipped, glare)
+    refuse_other_pictures(electrons, psf, responses, clipped, [*(glare or ()), *(nearby or ()), *(ghosts or ())])
+    _refuse_other_glare(glare or [], nearby)
     size = (electrons.shape[-2], electrons.shape[-1])
     fine = electrons.double() if max(size) <= _PRECISE else electrons
     kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
-    patterns = [crop(pattern.to(fine), shape=size) for pattern in glare or ()]
+    patterns, others, ghostly = ([crop(x.to(fine), shape=size) for x in g or ()] for g in (glare, nearby, ghosts))
     known = (~clipped).to(fine)
-    return _restored(fine, known, kernels, _visible(patterns, known), balance, read_noise).to(electrons)
+    light = visible([*patterns, *ghostly], [*others, *[None] * (len(patterns) + len(ghostly) - len(others))], known)
+    return _restored(fine, known, kernels, light, (balance, read_noise, doubt)).to(electrons)
 
 
 @wiener.check
@@ -82,6 +96,14 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[
             finite,
         )
     ]
+
+
+def _refuse_other_glare(glare: list[Tensor], nearby: list[Tensor] | None) -> None:
+    if nearby and [x.shape[-3:] for x in nearby] != [x.shape for x in glare]:
+        found, wanted = [tuple(x.shape) for x in nearby], [tuple(x.shape) for x in glare]
+        raise ValueError(
+            f"nearby {found} does not fit glare {wanted}: give one nearby, (pattern, channel, y, x), for each glare"
+        )
 
 
 def refuse_other_pictures(
@@ -128,22 +150,25 @@ def grey_shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
 
 
 def _restored(
-    electrons: Tensor, known: Tensor, kernels: Tensor, glare: list[Tensor], balance: float, read: float
+    electrons: Tensor, known: Tensor, kernels: Tensor, glare: Glare, settings: tuple[float, float, float]
 ) -> Tensor:
     """Deconvolve a picture: scale the scene to mean 0 and variance 1, solve this problem, and scale the result back."""
     y, x = electrons.shape[-2:]
+    balance, read, doubt = settings
     known = torch.where(known.amax((-2, -1), keepdim=True) > 0, known, 1.0)
-    picture = electrons - _strengths(electrons, known, glare)
-    mean = _mean(picture, known)
-    noise = _noise(electrons, mean, read)
+    trusted, light, wrong = doubted(electrons, known, glare, doubt, lambda mean: _noise(electrons, mean, read))
+    picture = electrons - light.sum
+    mean = average(picture, trusted)
+    noise = balance * _noise(electrons, mean, read) + light.variance
     size = torus((y, x), edge(kernels, (y, x)))
     transfer, power = torch.fft.rfft2(wrapped(kernels, size)), fall(size).to(kernels)
-    seen = _mean((picture - mean).square(), known)
+    seen = average((picture - mean).square(), trusted)
     passed = _passed(transfer, power, size)
-    scale = (torch.maximum(seen - mean - read**2, 0.01 * seen) / passed.clamp_min(1e-6)).clamp_min(1e-6).sqrt()
-    weight = known * (scale / (balance * noise).sqrt()).square()
-    scaled = tuple(pattern / scale for pattern in glare)
-    spectrum = most_likely(Blurred((picture - mean) / scale, weight, transfer, power, size, _GREY, scaled))
+    scale = (torch.maximum(seen - mean - read**2 - wrong, 0.01 * seen) / passed.clamp_min(1e-6)).clamp_min(1e-6).sqrt()
+    weight = known * (scale / noise.sqrt()).square()
+    scaled = tuple(pattern / scale for pattern in (*glare.patterns, *light.modes))
+    centred = (picture - mean) / scale
+    spectrum = most_likely(Blurred(centred, weight, transfer, power, size, _GREY, scaled, bounded=len(light.modes)))
     sharp = torch.stack([torch.fft.irfft2(s, s=size)[:y, :x] for s in spectrum])  # one batch takes twice as long
     return sharp * scale + mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None]
 
@@ -163,35 +188,6 @@ def _noise(electrons: Tensor, mean: Tensor, read: float) -> Tensor:
     for window, rim in (((9, 1), (4, 0)), ((1, 9), (0, 4))):
         around = avg_pool2d(around, window, stride=1, padding=rim, count_include_pad=False)
     return (torch.maximum(around[0], mean) + read**2).clamp_min(1e-3)
-
-
-def _mean(picture: Tensor, known: Tensor) -> Tensor:
-    """Return the mean of each channel over the known pixels: (channel, 1, 1)."""
-    total: Tensor = (picture * known).sum((-2, -1), keepdim=True)
-    return total / known.sum((-2, -1), keepdim=True)
-
-
-def _visible(patterns: list[Tensor], known: Tensor) -> list[Tensor]:
-    """Return the glare patterns that are nonzero at some known pixel, each scaled to a maximum of 1."""
-    peaks = [float((pattern.detach().abs() * known).max()) for pattern in patterns]
-    return [pattern / peak for pattern, peak in zip(patterns, peaks, strict=True) if peak > 0]
-
-
-def _strengths(electrons: Tensor, known: Tensor, glare: list[Tensor]) -> Tensor:
-    """Return a first estimate of the glare, a least-squares fit of the glare patterns and a constant."""
-    if not glare:
-        return torch.zeros_like(electrons)
-    means = [_mean(pattern, known) for pattern in glare]
-    products = torch.zeros(len(glare), len(glare) + 1, dtype=torch.float64, device=electrons.device)
-    for channel in range(len(electrons)):
-        for some in range(0, electrons.shape[-2], _ROWS):
-            at = (channel, slice(some, some + _ROWS))
-            flat = [(known[at] * (p[at] - m[channel])).flatten() for p, m in zip(glare, means, strict=True)]
-            every = torch.stack([*flat, electrons[at].flatten()]).double()
-            products += every[:-1] @ every.T
-    fit = (torch.linalg.pinv(products[:, :-1], hermitian=True) @ products[:, -1]).to(electrons)
-    parts = (strength * pattern for strength, pattern in zip(fit, glare, strict=True))
-    return sum(parts, torch.zeros_like(electrons))
 
 
 def fall(size: tuple[int, int]) -> Tensor:

@@ -9,8 +9,16 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from neusee.nodes.doe import Material
-from neusee.nodes.losses import ContrastFloor, HighestFrequency, NoiseVariance, OneBandShare
-from neusee.nodes.units import Count, DataFile, PositiveLength, Wavelength
+from neusee.nodes.losses import (
+    ContrastFloor,
+    ContrastVariance,
+    HighestFrequency,
+    NoiseVariance,
+    OneBandShare,
+    PeakLimit,
+    SceneLight,
+)
+from neusee.nodes.units import Count, DataFile, Electrons, PositiveLength, Wavelength, Waves
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.recipe.blocks.settings_block import SettingsBlock, Weight
 
@@ -30,12 +38,25 @@ class Weights(SettingsBlock):
     bsr: Weight = 1.0  #: `losses.background_loss` of a point on the axis: the light that left the field
     contrast: Weight = 0.0  #: `losses.contrast`
     wiener: Weight = 0.0  #: `losses.wiener` of all bands together: the error that remains after a Wiener filter
+    filtered_error: Weight = 0.0  #: `losses.filtered_error` behind the filter that keeps the peak at `limit`
+    information: Weight = 0.0  #: `losses.information` behind the same filter, in bits per frequency
 
     @model_validator(mode="after")
     def _some(self) -> Weights:
-        if not (self.lsr or self.bsr or self.contrast or self.wiener):
-            raise ValueError("every weight of the loss is 0: set lsr, bsr, contrast or wiener to a number above 0")
+        if not any(getattr(self, name) for name in type(self).model_fields):
+            names = " or ".join([", ".join([*type(self).model_fields][:-1]), [*type(self).model_fields][-1]])
+            raise ValueError(f"every weight of the loss is 0: set {names} to a number above 0")
         return self
+
+    @property
+    def protected(self) -> bool:
+        """Return True if a term of the loss is that of a picture behind a peak limit."""
+        return bool(self.filtered_error or self.information)
+
+    @property
+    def coloured(self) -> bool:
+        """Return True if a term of the loss depends on the light of the scene and the responses of the channels."""
+        return bool(self.wiener or self.protected)
 
 
 class MaskSettings(SettingsBlock):
@@ -53,6 +74,12 @@ class MaskSettings(SettingsBlock):
     up_to: HighestFrequency | None = None  #: cycles per pixel: higher frequencies do not affect the loss
     noise_share: NoiseVariance = 1e-3  #: of `losses.wiener`: noise variance over signal variance
     colour: OneBandShare = 1.0  #: of `losses.wiener`: fraction of the variance that belongs to one band alone
+    limit: PeakLimit | None = None  #: largest LSR behind mask and grey filter, for filtered_error and information
+    light: SceneLight = 30.0  #: mean of the scene behind the clear lens, in each pixel, for these two terms
+    read_noise: Electrons = 10.5
+    veil: Electrons = 0.0  #: even light of a laser behind the clear lens
+    contrast_variance: ContrastVariance = 0.1  #: of the scene, relative
+    defocus_spread: Waves = 0.0  #: standard deviation of the defocus, drawn at each iteration
     bands: Count | None = 7  #: number of bands of the recipe in one iteration; None: all bands
     seed: int = 0
     starts: Count = 1  #: independent starts; the result is the best mask on all bands
@@ -78,13 +105,16 @@ class MaskSettings(SettingsBlock):
     feature: PositiveLength | None = None  #: smallest feature (`doe.smooth`); the recipe sets depth and levels
 
     plain: str = "psf[plain]"  #: the step of the lens without a mask
-    illuminant: str = "illuminant"  #: of `losses.wiener`
+    illuminant: str = "illuminant"  #: of `losses.wiener`, `losses.filtered_error` and `losses.information`
     responses: str = "responses"
 
     @model_validator(mode="after")
     def _rising(self) -> Self:
         if not self.slopes[0] < self.slopes[1]:
             raise ValueError(f"slopes = {self.slopes}: give the smaller slope first")
+        if self.limit is not None and not self.weights.protected:
+            text = "set weights.filtered_error or weights.information, or remove limit; of weights.lsr, `enough` is it"
+            raise ValueError(f"limit = {self.limit:g} acts on no term of the loss: {text}")
         return self
 
     @property
@@ -106,7 +136,7 @@ class DesignError(ValueError):
 
 def need_steps(recipe_steps: Any, settings: MaskTraining) -> None:
     """Raise `DesignError` if a setting names a step that the recipe does not have."""
-    for setting in ("height", "psf", "plain", *(("illuminant", "responses") if settings.weights.wiener else ())):
+    for setting in ("height", "psf", "plain", *(("illuminant", "responses") if settings.weights.coloured else ())):
         name = getattr(settings, setting)
         if name not in recipe_steps:
             raise DesignError(f"{setting}: the recipe has no step {name!r}; {nearest(name, recipe_steps)}")

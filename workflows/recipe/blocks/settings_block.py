@@ -64,5 +64,5 @@ def _fields(model: type[BaseModel], path: Sequence[int | str]) -> list[str]:
     for key in path:
         if key in model.model_fields:
             annotation: Any = model.model_fields[str(key)].annotation
-            model = (get_args(annotation) or (annotation,))[-1]
+            model = next((each for each in get_args(annotation) if hasattr(each, "model_fields")), annotation)
     return list(model.model_fields)

@@ -14,6 +14,7 @@ from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VE
 from neusee.workflows.report.study_page import Section
 from neusee.workflows.training.mask_design.design_terms import Fabrication, Terms
 from neusee.workflows.training.mask_design.learnt_mask import LearntMask
+from neusee.workflows.training.mask_design.peak_limit import section
 
 _COLUMNS = ("nm", "LSR", "even light", "BSR", "median MTF", "at most", "rms MTF", "at most")
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, BLACK, "#CC79A7", "#56B4E9", "#777777")
@@ -55,8 +56,9 @@ def history(rows: Sequence[Mapping[str, float]]) -> Any:
     return figure
 
 
-def sections(bands: Mapping[str, Any], limits: Fabrication, shown: Mapping[str, bytes]) -> list[Section]:
+def sections(figures: Mapping[str, Any], limits: Fabrication, shown: Mapping[str, bytes]) -> list[Section]:
     """Return the sections of the report page of a designed mask: pictures, figures of merit and fabrication limits."""
+    bands = figures["bands"]
     columns = [[1e9 * value for value in bands["wavelength"]], *(bands[name] for name in _NAMES)]
     bounds = (
         "`even light` is the LSR of light that is spread evenly over the window of the PSF. "
@@ -70,6 +72,8 @@ def sections(bands: Mapping[str, Any], limits: Fabrication, shown: Mapping[str, 
         Section("Suppression", "", picture=shown.get("suppression")),
         Section("By wavelength", bounds, _COLUMNS, list(zip(*columns, strict=True))),
     ]
+    if figures["protected"]:
+        parts.insert(1, section(figures["protected"]))
     if "history" in shown:
         text = (
             "The loss is the weighted sum of its terms. Each term is a mean over the bands of an iteration and has no "

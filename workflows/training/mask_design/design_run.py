@@ -39,13 +39,20 @@ from neusee.workflows.training.mask_design.design_terms import Terms
 from neusee.workflows.training.mask_design.differential_evolution import evolve
 from neusee.workflows.training.mask_design.gradient_descent import descend
 from neusee.workflows.training.mask_design.learnt_mask import LearntMask
+from neusee.workflows.training.mask_design.peak_limit import against_stops, line
 
 __all__ = ["DesignError", "MaskTraining", "Weights", "design", "mask_figures"]
 
 MASK = 0  #: the number of the stage that designs the mask, before stage 1
 _LEARNT_WITH = {
     used.__module__
-    for used in (half_rings, PARAMETRISATIONS["doe.pixelwise"], losses.contrast, losses.suppression_loss)
+    for used in (
+        half_rings,
+        PARAMETRISATIONS["doe.pixelwise"],
+        losses.contrast,
+        losses.suppression_loss,
+        losses.filtered_error,
+    )
 }
 
 
@@ -131,6 +138,8 @@ class DesignedMask:
             height = learnt.height(full.stop).detach().to("cpu", torch.float32).contiguous()
             figures = mask_figures(full, height.to(full.device))
         progress(summary_line(figures))
+        if figures["protected"]:
+            progress(line(figures["protected"]))
         return cls(full, learnt, height, figures)
 
     def write(self, folder: RunFolder, command: Sequence[str] = ()) -> None:
@@ -161,7 +170,7 @@ class DesignedMask:
         header = list(dict.fromkeys(name for row in history for name in row))
         tables = {"history.csv": (header, [[row.get(name, "") for name in header] for row in history])}
         title, lead = f"{terms.recipe.name}: a mask designed without images", summary_line(self.figures)
-        parts = sections(self.figures["bands"], terms.fabrication, drawings)
+        parts = sections(self.figures, terms.fabrication, drawings)
         files = {"mask.safetensors": save({"height": self.height})}
         return StudyReport(title, f"{terms.settings.kind}: {lead}.", parts, drawings, tables, files, shown)
 
@@ -206,7 +215,8 @@ def mask_figures(terms: Terms, height: Tensor) -> dict[str, Any]:
     }  # fmt: skip
     plain_values = {name: [float(x) for x in value] for name, value in each.items()}
     means = {name: float(value.double().mean()) for name, value in each.items() if name != "wavelength"}
-    return {"mean": means, "bands": plain_values, "depth": float(height.amax() - height.amin())}
+    return {"mean": means, "bands": plain_values, "depth": float(height.amax() - height.amin()),
+            "protected": against_stops(terms, height)}  # fmt: skip
 
 
 def summary_line(figures: Mapping[str, Any]) -> str:

@@ -20,6 +20,7 @@ from neusee.workflows.store.result_store import Store
 
 _PRIME = 1_000_003
 _FREE = "not limited"
+_HERMITE = [(-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6)]  #: standard deviations and weights of a normal law
 
 
 @dataclass(frozen=True)
@@ -58,10 +59,10 @@ class Terms:
         self.fabrication = Fabrication.of(recipe, settings)
         self.recipe = replace(recipe, exact=True)  # because the error bound of a cheaper step has no gradient
         self._bands = _bands_step(self.recipe, settings.psf)
-        self._function = as_function(
-            self.recipe, settings.height, self._bands, outputs=[settings.psf], store=store, device=device
-        )
-        seen = [settings.illuminant, settings.responses] if settings.weights.wiener else []
+        self._defocus = _defocus_of(self.recipe, settings)
+        free = [settings.height, self._bands, *self._defocus]
+        self._function = as_function(self.recipe, *free, outputs=[settings.psf], store=store, device=device)
+        seen = [settings.illuminant, settings.responses] if settings.weights.coloured else []
         stop = self.mask_step.wires.get("stop")
         stops = [stop] if isinstance(stop, str) else []
         done = run(self.recipe, store, [self._bands, settings.plain, *seen, *stops], device=device)
@@ -83,9 +84,13 @@ class Terms:
             raise DesignError(f"height: the step {self.settings.height} has no input `stop`: name the step of a mask")
         return self._stop
 
-    def psf(self, height: Tensor, chosen: Sequence[int] | None = None) -> Psf:
-        """Return the PSF of a mask from its height map, for the spectral bands ``chosen`` or for all bands."""
-        values = {self.settings.height: height, self._bands: _some(self.bands, chosen)}
+    def psf(self, height: Tensor, chosen: Sequence[int] | None = None, further: float = 0.0) -> Psf:
+        """Return the PSF of a mask from its height map, for the spectral bands ``chosen`` or for all bands.
+
+        ``further`` is added to the defocus of the recipe, in standard deviations.
+        """
+        values: dict[str, Any] = {self.settings.height: height, self._bands: _some(self.bands, chosen)}
+        values |= {name: at + further * self.settings.defocus_spread for name, at in self._defocus.items()}
         psf: Psf = self._function(values)[self.settings.psf]
         return psf
 
@@ -103,10 +108,22 @@ class Terms:
         psf: Psf = _some(self._plain, chosen)
         return psf
 
-    def parts(self, height: Tensor, chosen: Sequence[int] | None = None) -> dict[str, Tensor]:
-        """Return the terms of the mask loss that have a weight above 0, by name, each as a mean over spectral bands."""
-        psf, settings = self.psf(height, chosen), self.settings
-        weights = settings.weights
+    def parts(
+        self, height: Tensor, chosen: Sequence[int] | None = None, number: int | None = None
+    ) -> dict[str, Tensor]:
+        """Return the terms of the mask loss that have a weight above 0, by name, each as a mean over spectral bands.
+
+        If the defocus is uncertain, it is drawn for the iteration ``number``; for None the terms are means over the law
+        of the defocus, by Gauss-Hermite quadrature of three points.
+        """
+        if not self._defocus:
+            return self._parts(self.psf(height, chosen), chosen)
+        points = [(self._drawn_defocus(number), 1.0)] if number is not None else _HERMITE
+        each = [(self._parts(self.psf(height, chosen, at), chosen), share) for at, share in points]
+        return {name: torch.stack([share * part[name] for part, share in each]).sum() for name in each[0][0]}
+
+    def _parts(self, psf: Psf, chosen: Sequence[int] | None) -> dict[str, Tensor]:
+        settings, weights = self.settings, self.settings.weights
         sums = {}
         if weights.lsr:
             sums["lsr"] = self._suppression(psf)
@@ -116,8 +133,28 @@ class Terms:
             sums["contrast"] = losses.contrast(psf, floor=settings.floor, up_to=settings.up_to)
         terms = {name: term / len(psf.intensity) for name, term in sums.items()}
         if weights.wiener:  # not a sum over bands, because each channel depends on all bands
-            terms["wiener"] = self._wiener_error(psf, chosen)
+            terms["wiener"] = losses.wiener(
+                psf, *self.seen(chosen), noise=settings.noise_share, colour=settings.colour, up_to=settings.up_to
+            )
+        for name in ("filtered_error", "information"):
+            if getattr(weights, name):
+                terms[name] = getattr(losses, name)(psf, *self.seen(chosen), **self.exposure(), power=settings.power)
         return terms
+
+    def exposure(self) -> dict[str, Any]:
+        """Return the parameters that `losses.filtered_error`, `losses.information` and `losses.best_stop` share."""
+        s = self.settings
+        return {"light": s.light, "read_noise": s.read_noise, "veil": s.veil, "limit": s.limit,
+                "contrast": s.contrast_variance, "up_to": s.up_to}  # fmt: skip
+
+    def seen(self, chosen: Sequence[int] | None = None) -> tuple[Tensor, Tensor, Bands]:
+        """Return illuminant, responses and bands, for the spectral bands ``chosen`` or for all bands."""
+        light, responses = (x if chosen is None else x[..., list(chosen)] for x in self._seen)
+        return light, responses, _some(self.bands, chosen)
+
+    def _drawn_defocus(self, number: int) -> float:
+        rng = torch.Generator().manual_seed(self.settings.seed * _PRIME - number - 1)
+        return float(torch.randn((), generator=rng, dtype=torch.float64))
 
     def _suppression(self, psf: Psf) -> Tensor:
         """Return the laser suppression loss summed over bands, which is constant below the setting ``enough``."""
@@ -126,14 +163,6 @@ class Terms:
         if settings.enough is None:
             return loss
         return loss.clamp_min(count * (math.log(settings.enough) if settings.log else settings.enough))
-
-    def _wiener_error(self, psf: Psf, chosen: Sequence[int] | None) -> Tensor:
-        light, responses = (x if chosen is None else x[..., list(chosen)] for x in self._seen)
-        bands, settings = _some(self.bands, chosen), self.settings
-        error: Tensor = losses.wiener(
-            psf, light, responses, bands, noise=settings.noise_share, colour=settings.colour, up_to=settings.up_to
-        )
-        return error
 
     def total(self, parts: dict[str, Tensor]) -> Tensor:
         """Return the loss of a mask, which is the weighted sum of its terms."""
@@ -162,6 +191,16 @@ def _bands_step(recipe: Recipe, psf: str) -> str:
         text = f"{psf} depends on {len(names)} steps of spectra.bands ({', '.join(names)}), not on one step"
         raise DesignError(f"psf: {text}")
     return names[0]
+
+
+def _defocus_of(recipe: Recipe, settings: MaskTraining) -> dict[str, float]:
+    """Return the parameter with the defocus of the mask's pupil and its value, or nothing if the defocus is certain."""
+    if not settings.defocus_spread:
+        return {}
+    name = recipe.steps[settings.psf].wires.get("pupil")
+    if not isinstance(name, str) or "defocus" not in recipe.steps[name].params:
+        raise DesignError(f"defocus_spread: the pupil of {settings.psf} has no defocus: remove it, or name another psf")
+    return {f"{name}.defocus": float(recipe.steps[name].params["defocus"])}
 
 
 def _some(value: Any, chosen: Sequence[int] | None) -> Any:

@@ -112,7 +112,7 @@ def _one_start(
 
 def _step(terms: Terms, shape: nn.Module, adam: torch.optim.Adam, start: int, number: int) -> dict[str, float]:
     adam.zero_grad()
-    parts = terms.parts(shape(terms.stop), terms.drawn(number))
+    parts = terms.parts(shape(terms.stop), terms.drawn(number), number)
     loss = terms.total(parts)
     row = {"start": start, "iteration": number, "loss": float(loss.detach())}
     row |= {name: float(term.detach()) for name, term in parts.items()}

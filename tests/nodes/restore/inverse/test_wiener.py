@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from neusee.nodes.optics import image
 from neusee.nodes.restore import wiener
 from neusee.nodes.restore._inverse import _wiener
-from neusee.nodes.restore._inverse._wiener import _strengths, effective_psf
+from neusee.nodes.restore._inverse._glare import strengths
+from neusee.nodes.restore._inverse._wiener import effective_psf
 from neusee.nodes.sensor import crop
 from neusee.nodes.spectra import bands, illuminant, leaves, reflectances, responses
 from neusee.nodes.values import Bands, Psf
@@ -241,7 +242,8 @@ def test_the_first_guess_of_the_glare_is_least_squares_beside_a_constant():
     rng = torch.Generator().manual_seed(0)
     electrons, one, two = torch.rand(3, 2, 150, 20, generator=rng)
     known = (torch.rand(2, 150, 20, generator=rng) > 0.2).float()
-    found = _strengths(electrons, known, [one, two])
+    fit_one, fit_two = strengths(electrons, known, [one, two])
+    found = fit_one * one + fit_two * two
     seen = known.double()
     centred = [p - (seen * p).sum((1, 2), keepdim=True) / seen.sum((1, 2), keepdim=True) for p in (one, two)]
     design = torch.stack([(seen * c).flatten() for c in centred], 1)

@@ -1,0 +1,221 @@
+"""Losses of a mask with a grey filter that holds the peak of a laser at a limit: error and information of a picture."""
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import node
+from neusee.nodes._half_precision import single
+from neusee.nodes.losses._contrast_loss import HighestFrequency
+from neusee.nodes.losses._filtered_picture import (
+    Exposure,
+    bits,
+    error_share,
+    filter_of,
+    frequencies,
+    natural_spectrum,
+    peak_share,
+    quanta,
+    round_mtf,
+)  # fmt: skip
+from neusee.nodes.restore._inverse._wiener import effective_psf, grey_shares
+from neusee.nodes.units import Electrons, Fraction
+from neusee.nodes.values import Bands, Psf
+
+PeakLimit = Annotated[float, Field(gt=0, le=1)]  #: of the LSR
+ContrastVariance = Annotated[float, Field(gt=0, le=1)]
+SceneLight = Annotated[Electrons, Field(gt=0, allow_inf_nan=False)]
+_STOPS = 24  #: diameters that are tried, and again on each side of the best
+NormPower = Annotated[float, Field(ge=8, le=256)]
+
+
+@node()
+def filtered_error(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    *,
+    light: SceneLight,
+    read_noise: Electrons,
+    veil: Electrons = 0.0,
+    limit: PeakLimit | None = None,
+    transmittance: Fraction = 1.0,
+    contrast: ContrastVariance = 0.1,
+    up_to: HighestFrequency | None = None,
+    power: NormPower | None = None,
+) -> Tensor:
+    """Average over channels the logarithm of the error of a natural picture after a Wiener filter, over its variance.
+
+    Behind a mask with a grey filter that lowers the peak of a laser to ``limit`` times that of the clear lens, in every
+    band. The scene has a power spectrum 1 / frequency^2 and a variance ``contrast`` of relative brightness; frequency 0
+    does not count. A pixel has the noise of its light, of an even ``veil`` of the laser, and of reading. The Wiener
+    filter of a channel knows the PSF of a grey scene. The transmittance of the grey filter follows from the mask: the
+    largest that keeps the limit is the best. ``power`` replaces the maximum over pixels by a norm, whose gradient
+    reaches every bright pixel. ``up_to`` excludes finer frequencies.
+
+    Shapes: psf.intensity (band, y, x), responses (channel, band) -> ().
+    Units:  none; natural logarithm of a share, 0 if nothing is seen. light, veil and read_noise e- in a pixel behind
+            the clear lens without a filter; transmittance: share of the light that the pupil behind the mask lets
+            through; up_to cycles per pixel.
+    Error:  1e-6 in float32. Clipped pixels, edges and unknown glare are neglected. Light that leaves the window counts
+            as noise, because as much comes from outside. The norm is up to n^(1/power) above the maximum.
+    Raises: ValueError where the inputs differ in the number of bands.
+    Source: Wiener filter as in Goodman, Introduction to Fourier Optics, 4th ed., ch. 8; NEQ as in Barrett and Myers,
+            Foundations of Image Science, 2004, ch. 13; spectrum of natural scenes: Field, J. Opt. Soc. Am. A 4, 2379
+            (1987). The limit by a filter is ours.
+    """
+    exposure = Exposure(light, read_noise, veil, transmittance)
+    snr, spectrum, counted = _behind(psf, (illuminant, responses, bands), exposure, (limit, power, contrast, up_to))
+    lost = error_share(snr, spectrum, _size(psf), counted)
+    return lost.clamp_min(1e-30).log().mean().to(single(psf.intensity))
+
+
+@node()
+def information(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    *,
+    light: SceneLight,
+    read_noise: Electrons,
+    veil: Electrons = 0.0,
+    limit: PeakLimit | None = None,
+    transmittance: Fraction = 1.0,
+    contrast: ContrastVariance = 0.1,
+    up_to: HighestFrequency | None = None,
+    power: NormPower | None = None,
+) -> Tensor:
+    """Average over channels and frequencies the negative information log2(1 + NEQ S) about a natural picture.
+
+    S is the power spectrum of the scene, and NEQ = (T n MTF)^2 / (T n + veil + read^2) are the noise equivalent quanta
+    behind mask and grey filter. Scene, filter and parameters are those of `losses.filtered_error`. Fine detail counts
+    here as much as coarse detail, whereas the error is that of coarse detail.
+
+    Shapes: psf.intensity (band, y, x), responses (channel, band) -> ().
+    Units:  bits per frequency, negative; the parameters as in `losses.filtered_error`.
+    Error:  1e-6 in float32. Neglects what `losses.filtered_error` neglects.
+    Raises: ValueError where the inputs differ in the number of bands.
+    Source: Shannon, Proc. IRE 37, 10 (1949), for Gaussian signals and noise; NEQ as in Barrett and Myers, Foundations
+            of Image Science, 2004, ch. 13.
+    """
+    exposure = Exposure(light, read_noise, veil, transmittance)
+    snr, _, counted = _behind(psf, (illuminant, responses, bands), exposure, (limit, power, contrast, up_to))
+    return -bits(snr, _size(psf), counted).mean().to(single(psf.intensity))
+
+
+def _behind(
+    psf: Psf,
+    grey: tuple[Tensor, Tensor, Bands],
+    exposure: Exposure,
+    settings: tuple[float | None, float | None, float, float | None],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return NEQ x S of each channel behind mask and filter, S, and which frequencies count."""
+    limit, power, contrast, up_to = settings
+    size, kernels = _size(psf), effective_psf(psf, *grey, torch.float64).double()
+    otf = torch.fft.rfft2(kernels)
+    spectrum = natural_spectrum(size, contrast, kernels)
+    filtered = filter_of(peak_share(psf.intensity, psf.clear_peak, power), limit)
+    neq = quanta(otf.real.square() + otf.imag.square(), exposure, filtered)
+    return neq * spectrum, spectrum, _counted(size, up_to, kernels)
+
+
+def _counted(size: tuple[int, int], up_to: float | None, like: Tensor) -> Tensor:
+    at = frequencies(size, like)
+    return (at > 0) & (at <= (1.0 if up_to is None else up_to))
+
+
+def _size(psf: Psf) -> tuple[int, int]:
+    return psf.intensity.shape[-2], psf.intensity.shape[-1]
+
+
+@filtered_error.reference
+def _(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, **settings: Any) -> Tensor:
+    logs = [
+        (spectrum / (1 + snr))[counted].sum().div(spectrum[counted].sum()).clamp_min(1e-30).log()
+        for snr, spectrum, counted in _by_definition(psf, illuminant, responses, bands, **settings)
+    ]
+    return torch.stack(logs).mean()
+
+
+@information.reference
+def _(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, **settings: Any) -> Tensor:
+    each = _by_definition(psf, illuminant, responses, bands, **settings)
+    return -torch.stack([snr[counted].log1p().mean() / math.log(2) for snr, _, counted in each]).mean()
+
+
+def _by_definition(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    *,
+    light: float,
+    read_noise: float,
+    veil: float = 0.0,
+    limit: float | None = None,
+    transmittance: float = 1.0,
+    contrast: float = 0.1,
+    up_to: float | None = None,
+    power: float | None = None,
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Yield NEQ x S, S and the counted frequencies of each channel, on the whole spectrum."""
+    y, x = psf.intensity.shape[-2:]
+    fy, fx = torch.fft.fftfreq(y, dtype=torch.float64), torch.fft.fftfreq(x, dtype=torch.float64)
+    square = fy[:, None].square() + fx.square()
+    spectrum = torch.where(square > 0, 1 / square, 0.0)
+    spectrum = spectrum * (contrast * x * y / spectrum.sum().clamp_min(1e-300))
+    lsr = (psf.intensity.double() / psf.clear_peak[:, None, None]).flatten()
+    worst = lsr.max() if power is None else (power * lsr.clamp_min(1e-300).log()).logsumexp(0).div(power).exp()
+    passed = torch.minimum(torch.ones(()), limit / worst) if limit is not None else torch.ones(())
+    seen = responses.double() * (illuminant.double() * bands.centres)
+    for share in seen / seen.sum(-1, keepdim=True):
+        mtf = torch.fft.fft2(torch.tensordot(share, psf.intensity.double(), 1)).abs()
+        noise = passed * (light * transmittance + veil) + read_noise**2
+        counted = (square > 0) & (square <= (up_to or 1.0) ** 2)
+        yield (passed * light * mtf).square() / noise * spectrum, spectrum, counted
+
+
+def best_stop(
+    plain: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    *,
+    light: float,
+    read_noise: float,
+    veil: float = 0.0,
+    limit: float | None = None,
+    contrast: float = 0.1,
+    up_to: float | None = None,
+    measure: Literal["filtered_error", "information"] = "filtered_error",
+) -> tuple[float, float, float]:
+    """Return the least loss of a round stop with a grey filter at the same limit, its diameter and transmittance.
+
+    The diameter is a share of that of the clear aperture, whose cut-off follows from ``plain.clear_peak``. The peak of
+    a stop falls with the fourth power of its diameter and its light with the second power. ``measure`` names the loss:
+    ``filtered_error`` or ``information``.
+    """
+    size, grey = _size(plain), grey_shares(illuminant, responses, bands)
+    cuts = (4 * plain.clear_peak.double().cpu() / math.pi).sqrt()
+    spectrum = natural_spectrum(size, contrast, cuts)
+    counted, at = _counted(size, up_to, cuts), frequencies(size, cuts)
+
+    def loss_of(width: float) -> tuple[float, float, float]:
+        filtered = filter_of(torch.tensor(width, dtype=torch.float64) ** 4, limit)
+        exposure = Exposure(light, read_noise, veil, width**2)
+        snr = quanta((width**2 * round_mtf(at, width * cuts, grey)).square(), exposure, filtered) * spectrum
+        lost = error_share(snr, spectrum, size, counted).clamp_min(1e-30).log()
+        loss = lost if measure == "filtered_error" else -bits(snr, size, counted)
+        return float(loss.mean()), width, float(filtered)
+
+    narrowest = (limit or 1.0) ** 0.25  # a narrower stop loses light and contrast, and protects more than is asked
+    coarse = min(loss_of(1.0 + i / (_STOPS - 1) * (narrowest - 1.0)) for i in range(_STOPS))
+    step = (1.0 - narrowest) / (_STOPS - 1)
+    near = (coarse[1] + i / (_STOPS - 1) * step for i in range(1 - _STOPS, _STOPS))
+    return min([coarse, *(loss_of(width) for width in near if narrowest <= width <= 1.0)])

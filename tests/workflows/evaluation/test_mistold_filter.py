@@ -1,0 +1,115 @@
+"""Restorers that are told optics or laser with an error: the camera stays, and what the filter knows moves."""
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from neusee.workflows import load
+from neusee.workflows.engine.runner import run
+from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
+from neusee.workflows.evaluation.evaluation_scenes import scenes
+from neusee.workflows.evaluation.mistold_filter import TOLD, errors_of, mistold
+from neusee.workflows.evaluation.mistold_points import mistold_points
+from neusee.workflows.evaluation.pipelines import compose_pipelines, read_pipelines
+from neusee.workflows.evaluation.run_evaluation import evaluate
+from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.recipe.blocks.evaluate_block import Mismatch
+from neusee.workflows.store.result_store import Store
+
+SMALL = ["optics.samples=96", "optics.pitch=84.15 um", "optics.bands=5", "optics.window=[24, 24]",
+         "scene.shape=[32, 32]", "sensor.shape=[24, 24]", "scene=siemens"]  # fmt: skip
+HERE = Path()
+HALF = 0.5 * 2.9e-6 / 0.11
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    return Store(tmp_path_factory.mktemp("mistold"))
+
+
+def composed(text, *more):
+    return compose_pipelines("first_light", [*SMALL, *more], read_pipelines(text, HERE), HERE)
+
+
+def green(*more):
+    line = "wavelength: 532 nm, fwhm: 10 nm, strength: 1e4, angle: [0.1 mrad, 0.2 mrad]"
+    return load("first_light", [*SMALL, f"lasers={{beam: {{{line}}}}}", *more])
+
+
+def test_the_camera_stays_and_the_filter_is_told_what_another_camera_would_know(store):
+    """Each error is that of a recipe written by hand with this parameter, of which only the knowledge is taken."""
+    recipe = green()
+    errors = errors_of(recipe, Mismatch())
+    assert list(errors) == ["direction 0.5 px off", "wavelength 2 nm off", "defocus 0.1 waves off"]
+    by_hand = {
+        "direction 0.5 px off": [f"lasers.beam.angle=[{1e-4 + HALF!r} rad, {2e-4 + HALF!r} rad]"],
+        "wavelength 2 nm off": ["lasers.beam.wavelength=534 nm"],
+        "defocus 0.1 waves off": ["optics.defocus=0.1 waves"],
+    }
+    true = run(recipe, store, ["raw[mask]", "restored"])
+    for text, error in errors.items():
+        wrong = mistold(recipe, error)
+        names = {wire for wire in wrong.steps["deconvolved"].sources if wire.startswith(TOLD)}
+        assert names == ({f"{TOLD}psf[mask]"} if "defocus" in text else set()) | {f"{TOLD}laser_photons[mask,beam]"}
+        found = run(wrong, store, ["raw[mask]", "restored", *names])
+        other = run(green(*by_hand[text]), store, [name.removeprefix(TOLD) for name in names])
+        assert bool((found["raw[mask]"] == true["raw[mask]"]).all())
+        assert not bool((found["restored"] == true["restored"]).all())
+        for name in names:
+            mine, hand = (getattr(x, "intensity", x) for x in (found[name], other[name.removeprefix(TOLD)]))
+            assert float((mine - hand).abs().max()) <= 1e-6 * float(hand.abs().max())
+
+
+def test_dirt_is_not_told_and_ghosts_stay_those_of_the_camera(store):
+    recipe = green("flare=dirty_windshield")
+    errors = errors_of(recipe, Mismatch(pixels=0, wavelength="0 nm", defocus="0 waves"))
+    assert list(errors) == ["dirt not told"]
+    wrong = mistold(recipe, errors["dirt not told"])
+    assert wrong.steps[f"{TOLD}pupil[mask]"].wires["dirt"] is None
+    assert wrong.steps["pupil[mask]"].wires["dirt"] == "dirt"
+    assert not any("ghost" in name for name in wrong.steps if name.startswith(TOLD))
+
+
+def test_who_knows_nothing_cannot_be_told_wrongly():
+    gone = ("restored", "deconvolved", "restored_quality")
+    recipe = green(*(f"steps.{name}=null" for name in gone), "outputs=[raw]")
+    assert errors_of(recipe, Mismatch()) == {}
+
+
+def test_points_are_those_of_the_recipe_with_the_error(store):
+    """The direction that a scene draws, moved by half a pixel, and the strength of the point."""
+    (pipeline,) = composed("flat+wiener", "+evaluate.mismatch={wavelength: 0 nm, defocus: 0 waves, scenes: 1}")
+    shown, _ = scenes(load("first_light", SMALL), store, None, 2)
+    bench = EvaluationPoints(store, 16)
+    (found,) = mistold_points(bench, [pipeline], shown, (0.0, 1e5), lambda _: None)
+    assert found.true == bench.point(pipeline, PointRequest(shown[0], 1e5))
+    assert found.wrong["psnr"] != found.true["psnr"]
+    angle = shown[0].angle(pipeline.recipe("violet"))
+    line = f"wavelength: 405 nm, fwhm: 10 nm, strength: 1e5, angle: [{angle[0]!r} rad, {angle[1]!r} rad]"
+    by_hand = load("first_light", [*SMALL, "doe=flat", f"lasers={{beam: {{{line}}}}}", f"seed={shown[0].seed}"])
+    wrong = mistold(by_hand, {"direction[beam].angle": (HALF, HALF)})
+    expected = run(wrong, store, ["restored_quality"])["restored_quality"]
+    assert found.wrong["psnr"] == pytest.approx(float(expected.psnr), abs=1e-3)
+
+
+def test_an_evaluation_has_the_rows_and_a_recipe_can_leave_them_out(store, tmp_path):
+    run_it = {"count": 1, "strengths": [1e4], "store": store, "runs": tmp_path, "folder": HERE}
+    lines = read_pipelines("flat+none, flat+wiener", HERE)
+    folder = evaluate("first_light", lines, SMALL, **run_it)
+    rows = list(csv.DictReader((folder / "mistold.csv").read_text().splitlines()))
+    assert [(row["pipeline"], row["told"]) for row in rows] == [
+        ("flat+wiener", told)
+        for told in ("exactly", "direction 0.5 px off", "wavelength 2 nm off", "defocus 0.1 waves off")
+    ]
+    assert "What the restorer is not told" in next(folder.glob("*.html")).read_text()
+    folder = evaluate("first_light", lines, [*SMALL, "+evaluate.mismatch=null"], **run_it)
+    assert "What the restorer is not told" not in next(folder.glob("*.html")).read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"), [("{pixel: 1}", "pixels"), ("{wavelength: -2 nm}", "greater than"), ("{scenes: 0}", "greater")]
+)
+def test_a_mistake_in_the_block_is_told_with_its_place(text, said):
+    with pytest.raises(RecipeError, match=said):
+        load("first_light", [*SMALL, f"+evaluate.mismatch={text}"])
