@@ -58,6 +58,7 @@ DIRECTION = torch.tensor([1e-4, -2e-4], dtype=torch.float64)
 
 STOP = optics.stop(samples=16, pitch=5e-4, diameter=8e-3)
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
+STRAY = {**LENS, "diameter": 8e-3, "surfaces": {"lens": {"b0": 0.4, "l": 0.01, "s": -1.5}}}
 WELL = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pixel_pitch": 2.9e-6, "exposure": 0.1}
 SHUTTER = {"pixel_pitch": 2.9e-6, "exposure": 0.1}
 ADC = {"full_well": 25500.0, "gain": 1 / 0.37}
@@ -135,6 +136,8 @@ CASES = {
     "doe.zernike": Case("coefficients.4", (STOP,), {"coefficients": {4: number(0.3), 6: number(0.1)}}),
     "flare.dirt": Case("grease", (STOP,), {"grease": number(1e-7), "dust": 3.0}),
     "flare.ghosts": Case("0", (rand(3, 12, 12), LINE, DIRECTION), {**LENS, "count": 3, "radius": 3e-5}),
+    "flare.stray_light": Case("0.intensity", (PSF, PUPIL), STRAY),
+    "flare.stray_shares": Case("0.intensity", (PSF, PSF, PUPIL), STRAY),
     "losses.background_loss": Case("0.intensity", (PSF, SCENE)),
     "losses.charbonnier": Case("0", (PICTURE, OTHER)),
     "losses.contrast": Case("0.intensity", (WIDE,)),
