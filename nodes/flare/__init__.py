@@ -1,7 +1,8 @@
-"""Flare: dirt in the pupil and ghosts on the sensor."""
+"""Flare: dirt in the pupil, ghosts on the sensor, and stray light of the lens."""
 
 from neusee.nodes.flare import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.flare._dirt import dirt
 from neusee.nodes.flare._ghosts import ghosts
+from neusee.nodes.flare._stray_light import StrayShares, stray_light, stray_shares
 
-__all__ = ["dirt", "ghosts"]
+__all__ = ["StrayShares", "dirt", "ghosts", "stray_light", "stray_shares"]

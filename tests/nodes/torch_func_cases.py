@@ -60,6 +60,7 @@ DIRECTION = torch.tensor([1e-4, -2e-4], dtype=torch.float64)
 
 STOP = optics.stop(samples=16, pitch=5e-4, diameter=8e-3)
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
+STRAY = {**LENS, "diameter": 8e-3, "surfaces": {"lens": {"b0": 0.4, "l": 0.01, "s": -1.5}}}
 WELL = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pixel_pitch": 2.9e-6, "exposure": 0.1}
 SHUTTER = {"pixel_pitch": 2.9e-6, "exposure": 0.1}
 ADC = {"full_well": 25500.0, "gain": 1 / 0.37}
@@ -149,6 +150,8 @@ CASES = {
     "laser.dazzle_curve": Case("0.intensity", (Psf(rand(3, 9, 9), rand(3)), LINE)),
     "laser.light": Case("power", (LINE, STOP), {**BEAM, "power": number(5e-3), "focal_length": 0.11, "exposure": 0.1}),
     "laser.wavefront": Case("distance", (LINE,), {**BEAM, "distance": number(100.0)}),
+    "flare.stray_light": Case("0.intensity", (PSF, PUPIL), STRAY),
+    "flare.stray_shares": Case("0.intensity", (PSF, PSF, PUPIL), STRAY),
     "losses.background_loss": Case("0.intensity", (PSF, SCENE)),
     "losses.charbonnier": Case("0", (PICTURE, OTHER)),
     "losses.contrast": Case("0.intensity", (WIDE,)),
