@@ -60,6 +60,8 @@ class LaserLight(NamedTuple):
     peak: Tensor  #: () float64, W/m2 at the peak on the sensor behind the clear, focused lens
     pulses: Tensor  #: () float64, pulses within the exposure; 0 for a continuous laser
     pulse_fluence: Tensor  #: () float64, J/m2 of one pulse at the peak on the sensor; 0 for a continuous laser
+
+
 class Shade(NamedTuple):
     """The light that a grey filter, a smaller stop and notch filters in the pupil of one arm let through."""
 

@@ -12,8 +12,7 @@ from neusee.nodes.optics._phase_steps import LARGE_STEPS, phase_steps
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, inside, opening, refuse_other_grid, stripes
 from neusee.nodes.optics._zernike import surface
 from neusee.nodes.units import Count, Length, Waves
-from neusee.nodes.values import Bands, Dirt, Pupil, Stop, Wavefront
-from neusee.nodes.values import Bands, Dirt, Pupil, Shade, Stop
+from neusee.nodes.values import Bands, Dirt, Pupil, Shade, Stop, Wavefront
 
 DEFOCUS_WAVELENGTH = 550e-9  #: m; the wavelength in which waves of defocus are counted
 _ROWS = 512  #: least number of pupil rows in which phase steps are measured
@@ -37,8 +36,6 @@ def pupil(
     Field of band b: amplitude * exp(2 pi i (index[b] * height + path) / wavelength[b]). Defocus adds the path
     W * 550 nm * r**2 with r = 1 at the rim, so W is the peak-to-valley defocus in waves at 550 nm. A `wavefront` adds
     the taper and the curvature of a laser beam; the lens without defocus is focused at infinity. The stop passes a
-    sample if the centre of the sample lies inside the stop.
-    W * 550 nm * r**2 with r = 1 at the rim, so W is the peak-to-valley defocus in waves at 550 nm. The stop passes a
     sample if the centre of the sample lies inside the stop. A shade is a grey filter, a smaller stop or a notch filter.
     The aperture stays that of the lens, so that the PSF and the laser suppression ratio count the light that is lost.
 
@@ -62,7 +59,6 @@ def pupil(
     amplitude = clear if dirt is None else clear * dirt.amplitude
     if wavefront is not None and bool(wavefront.taper):
         amplitude = amplitude * _taper(grid, wavefront.taper.to(height.device) * grid.diameter**2 / 4, height)
-    return Pupil(clear, amplitude, height, path, index, bands.centres, stop.pitch.to(height.device))
     if shade is not None:
         amplitude = amplitude * shade.amplitude
     notches = torch.zeros(0, 3, dtype=torch.float64) if shade is None else shade.notches

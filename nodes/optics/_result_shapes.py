@@ -29,15 +29,14 @@ def _(
     stop: Stop,
     dirt: Any = None,
     wavefront: Wavefront | None = None,
+    shade: Any = None,
     **params: Any,
-    height: Tensor | None, index: Any, bands: Bands, stop: Stop, dirt: Any = None, shade: Any = None, **params: Any
 ) -> Pupil:
     side, dtype = int(stop.samples), torch.float32 if height is None else height.dtype
     clear, amplitude, relief, path = (blank(side, side, dtype=dtype) for _ in range(4))
     wave = double(len(bands.centres))
     even = wavefront is None or (known(wavefront.taper) and not float(wavefront.taper))
-    return Pupil(clear, clear if dirt is None and even else amplitude, relief, path, wave, bands.centres, stop.pitch)
-    open_ = clear if dirt is None and shade is None else amplitude
+    open_ = clear if dirt is None and shade is None and even else amplitude
     found = Pupil(clear, open_, relief, path, wave, bands.centres, stop.pitch)
     return found if shade is None else found._replace(notches=shade.notches)
 

@@ -32,17 +32,13 @@ from neusee.workflows.recipe.wiring import Wiring, cycles
 if TYPE_CHECKING:
     from types import ModuleType
 
+    from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.safety_block import Safety
     from neusee.workflows.recipe.blocks.train_block import Training
     from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 
-TRAININGS = ("train", "train_lift")  #: keys of the blocks of a recipe that train something
-SAFETY = "safety"  #: key of the block that an estimate of damage and dazzle reads
-    from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
-    from neusee.workflows.recipe.blocks.train_block import Training
-    from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
-
 BLOCKS = ("train", "train_lift", "evaluate")  #: keys of the blocks of settings in a recipe
+SAFETY = "safety"  #: key of the block that an estimate of damage and dazzle reads
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +146,7 @@ def check(composed: Composed) -> Recipe:
     nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
     notes = (*composed.notes, *own.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
     parts = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
-    return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting, safety=safety)
+    return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting, evaluation=evaluation, safety=safety)
 
 
 def _safety(
@@ -162,7 +158,6 @@ def _safety(
     from neusee.workflows.recipe.blocks.safety_block import read_safety
 
     return read_safety(root, references, diagnostics, files)
-    return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting, evaluation=evaluation)
 
 
 def _causes(problems: list[Diagnostic], own: OwnFamilies) -> list[Diagnostic]:
