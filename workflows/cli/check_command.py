@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +15,8 @@ from neusee.workflows.cli.command_list import DONE, MISSED
 from neusee.workflows.cli.command_options import AsJson, Debug
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from torch import nn
 
     from neusee.nodes import Node
@@ -45,9 +48,27 @@ def check(
         say([name, *(f"  {_MARKS[f.ok]:<4}  {f.rule:<11}  {f.text}" for f in findings), ""])
     failed = sum(f.ok is False for findings in found.values() for f in findings)
     if not as_json:
-        end = f"{failed} rules fail" if failed else "every rule holds"
+        end = f"{failed} rule{'s fail' if failed > 1 else ' fails'}" if failed else "every rule holds"
         say([f"{_count(len(nodes), len(networks))}: {end}"])
     raise typer.Exit(MISSED if failed else DONE)
+
+
+def _installed(family: str) -> ModuleType | None:
+    """Return the module of a family of an installed package; None for a family of neusee."""
+    from neusee.workflows.recipe.node_families import module_of
+
+    try:
+        return module_of(family)
+    except LookupError:
+        return None
+
+
+def _is_module(place: str) -> bool:
+    """Return True if a name with dots is that of a module, such as ``mylab.nodes``, and not of a node."""
+    try:
+        return find_spec(place) is not None
+    except ImportError:
+        return False
 
 
 def _count(nodes: int, networks: int) -> str:
@@ -59,14 +80,18 @@ def _count(nodes: int, networks: int) -> str:
 def _found(place: str) -> tuple[dict[str, Node], dict[str, type[nn.Module]]]:
     """Return the nodes and the network classes at a place by name; raise `LookupError` if there are none."""
     from neusee.workflows.contract.network_contract import whole_networks
-    from neusee.workflows.recipe.node_families import find_node, import_own, is_known, nodes_of, own_nodes
+    from neusee.workflows.recipe.node_families import find_node, import_own, installed_as, is_known, nodes_of, own_nodes
 
     family = place.partition(".")[0]
     if not place.endswith(".py") and "/" not in place and is_known(family):
-        if place != family:
+        if place == family:
+            module = _installed(family)
+            networks = whole_networks(module) if module else {}
+            nodes = {f"{family}.{name}": node for name, node in nodes_of(family).items()}
+            return nodes, {f"{family}.{key}": value for key, value in networks.items()}
+        if not _is_module(place):
             return {place: find_node(place)}, {}
-        return {f"{family}.{name}": node for name, node in nodes_of(family).items()}, {}
     module = import_own(place, Path.cwd())
-    name = module.__name__.rpartition(".")[2]
+    name = installed_as(module.__name__) or module.__name__.rpartition(".")[2]
     nodes = {f"{name}.{key}": node for key, node in own_nodes(name, module).items()}
     return nodes, {f"{name}.{key}": value for key, value in whole_networks(module).items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import keyword
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -69,6 +70,8 @@ def new(
     paths = {folder / path.replace("NAME", name): start for path, start in names.items()}
     if there := [str(path) for path in paths if path.exists()]:
         fail(f"{', '.join(there)}: there is such a file already, and none is replaced")
+    if "NAME.py" in names and (taken := _taken(name)):
+        fail(f"{name} is the name of {taken}: take another name, because both cannot be imported")
     with failing(OSError):
         for path, start in paths.items():
             text = (files("neusee.workflows.cli") / "starts" / start).read_text(encoding="utf-8")
@@ -77,3 +80,16 @@ def new(
     place = [] if folder == Path() else [f"  cd {folder}"]
     written = [f"written  {path}" for path in paths]
     say([*written, "", "next", *place, *(f"  {command.replace('NAME', name)}" for command in commands)])
+
+
+def _taken(name: str) -> str:
+    """Return what has the name of a new module already: a family of neusee or a module elsewhere; no text if none."""
+    if (files("neusee") / "nodes" / name).is_dir():
+        return f"the family {name} of neusee"
+    try:
+        spec = find_spec(name)
+    except (ImportError, ValueError):
+        return ""
+    if spec is None or (spec.origin and Path(spec.origin).resolve().is_relative_to(Path.cwd())):
+        return ""
+    return f"a module of Python or of an installed package ({spec.origin or name})"

@@ -37,11 +37,12 @@ def check_signature(node: Node) -> Iterator[Finding]:
         names = inspect.signature(node.fn).parameters
         bare = [name for name in names if name not in node.hints and name != "rng"]
         bare += [] if "return" in node.hints else ["the result"]
-        fields = list(node.params.model_fields)
+        fields = [] if bare else list(node.params.model_fields)
     except Exception as error:
         yield Finding("signature", False, f"an annotation cannot be read: {type(error).__name__}: {error}")
         return
-    text = f"without an annotation: {', '.join(bare)}" if bare else f"{len(fields)} parameters, all annotated"
+    count = f"{len(fields)} parameter{'s' * (len(fields) != 1)}"
+    text = f"without an annotation: {', '.join(bare)}" if bare else f"{count}, all annotated"
     yield Finding("signature", not bare, text)
 
 

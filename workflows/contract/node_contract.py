@@ -68,6 +68,10 @@ def _call(node: Node, example: Mapping[str, Any] | None) -> Call | Finding:
         name = node.fn.__name__
         return Finding("example", False, f"none: attach a function with @{name}.example that returns its arguments")
     try:
+        validated = node.params
+    except Exception:
+        return Finding("example", False, "not tried: the parameters cannot be validated, see the rule signature")
+    try:
         given = dict(node.hooks.example() if example is None and node.hooks.example else example or {})
     except Exception as error:
         return Finding("example", False, f"the example raises {type(error).__name__}: {error}")
@@ -76,10 +80,11 @@ def _call(node: Node, example: Mapping[str, Any] | None) -> Call | Finding:
     if missing:
         return Finding("example", False, f"lacks the inputs {', '.join(missing)}")
     try:
-        params = {name: value for name, value in node.params(**given)}
+        params = {name: value for name, value in validated(**given)}
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        return Finding("example", False, f"{'.'.join(map(str, first['loc']))}: {first['msg']}")
+        text = first["msg"].removeprefix("Value error, ")
+        return Finding("example", False, f"{'.'.join(map(str, first['loc']))}: {text}")
     return Call(node, inputs, params)
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import inspect
 import itertools
 import math
+import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -23,6 +24,7 @@ from neusee.workflows.store.stored_types import fits
 
 _SEED = 2026
 _FEW = 8  #: numbers of a tensor whose values a rule for shapes may read
+_SLOPES = re.compile(r"numerical:\s*(?:tensor\()?([^\s,)]+).*?analytical:\s*(?:tensor\()?([^\s,)]+)", re.DOTALL)
 _STEP, _ATOL, _RTOL = 1e-5, 1e-4, 1e-3  #: of the comparison of gradients, relative to the scale of input and result
 
 
@@ -68,8 +70,12 @@ def check_reference(call: Call) -> Iterator[Finding]:
     if node.hooks.approximation_error is not None:
         return  # factors of a cheaper form, of which many have the same product
     rng = {"rng": torch.Generator().manual_seed(_SEED)} if node.random else {}
-    slow = node.hooks.reference(*call.inputs, **call.params, **rng)
-    error = max(map(_off, tensors_in(call.result()), tensors_in(slow)), default=0.0)
+    found, slow = tensors_in(call.result()), tensors_in(node.hooks.reference(*call.inputs, **call.params, **rng))
+    if [x.shape for x in found] != [x.shape for x in slow]:
+        shapes = [_shapes(tensors) or "no tensor" for tensors in (found, slow)]
+        yield Finding("reference", False, f"the result is {shapes[0]}, the reference {shapes[1]}")
+        return
+    error = max(map(_off, found, slow), default=0.0)
     ok = error <= node.rtol
     yield Finding("reference", ok, f"off by {error:.2g} of the largest value; rtol = {node.rtol:.2g}")
 
@@ -93,14 +99,28 @@ def check_gradient(call: Call) -> Iterator[Finding]:
                 warnings.simplefilter("ignore")  # a node may read a number of a tensor without a slope
                 if not any(y.requires_grad for y in function(zero)):
                     continue
-            try:
-                gradcheck(function, (zero,), eps=_STEP, atol=_ATOL, rtol=_RTOL, fast_mode=True)
-            except GradcheckError as error:
-                yield Finding("gradient", False, f"with respect to {name}: {' '.join(str(error).split())[:200]}")
+            if fault := _slope_fault(function, zero):
+                yield Finding("gradient", False, f"with respect to {name}: {fault}")
                 return
             followed.append(name)
     if followed:
         yield Finding("gradient", True, f"as finite differences, with respect to {', '.join(dict.fromkeys(followed))}")
+
+
+def _slope_fault(function: Callable[[Tensor], tuple[Tensor, ...]], zero: Tensor) -> str:
+    """Return what is wrong with the slopes of a function at ``zero``; no text if they are those of differences."""
+    results = [y for y in function(zero) if y.requires_grad]
+    slope = torch.autograd.grad(results, zero, [torch.ones_like(y) for y in results])[0]
+    if bad := int((~slope.isfinite()).sum()):
+        return f"NaN or infinite for {bad} of {slope.numel()} values: see where a root, a logarithm or a quotient is 0"
+    try:
+        gradcheck(function, (zero,), eps=_STEP, atol=_ATOL, rtol=_RTOL, fast_mode=True)
+    except GradcheckError as error:
+        both = _SLOPES.search(str(error))
+        if both is None:
+            return " ".join(str(error).split())
+        return f"along a drawn direction the slope is {both[2]}, but by finite differences {both[1]}"
+    return ""
 
 
 def check_bands(call: Call) -> Iterator[Finding]:
@@ -185,8 +205,6 @@ def _first_band(value: Any, axis: int) -> Any:
 
 def _off(found: Tensor, wanted: Tensor) -> float:
     """Return the largest difference of two tensors relative to the largest wanted value."""
-    if found.shape != wanted.shape:
-        return math.inf
     if found.numel() == 0:
         return 0.0
     wide = torch.complex128 if wanted.is_complex() else torch.float64

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import importlib
 import importlib.util
+import inspect
 import pkgutil
 import re
 import sys
@@ -46,7 +47,7 @@ def find_node(name: str, own: Own = _NO_OWN) -> Node:
     if attribute not in nodes:
         hint = nearest(attribute, nodes).replace("did you mean ", f"did you mean {family}.")
         raise LookupError(f"no node {name}; {_elsewhere(attribute, own) or hint}")
-    return nodes[attribute]
+    return nodes[attribute] if _is_ours(family) else _with_parameters(nodes[attribute])
 
 
 def families(own: Own = _NO_OWN) -> list[str]:
@@ -104,6 +105,11 @@ def class_context(own: Own) -> dict[str, Any]:
     return {FAMILY: functools.partial(module_of, own=own)}
 
 
+def installed_as(module: str) -> str | None:
+    """Return the family that an installed package makes of a module; None if no package makes one."""
+    return next((family for family, points in _installed().items() if points[0].value == module), None)
+
+
 def family_title(family: str, own: Own = _NO_OWN) -> str:
     """Return the first line of the docstring of a family's module; raise `LookupError` as `nodes_of` does."""
     if family in own:
@@ -153,8 +159,33 @@ def import_own(where: str, folder: Path) -> ModuleType:
             beside = f"; write ./{where} for the folder" if path.is_dir() else ""
             raise LookupError(f"no module {where} is installed{beside}") from None
         raise LookupError(_failure(where, error)) from None
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise LookupError(_failure(where, error)) from None
+
+
+def _with_parameters(node: Node) -> Node:
+    """Return a node of a user; raise `LookupError` with the place of one whose parameters cannot be validated."""
+    code = inspect.unwrap(node.fn).__code__
+    place, name = f"{Path(code.co_filename).name}:{code.co_firstlineno}", node.fn.__name__
+    try:
+        if bare := unannotated(node):
+            raise LookupError(
+                f"{place}: {name} does not say what {bare[0]} is: write a type such as `{bare[0]}: float`, or a unit "
+                f"of neusee.nodes.units"
+            )
+        assert node.params
+    except LookupError:
+        raise
+    except Exception as error:
+        text = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        raise LookupError(f"{place}: the annotations of {name} cannot be read: {text}") from None
+    return node
+
+
+def unannotated(node: Node) -> list[str]:
+    """Return the names of the parameters of a node that have no annotation."""
+    given = inspect.signature(node.fn).parameters.values()
+    return [p.name for p in given if p.kind is p.KEYWORD_ONLY and p.name != "rng" and p.name not in node.hints]
 
 
 def _failure(where: str, error: BaseException) -> str:
@@ -203,7 +234,7 @@ def _load(family: str) -> ModuleType:
     module, place = points[0].value, points[0].dist.name if points[0].dist else points[0].value
     try:
         return importlib.import_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise LookupError(f"{family} of the installed package {place} fails: {_failure(module, error)}") from None
 
 

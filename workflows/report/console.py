@@ -30,7 +30,7 @@ Mode = Literal["silent", "plain", "live"]
 _STYLES = {"run": "bold", "cached": "cyan", "left out": "dim", "failed": "red"}  #: by state
 
 HEADER = ("step", "where", "state", "seconds", "output", "check")
-_WIDTHS = (5, 10, 9, 28, 0)  #: of the columns after the first
+_WIDTHS = (5, 19, 9, 28, 0)  #: of the columns after the first
 
 
 @dataclass
@@ -66,7 +66,7 @@ class Family:
 
     def state(self) -> str:
         """Return the common state of all copies of a step, such as ``run``, or the number of copies in each state."""
-        states = Counter(str(d.state) for d in self.needed)
+        states = Counter(str(d.state) for d in self.done)
         return "".join(states) if len(states) == 1 else ", ".join(f"{n} {s}" for s, n in states.items())
 
 
@@ -177,7 +177,8 @@ class RunTable(ProgressTable):
         if (left := sum(self._left.values())) >= 1:
             return f"about {lasts(left)} left, as earlier runs took"
         count = sum(d.state == "not needed" for f in self.families.values() for d in f.done)
-        return f"{count} steps were not needed: the results that need them are in the cache" if count else ""
+        steps = "1 step was" if count == 1 else f"{count} steps were"
+        return f"{steps} not needed: the results that need them are in the cache" if count else ""
 
 
 def families(recipe: Recipe, names: Iterable[str]) -> dict[str, Family]:
@@ -275,7 +276,7 @@ def next_commands(recipe: Recipe, words: Sequence[str], works: Callable[[Sequenc
     noise = "sensor.read_noise"
     changed = {
         "only what follows is run": _with(words, f"{noise}=20 e-") if noise in recipe.config.settings else [],
-        "another mask": _with(words, "doe=vortex") if "height" in recipe.steps else [],
+        "another mask": _with(words, f"doe={_another_mask(recipe)}") if "height" in recipe.steps else [],
     }
     tried = {what: again for what, again in changed.items() if again and works(again)}
     shown = [[shlex.join(["neusee", "run", *again]), f"# {what}"] for what, again in tried.items()]
@@ -285,6 +286,10 @@ def next_commands(recipe: Recipe, words: Sequence[str], works: Callable[[Sequenc
         ["neusee recipes", "# what else there is"],
     ]
     return columns(shown[:3], gap="   ")
+
+
+def _another_mask(recipe: Recipe) -> str:
+    return "axicon" if recipe.steps["height"].node.path == "doe.vortex" else "vortex"
 
 
 def _with(words: Sequence[str], change: str) -> list[str]:

@@ -48,6 +48,9 @@ def test_nothing_is_replaced(tmp_path):
         (["node", "my-node"], "my-node is no name: use small letters, digits and _"),
         (["node", "class"], "class is no name"),
         (["node", "../mine"], "../mine is no name"),
+        (["node", "torch"], "torch is the name of a module of Python or of an installed package"),
+        (["network", "json"], "json is the name of a module of Python"),
+        (["mask", "optics"], "optics is the name of the family optics of neusee"),
     ],
 )
 def test_a_wrong_word_is_said(words, message, tmp_path):

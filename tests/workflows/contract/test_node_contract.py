@@ -1,6 +1,7 @@
 """The contract of a node finds what is wrong with a node of a user, and the nodes of neusee keep it."""
 
 import json
+import re
 import sys
 from importlib.resources import files
 from pathlib import Path
@@ -80,6 +81,47 @@ FAULTS = {
 def test_a_planted_fault_breaks_its_rule(made, rule):
     found = made(f"fault_{rule.replace(' ', '_')}", *FAULTS[rule])
     assert found[rule].ok is False, found[rule].text
+
+
+LOGARITHM = (
+    "    excess = torch.where(charge > full_well, torch.log(charge - full_well).exp(), 0) * spill\n    return charge"
+)
+TEXTS = {
+    "gradient": ("    return charge", LOGARITHM, "with respect to charge: NaN or infinite for "),
+    "reference": (
+        "    return charge - excess",
+        "    excess = excess[:, 1:]\n    return charge[:, 1:] - excess",
+        "the result is 3 x 15 x 16, the reference 3 x 16 x 16",
+    ),
+    "example": (
+        '"full_well": "25500 e-"',
+        '"full_well": "25500 um"',
+        "full_well: has the wrong unit 'um': write one of",
+    ),
+    "signature": ("spill: float = 0.5) ->", "spill=0.5) ->", "without an annotation: spill"),
+}
+
+
+@pytest.mark.parametrize("rule", TEXTS)
+def test_a_fault_is_said_in_words_of_its_own(made, rule):
+    old, new, text = TEXTS[rule]
+    found = made(f"text_{rule}", (old, new))[rule]
+    assert found.ok is False
+    assert found.text.startswith(text)
+
+
+def test_a_wrong_slope_is_said_with_both_numbers(made):
+    found = made("text_slope", *FAULTS["gradient"])["gradient"].text
+    assert re.fullmatch(
+        r"with respect to charge: along a drawn direction the slope is [-\d.e+]+, but by finite differences [-\d.e+]+",
+        found,
+    )
+
+
+def test_a_reference_that_returns_nothing_agrees_with_no_result(made):
+    found = made("text_nothing", ("    return torch.stack(each, -2)", "    torch.stack(each, -2)"))["reference"]
+    assert found.ok is False
+    assert found.text.endswith("the reference no tensor")
 
 
 def test_a_node_without_a_reference_or_an_example_is_told_how_to_attach_one(made):

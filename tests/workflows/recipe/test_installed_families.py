@@ -74,6 +74,24 @@ def test_two_packages_with_one_family_are_named(install, write, tmp_path):
     assert problem.endswith("kit_one and kit_two both install a family of nodes gauge: uninstall one")
 
 
+def test_check_takes_the_module_of_a_family_that_is_called_as_its_package(install, write):
+    install("labpack", "labpack", GOOD)
+    write("[neusee.nodes]\nlabpack = labpack.nodes\n", "site-packages/labpack-1.0.dist-info/entry_points.txt")
+    (write("", "site-packages/labpack.py")).unlink()
+    network = "from torch import nn\n\n\nclass Small(nn.Module):\n"
+    network += '    """A network."""\n\n    def forward(self, x):\n        return x\n'
+    write("", "site-packages/labpack/__init__.py")
+    write(GOOD + network, "site-packages/labpack/nodes.py")
+    for place in ("labpack.nodes", "labpack", "labpack.double"):
+        found = CliRunner().invoke(app, ["check", place])
+        assert found.exit_code == 3, found.output
+        assert found.output.startswith("labpack.double\n")
+        assert ("labpack.Small\n" in found.output) == (place != "labpack.double")
+    unknown = CliRunner().invoke(app, ["check", "labpack.duoble"])
+    assert unknown.exit_code == 2
+    assert "did you mean labpack.double?" in unknown.output
+
+
 def test_a_package_cannot_replace_a_family_of_neusee(install):
     install("optics_kit", "optics", GOOD)
     assert "double" not in node_families.nodes_of("optics")

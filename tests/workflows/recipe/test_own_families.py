@@ -151,6 +151,7 @@ BAD = {
     "[empty_c.py]": "empty_c defines no node: decorate a function with @node() of neusee.nodes",
     "[math]": "math defines no node",
     "[a-b.py]": f"a-b.py {FAILS}a-b is not the name of a module: use letters, digits and _",
+    "[exits_c.py]": f"exits_c.py {FAILS}exits_c.py:2: SystemExit: 0",
     "[lacks_c.py]": f"lacks_c.py {FAILS}lacks_c.py:1: ModuleNotFoundError: No module named 'none_such_at_all'",
 }
 
@@ -164,12 +165,28 @@ def test_a_mistake_is_located_once_and_hides_what_follows_from_it(write, tmp_pat
     write("def (\n", "syntax_c.py")
     write("x = 1\n", "empty_c.py")
     write("import none_such_at_all\n", "lacks_c.py")
+    write("import sys\nsys.exit(0)\n", "exits_c.py")
     write(f"nodes: {nodes}\noutputs: [b]\nsteps: {{b: {{node: bloomy.f}}}}\n")
     found = problems("mine.yaml", (), tmp_path)
     assert len(found) == 1
     mark, _, message = found[0].split(" | ")
     assert mark.startswith("mine.yaml:1:")
     assert message.startswith(problem)
+
+
+@pytest.mark.parametrize(
+    ("annotation", "problem"),
+    [
+        ("by=1.0", "tilt_d.py:5: tilt does not say what by is: write a type such as `by: float`, or a unit"),
+        ("by: 'None_such' = 1", "tilt_d.py:5: the annotations of tilt cannot be read: NameError: name 'None_such'"),
+    ],
+)
+def test_a_parameter_without_a_type_is_located_at_its_function(write, tmp_path, annotation, problem):
+    code = "from torch import Tensor\nfrom neusee.nodes import node\n\n\n@node()\n"
+    write(f'{code}def tilt(x: Tensor, *, {annotation}) -> Tensor:\n    """Tilt."""\n    return x\n', "tilt_d.py")
+    write("nodes: [tilt_d.py]\n" + USES.format("tilt_d.tilt"))
+    [found] = problems("mine.yaml", (), tmp_path)
+    assert found.startswith(f"mine.yaml:5:13 | steps.b.node | {problem}")
 
 
 def test_a_helper_of_another_folder_is_not_taken_for_the_one_beside(write, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -45,7 +46,24 @@ def test_items_share_a_line_that_comes_when_the_last_is_done(capsys):
     assert " ".join(out.split()) == "spot ×2 cpu 1 run, 1 cached 0.250 3 × 4 × 5 e- peak 3"
     rest = capsys.readouterr().out
     assert "raw" not in rest
-    assert "1 steps were not needed" in rest
+    assert "1 step was not needed" in rest
+
+
+def test_a_copy_that_was_not_needed_is_not_said_to_have_run(capsys):
+    with console_room.RunTable(recipe(), NAMES, "plain") as shown:
+        shown.watch(done(NAMES[0], "not needed", 0.0))
+        shown.watch(done(NAMES[1], "run"))
+    out = " ".join(capsys.readouterr().out.split())
+    assert "spot ×2 cpu 1 not needed, 1 run 0.250" in out
+
+
+@pytest.mark.parametrize(("there", "suggested"), [("doe.vortex", "axicon"), ("doe.half_rings", "vortex")])
+def test_the_mask_to_try_next_is_not_the_mask_of_the_run(there, suggested):
+    made = SimpleNamespace(
+        config=SimpleNamespace(settings={}), steps={"height": SimpleNamespace(node=SimpleNamespace(path=there))}
+    )
+    first = console_room.next_commands(made, ["first_light", "doe=x"], lambda words: True)[0]
+    assert first.split("#")[0].split() == ["neusee", "run", "first_light", f"doe={suggested}"]
 
 
 def test_a_check_that_does_not_hold_is_shown_of_all_items(capsys):
