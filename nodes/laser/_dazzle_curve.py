@@ -49,7 +49,7 @@ def dazzle_curve(
     weights = bands.weights.double() * bands.centres.double()  # photons of each wavelength, whose wells they fill
     light = torch.zeros(psf.intensity[0].numel(), dtype=torch.float64, device=psf.intensity.device)
     for weight, band in zip(weights.tolist(), psf.intensity.detach(), strict=True):
-        light += weight * band.flatten().double()
+        light = light + weight * band.flatten().double()
     peak = float((weights * psf.clear_peak.detach().cpu()).sum())
     at = torch.tensor(strengths, dtype=torch.float64)
     ordered = light.sort().values.cpu()
