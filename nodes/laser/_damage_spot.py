@@ -142,7 +142,7 @@ def laws_before(line: Bands, light: LaserLight | None, **params: Any) -> tuple[D
 
 def exposed(spot: Tensor, light: LaserLight | None, law: DamageLaw, exposure: float) -> Tensor:
     """Return the irradiance in W/m2, or the fluence of one pulse in J/m2, of each pixel (y, x) of a laser spot."""
-    image = spot.detach().double().sum(0)
+    image = spot.detach().sum(0, dtype=torch.float64)
     if law.quantity == "irradiance":
         return image
     if light is None or not float(light.pulse_fluence) > 0:  # a laser that is given by its strength

@@ -47,7 +47,9 @@ def dazzle_curve(
     Source: Born and Wolf, Principles of Optics, 7th ed., section 8.5.2 (the Airy pattern and its far rings).
     """
     weights = bands.weights.double() * bands.centres.double()  # photons of each wavelength, whose wells they fill
-    light = torch.tensordot(weights.to(psf.intensity.device), psf.intensity.detach().double(), 1).flatten()
+    light = torch.zeros(psf.intensity[0].numel(), dtype=torch.float64, device=psf.intensity.device)
+    for weight, band in zip(weights.tolist(), psf.intensity.detach(), strict=True):
+        light = light + weight * band.flatten().double()
     peak = float((weights * psf.clear_peak.detach().cpu()).sum())
     at = torch.tensor(strengths, dtype=torch.float64)
     ordered = light.sort().values.cpu()

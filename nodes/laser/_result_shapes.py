@@ -54,4 +54,4 @@ def _(psf: Psf, bands: Bands, *, strengths: tuple[float, ...] = DECADES, **param
 @dazzle_curve.work
 def _(result: DazzleCurve, psf: Psf, *inputs: Any, **params: Any) -> tuple[float, float]:
     pixels = float(psf.intensity[0].numel())
-    return 8.0 * psf.intensity.numel() + 32 * pixels, 2.0 * psf.intensity.numel() + 20 * pixels
+    return 40.0 * pixels, 2.0 * psf.intensity.numel() + 20 * pixels
