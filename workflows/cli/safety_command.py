@@ -30,9 +30,9 @@ def safety(
     from neusee.workflows.safety.safety_text import lines
 
     with refusing(), failing(RunError, code=FAILED):
-        found, folder, document = assess(recipe, store, out, command)
+        folder, found = assess(recipe, store, out, command)
     page = folder / "report.html"
     if as_json:
-        say_json({"report": str(page), **document})
+        say_json({"report": str(page), **found.document})
     else:
-        say([str(page)] if quiet else [*lines(found), "", f"page   {page}"])
+        say([str(page)] if quiet else [*lines(found.paragraphs), "", f"page   {page}"])

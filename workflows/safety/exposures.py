@@ -105,8 +105,11 @@ def _column(draws: SettingDraws, name: str, nominal: float) -> Any:
 def _air(safety: Safety, draws: SettingDraws, at: FloatArray) -> FloatArray:
     """Return the transmittance of the air (1 + draw, distance), from that of one metre: even air has equal metres."""
     laser = safety.laser
+    if laser.air_transmittance is not None:
+        whole = draws.column("laser.air_transmittance", laser.air_transmittance)[:, None]
+        return np.asarray(np.power(whole, at / laser.distance), np.float64)
     if laser.visibility is None:
-        return np.ones((1 + draws.count, len(at)))
+        return np.ones((1, 1))
     visible = _column(draws, "laser.visibility", laser.visibility)[:, 0].tolist()
     known = {v: air_transmittance(1.0, v, laser.wavelength, laser.haze) for v in set(visible)}
     return np.asarray(np.power(np.array([known[v] for v in visible])[:, None], at), np.float64)

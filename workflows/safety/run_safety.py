@@ -3,30 +3,83 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.report.study_folder import StudyRun
-from neusee.workflows.safety.safety_estimate import CERTIFICATE, Estimate, Finding, estimate
+from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.report.study_folder import StudyReport, StudyRun
+from neusee.workflows.report.study_page import Section
+from neusee.workflows.safety.safety_estimate import CERTIFICATE, Estimate, Finding, Prepared, complete, prepare
 from neusee.workflows.safety.safety_page import report
+from neusee.workflows.safety.safety_text import paragraphs
+from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 
 
-def assess(
-    recipe: Recipe, store: Store | None, out: Path, command: Sequence[str]
-) -> tuple[Estimate, Path, dict[str, Any]]:
-    """Estimate damage, dazzle and eye exposure, write the folder, and return estimate, folder and document.
+@dataclass(frozen=True)
+class Assessment:
+    """A finished estimate as the store keeps it: its document, its text for a terminal, and its page with pictures."""
+
+    document: dict[str, Any]
+    paragraphs: list[list[str]]
+    title: str
+    lead: str
+    sections: list[dict[str, Any]]  #: as `Section`, with the marks as a list of row, column and mark
+    pictures: dict[str, bytes]
+    rows: list[list[Any]]  #: of limits.csv, the header first
+
+    @property
+    def report(self) -> StudyReport:
+        """Return the page of the estimate with its files."""
+        sections = [
+            Section(**{**each, "marks": {(row, column): mark for row, column, mark in each["marks"]}})
+            for each in self.sections
+        ]
+        return StudyReport(
+            self.title, self.lead, sections, self.pictures, {"limits.csv": (self.rows[0], self.rows[1:])}
+        )
+
+
+def assess(recipe: Recipe, store: Store, out: Path, command: Sequence[str]) -> tuple[Path, Assessment]:
+    """Estimate damage, dazzle and eye exposure, or take the estimate from the store, and write the folder.
 
     Raises `RecipeError` for a recipe that cannot be estimated, and `RunError` if a step of its mask fails.
     """
     run = StudyRun("safety", recipe, command)
-    found = estimate(recipe, store)
-    content = document(found)
-    folder = run.write(out, digest(recipe.config.to_yaml()), run.document(content), report(found), "safety")
-    return found, folder, content
+    prepared = prepare(recipe, store)
+    key = key_of(recipe, prepared, store)
+    found = compute_once(store, key, Assessment, lambda: _assessed(complete(recipe, prepared)), {"step": "safety"})
+    return run.write(out, key, run.document(found.document), found.report, "safety"), found
+
+
+def key_of(recipe: Recipe, prepared: Prepared, store: Store) -> str:
+    """Return the key of an estimate: values, draws, laws, what the steps say of lens and mask, and the code."""
+    code = Code(store.code_memo)
+    modules = [code.digest(f"neusee.nodes.{family}") for family in ("laser", "sensor")]
+    draws = {name: values.tobytes().hex() for name, values in prepared.draws.values.items()}
+    spots = [(each.option, each.pitch, each.light.tobytes().hex()) for each in prepared.spots]
+    options = [asdict(each) for each in prepared.options]
+    laws = [tuple(law) for law in prepared.safety.laws]
+    values = (recipe.name, recipe.title, recipe.config.to_yaml(), recipe.seed, prepared.safety.settings.draws)
+    key = digest("safety", values, draws, spots, options, laws, modules, engine("safety.run_safety"))
+    code.save()
+    return key
+
+
+def _assessed(found: Estimate) -> Assessment:
+    """Return an estimate as the store keeps it."""
+    page = report(found)
+    pictures = {name: picture for name, picture in page.pictures.items() if picture}
+    header, rows = page.tables["limits.csv"]
+    sections = [
+        {**vars(each), "marks": [[*place, mark] for place, mark in each.marks.items()]} for each in page.sections
+    ]
+    plain = [list(header), *(list(row) for row in rows)]
+    return Assessment(document(found), paragraphs(found), page.title, page.lead, sections, pictures, plain)
 
 
 def document(found: Estimate) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,9 +11,10 @@ from neusee.nodes import ParameterError
 from neusee.nodes.laser import eye_limit, frame_power, nominal_ocular_hazard_distance
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
-from neusee.workflows.graph.recipe_graph import Recipe, unknown_step
+from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.blocks.safety_block import SATURATION, Safety
 from neusee.workflows.recipe.distributions.scalar import FloatArray
+from neusee.workflows.safety.damage_pattern import DamagePattern, Spot, damage_patterns, spots_of, step_of
 from neusee.workflows.safety.distance_zones import QUANTILES, Spread, Zones, zones_of
 from neusee.workflows.safety.exposures import (
     Emission,
@@ -71,6 +72,7 @@ class Estimate:
     findings: tuple[Finding, ...]
     eye: EyeFinding | None
     unsaid: tuple[str, ...]  #: what the estimate does not say, with the reason
+    patterns: tuple[DamagePattern, ...] = ()
 
     @property
     def at(self) -> int:
@@ -84,14 +86,37 @@ def estimate(recipe: Recipe, store: Store | None = None) -> Estimate:
     Raises `RecipeError` for a recipe without the block, for a distribution with values that are not allowed and for a
     step that does not exist, all before anything is computed, and `RunError` if a step of the mask fails.
     """
-    safety = settings_of(recipe)
+    return complete(recipe, prepare(recipe, store))
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Everything that decides an estimate: settings, draws, and what the steps of the recipe say of lens and mask."""
+
+    safety: Safety
+    draws: SettingDraws
+    options: tuple[Option, ...]
+    spots: tuple[Spot, ...]
+
+
+def prepare(recipe: Recipe, store: Store | None) -> Prepared:
+    """Return what decides an estimate, with the errors that `estimate` lists."""
+    safety = _with_stop(recipe, settings_of(recipe), store)
     draws = draw_settings(recipe, safety)
-    options = options_of(safety, _mask_peak(recipe, safety, store))
+    spots = spots_of(recipe, safety, store)
+    return Prepared(safety, draws, options_of(safety, _mask_peak(recipe, safety, store)), spots)
+
+
+def complete(recipe: Recipe, prepared: Prepared) -> Estimate:
+    """Return the estimate from everything that decides it."""
+    safety, draws, options = prepared.safety, prepared.draws, prepared.options
     exposures = compute_exposures(safety, draws, options)
     findings = tuple(_findings(safety, draws, options, exposures))
     eye, faults = _eye(safety, exposures)
     unsaid = (*_unsaid(safety, findings), *faults)
-    return Estimate(recipe, safety, emission_of(safety.laser.beam()), options, draws, exposures, findings, eye, unsaid)
+    patterns = tuple(damage_patterns(prepared.spots, findings))
+    emission = emission_of(safety.laser.beam())
+    return Estimate(recipe, safety, emission, options, draws, exposures, findings, eye, unsaid, patterns)
 
 
 def settings_of(recipe: Recipe) -> Safety:
@@ -102,15 +127,32 @@ def settings_of(recipe: Recipe) -> Safety:
     return recipe.safety
 
 
+def _with_stop(recipe: Recipe, safety: Safety, store: Store | None) -> Safety:
+    """Return the settings with the diameter of the step of the stop, whose grid may be narrower than the lens."""
+    lens = safety.settings.lens
+    if lens.stop is None:
+        return safety
+    step = step_of(recipe, safety, "lens.stop", lens.stop, "")
+    diameter = min(lens.diameter, float(run(recipe, store, [step])[step].diameter))
+    narrowed = lens.model_copy(update={"diameter": diameter})
+    return replace(safety, settings=safety.settings.model_copy(update={"lens": narrowed}))
+
+
 def _mask_peak(recipe: Recipe, safety: Safety, store: Store | None) -> float | None:
-    """Return the largest laser suppression ratio that the step of the mask gives, or None without such a step."""
-    step = safety.settings.protection.mask
-    if step is None:
+    """Return the peak behind the mask over that behind the plain lens, or None without a mask.
+
+    The largest laser suppression ratio of the mask counts. Where the same step has a copy for the plain lens, its ratio
+    divides: a beam that does not fill the lens lowers both.
+    """
+    named = safety.settings.protection.mask
+    if named is None:
         return None
-    if step not in recipe.steps:
-        value = safety.values["protection.mask"]
-        raise RecipeError([Diagnostic(value.mark, value.name, unknown_step(step, recipe.steps))])
-    return float(run(recipe, store, [step])[step].max())
+    step = step_of(recipe, safety, "protection.mask", named, "mask")
+    plain = step.replace("[mask,", "[plain,")
+    if plain == step or plain not in recipe.steps:
+        return float(run(recipe, store, [step])[step].max())
+    found = run(recipe, store, [step, plain])
+    return float(found[step].max() / found[plain].max())
 
 
 def _findings(

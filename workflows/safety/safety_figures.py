@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn
+from neusee.workflows.safety.damage_pattern import DamagePattern
 from neusee.workflows.safety.distance_zones import QUANTILES
 from neusee.workflows.safety.safety_estimate import Estimate, Finding
 
@@ -48,6 +50,23 @@ def _panel(axis: Any, found: Estimate, kind: Any, findings: list[Finding]) -> No
     shown = np.concatenate([curve[0], *(each.curve[0] for each in findings)])
     axis.set_ylim(shown.min() / 5, shown.max() * 5)
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+@drawn
+def spots(patterns: Sequence[DamagePattern]) -> Any:
+    """Draw the exposure on the sensor over the limit of damage, with a line around the area above the limit."""
+    figure, axes = canvas(4.6 * len(patterns), 4.0, 1, len(patterns))
+    for axis, each in zip(axes[0], patterns, strict=True):
+        half = each.width / 2 * 1e6
+        shown = axis.imshow(
+            np.log10(np.maximum(each.ratio, each.peak * 1e-5)), cmap="viridis", extent=(-half, half, -half, half)
+        )
+        if each.area > 0:
+            axis.contour(each.ratio, [1.0], colors="white", linewidths=1.2, extent=(-half, half, half, -half))
+        axis.set(title=f"{each.option}: {each.limit}", xlabel="um", ylabel="um")
+        axis.grid(False)
+        figure.colorbar(shown, ax=axis, label="log10 of exposure over limit", shrink=0.8)
+    return figure
 
 
 @drawn

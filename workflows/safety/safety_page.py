@@ -17,8 +17,11 @@ def report(found: Estimate) -> StudyReport:
     shown = {"irradiance": figures.over_distance(found)}
     if found.findings or found.eye:
         shown["distances"] = figures.zones(found)
+    patterns = found.patterns
+    if patterns:
+        shown["pattern"] = figures.spots(patterns)
     sections = [_limits(found), _distances(found, shown.get("distances")), _curve(shown["irradiance"])]
-    sections += [_eye(found), _unsaid(found), _assumed(found), _sources(found)]
+    sections += [_pattern(found, shown.get("pattern")), _eye(found), _unsaid(found), _assumed(found), _sources(found)]
     return StudyReport(
         f"{found.recipe.name}: damage, dazzle and distance",
         "\n\n".join([CERTIFICATE, found.recipe.title, words.laser_text(found), " ".join(words.verdict(found))]),
@@ -60,6 +63,18 @@ def _curve(picture: bytes) -> Section:
     return Section("Exposure over distance", text, picture=picture)
 
 
+def _pattern(found: Estimate, picture: bytes | None) -> Section | None:
+    if picture is None:
+        return None
+    pitch = found.safety.settings.sensor.pixel_pitch
+    text = f"""The exposure on the sensor at {words.metres(found.safety.laser.distance)} over the limit of the median
+        device, for the law that is named. Inside the white line the limit is exceeded; a pixel is {pitch * 1e6:.3g} um
+        wide. A line, a cross or a lost frame is the damage of the circuits around this spot. {CERTIFICATE}"""
+    rows = [[each.option, each.limit, each.peak, each.area, each.area / (pitch * 1e6) ** 2] for each in found.patterns]
+    columns = ("protection", "limit", "peak over the limit", "area above the limit (um²)", "pixels")
+    return Section("Pattern of damage", text, columns, rows, picture)
+
+
 def _eye(found: Estimate) -> Section | None:
     if found.eye is None:
         return None
@@ -72,11 +87,14 @@ def _unsaid(found: Estimate) -> Section | None:
 
 def _assumed(found: Estimate) -> Section:
     laser = found.safety.laser
-    air = "Clear air." if laser.visibility is None else (
-        f"Air with a visibility of {words.metres(laser.visibility)} by the law of {laser.haze.capitalize()}."
-    )  # fmt: skip
+    air = "Clear air."
+    if laser.air_transmittance is not None:
+        air = f"Air that passes {laser.air_transmittance:g} over {words.metres(laser.distance)}, evenly."
+    elif laser.visibility is not None:
+        air = f"Air with a visibility of {words.metres(laser.visibility)} by the law of {laser.haze.capitalize()}."
     text = f"""The beam is Gaussian, hits the middle of the lens and is in focus at every distance: a camera that is
-        focused elsewhere receives less at the peak. The lens is limited by diffraction and scatters no light. {air}
+        focused elsewhere receives less at the peak. The lens is limited by diffraction and scatters no light: a real
+        lens scatters, and is dazzled from farther away than is said here. {air}
 
         Continuous light stays on one place of the sensor for {found.safety.settings.damage.dwell:g} s. A pulse train
         is compared by each pulse and by its mean; heat that pulses leave behind is not added up. Behind a mask the

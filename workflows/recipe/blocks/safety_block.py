@@ -50,7 +50,8 @@ class Laser(SettingsBlock):
     m_squared: Above | None = None
     convention: Literal["1/e2", "1/e"] = "1/e2"  #: of waist and divergence
     distance: PositiveLength
-    visibility: PositiveLength | None = None  #: None: clear air
+    air_transmittance: Passing | None = None  #: over the whole distance
+    visibility: PositiveLength | None = None  #: None: clear air, unless its transmittance is given
     haze: Literal["kruse", "kim"] = "kim"
 
     def beam(self, values: Mapping[str, float] | None = None) -> Beam:
@@ -59,6 +60,12 @@ class Laser(SettingsBlock):
         given |= {name: value for name, value in (values or {}).items() if name in BEAM}
         return beam(**given, convention=self.convention)
 
+    @model_validator(mode="after")
+    def _has_one_air(self) -> Laser:
+        if self.air_transmittance is not None and self.visibility is not None:
+            raise ValueError("the air is stated twice: leave air_transmittance or visibility out")
+        return self
+
 
 class Lens(SettingsBlock):
     """Lens of the camera: its focal length, its clear diameter and its transmittance."""
@@ -66,14 +73,26 @@ class Lens(SettingsBlock):
     focal_length: PositiveLength
     diameter: PositiveLength
     transmittance: Passing = 1.0
+    stop: str | None = None  #: step that returns the stop; its grid may narrow the diameter
+
+
+class Spots(SettingsBlock):
+    """Steps that return the PSFs of the pattern of damage, at the wavelength of the laser.
+
+    ``laser_psf`` means ``laser_psf[plain,pointer]`` and ``laser_psf[mask,pointer]`` for the laser ``pointer``.
+    """
+
+    plain: str | None = None
+    mask: str | None = None
 
 
 class Protection(SettingsBlock):
     """Protections beside the plain lens: the mask of the recipe, a grey filter and a smaller stop."""
 
-    mask: str | None = None  #: step that returns the laser suppression ratio (LSR) at the wavelength of the laser
+    mask: str | None = None  #: step of the laser suppression ratio (LSR) at the wavelength of the laser, as in `Spots`
     filter: Passing | None = None  #: transmittance
     stop: PositiveLength | None = None  #: diameter
+    spots: Spots = Spots()
 
 
 class SensorFacts(SettingsBlock):

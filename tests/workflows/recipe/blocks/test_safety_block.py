@@ -69,13 +69,25 @@ def test_a_recipe_without_the_block_says_what_to_add():
 def test_a_mask_that_is_no_step_is_found_before_anything_runs():
     from neusee.workflows.safety.safety_estimate import estimate
 
-    with pytest.raises(RecipeError, match=r"safety\.protection\.mask +no output laser_lsr: this recipe has laser_lsr"):
-        estimate(load("safety_pointer", ["safety.protection.mask=laser_lsr"]))
+    with pytest.raises(RecipeError, match=r"safety\.protection\.mask +no step 'lsr'"):
+        estimate(load("safety_pointer", ["safety.protection.mask=lsr"]))
 
 
 def test_null_is_no_estimate_and_a_run_needs_no_block():
     assert load("safety_pointer", ["safety=null", "lasers.pointer={wavelength: 532 nm}"]).safety is None
     assert load("laser_free").safety is None
+
+
+def test_the_questions_are_added_to_a_camera_and_its_stop_narrows_the_lens():
+    from neusee.workflows.safety.safety_estimate import prepare
+
+    changes = ["laser=pointer", "+safety=camera", "safety.protection.mask=null"]
+    recipe = load("first_light", changes)
+    assert (recipe.safety.settings.lens.diameter, recipe.safety.settings.lens.transmittance) == (11e-3, 1.0)
+    assert recipe.safety.settings.sensor.full_well == 25500
+    assert prepare(recipe, None).safety.settings.lens.diameter == pytest.approx(540 * 14.96e-6)
+    with pytest.raises(RecipeError, match=r"lasers\.green +needs distance"):
+        load("first_light", ["+safety=camera"])
 
 
 def test_a_value_knows_where_a_reference_leads():
