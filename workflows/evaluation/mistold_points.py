@@ -17,7 +17,7 @@ from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
 from neusee.workflows.report.study_folder import Progress
 
 
-def mistold_points(
+def told_with_errors(
     bench: EvaluationPoints,
     each: Sequence[PipelineRecipes],
     shown: Sequence[Scene],

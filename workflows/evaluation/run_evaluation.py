@@ -22,7 +22,7 @@ from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, Poin
 from neusee.workflows.evaluation.evaluation_result import EvaluationResult
 from neusee.workflows.evaluation.evaluation_scenes import Scene, refuse_directions, scenes
 from neusee.workflows.evaluation.mask_optics import masks
-from neusee.workflows.evaluation.mistold_points import mistold_points, mistold_rows
+from neusee.workflows.evaluation.mistold_points import mistold_rows, told_with_errors
 from neusee.workflows.evaluation.pipelines import (
     NONE,
     EvaluationRefused,
@@ -80,7 +80,7 @@ def evaluate(
     _report_broken(broken, progress)
     bench = EvaluationPoints(store, small, device)
     points = _points(bench, each, shown, strengths, progress)
-    mistold = mistold_points(bench, each, shown, strengths, progress)
+    mistold = told_with_errors(bench, each, shown, strengths, progress)
     optics = masks(each, store, device, points)
     drawn = panels(bench, each, shown[0], strengths)
     tables = {name: metric_table(own, strengths) for name, own in points.items()}

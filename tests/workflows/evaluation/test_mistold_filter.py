@@ -10,7 +10,7 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
 from neusee.workflows.evaluation.evaluation_scenes import scenes
 from neusee.workflows.evaluation.mistold_filter import TOLD, errors_of, mistold
-from neusee.workflows.evaluation.mistold_points import mistold_points
+from neusee.workflows.evaluation.mistold_points import told_with_errors
 from neusee.workflows.evaluation.pipelines import compose_pipelines, read_pipelines
 from neusee.workflows.evaluation.run_evaluation import evaluate
 from neusee.workflows.graph.diagnostics import RecipeError
@@ -37,23 +37,26 @@ def green(*more):
     return load("first_light", [*SMALL, f"lasers={{beam: {{{line}}}}}", *more])
 
 
+BY_HAND = {
+    "direction 0.5 px off": f"lasers.beam.angle=[{1e-4 + HALF!r} rad, {2e-4 + HALF!r} rad]",
+    "wavelength 2 nm off": "lasers.beam.wavelength=534 nm",
+    "defocus 0.1 waves off": "optics.defocus=0.1 waves",
+}
+
+
+@pytest.mark.slow
 def test_the_camera_stays_and_the_filter_is_told_what_another_camera_would_know(store):
     """Each error is that of a recipe written by hand with this parameter, of which only the knowledge is taken."""
     recipe = green()
     errors = errors_of(recipe, Mismatch())
-    assert list(errors) == ["direction 0.5 px off", "wavelength 2 nm off", "defocus 0.1 waves off"]
-    by_hand = {
-        "direction 0.5 px off": [f"lasers.beam.angle=[{1e-4 + HALF!r} rad, {2e-4 + HALF!r} rad]"],
-        "wavelength 2 nm off": ["lasers.beam.wavelength=534 nm"],
-        "defocus 0.1 waves off": ["optics.defocus=0.1 waves"],
-    }
+    assert list(errors) == list(BY_HAND)
     true = run(recipe, store, ["raw[mask]", "restored"])
     for text, error in errors.items():
         wrong = mistold(recipe, error)
         names = {wire for wire in wrong.steps["deconvolved"].sources if wire.startswith(TOLD)}
         assert names == ({f"{TOLD}psf[mask]"} if "defocus" in text else set()) | {f"{TOLD}laser_photons[mask,beam]"}
         found = run(wrong, store, ["raw[mask]", "restored", *names])
-        other = run(green(*by_hand[text]), store, [name.removeprefix(TOLD) for name in names])
+        other = run(green(BY_HAND[text]), store, [name.removeprefix(TOLD) for name in names])
         assert bool((found["raw[mask]"] == true["raw[mask]"]).all())
         assert not bool((found["restored"] == true["restored"]).all())
         for name in names:
@@ -77,12 +80,28 @@ def test_who_knows_nothing_cannot_be_told_wrongly():
     assert errors_of(recipe, Mismatch()) == {}
 
 
+def test_what_is_copied_is_what_the_error_changes():
+    """And no more: the raw picture, its true glare and its colour keep their steps."""
+    recipe = green()
+    for text, error in errors_of(recipe, Mismatch()).items():
+        wrong = mistold(recipe, error)
+        copies = {name.removeprefix(TOLD).partition("[")[0] for name in wrong.steps if name.startswith(TOLD)}
+        glare = {"laser_psf", "spot", "laser_photons"}
+        line = {"line", "laser_index", "laser_pupil", "laser_responses"}
+        own = {"direction": {"direction"}, "wavelength": line, "defocus": {"pupil", "psf", "laser_pupil"}}
+        assert copies == glare | own[text.partition(" ")[0]]
+        assert {name: step for name, step in wrong.steps.items() if name in recipe.steps and name != "deconvolved"} == {
+            name: step for name, step in recipe.steps.items() if name != "deconvolved"
+        }
+
+
+@pytest.mark.slow
 def test_points_are_those_of_the_recipe_with_the_error(store):
     """The direction that a scene draws, moved by half a pixel, and the strength of the point."""
     (pipeline,) = composed("flat+wiener", "+evaluate.mismatch={wavelength: 0 nm, defocus: 0 waves, scenes: 1}")
     shown, _ = scenes(load("first_light", SMALL), store, None, 2)
     bench = EvaluationPoints(store, 16)
-    (found,) = mistold_points(bench, [pipeline], shown, (0.0, 1e5), lambda _: None)
+    (found,) = told_with_errors(bench, [pipeline], shown, (0.0, 1e5), lambda _: None)
     assert found.true == bench.point(pipeline, PointRequest(shown[0], 1e5))
     assert found.wrong["psnr"] != found.true["psnr"]
     angle = shown[0].angle(pipeline.recipe("violet"))
@@ -93,6 +112,7 @@ def test_points_are_those_of_the_recipe_with_the_error(store):
     assert found.wrong["psnr"] == pytest.approx(float(expected.psnr), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_an_evaluation_has_the_rows_and_a_recipe_can_leave_them_out(store, tmp_path):
     run_it = {"count": 1, "strengths": [1e4], "store": store, "runs": tmp_path, "folder": HERE}
     lines = read_pipelines("flat+none, flat+wiener", HERE)

@@ -8,7 +8,7 @@ import pytest
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.recipe import loading
-from neusee.workflows.recipe.blocks import train_block, train_lift_block
+from neusee.workflows.recipe.blocks import evaluate_block, train_block, train_lift_block
 from neusee.workflows.recipe.loading import groups, load, recipes
 from neusee.workflows.recipe.text.yaml_values import parse
 from neusee.workflows.store.result_store import Store
@@ -306,4 +306,4 @@ def test_the_settings_of_trainings_are_imported_for_recipes_that_have_one():
     ]
     assert "neusee.workflows.recipe.wiring" in tops
     assert not [name for name in tops if ".blocks" in name]
-    assert loading.TRAININGS == (train_block.KEY, train_lift_block.KEY)
+    assert loading.BLOCKS == (train_block.KEY, train_lift_block.KEY, evaluate_block.KEY)

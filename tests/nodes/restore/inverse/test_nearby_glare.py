@@ -33,13 +33,13 @@ def drawn(count=6, **how):
 
 
 def test_each_pattern_is_that_of_its_direction_wavelength_and_focus():
-    laws = {"pixels": 1.5, "wavelength": 4e-9, "defocus": 0.3}
+    laws = {"pixels": 1.5, "wavelength": 4e-9, "defocus": 0.1}
     numbers = _nearby_glare._normal(6, torch.Generator().manual_seed(2)).tolist()
     for found, (y, x, longer, further) in zip(drawn(**laws), numbers, strict=True):
         towards = DIRECTION + 1.5 * 2.9e-6 / 0.11 * torch.tensor([y, x], dtype=torch.float64)
         line = LINE._replace(centres=LINE.centres + 4e-9 * longer)
-        expected = 3e5 * pattern(towards, line, doe.material(LINE), 0.3 * further)[0]
-        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-3 * float(expected.max()))
+        expected = 3e5 * pattern(towards, line, doe.material(LINE), 0.1 * further)[0]
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=3e-3 * float(expected.max()))
 
 
 def test_without_errors_every_pattern_is_the_glare():

@@ -9,6 +9,7 @@ import torch
 from pydantic import ValidationError
 from safetensors.torch import load_file
 
+from neusee.nodes import losses
 from neusee.workflows import load
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.mask_design import design_page, gradient_descent
@@ -35,6 +36,7 @@ def how(**values):
     return MaskTraining.model_validate({**PROTECTED, **values})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weights", [{"filtered_error": 1}, {"information": 1}], ids=lambda w: next(iter(w)))
 def test_the_loss_falls_and_the_page_has_the_rival(weights, recipe, store, tmp_path, monkeypatch):
     monkeypatch.setattr(design_page, "pictures", lambda *_: {})
@@ -79,6 +81,8 @@ def test_a_law_of_defocus_is_drawn_in_learning_and_averaged_in_the_end(recipe, s
     sharp = float(Terms(recipe, how(), store).parts(height)["filtered_error"])
     points = [float(terms.parts(height, None, number)["filtered_error"]) for number in range(3)]
     assert len(set(points)) == 3
+    exact = losses.filtered_error(terms.psf(height), *terms.seen(), **terms.exposure())
+    assert float(exact) == pytest.approx(_by_numpy(terms, height), abs=1e-6)
     whole = float(terms.parts(height)["filtered_error"])
     assert whole != pytest.approx(sharp, abs=1e-6)
     far = [float(terms._parts(terms.psf(height, None, x), None)["filtered_error"]) for x in (-(3**0.5), 3**0.5)]
