@@ -54,9 +54,12 @@ def recipe():
 
 
 def test_a_step_that_takes_more_than_the_limit_is_stopped_by_name_and_the_finished_work_stays(tmp_path, monkeypatch):
+    seen = []
+
     def look():
+        seen.append(process_memory())  # not the peak of the process: an earlier test may have held more
         LOOKED.set()
-        return process_memory()
+        return seen[-1]
 
     monkeypatch.setattr(memory_watch, "process_memory", look)
     store = Store(tmp_path)
@@ -64,7 +67,7 @@ def test_a_step_that_takes_more_than_the_limit_is_stopped_by_name_and_the_finish
     with pytest.raises(RunError, match=r"b \(.*hoard\): MemoryLimit: the process holds .* the limit is ") as caught:
         run(recipe(), store, memory=limit)
     assert caught.value.step == "b"
-    assert process_peak() < limit + 100 * MB  # of pieces of 20 MB
+    assert limit < max(seen) < limit + 100 * MB  # of pieces of 20 MB
     done = run(recipe(), Store(tmp_path), ("a",)).done
     assert done["a"].state == "cached"
 
