@@ -26,8 +26,8 @@ FORBIDDEN_IN_NODES = {"yaml", "ruamel", "emcee", "typer", "rich", "jinja2", "log
 #: The rooms in order: a file imports its own room and earlier ones.
 ROOMS = (
     "graph", "keys", "recipe.text", "recipe.blocks", "recipe.distributions", "recipe", "store", "placement",
-    "tolerance", "engine", "report.figures", "report", "contract", "explain", "simulation", "comparison", "sweeps",
-    "training.loop",
+    "tolerance", "engine", "report.figures", "report", "contract", "explain", "simulation", "comparison",
+    "protection", "sweeps", "training.loop",
     "training.parallel", "training.mask_design", "training", "training.lift", "evaluation", "calibration", "studies",
     "studies.accuracy", "studies.stability", "studies.leave_out", "studies.uncertainty", "studies.calibration",
     "studies.protection", "api",

@@ -11,14 +11,14 @@ from typer.testing import CliRunner
 from neusee.nodes import metrics
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
+from neusee.workflows.protection import front_optics
+from neusee.workflows.protection.camera_parts import ProtectionCamera
+from neusee.workflows.protection.equal_rivals import MEASURES, Candidate, best, quiet_picture
+from neusee.workflows.protection.front_optics import Front, FrontBench, FrontSettings
+from neusee.workflows.protection.protection_result import LIGHTS
 from neusee.workflows.recipe.distributions.unknown_conditions import draw_conditions, usual_condition
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.protection import front_optics
-from neusee.workflows.studies.protection.camera_parts import NotComparable, ProtectionCamera
-from neusee.workflows.studies.protection.equal_rivals import MEASURES, Candidate, best, quiet_picture
-from neusee.workflows.studies.protection.front_optics import Front, FrontBench, FrontSettings
 from neusee.workflows.studies.protection.protection_page import crossing
-from neusee.workflows.studies.protection.protection_result import LIGHTS
 from neusee.workflows.studies.run_study import study_recipe
 
 SMALL = ["optics.samples=128", "optics.pitch=63.125 um", "optics.bands=3", "optics.window=[64, 64]"]
@@ -161,7 +161,7 @@ def test_the_light_at_which_a_gain_ends():
 )
 def test_an_unsuitable_recipe_is_refused_with_the_fix(recipe, changes, options, said, store, tmp_path):
     words = [] if changes is None else [*changes, *(w for w in SMALL if recipe == "axicon" or "doe." not in w)]
-    with pytest.raises(NotComparable, match=said):
+    with pytest.raises(ValueError, match=said):
         study_recipe("protection", load(recipe, words), store, tmp_path, draws=2, bands=3, **options)
 
 
