@@ -27,7 +27,7 @@ FORBIDDEN_IN_NODES = {"yaml", "ruamel", "emcee", "typer", "rich", "jinja2", "log
 ROOMS = (
     "graph", "keys", "recipe.text", "recipe.blocks", "recipe.distributions", "recipe", "store", "placement",
     "tolerance", "engine", "report.figures", "report", "contract", "explain", "simulation", "comparison", "safety",
-    "sweeps", "training.loop",
+    "protection", "sweeps", "training.loop",
     "training.parallel", "training.mask_design", "training", "training.lift", "evaluation", "calibration", "studies",
     "studies.accuracy", "studies.stability", "studies.leave_out", "studies.uncertainty", "studies.calibration",
     "studies.protection", "api",

@@ -1,5 +1,5 @@
-"""At equal protection of the sensor, does a mask give a better picture than a filter or a smaller stop?
+"""Where does the mask of a recipe give a better picture than a filter or a smaller stop of equal protection?
 
-The study compares the recipe's mask with what anyone can buy, for a quiet frame and under attack.
-Offers: `protection_study.study`, `camera_parts.ProtectionCamera`, `equal_rivals.Rival`.
+The page, the table and the pictures of the comparison, with a paragraph to quote.
+Offers: `protection_study.study`, `protection_page.quotable`.
 """

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn
-from neusee.workflows.studies.protection.equal_rivals import MEASURES
-from neusee.workflows.studies.protection.protection_result import (
+from neusee.workflows.protection.equal_rivals import MEASURES
+from neusee.workflows.protection.protection_result import (
     DRAWN,
     LEVELS,
     LIGHTS,
@@ -17,6 +16,7 @@ from neusee.workflows.studies.protection.protection_result import (
     STRENGTHS,
     ProtectionResult,
 )
+from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn
 
 _LOOKS: Mapping[str, tuple[str, str]] = {
     "open lens": (BLACK, ":"),

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from neusee.workflows.protection.equal_rivals import MEASURES
+from neusee.workflows.protection.protection_result import ATTACKED_AT, DRAWN, LIGHTS, ProtectionResult
 from neusee.workflows.report.study_page import Section
 from neusee.workflows.studies.protection import protection_figures as figures
-from neusee.workflows.studies.protection.equal_rivals import MEASURES
-from neusee.workflows.studies.protection.protection_result import ATTACKED_AT, DRAWN, LIGHTS, ProtectionResult
 
 
 def draw_pictures(result: ProtectionResult) -> dict[str, bytes]:
@@ -55,13 +55,13 @@ def quotable(result: ProtectionResult, camera: str, light: str) -> str:
 
 
 def _said(result: ProtectionResult, measure: str) -> str:
-    """Return where the mask wins by one measure, with the interval over the draws."""
-    own = [result.gain[result.own][n][measure] for n in LIGHTS]
-    at = crossing(own)
-    if at == 0.0:
-        return f"by the {MEASURES[measure]} it loses at every light, by {-max(own):.1f} dB or more"
+    """Return where the mask wins by one measure: medians over the draws, with intervals."""
     draws = np.array([result.drawn[n][measure] for n in LIGHTS])
-    most = int(np.argmax(own))
+    own = np.median(draws, axis=1)
+    at = crossing(own.tolist())
+    if at == 0.0:
+        return f"by the {MEASURES[measure]} it loses at every light, by {-own.max():.1f} dB or more"
+    most = int(own.argmax())
     by = f"by {own[most]:.1f} dB ({_ends(draws[most], '.1f')}) at {LIGHTS[most]:g} e- a pixel"
     if math.isinf(at):
         return f"by the {MEASURES[measure]} it wins at every light, {by}"
@@ -85,7 +85,7 @@ def _interval(values: Sequence[float], form: str) -> str:
 
 
 def _ends(values: Any, form: str) -> str:
-    low, up = np.quantile(values, [0.05, 0.95])
+    low, up = np.quantile(values, [0.05, 0.95], method="nearest")
     return f"{format(float(low), form)} to {format(float(up), form)}"
 
 

@@ -9,14 +9,14 @@ from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.protection.camera_parts import ProtectionCamera
+from neusee.workflows.protection.equal_rivals import CONTRAST, MEASURES
+from neusee.workflows.protection.front_optics import FrontBench, FrontSettings
+from neusee.workflows.protection.protection_result import DRAWN, LIGHTS, ProtectionResult, measure_protection
 from neusee.workflows.recipe.distributions.unknown_conditions import Condition, UnknownLaws, draw_conditions
 from neusee.workflows.report.study_folder import SHOWN, Progress, StudyReport, StudyRun
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.protection.camera_parts import NotComparable, ProtectionCamera
-from neusee.workflows.studies.protection.equal_rivals import CONTRAST, MEASURES
-from neusee.workflows.studies.protection.front_optics import FrontBench, FrontSettings
 from neusee.workflows.studies.protection.protection_page import draw_pictures, quotable, sections
-from neusee.workflows.studies.protection.protection_result import DRAWN, LIGHTS, ProtectionResult, measure_protection
 
 _COLUMNS = ("protection", "scene light", "measure", "gain", "5 %", "95 %")
 _VARIANCE, _LOW = 0.1, 0.12  #: contrast of a natural scene; highest frequency of the mean log NEQ, cycles per pixel
@@ -47,9 +47,7 @@ def study(
     camera = ProtectionCamera.of(recipe, store, bands)
     side = min(int(n) for n in camera.lens["shape"])
     if 4 * size > side:
-        raise NotComparable(
-            f"a text {size:g} pixels high is wider than the PSF window of {side}; give a smaller --size"
-        )
+        raise ValueError(f"a text {size:g} pixels high is wider than the PSF window of {side}; give a smaller --size")
     dwell = None if light == "pulse" else _CONTINUOUS
     settings = FrontSettings(_VARIANCE, _LOW, size, (side, 2 * side, 4 * side), dwell)
     bench = FrontBench(camera, store, settings)

@@ -1,24 +1,22 @@
-"""The study of equal protection: equal peaks, gains of best rivals, pictures under attack, and what is refused."""
+"""The study of equal protection: page, gains below their bounds, pictures under attack, and what is refused."""
 
 import json
 import math
 
 import numpy as np
 import pytest
-import torch
 from typer.testing import CliRunner
 
-from neusee.nodes import metrics
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
-from neusee.workflows.recipe.distributions.unknown_conditions import draw_conditions, usual_condition
+from neusee.workflows.protection import front_optics
+from neusee.workflows.protection.camera_parts import ProtectionCamera
+from neusee.workflows.protection.equal_rivals import MEASURES
+from neusee.workflows.protection.front_optics import Front, FrontBench, FrontSettings
+from neusee.workflows.protection.protection_result import LIGHTS
+from neusee.workflows.recipe.distributions.unknown_conditions import usual_condition
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.protection import front_optics
-from neusee.workflows.studies.protection.camera_parts import NotComparable, ProtectionCamera
-from neusee.workflows.studies.protection.equal_rivals import MEASURES, Candidate, best, quiet_picture
-from neusee.workflows.studies.protection.front_optics import Front, FrontBench, FrontSettings
 from neusee.workflows.studies.protection.protection_page import crossing
-from neusee.workflows.studies.protection.protection_result import LIGHTS
 from neusee.workflows.studies.run_study import study_recipe
 
 SMALL = ["optics.samples=128", "optics.pitch=63.125 um", "optics.bands=3", "optics.window=[64, 64]"]
@@ -33,11 +31,6 @@ def store(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def bench(store):
-    return FrontBench(ProtectionCamera.of(load("axicon", SMALL), store, 3), store, SETTINGS)
-
-
-@pytest.fixture(scope="module")
 def folder(store, tmp_path_factory):
     """A finished study of two draws."""
     return study_recipe("protection", load("axicon", SMALL), store, tmp_path_factory.mktemp("runs"), draws=2, bands=3)
@@ -45,53 +38,6 @@ def folder(store, tmp_path_factory):
 
 def found(folder):
     return json.loads((folder / "provenance.json").read_text())
-
-
-def test_every_rival_has_the_peak_of_the_mask(bench):
-    usual = usual_condition()
-    own = bench.measure(Front(True), usual).peak
-    psf = bench.camera.psf(True, 1.0, bench.camera.bands)
-    assert own == pytest.approx(float(metrics.lsr(psf).max()), rel=1e-6)
-    for diameter in (1.0, 0.7, 0.5):
-        one = bench.measure(Front(False, diameter), usual)
-        grey = Candidate(Front(False, diameter), one, one.peak).transmittance(own)
-        dimmed = bench.camera.psf(False, diameter, bench.camera.bands)
-        peak = grey * metrics.lsr(dimmed).max()
-        assert float(peak) == pytest.approx(own, rel=1e-6)
-        assert one.peak == pytest.approx(diameter**4, rel=0.06)
-
-
-def test_a_quiet_picture_is_that_of_the_nodes(bench):
-    front, usual = Front(True, 1.0), usual_condition()
-    pixel = bench.camera.pixel(0.01, 0.02)
-    psf = bench.camera.psf(True, 1.0, bench.camera.bands)
-    light = bench.camera.illuminant, bench.camera.responses, bench.camera.bands
-    for grey, n in ((1.0, 100.0), (0.1, 3000.0)):
-        dim = psf._replace(intensity=psf.intensity * grey)
-        exact = metrics.filtered_picture(dim, *light, electrons=n, read_noise=10.5, prnu=0.01)
-        values = quiet_picture(bench.measure(front, usual), grey, n, pixel)
-        assert values["error"] == pytest.approx(-10 * math.log10(float(exact.error.mean())), abs=2e-3)
-        assert values["information"] == pytest.approx(10 * math.log10(float(exact.information.mean())), abs=2e-3)
-        assert values["NEQ"] == pytest.approx(10 / math.log(10) * float(exact.log_neq.mean()), abs=1e-3)
-
-
-def test_the_best_rival_is_the_best_of_the_candidates_at_the_wanted_protection(bench):
-    usual, pixel = usual_condition(), bench.camera.pixel(0.0, 0.0)
-    fronts = [Front(False, d) for d in (1.0, 0.7, 0.5)]
-    measured = [Candidate(f, bench.measure(f, usual), bench.measure(f, usual).peak) for f in fronts]
-    chosen = best(measured, 0.03, 100.0, pixel)
-    for measure in MEASURES:
-        each = [quiet_picture(c.found, min(1, 0.03 / c.protection), 100.0, pixel)[measure] for c in measured]
-        assert chosen[measure][0] == max(each)
-        assert chosen[measure][1].front == fronts[int(np.argmax(each))]
-
-
-def test_dirt_and_defocus_cost_the_filter_that_does_not_know_them(bench):
-    calm, pixel = usual_condition(), bench.camera.pixel(0.01, 0.02)
-    (rough,) = draw_conditions(1, 3)
-    for front in (Front(True), Front(False)):
-        one, other = (quiet_picture(bench.measure(front, c), 1.0, 1e4, pixel)["error"] for c in (calm, rough))
-        assert other < one
 
 
 @pytest.mark.slow
@@ -138,12 +84,6 @@ def test_a_finished_study_measures_nothing_again(folder, store, tmp_path, monkey
     assert found(again)["gain"] == found(folder)["gain"]
 
 
-def test_another_mask_is_another_result(bench, store):
-    other = FrontBench(ProtectionCamera.of(load("axicon", [*SMALL, "doe.waves=3"]), store, 3), store, SETTINGS)
-    steep, gentle = (one.measure(Front(True), usual_condition()).peak for one in (bench, other))
-    assert gentle > 1.2 * steep
-
-
 def test_the_light_at_which_a_gain_ends():
     assert crossing([-1.0] * 7) == 0.0
     assert math.isinf(crossing([1.0] * 7))
@@ -161,7 +101,7 @@ def test_the_light_at_which_a_gain_ends():
 )
 def test_an_unsuitable_recipe_is_refused_with_the_fix(recipe, changes, options, said, store, tmp_path):
     words = [] if changes is None else [*changes, *(w for w in SMALL if recipe == "axicon" or "doe." not in w)]
-    with pytest.raises(NotComparable, match=said):
+    with pytest.raises(ValueError, match=said):
         study_recipe("protection", load(recipe, words), store, tmp_path, draws=2, bands=3, **options)
 
 
@@ -183,11 +123,3 @@ def test_equal_heat_asks_for_a_darker_rival_than_equal_peak(store, tmp_path):
     folder = study_recipe("protection", load("axicon", SMALL), store, tmp_path, draws=2, bands=3, light="continuous")
     assert found(folder)["protection"] == pytest.approx(one.heat, rel=1e-6)
     assert "heat of a laser" in found(folder)["paragraph"]
-
-
-def test_the_colour_of_a_laser_is_relative_to_the_channel_that_responds_most(bench):
-    colour = bench.camera.laser_colour(bench.camera.laser_line(532e-9))
-    assert float(colour.max()) == 1.0
-    assert int(colour.argmax()) == 1
-    at = bench.camera.laser_colour(bench.camera.laser_line(usual_condition().wavelength))
-    assert torch.equal(bench.measure(Front(False), usual_condition()).colour, at)

@@ -19,7 +19,7 @@ from neusee.nodes.metrics import (
     noise_variance,
     remaining_error,
 )
-from neusee.workflows.studies.protection.front_optics import Front, FrontMeasures
+from neusee.workflows.protection.front_optics import Front, FrontMeasures
 
 #: what is measured of a quiet picture, with what it means
 MEASURES: Mapping[str, str] = {

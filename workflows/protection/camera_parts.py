@@ -23,10 +23,6 @@ _NEEDED = ("psf[mask]", "pupil[mask]", "pupil[plain]", "illuminant", "responses"
 _LEAST_MASK = 0.9  #: laser suppression ratio above which a recipe has no mask to compare
 
 
-class NotComparable(ValueError):
-    """A recipe whose mask cannot be compared with filters and stops; the message says what to change."""
-
-
 @dataclass(frozen=True)
 class ProtectionCamera:
     """Lens, mask and sensor of a recipe, as values and parameters from which PSFs of any shade are computed."""
@@ -42,7 +38,7 @@ class ProtectionCamera:
 
     @classmethod
     def of(cls, recipe: Recipe, store: Store, count: int) -> ProtectionCamera:
-        """Return the camera of a recipe with ``count`` of its bands; raise `NotComparable` for an unsuitable recipe."""
+        """Return the camera of a recipe with ``count`` of its bands; raise ValueError for an unsuitable recipe."""
         _refuse_unsuitable(recipe)
         pupil, plain = (recipe.steps[f"pupil[{arm}]"].wires for arm in ("mask", "plain"))
         names = [str(w) for w in (pupil["height"], plain["height"], pupil["stop"], pupil["bands"])]
@@ -110,23 +106,23 @@ class ProtectionCamera:
 
 
 def _refuse_unsuitable(recipe: Recipe) -> None:
-    """Raise `NotComparable` where the recipe lacks a step, or its mask is shaded already."""
+    """Raise ValueError where the recipe lacks a step, or its mask is shaded already."""
     missing = [name for name in _NEEDED if name not in recipe.steps]
     if missing:
-        raise NotComparable(
+        raise ValueError(
             f"the recipe {recipe.name} has no step {missing[0]}: study a recipe of the camera with the arms plain and "
             "mask, such as five_half_rings"
         )
     if recipe.steps["pupil[mask]"].wires.get("shade"):
-        raise NotComparable(
+        raise ValueError(
             "the mask of this recipe is shaded already: choose the mask alone, such as doe=axicon, because the study "
             "adds filters and stops itself"
         )
 
 
 def refuse_no_mask(lsr: float) -> None:
-    """Raise `NotComparable` for a mask that lowers the peak too little to compare."""
+    """Raise ValueError for a mask that lowers the peak too little to compare."""
     if lsr > _LEAST_MASK:
-        raise NotComparable(
+        raise ValueError(
             f"the mask of this recipe lowers the peak of a laser to {lsr:.3g} only: choose a mask, such as doe=axicon"
         )

@@ -11,9 +11,8 @@ import torch
 
 from neusee.nodes import metrics
 from neusee.nodes.metrics import PixelNoise, attacked_picture, largest_glare
-from neusee.workflows.recipe.distributions.unknown_conditions import Condition, usual_condition
-from neusee.workflows.studies.protection.camera_parts import refuse_no_mask
-from neusee.workflows.studies.protection.equal_rivals import (
+from neusee.workflows.protection.camera_parts import refuse_no_mask
+from neusee.workflows.protection.equal_rivals import (
     Candidate,
     Rival,
     best,
@@ -22,7 +21,8 @@ from neusee.workflows.studies.protection.equal_rivals import (
     neq_curve,
     quiet_picture,
 )
-from neusee.workflows.studies.protection.front_optics import Front, FrontBench
+from neusee.workflows.protection.front_optics import Front, FrontBench
+from neusee.workflows.recipe.distributions.unknown_conditions import Condition, usual_condition
 
 LIGHTS = (10.0, 30.0, 100.0, 300.0, 1e3, 3e3, 1e4)  #: e- a pixel
 LEVELS = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4)  #: share of the clear lens's peak, or heat
@@ -69,7 +69,7 @@ def measure_protection(
     own = mask.protection
     refuse_no_mask(own)
     progress(f"the mask lowers the harm of a laser to {own:.3g} of that behind the clear lens")
-    clear = [candidate(Front(False, d)) for d in _diameters(min(own, LEVELS[-1]), bench.settings.dwell is not None)]
+    clear = [candidate(Front(False, d)) for d in _diameters(own, bench.settings.dwell is not None)]
     masked = [candidate(Front(True, d)) for d in _MASK_STOPS]
     progress(f"{len(clear)} stops and {len(masked)} stops with the mask are measured")
     gain = {level: {n: gains(masked, clear, level, n, pixel) for n in LIGHTS} for level in (own, *LEVELS)}
@@ -93,13 +93,15 @@ def measure_protection(
                             lost, tint)  # fmt: skip
 
 
-def _diameters(least: float, continuous: bool) -> list[float]:
-    """Return the relative diameters of stops, from the open lens to the stop that alone protects to ``least``."""
-    last = least ** (1 / 3 if continuous else 1 / 4)
-    found = [1.0]
-    while found[-1] * _RATIO > last:
-        found.append(found[-1] * _RATIO)
-    return [*found, last]
+def _diameters(own: float, continuous: bool) -> list[float]:
+    """Return the relative diameters of stops: a series from the open lens, and the stop that alone protects as wanted.
+
+    The best rival is often a stop without a filter, so that each wanted protection has such a stop.
+    """
+    power = 1 / 3 if continuous else 1 / 4
+    alone = {level**power for level in (own, *LEVELS)}
+    series = {_RATIO**k for k in range(40) if _RATIO**k > min(alone)}
+    return sorted(alone | series, reverse=True)
 
 
 def _rivals(

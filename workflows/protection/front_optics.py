@@ -29,10 +29,10 @@ from neusee.nodes.values import Bands, Psf
 from neusee.workflows.keys.cache_key import digest, plain
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.input_file_digest import file_digest
+from neusee.workflows.protection.camera_parts import ProtectionCamera
 from neusee.workflows.recipe.distributions.unknown_conditions import Condition
 from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.protection.camera_parts import ProtectionCamera
 
 _ABOUT = {"step": "study protection"}
 _SOURCES = (picture_spectrum, detail_energy, glare_levels)

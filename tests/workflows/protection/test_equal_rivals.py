@@ -1,0 +1,91 @@
+"""Rivals of equal protection: equal peaks, the best of the candidates, and values that are those of the nodes."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from neusee.nodes import metrics
+from neusee.workflows import load
+from neusee.workflows.protection.camera_parts import ProtectionCamera
+from neusee.workflows.protection.equal_rivals import MEASURES, Candidate, best, quiet_picture
+from neusee.workflows.protection.front_optics import Front, FrontBench, FrontSettings
+from neusee.workflows.recipe.distributions.unknown_conditions import draw_conditions, usual_condition
+from neusee.workflows.store.result_store import Store
+
+SMALL = ["optics.samples=128", "optics.pitch=63.125 um", "optics.bands=3", "optics.window=[64, 64]"]
+SMALL += ["scene.shape=[64, 64]", "sensor.shape=[48, 48]", "doe.waves=5"]
+SETTINGS = FrontSettings(0.1, 0.12, 12.0, (64,), None)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """Fronts are measured once for all tests."""
+    return Store(tmp_path_factory.mktemp("protection"))
+
+
+@pytest.fixture(scope="module")
+def bench(store):
+    return FrontBench(ProtectionCamera.of(load("axicon", SMALL), store, 3), store, SETTINGS)
+
+
+def test_every_rival_has_the_peak_of_the_mask(bench):
+    usual = usual_condition()
+    own = bench.measure(Front(True), usual).peak
+    psf = bench.camera.psf(True, 1.0, bench.camera.bands)
+    assert own == pytest.approx(float(metrics.lsr(psf).max()), rel=1e-6)
+    for diameter in (1.0, 0.7, 0.5):
+        one = bench.measure(Front(False, diameter), usual)
+        grey = Candidate(Front(False, diameter), one, one.peak).transmittance(own)
+        dimmed = bench.camera.psf(False, diameter, bench.camera.bands)
+        peak = grey * metrics.lsr(dimmed).max()
+        assert float(peak) == pytest.approx(own, rel=1e-6)
+        assert one.peak == pytest.approx(diameter**4, rel=0.06)
+
+
+def test_a_quiet_picture_is_that_of_the_nodes(bench):
+    front, usual = Front(True, 1.0), usual_condition()
+    pixel = bench.camera.pixel(0.01, 0.02)
+    psf = bench.camera.psf(True, 1.0, bench.camera.bands)
+    light = bench.camera.illuminant, bench.camera.responses, bench.camera.bands
+    for grey, n in ((1.0, 100.0), (0.1, 3000.0)):
+        dim = psf._replace(intensity=psf.intensity * grey)
+        exact = metrics.filtered_picture(dim, *light, electrons=n, read_noise=10.5, prnu=0.01)
+        values = quiet_picture(bench.measure(front, usual), grey, n, pixel)
+        assert values["error"] == pytest.approx(-10 * math.log10(float(exact.error.mean())), abs=2e-3)
+        assert values["information"] == pytest.approx(10 * math.log10(float(exact.information.mean())), abs=2e-3)
+        assert values["NEQ"] == pytest.approx(10 / math.log(10) * float(exact.log_neq.mean()), abs=1e-3)
+
+
+def test_the_best_rival_is_the_best_of_the_candidates_at_the_wanted_protection(bench):
+    usual, pixel = usual_condition(), bench.camera.pixel(0.0, 0.0)
+    fronts = [Front(False, d) for d in (1.0, 0.7, 0.5)]
+    measured = [Candidate(f, bench.measure(f, usual), bench.measure(f, usual).peak) for f in fronts]
+    chosen = best(measured, 0.03, 100.0, pixel)
+    for measure in MEASURES:
+        each = [quiet_picture(c.found, min(1, 0.03 / c.protection), 100.0, pixel)[measure] for c in measured]
+        assert chosen[measure][0] == max(each)
+        assert chosen[measure][1].front == fronts[int(np.argmax(each))]
+
+
+def test_dirt_and_defocus_cost_the_filter_that_does_not_know_them(bench):
+    calm, pixel = usual_condition(), bench.camera.pixel(0.01, 0.02)
+    (rough,) = draw_conditions(1, 3)
+    for front in (Front(True), Front(False)):
+        one, other = (quiet_picture(bench.measure(front, c), 1.0, 1e4, pixel)["error"] for c in (calm, rough))
+        assert other < one
+
+
+def test_another_mask_is_another_result(bench, store):
+    other = FrontBench(ProtectionCamera.of(load("axicon", [*SMALL, "doe.waves=3"]), store, 3), store, SETTINGS)
+    steep, gentle = (one.measure(Front(True), usual_condition()).peak for one in (bench, other))
+    assert gentle > 1.2 * steep
+
+
+def test_the_colour_of_a_laser_is_relative_to_the_channel_that_responds_most(bench):
+    colour = bench.camera.laser_colour(bench.camera.laser_line(532e-9))
+    assert float(colour.max()) == 1.0
+    assert int(colour.argmax()) == 1
+    at = bench.camera.laser_colour(bench.camera.laser_line(usual_condition().wavelength))
+    assert torch.equal(bench.measure(Front(False), usual_condition()).colour, at)
