@@ -26,7 +26,8 @@ from neusee.nodes.values import Bands, LaserLight, Stop, Wavefront
 
 Quality = Annotated[float, Field(ge=1, allow_inf_nan=False)]  #: M2 of a beam
 Multiple = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-_NEAR = 1e-3  #: part of a wave of defocus from which a finite distance is worth a note
+_NEAR = 0.25  #: waves of defocus at 550 nm from which a near laser is worth a note
+_WAVE = 550e-9  #: m; the wavelength in which waves of defocus are counted
 
 
 class _Geometry(NamedTuple):
@@ -211,7 +212,7 @@ def _(*, line: Bands | None = None, stop: Stop | None = None, **params: Any) -> 
     if line is None or stop is None or line.centres.is_meta or stop.diameter.is_meta:
         return []
     try:
-        return _notes(light(line, stop, **params), params)
+        return [*_out_of_focus(line, stop, params), *_pulse_notes(light(line, stop, **params), params)]
     except ParameterError as error:
         name = error.parameter if error.parameter in given else given[0]
         raise ParameterError(name, str(error)) from None
@@ -233,8 +234,16 @@ def _refuse_air(given: list[str]) -> None:
         raise ParameterError("haze", "a law of haze needs the visibility, such as visibility: 5 km")
 
 
-def _notes(found: LaserLight, params: dict[str, Any]) -> list[str]:
-    """Return what a user must know of the light of a laser before the run."""
+def _out_of_focus(line: Bands, stop: Stop, params: dict[str, Any]) -> list[str]:
+    """Return a note on a laser that is so near that a lens focused at infinity does not focus it."""
+    shape = {name: params[name] for name in (*_BEAM, "convention", "distance")}
+    waves = float(wavefront(line, **shape).curvature * stop.diameter**2) / 8 / _WAVE
+    text = f"a laser at {params['distance']:g} m is {waves:.3g} waves out of focus for a lens focused at infinity"
+    return [f'{text}: optics.defocus="-{waves:.3g} waves" focuses it'] if waves > _NEAR else []
+
+
+def _pulse_notes(found: LaserLight, params: dict[str, Any]) -> list[str]:
+    """Return a note on the pulses that an exposure catches."""
     if not params["pulse_duration"]:
         return []
     count = float(found.pulses)

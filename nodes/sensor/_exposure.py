@@ -127,6 +127,8 @@ def level(
     if strength is None:
         if white is None or not bool(white > 0):
             raise ParameterError("strength", _DARK)
+        planes = plain_image.planes if isinstance(plain_image, Channels) else plain_image
+        refuse_not_finite("no level can scale this image", plain_image=planes.amin() + planes.amax())
         return white.double().expand(len(bands.centres)).clone()
     if rule == "per_band":
         if isinstance(plain_image, Channels):

@@ -90,6 +90,22 @@ def test_a_near_laser_is_as_far_out_of_focus_as_waves_of_defocus_say(distance):
     assert waves == pytest.approx(7.27 if distance == 2.0 else 0.145, rel=0.01)
 
 
+@pytest.mark.parametrize("distance", [2.0, 60.0])
+def test_a_laser_that_is_out_of_focus_is_told_with_the_defocus_that_focuses_it(distance):
+    params = {each: field.default for each, field in laser.light.params.model_fields.items()}
+    params |= {**CAMERA, "power": 1.0, "divergence": 0.1, "distance": distance}
+    notes = laser.light.hooks.preflight(line=LINE, stop=STOP, **params)
+    if distance == 60.0:
+        assert notes == []
+        return
+    (note,) = notes
+    assert note.startswith("a laser at 2 m is 7.27 waves out of focus for a lens focused at infinity")
+    assert note.endswith(': optics.defocus="-7.27 waves" focuses it')
+    wave = laser.wavefront(LINE, divergence=0.1, distance=2.0)
+    focused = optics.pupil(torch.zeros(128, 128), doe.material(LINE), LINE, STOP, None, wave, defocus=-7.27)
+    assert float(focused.path.abs().max()) < 0.01 * 550e-9
+
+
 def test_a_narrow_beam_fills_the_middle_of_the_pupil_alone():
     narrow = laser.wavefront(LINE, waist=1e-3, distance=0.1)
     pupil = optics.pupil(torch.zeros(128, 128), doe.material(LINE), LINE, STOP, None, narrow)

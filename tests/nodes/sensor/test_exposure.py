@@ -88,6 +88,9 @@ def test_a_scene_in_lux_has_the_level_of_its_white_and_no_other():
     white = torch.tensor(3e-4, dtype=torch.float64)
     factor = level(scene(6, 6), BANDS, RESPONSES, white, **SENSOR)
     assert factor.tolist() == [3e-4] * 5
+    broken = scene(6, 6).index_fill(0, torch.tensor(2), math.nan)
+    with pytest.raises(ValueError, match="plain_image holds values that are not finite"):
+        level(broken, BANDS, RESPONSES, white, **SENSOR)
     zero = torch.zeros((), dtype=torch.float64)
     with pytest.raises(ParameterError, match="the brightness of the scene is not known"):
         level(scene(6, 6), BANDS, RESPONSES, zero, **SENSOR)

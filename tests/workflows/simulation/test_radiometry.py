@@ -102,6 +102,22 @@ def test_unclipped_electrons_of_twelve_lasers_agree_to_1e_4(compute):
 
 
 @pytest.mark.slow
+def test_pixels_that_average_over_their_area_agree_with_a_quadrature(compute):
+    name, half = "pointer", 4
+    only = f"lasers={{pointer: {{{LASERS[name]}, {REST}}}}}"
+    found = compute('"laser_photons[plain,pointer]"', only, "sensor.sampling=integrated")
+    middle = slice(16 - half, 16 + half)
+    node, weight = np.polynomial.legendre.leggauss(6)
+    at = (np.arange(-half, half)[:, None] + node / 2).ravel() * radiometry.PIXEL
+    away = np.hypot(*np.meshgrid(at - 0.11 * 9e-6, at + 0.11 * 6e-6, indexing="ij")).ravel()
+    fine = radiometry.electrons(numbers(LASERS[name]), away, 5e-3, efficiency).reshape(2 * half, 6, 2 * half, 6)
+    wanted = np.einsum("aibj,i,j->ab", fine, weight / 2, weight / 2)
+    electrons = found["laser_photons[plain,pointer]"][0, middle, middle].double().numpy() * 0.5
+    assert electrons.max() == pytest.approx(wanted.max(), rel=1e-4)
+    assert np.abs(electrons - wanted).max() < 1e-4 * wanted.max()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seconds", ["1 us", "1 ms", "1 s"])
 def test_electrons_of_a_continuous_laser_of_the_scene_and_of_the_dark_rise_with_the_exposure(compute, seconds):
     outputs = '"laser_photons[plain,pointer]", "scene_photons[plain]", "spot[plain,pointer]", "dark[plain]", "light"'
