@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import ParameterError
+from neusee.nodes.laser._beam import plain
 
 Number = TypeVar("Number", float, Tensor)
 
@@ -28,7 +29,7 @@ def air_transmittance(
     Source: Koschmieder (1924); Kruse, McGlauchlin, McQuistan, Elements of Infrared Technology (1962); Kim, McArthur,
     Korevaar, Proc. SPIE 4214, 26 (2001).
     """
-    if not (math.isfinite(distance) and distance >= 0):
+    if not (math.isfinite(plain(distance)) and distance >= 0):
         raise ParameterError("distance", f"{distance:g} m is no distance: give a finite number from 0")
     if visibility is None:
         return 1.0

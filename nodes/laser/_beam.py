@@ -72,7 +72,7 @@ def beam(
              "repetition_rate": repetition_rate, "waist": waist, "divergence": divergence,
              "m_squared": m_squared}  # fmt: skip
     for name, value in given.items():
-        if value is not None and not (math.isfinite(value) and value > 0):
+        if value is not None and not (math.isfinite(plain(value)) and value > 0):
             raise ParameterError(name, f"{value:g} is no {name.replace('_', ' ')}: give a finite number above 0")
     wider = math.sqrt(2) if convention == "1/e" else 1.0
     shape = _shape(wavelength, waist and waist * wider, divergence and divergence * wider, m_squared)
@@ -103,7 +103,7 @@ def _emission(
         return power, power / rate, duration, rate
     assert energy is not None
     mean = energy * rate
-    if power is not None and not math.isclose(power, mean, rel_tol=_AGREE):
+    if power is not None and not math.isclose(plain(power), plain(mean), rel_tol=_AGREE):
         text = f"pulse energy {energy:.4g} J x repetition rate {rate:.4g} Hz = {mean:.4g} W, not power {power:.4g} W"
         raise ParameterError("power", f"{text}: leave one of the three out")
     return mean, energy, duration, rate
@@ -136,9 +136,14 @@ def _shape(
     if found < 1 - _AGREE:
         text = f"{said}, but no beam has less than 1: at this waist the divergence is at least {least / waist:.4g} rad"
         raise ParameterError("divergence", text)
-    if m_squared is not None and not math.isclose(found, m_squared, rel_tol=_AGREE):
+    if m_squared is not None and not math.isclose(plain(found), plain(m_squared), rel_tol=_AGREE):
         raise ParameterError("m_squared", f"{said}, not {m_squared:g}: leave one of the three out")
     return waist, divergence, max(found, 1.0)
+
+
+def plain(value: float | Tensor) -> float:
+    """Return a number, also of a tensor whose gradient is followed."""
+    return float(value.detach()) if isinstance(value, Tensor) else value
 
 
 # --- the beam at a distance -------------------------------------------------------------------------------------------

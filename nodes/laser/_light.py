@@ -15,6 +15,7 @@ from neusee.nodes.laser._beam import (
     beam,
     beam_radius,
     curvature_radius,
+    plain,
     sensor_density,
     share_through,
 )
@@ -25,7 +26,8 @@ from neusee.nodes.values import Bands, LaserLight, Stop, Wavefront
 
 Quality = Annotated[float, Field(ge=1, allow_inf_nan=False)]  #: M2 of a beam
 Multiple = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-_NEAR = 1e-3  #: part of a wave of defocus from which a finite distance is worth a note
+_NEAR = 0.25  #: waves of defocus at 550 nm from which a near laser is worth a note
+_WAVE = 550e-9  #: m; the wavelength in which waves of defocus are counted
 
 
 class _Geometry(NamedTuple):
@@ -155,7 +157,7 @@ def pulses_within(beam: Beam, exposure: float, delay: float) -> float:
         assert beam.pulse_duration is not None
         if beam.repetition_rate is None:
             return min(max(time / beam.pulse_duration, 0.0), 1.0)
-        whole = math.floor(time * beam.repetition_rate)
+        whole = math.floor(plain(time * beam.repetition_rate))
         return whole + min(max(time - whole / beam.repetition_rate, 0.0) / beam.pulse_duration, 1.0)
 
     return begun(exposure - delay) - begun(-delay)
@@ -210,7 +212,7 @@ def _(*, line: Bands | None = None, stop: Stop | None = None, **params: Any) -> 
     if line is None or stop is None or line.centres.is_meta or stop.diameter.is_meta:
         return []
     try:
-        return _notes(light(line, stop, **params), params)
+        return [*_out_of_focus(line, stop, params), *_pulse_notes(light(line, stop, **params), params)]
     except ParameterError as error:
         name = error.parameter if error.parameter in given else given[0]
         raise ParameterError(name, str(error)) from None
@@ -232,8 +234,16 @@ def _refuse_air(given: list[str]) -> None:
         raise ParameterError("haze", "a law of haze needs the visibility, such as visibility: 5 km")
 
 
-def _notes(found: LaserLight, params: dict[str, Any]) -> list[str]:
-    """Return what a user must know of the light of a laser before the run."""
+def _out_of_focus(line: Bands, stop: Stop, params: dict[str, Any]) -> list[str]:
+    """Return a note on a laser that is so near that a lens focused at infinity does not focus it."""
+    shape = {name: params[name] for name in (*_BEAM, "convention", "distance")}
+    waves = float(wavefront(line, **shape).curvature * stop.diameter**2) / 8 / _WAVE
+    text = f"a laser at {params['distance']:g} m is {waves:.3g} waves out of focus for a lens focused at infinity"
+    return [f'{text}: optics.defocus="-{waves:.3g} waves" focuses it'] if waves > _NEAR else []
+
+
+def _pulse_notes(found: LaserLight, params: dict[str, Any]) -> list[str]:
+    """Return a note on the pulses that an exposure catches."""
     if not params["pulse_duration"]:
         return []
     count = float(found.pulses)

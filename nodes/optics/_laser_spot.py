@@ -16,6 +16,7 @@ from neusee.nodes.values import Bands, LaserLight, Psf
 Meaning = Literal["first_channel", "irradiance"]
 
 _LSR = 2.2  #: largest laser suppression ratio of a pupil that only absorbs and delays; derived in the bound
+_SQUARE = 4 / math.pi  #: largest area of the samples of a coarse pupil grid, relative to their disc
 _UNSEEN = 1e-3  #: relative response below which a channel does not see a line
 
 
@@ -76,7 +77,7 @@ def unit(clear_peak: Tensor, bands: Bands, wells: Tensor, responses: Tensor | No
     if responses is None or responses.shape[-1] != len(each):
         raise ValueError("strength counts the channel that saturates first: give `responses` for the bands of the line")
     most = (responses.to(each) * each).sum(-1).amax()
-    if not float(most) > 0:
+    if not bool(most > 0):
         raise ValueError(_no_channel(bands))
     return most
 
@@ -123,7 +124,7 @@ def _(
     A channel of small response needs more irradiance to saturate; light in watts has its peak at the mean wavelength.
     """
     if strength is None:
-        return math.inf if light is None else _LSR * light.max * (bands.max / bands.min) ** 2
+        return math.inf if light is None else _LSR * _SQUARE * light.max * (bands.max / bands.min) ** 2
     if strength == 0:
         return 0.0
     least = 1.0

@@ -125,8 +125,10 @@ def level(
     Source: NeuSee, Eq. (peak_irrad_coded).
     """
     if strength is None:
-        if white is None or not float(white) > 0:
+        if white is None or not bool(white > 0):
             raise ParameterError("strength", _DARK)
+        planes = plain_image.planes if isinstance(plain_image, Channels) else plain_image
+        refuse_not_finite("no level can scale this image", plain_image=planes.amin() + planes.amax())
         return white.double().expand(len(bands.centres)).clone()
     if rule == "per_band":
         if isinstance(plain_image, Channels):

@@ -160,7 +160,7 @@ def _peak_note(file: Path, quantum_efficiency: float | None) -> list[str]:
     if quantum_efficiency is not None:
         told = f"sensor.quantum_efficiency={quantum_efficiency:.4g}"
         same = abs(quantum_efficiency / largest - 1) < 1e-3
-        return [] if same else [f"{peak}, and the QE of the table counts for electrons, not {told}"]
+        return [f"{peak}, as {told}"] if same else [f"{peak}, and the QE of the table counts for electrons, not {told}"]
     return [
         f"{peak}, and responses are relative to it: electrons are right with sensor.quantum_efficiency={largest:.4g}"
     ]

@@ -12,6 +12,7 @@ import torch
 from scipy import stats
 
 from neusee.nodes import TensorStats, doe, flare, optics, sensor, spectra
+from neusee.nodes.laser import light
 
 ROUNDING = 1e-9  #: of a bound, in float64
 SINGLE = 1e-5  #: the same, of results in float32
@@ -138,9 +139,24 @@ def shining(draw):
     pupil = optics.pupil(height, spectra_index(line), line, stop)
     camera = {"focal_length": 0.1, "pixel_pitch": draw.decades(1e-6, 3e-5), "shape": (8, 8), "pixel": "zoh"}
     psf = optics.psf(pupil, **camera, sensor=draw.one_of("point", "integrated"))
-    power = {"strength": draw.often(0.0, draw.decades(1e-9, 1e8)), **SENSOR, "exposure": draw.decades(1e-6, 1e3)}
-    found = optics.laser_irradiance(psf, line, **power)
-    return optics.laser_irradiance.hooks.zero_bound(Unread(), TensorStats.of(line), **power), float(found.max())
+    power = {**SENSOR, "pixel_pitch": camera["pixel_pitch"], "exposure": draw.decades(1e-6, 1e3)}
+    seen, watts = None, None
+    if draw.uniform() < 0.3:
+        watts = in_watts(draw, line, stop, power["exposure"])
+    else:
+        power["strength"] = draw.often(0.0, draw.decades(1e-9, 1e8))
+        if draw.uniform() < 0.5:
+            power["meaning"] = "first_channel"
+            seen = 10 ** (-2 * torch.rand(3, len(line.centres), generator=draw.rng, dtype=torch.float64))
+    found = optics.laser_irradiance(psf, line, seen, watts, **power)
+    facts = (TensorStats.of(line), seen if seen is None else TensorStats.of(seen), watts and TensorStats.of(watts))
+    return optics.laser_irradiance.hooks.zero_bound(Unread(), *facts, **power), float(found.max())
+
+
+def in_watts(draw, line, stop, exposure):
+    camera = {"focal_length": 0.1, "exposure": exposure, "lens_transmittance": draw.uniform(0.01, 1.0)}
+    beam = {"power": draw.decades(1e-9, 1e3), "divergence": draw.decades(1e-4, 1e-1)}
+    return light(line, stop, **camera, **beam, distance=draw.decades(0.1, 1e5))
 
 
 GHOSTS = {"focal_length": 0.1, "pixel_pitch": 3e-6, "count": 8, "energy": 1e-4, "spread": 2.0, "radius": 3e-4}

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes import ErrorBound, TensorStats
+from neusee.nodes import ErrorBound, ParameterError, TensorStats
 from neusee.nodes.sensor import add_photons, expose, level, saturation
 from neusee.nodes.spectra import rows
 from neusee.nodes.values import Bands, Channels
@@ -82,6 +82,20 @@ def test_a_level_is_off_by_as_much_as_stated_where_the_brightest_pixel_is(share)
 def test_nothing_is_known_of_a_level_where_the_brightest_pixel_may_be_dark():
     image, found = ErrorBound(0.1, TensorStats.of(scene(2, 2)), 1.0), TensorStats.of(torch.ones(5))
     assert level.hooks.propagate_error(image, None, None, result=found, strength=0.7, **SENSOR) == math.inf
+
+
+def test_a_scene_in_lux_has_the_level_of_its_white_and_no_other():
+    white = torch.tensor(3e-4, dtype=torch.float64)
+    factor = level(scene(6, 6), BANDS, RESPONSES, white, **SENSOR)
+    assert factor.tolist() == [3e-4] * 5
+    broken = scene(6, 6).index_fill(0, torch.tensor(2), math.nan)
+    with pytest.raises(ValueError, match="plain_image holds values that are not finite"):
+        level(broken, BANDS, RESPONSES, white, **SENSOR)
+    zero = torch.zeros((), dtype=torch.float64)
+    with pytest.raises(ParameterError, match="the brightness of the scene is not known"):
+        level(scene(6, 6), BANDS, RESPONSES, zero, **SENSOR)
+    bound = level.hooks.propagate_error(ErrorBound(0.1), result=TensorStats.of(factor), strength=None)
+    assert bound == 0.0
 
 
 def test_level_per_band_lets_each_band_reach_the_strength():

@@ -7,8 +7,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes import ErrorBound, TensorStats
+from neusee.nodes import ErrorBound, ParameterError, TensorStats
 from neusee.nodes.sensor import dark_current, photon_noise, read_noise
+from neusee.nodes.units import ElectronsPerSecond
 
 N = 200_000
 
@@ -21,6 +22,27 @@ def moments(photons, **how):
     flat = torch.full((N,), photons, dtype=torch.float64)
     found = photon_noise(flat, quantum_efficiency=0.56, rng=seeded(), **how)
     return float(found.mean()), float(found.var())
+
+
+def test_a_dark_current_by_time_is_that_of_the_exposure_times_the_rate():
+    dark = torch.zeros(N, dtype=torch.float64)
+    by_time = dark_current(dark, mean=ElectronsPerSecond(50.0), exposure=0.1, rng=seeded())
+    assert torch.equal(by_time, dark_current(dark, mean=5.0, rng=seeded()))
+    long = dark_current(dark, mean=ElectronsPerSecond(50.0), exposure=1.0, rng=seeded())
+    assert float(long.mean()) == pytest.approx(50.0, abs=5 * math.sqrt(50 / N))
+    facts = TensorStats.of(torch.full((3, 3), 100.0))
+    bound = dark_current.hooks.skip_bound
+    params = {"full_well": None, "mean_of": "sensor"}
+    assert bound(facts, mean=ElectronsPerSecond(50.0), exposure=0.1, **params) == bound(facts, mean=5.0, **params)
+    with pytest.raises(ParameterError, match="50 e-/s needs the exposure"):
+        dark_current.hooks.preflight(mean=ElectronsPerSecond(50.0), exposure=None)
+
+
+@pytest.mark.parametrize(("text", "read"), [("0.02 e-", 0.02), ("0.02 e-/s", (0.02,)), ("3 ke-/s", (3000.0,))])
+def test_a_dark_current_is_read_with_its_unit(text, read):
+    found = dark_current.params(mean=text).mean
+    assert found == read
+    assert isinstance(found, ElectronsPerSecond) == isinstance(read, tuple)
 
 
 @pytest.mark.parametrize("distribution", ["gaussian", "poisson"])

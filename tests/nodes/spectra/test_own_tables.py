@@ -71,6 +71,22 @@ def test_percent_fraction_and_responsivity_are_one_camera(write):
         assert note.endswith("electrons are right with sensor.quantum_efficiency=0.69")
 
 
+@pytest.mark.parametrize("efficiency", [0.3, 0.69])
+def test_an_absolute_table_gives_its_electrons_whatever_the_efficiency_of_the_sensor(write, efficiency):
+    table, sampled = write(MONO), at(*(w for w, _ in QE))
+    found = responses(sampled, camera=table, quantum_efficiency=efficiency)[0] * efficiency
+    torch.testing.assert_close(found, torch.tensor([q / 100 for _, q in QE], dtype=torch.float64), rtol=1e-12, atol=0)
+    (note,) = responses.hooks.preflight(camera=table, quantum_efficiency=efficiency)
+    counts = "and the QE of the table counts for electrons, not sensor.quantum_efficiency=0.3"
+    assert note.endswith(counts if efficiency == 0.3 else "at 525 nm, as sensor.quantum_efficiency=0.69")
+
+
+def test_a_relative_table_counts_with_the_efficiency_of_the_sensor(write):
+    table = write("wavelength (nm),signal (1)\n400,3\n700,5\n")
+    found = (responses(at(400, 700), camera=table, quantum_efficiency=each) for each in (None, 0.3))
+    torch.testing.assert_close(*found, rtol=0, atol=0)
+
+
 def test_a_relative_curve_says_nothing_of_electrons(write):
     assert responses.hooks.preflight(camera=write("wavelength (nm),signal (1)\n400,3\n700,5\n")) == []
 

@@ -29,8 +29,8 @@ REST = "fwhm: 1 nm, angle: [9 urad, -6 urad]"
 SCALE = {"km": 1e3, "m": 1, "mm": 1e-3, "nm": 1e-9, "W": 1, "mW": 1e-3, "uJ": 1e-6, "nJ": 1e-9, "mrad": 1e-3,
          "ns": 1e-9, "us": 1e-6, "ms": 1e-3, "Hz": 1, "kHz": 1e3}  # fmt: skip
 QUIET = [
-    "camera=mono", "scene=wall", "flare=clean", "doe=flat", "restore=wiener", "sensor=mine", "sensor.background=null", "expect={}",
-    "scene.shape=[32,32]", "sensor.shape=[32,32]", "optics.window=[32,32]", "optics.bands=4",
+    "camera=mono", "scene=wall", "flare=clean", "doe=flat", "restore=wiener", "sensor=mine", "sensor.background=null",
+    "expect={}", "scene.shape=[32,32]", "sensor.shape=[32,32]", "optics.window=[32,32]", "optics.bands=4",
 ]  # fmt: skip
 SENSOR = """\
 # A mono camera with an absolute QE; the efficiency below does not count beside it.
@@ -99,6 +99,22 @@ def test_unclipped_electrons_of_twelve_lasers_agree_to_1e_4(compute):
         wanted = expected(name, 5e-3)
         assert found.max() == pytest.approx(wanted.max(), rel=1e-4), name
         assert np.abs(found - wanted).max() < 1e-4 * wanted.max(), name
+
+
+@pytest.mark.slow
+def test_pixels_that_average_over_their_area_agree_with_a_quadrature(compute):
+    name, half = "pointer", 4
+    only = f"lasers={{pointer: {{{LASERS[name]}, {REST}}}}}"
+    found = compute('"laser_photons[plain,pointer]"', only, "sensor.sampling=integrated")
+    middle = slice(16 - half, 16 + half)
+    node, weight = np.polynomial.legendre.leggauss(6)
+    at = (np.arange(-half, half)[:, None] + node / 2).ravel() * radiometry.PIXEL
+    away = np.hypot(*np.meshgrid(at - 0.11 * 9e-6, at + 0.11 * 6e-6, indexing="ij")).ravel()
+    fine = radiometry.electrons(numbers(LASERS[name]), away, 5e-3, efficiency).reshape(2 * half, 6, 2 * half, 6)
+    wanted = np.einsum("aibj,i,j->ab", fine, weight / 2, weight / 2)
+    electrons = found["laser_photons[plain,pointer]"][0, middle, middle].double().numpy() * 0.5
+    assert electrons.max() == pytest.approx(wanted.max(), rel=1e-4)
+    assert np.abs(electrons - wanted).max() < 1e-4 * wanted.max()
 
 
 @pytest.mark.slow

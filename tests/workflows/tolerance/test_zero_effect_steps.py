@@ -24,7 +24,8 @@ SMALL = [
     "outputs=[raw, peak, lsr]",
 ]
 CLEAN = [f"dirt.{name}=0" for name in ("dust", "scratches", "smudges")] + ["dirt.grease=0 waves", "dirt.dents=0 waves"]
-LASER = {"laser_psf", "laser_pupil", "laser_photons", "spot", "direction", "line", "laser_index", "laser_responses"}
+LASER = {"laser_psf", "laser_pupil", "laser_photons", "spot", "direction", "line", "laser_index", "laser_responses",
+         "light", "wavefront"}  # fmt: skip
 
 
 def recipe(*changes, flare="dirty_windshield"):
