@@ -96,8 +96,8 @@ def _(
     every = _known(thresholds)
     if line is None or line.centres.is_meta:
         return []
-    train = light is not None and (light.pulses.is_meta or _is_train(light))
-    laws = laws_of(mean_wavelength(line), train, dwell, pulse_duration, device, thresholds)
+    choice = {"dwell": dwell, "pulse_duration": pulse_duration, "device": device, "thresholds": thresholds}
+    laws = laws_before(line, light, **choice)
     if not any(law.quantity == ("irradiance" if pulse_duration is None else "fluence") for law in laws):
         raise ParameterError(*_no_law(every, mean_wavelength(line), dwell, pulse_duration, device))
     return [f"{law.damage} of a {law.device}: {law.median / 1e4:.4g} {law.unit}, {law.source}" for law in laws]
@@ -105,12 +105,9 @@ def _(
 
 @damage.check
 def _(result: SpotDamage, spot: Tensor, line: Bands, light: LaserLight | None = None, **params: Any) -> list[Check]:
-    choice = {name: params[name] for name in ("dwell", "pulse_duration", "device", "thresholds") if name in params}
-    laws = laws_of(mean_wavelength(line), _is_train(light), **choice)
-    return [
-        Check(_sentence(law, [float(x[i]) for x in result[:6]]), float(result.ratio[i]) < 1)
-        for i, law in enumerate(laws)
-    ]
+    rows = zip(*(column.tolist() for column in result[:6]), strict=True)
+    laws = laws_before(line, light, **params)
+    return [Check(_sentence(law, list(row)), row[0] < 1) for law, row in zip(laws, rows, strict=True)]
 
 
 def _sentence(law: DamageLaw, row: list[float]) -> str:
@@ -136,12 +133,19 @@ def laws_of(
     return (*steady, *pulses)
 
 
+def laws_before(line: Bands, light: LaserLight | None, **params: Any) -> tuple[DamageLaw, ...]:
+    """Return the laws for a laser, from the parameters of the step; a laser that is not yet known may be a train."""
+    choice = {name: params[name] for name in ("dwell", "pulse_duration", "device", "thresholds") if name in params}
+    unknown = light is not None and light.pulses.is_meta
+    return laws_of(mean_wavelength(line), unknown or _is_train(light), **choice)
+
+
 def exposed(spot: Tensor, light: LaserLight | None, law: DamageLaw, exposure: float) -> Tensor:
     """Return the irradiance in W/m2, or the fluence of one pulse in J/m2, of each pixel (y, x) of a laser spot."""
-    image = spot.detach().double().sum(0)
+    image = spot.detach().sum(0, dtype=torch.float64)
     if law.quantity == "irradiance":
         return image
-    if light is None:
+    if light is None or not float(light.pulse_fluence) > 0:  # a laser that is given by its strength
         return image * exposure
     pulses = float(light.pulses)
     if not pulses > 0:
@@ -199,7 +203,7 @@ def _no_law(
 ) -> tuple[str, str]:
     """Return the parameter and the message for a laser that no law covers."""
     kind = f"light that stays {dwell:.3g} s" if pulse_duration is None else f"pulses of {pulse_duration:.3g} s"
-    text = f"no threshold of damage for a {device} at {wavelength * 1e9:.5g} nm and {kind}"
+    text = f"no threshold of damage for the device {device} at {wavelength * 1e9:.5g} nm and {kind}"
     devices = sorted({law.device for law in laws})
     if device.casefold() not in {name.casefold() for name in devices}:
         return "device", f"{text}: there are laws for {', '.join(devices)}"

@@ -13,7 +13,7 @@ from neusee.nodes import Check, node
 from neusee.nodes.values import Bands, Psf
 
 Strengths = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...], Field(min_length=1)]
-_DECADES = tuple(10 ** (k / 4) for k in range(4, 25))  #: 10 to 1e6
+DECADES = tuple(10 ** (k / 4) for k in range(4, 25))  #: 10 to 1e6
 
 
 class DazzleCurve(NamedTuple):
@@ -30,7 +30,7 @@ def dazzle_curve(
     psf: Psf,
     bands: Bands,
     *,
-    strengths: Strengths = _DECADES,
+    strengths: Strengths = DECADES,
     level: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
 ) -> DazzleCurve:
     """Count the pixels in which a laser exceeds saturation, for each of several strengths.
@@ -47,7 +47,9 @@ def dazzle_curve(
     Source: Born and Wolf, Principles of Optics, 7th ed., section 8.5.2 (the Airy pattern and its far rings).
     """
     weights = bands.weights.double() * bands.centres.double()  # photons of each wavelength, whose wells they fill
-    light = torch.tensordot(weights.to(psf.intensity.device), psf.intensity.detach().double(), 1).flatten()
+    light = torch.zeros(psf.intensity[0].numel(), dtype=torch.float64, device=psf.intensity.device)
+    for weight, band in zip(weights.tolist(), psf.intensity.detach(), strict=True):
+        light = light + weight * band.flatten().double()
     peak = float((weights * psf.clear_peak.detach().cpu()).sum())
     at = torch.tensor(strengths, dtype=torch.float64)
     ordered = light.sort().values.cpu()

@@ -1,10 +1,19 @@
-"""Values of the results of the laser nodes before a run, which have few numbers."""
+"""Values of the results of the laser nodes before a run, which have few numbers, and shapes of the other results."""
 
 from typing import Any
 
+import torch
+from torch import Tensor
+
+from neusee.nodes.laser._damage_pixels import damaged_pixels
+from neusee.nodes.laser._damage_spot import SpotDamage, damage, laws_before
+from neusee.nodes.laser._dazzle_curve import DECADES, DazzleCurve, dazzle_curve
+from neusee.nodes.laser._dazzle_picture import Dazzle, dazzle
 from neusee.nodes.laser._light import light, wavefront
-from neusee.nodes.shape_rules import known, scalars
-from neusee.nodes.values import Bands, LaserLight, Stop, Wavefront
+from neusee.nodes.shape_rules import blank, double, known, scalars, transform_operations
+from neusee.nodes.values import Bands, LaserLight, Psf, Stop, Wavefront
+
+dazzle.shape(scalars(Dazzle))
 
 
 @wavefront.shape
@@ -17,3 +26,32 @@ def _(line: Bands, **params: Any) -> Wavefront:
 def _(line: Bands, stop: Stop, **params: Any) -> LaserLight:
     found: LaserLight = light(line, stop, **params) if known(line.centres) else scalars(LaserLight)()
     return found
+
+
+@damage.shape
+def _(spot: Tensor, line: Bands, light: LaserLight | None = None, **params: Any) -> SpotDamage:
+    laws = double(len(laws_before(line, light, **params)))
+    return SpotDamage(laws, laws, laws, laws, laws, laws, blank(*spot.shape[-2:], dtype=torch.uint8))
+
+
+@damage.work
+def _(result: SpotDamage, spot: Tensor, *inputs: Any, **params: Any) -> tuple[float, float]:
+    pixels = float(spot[0].numel())  # six planes of twice the size for the heat, and the sum of the bands
+    return 8.0 * 26 * pixels, float(spot.numel()) + 12 * transform_operations(2 * spot.shape[-2], 2 * spot.shape[-1])
+
+
+@damaged_pixels.shape
+def _(raw: Tensor, *inputs: Any, **params: Any) -> Tensor:
+    return blank(*raw.shape, dtype=raw.dtype)
+
+
+@dazzle_curve.shape
+def _(psf: Psf, bands: Bands, *, strengths: tuple[float, ...] = DECADES, **params: Any) -> DazzleCurve:
+    column = double(len(strengths))
+    return DazzleCurve(column, column, column, column)
+
+
+@dazzle_curve.work
+def _(result: DazzleCurve, psf: Psf, *inputs: Any, **params: Any) -> tuple[float, float]:
+    pixels = float(psf.intensity[0].numel())
+    return 40.0 * pixels, 2.0 * psf.intensity.numel() + 20 * pixels

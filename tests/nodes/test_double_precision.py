@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes import doe, flare, losses, metrics, optics, restore, scene, sensor, spectra
+from neusee.nodes import doe, flare, laser, losses, metrics, optics, restore, scene, sensor, spectra
 from neusee.nodes.values import Bands, LowRankCube, Psf, Pupil, Stop
 from tests.nodes.optics.independent_psf import window
 from tests.nodes.test_contract import NODES
@@ -239,6 +239,12 @@ def averaged(height, stop, *, feature):
     return weights @ exact(height) @ weights.T
 
 
+def pulse_over_thresholds(spot, line, exposure, **_):
+    """The fluence of one pulse over the published thresholds of a CMOS, in J/m2 from J/cm2."""
+    thresholds = [L("0.1"), L("100"), L("0.0789"), L("0.2419"), L("2.0054")]
+    return np.array([exact(spot).sum(0).max() * L(exposure) / (threshold * 10_000) for threshold in thresholds])
+
+
 def photons(irradiance, bands, responses, level, **_):
     weights = exact(responses) * photons_per_joule(bands.centres) * AREA * exact(level)
     return np.tensordot(weights, exact(irradiance), 1)
@@ -309,6 +315,8 @@ CASES = [
     case(metrics.encircled, (WIDE,), encircled, {"pixel_pitch": 1e-6, "radius": 4.99999999e-6}),
     case(metrics.light_outside, (PSF, PUPIL), outside),
     case(metrics.limits, (WIDE,), limits, take=torch.stack),
+    case(laser.damage, (IMAGE, spectra.line(wavelength=532e-9)), pulse_over_thresholds,
+         {"pixel_pitch": 2.9e-6, "exposure": 0.1, "dwell": 0.1, "pulse_duration": 1e-8}, take=lambda d: d.ratio),
     case(metrics.lsr, (PSF,), lambda p: exact(p.intensity).max((1, 2)) / exact(p.clear_peak)),
     case(metrics.mtf, (WIDE,), mtf_rms),
     case(metrics.peak_bsr, (IMAGE, SCENE), lambda x, y: exact(x).max((-2, -1)) / exact(y).max((-2, -1))),
@@ -368,8 +376,8 @@ _ELSEWHERE = {
     "is a fit or a likelihood, with tests of its own": ("calibrate.camera", "calibrate.camera_prior",
         "calibrate.density", "calibrate.least_squares", "calibrate.levels", "calibrate.prior", "calibrate.reduce",
         "calibrate.sufficient", "restore.richardson_lucy", "restore.wiener", "spectra.compress"),
-    "copies, counts or states": ("metrics.saturated", "optics.stop", "restore.clipped", "sensor.crop", "sensor.limits",
-        "spectra.filters"),
+    "copies, counts or states": ("laser.damaged_pixels", "laser.dazzle", "laser.dazzle_curve", "metrics.saturated",
+        "optics.stop", "restore.clipped", "sensor.crop", "sensor.limits", "spectra.filters"),
     "has a stated error above 1e-11": ("metrics.quality", "metrics.spectral_error"),
 }  # fmt: skip
 

@@ -137,6 +137,12 @@ CASES = {
     "doe.zernike": Case("coefficients.4", (STOP,), {"coefficients": {4: number(0.3), 6: number(0.1)}}),
     "flare.dirt": Case("grease", (STOP,), {"grease": number(1e-7), "dust": 3.0}),
     "flare.ghosts": Case("0", (rand(3, 12, 12), LINE, DIRECTION), {**LENS, "count": 3, "radius": 3e-5}),
+    "laser.damage": Case("0", (rand(3, 12, 12), LINE), {"pixel_pitch": 2.9e-6, "exposure": 0.1, "dwell": 0.1}),
+    "laser.damaged_pixels": Case("0", (RAW,), ADC),
+    "laser.dazzle": Case(
+        "0", (RAW, [RAW]), {"shape": (8, 8), "full_well": 25500.0, "quantum_efficiency": 0.56, "read_noise": 5.0}
+    ),
+    "laser.dazzle_curve": Case("0.intensity", (Psf(rand(3, 9, 9), rand(3)), LINE)),
     "laser.light": Case("power", (LINE, STOP), {**BEAM, "power": number(5e-3), "focal_length": 0.11, "exposure": 0.1}),
     "laser.wavefront": Case("distance", (LINE,), {**BEAM, "distance": number(100.0)}),
     "losses.background_loss": Case("0.intensity", (PSF, SCENE)),

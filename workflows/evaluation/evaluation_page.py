@@ -105,8 +105,8 @@ def _with_interval(x: Interval, metric: str) -> str:
 def _numbers(result: EvaluationResult) -> Section:
     text = f"""Mean and 95 % interval over scenes. Small: the picture that a display shows, reduced to {result.small}
         pixels of its shorter side in linear light, antialiased. Saturated: number of saturated pixels of the raw
-        picture. Damaged: fraction of the points whose brightest pixel exceeds the damage threshold of the sensor.
-        PSNR is a mean of decibels."""
+        picture. Damaged: fraction of the points whose brightest pixel exceeds `sensor.damage` times saturation, which
+        is the threshold of the paper and no damage in W/cm2. PSNR is a mean of decibels."""
     metrics = [metric for metric in METRICS if metric != "peak"]
     columns = ("pipeline", *(_column(metric) for metric in metrics))
     listed = [

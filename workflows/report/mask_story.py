@@ -35,7 +35,7 @@ def sentences(numbers: Mapping[str, Arm], lsr: Mapping[str, float], laser: bool)
     plain, mask = numbers.get(PLAIN, {}), numbers.get(MASK, {})
     if not plain or not mask:
         return {}
-    texts = _buys(plain, mask, lsr, laser), _costs(plain, mask, numbers.get(RESTORED, {}))
+    texts = _buys(plain, mask, lsr, laser), _costs(plain, mask, numbers.get(RESTORED, {}), laser)
     return {name: text for name, text in zip(SENTENCES, texts, strict=True) if text}
 
 
@@ -80,9 +80,9 @@ def _ratios(lsr: Mapping[str, float]) -> str:
     return f"LSR {first}" if len(lsr) == 1 else f"LSR from {first} to {last}"
 
 
-def _costs(plain: Arm, mask: Arm, restored: Arm) -> str:
+def _costs(plain: Arm, mask: Arm, restored: Arm, laser: bool) -> str:
     """Return a sentence with the picture quality and the saturated pixels without and with the mask."""
-    parts = [part for part in (_picture(plain, mask, restored), _saturation(plain, mask)) if part]
+    parts = [part for part in (_picture(plain, mask, restored), _saturation(plain, mask, laser)) if part]
     return f"{'; '.join(parts)}." if parts else ""
 
 
@@ -97,15 +97,17 @@ def _picture(plain: Arm, mask: Arm, restored: Arm) -> str:
     return f"The mask costs picture quality{', which restoration wins back' if after >= before else ''}: {text}"
 
 
-def _saturation(plain: Arm, mask: Arm) -> str:
-    """Return how many pixels saturate with the mask and with the plain lens, as text."""
+def _saturation(plain: Arm, mask: Arm, laser: bool) -> str:
+    """Return how many pixels saturate with the mask and with the plain lens, and that a laser dazzles more of them."""
     if _LOST not in plain or _LOST not in mask:
         return ""
     with_mask, without = (f"{arm[_LOST]:,.0f}" for arm in (mask, plain))
     if with_mask == without == "0":
         return "no pixel saturates"
     same = f"{with_mask} pixels saturate with and without the mask"
-    return same if with_mask == without else f"{with_mask} pixels saturate with the mask, {without} without"
+    text = same if with_mask == without else f"{with_mask} pixels saturate with the mask, {without} without"
+    wider = mask[_LOST] / plain[_LOST] if laser and plain[_LOST] > 0 else 0.0
+    return f"{text}: the mask enlarges the dazzled area {_number(wider)} times" if wider > 1 + _EQUAL else text
 
 
 def _number(value: float) -> str:

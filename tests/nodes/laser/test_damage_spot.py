@@ -118,10 +118,10 @@ def test_at_1550_nm_own_thresholds_are_judged_without_any_response_of_the_sensor
 
 
 @pytest.mark.parametrize(("nm", "change", "parameter", "message"), [
-    (1550, {}, "thresholds", "no threshold of damage for a CMOS at 1550 nm and light that stays 0.1 s .*500 to 560 nm"),
+    (1550, {}, "thresholds", "for the device CMOS at 1550 nm and light that stays 0.1 s .*500 to 560 nm"),
     (532, {"dwell": 1e-6}, "thresholds", "light that stays 1e-06 s"),
     (905, {"pulse_duration": 5e-9}, "thresholds", "pulses of 5e-09 s .*: give a file of your own thresholds"),
-    (532, {"device": "InGaAs"}, "device", "for a InGaAs at 532 nm .*: there are laws for CCD, CMOS"),
+    (532, {"device": "InGaAs"}, "device", "for the device InGaAs at 532 nm .*: there are laws for CCD, CMOS"),
     (532, {"pulse_duration": 1e-3}, "thresholds", "pulses of 0.001 s"),
 ])  # fmt: skip
 def test_a_laser_that_no_law_covers_is_refused_before_the_run(nm, change, parameter, message):

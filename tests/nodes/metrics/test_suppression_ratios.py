@@ -1,5 +1,7 @@
 """Suppression, peak and saturation: closed forms and both ends of the range."""
 
+import math
+
 import pytest
 import torch
 from hypothesis import given
@@ -66,6 +68,20 @@ def test_the_peak_of_a_laser_alone_is_its_strength(strength):
     found = peak_irradiance(dark, bands(550e-9), torch.ones(1), [laser], [line], **SENSOR)
     assert float(found.irradiance) == pytest.approx(strength, rel=1e-5)
     assert bool(found.damaged) == (float(found.irradiance) > 1e6)
+
+
+def test_the_papers_threshold_of_damage_is_a_reading_and_can_be_left_out():
+    """A multiple of saturation is no damage: the same light exceeds it after a longer exposure."""
+    light, one = torch.full((1, 2, 2), 1e5), torch.ones(1)
+    short, long = (peak_irradiance(light, bands(550e-9), one, **{**SENSOR, "exposure": t}) for t in (1e-3, 1.0))
+    assert (float(short.damaged), float(long.damaged)) == (0.0, 1.0)
+    text = peak_irradiance.hooks.check(long)[0].text
+    assert text.endswith("above the 1e+06 at which the paper expects damage (no threshold in W/cm2)")
+    none = peak_irradiance(light, bands(550e-9), one, **{**SENSOR, "exposure": 1.0}, damage=None)
+    assert math.isnan(float(none.damaged))
+    (check,) = peak_irradiance.hooks.check(none, damage=None)
+    assert check.ok
+    assert "damage" not in check.text
 
 
 def test_scene_and_lasers_add():

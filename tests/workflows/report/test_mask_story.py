@@ -27,7 +27,8 @@ def test_both_sentences_have_the_numbers_of_the_run():
         "buys": "The mask buys protection for the sensor: the brightest pixel receives 236 times less light than "
         "behind the plain lens (3.87 in place of 912 times saturation; LSR 0.00149 at 530 nm).",
         "costs": "The mask costs picture quality: PSNR 27.1 dB with the plain lens, 14.6 dB with the mask, and 17.7 dB "
-        "after restoration; 418 pixels saturate with the mask, 244 without.",
+        "after restoration; 418 pixels saturate with the mask, 244 without: the mask enlarges the dazzled area "
+        "1.71 times.",
     }
 
 
@@ -74,11 +75,22 @@ def test_the_cost_follows_from_the_quality(mask, restored, opening):
         (244, 244, "; 244 pixels saturate with and without the mask."),
         (0, 0, "; no pixel saturates."),
         (173788, 0, "; 0 pixels saturate with the mask, 173,788 without."),
+        (0, 12, "; 12 pixels saturate with the mask, 0 without."),
+        (
+            23643,
+            173788,
+            "; 173,788 pixels saturate with the mask, 23,643 without: the mask enlarges the dazzled area 7.35 times.",
+        ),
     ],
 )
 def test_the_saturated_pixels_are_compared(without, behind, end):
     found = said(plain=PLAIN | {"saturated px": without}, mask=MASK | {"saturated px": behind})
     assert found["costs"].endswith(end)
+
+
+def test_without_a_laser_no_area_is_dazzled():
+    found = said(lsr={}, laser=False)["costs"]
+    assert found.endswith("; 418 pixels saturate with the mask, 244 without.")
 
 
 def test_without_a_laser_the_mask_is_not_said_to_protect():
