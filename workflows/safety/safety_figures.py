@@ -54,15 +54,13 @@ def _panel(axis: Any, found: Estimate, kind: Any, findings: list[Finding]) -> No
 
 @drawn
 def spots(patterns: Sequence[DamagePattern]) -> Any:
-    """Draw the exposure on the sensor over the limit of damage, with a line around the area above the limit."""
+    """Draw the exposure on the sensor over the limit of damage: red above the limit, blue below."""
     figure, axes = canvas(4.6 * len(patterns), 4.0, 1, len(patterns))
     for axis, each in zip(axes[0], patterns, strict=True):
-        half = each.width / 2 * 1e6
-        shown = axis.imshow(
-            np.log10(np.maximum(each.ratio, each.peak * 1e-5)), cmap="viridis", extent=(-half, half, -half, half)
-        )
-        if each.area > 0:
-            axis.contour(each.ratio, [1.0], colors="white", linewidths=1.2, extent=(-half, half, half, -half))
+        half, decades = each.width / 2 * 1e6, max(1.0, abs(float(np.log10(each.peak))))
+        light = np.log10(np.maximum(each.ratio, 10.0**-decades))
+        limits = {"vmin": -decades, "vmax": decades}
+        shown = axis.imshow(light, cmap="RdBu_r", extent=(-half, half, -half, half), **limits)
         axis.set(title=f"{each.option}: {each.limit}", xlabel="um", ylabel="um")
         axis.grid(False)
         figure.colorbar(shown, ax=axis, label="log10 of exposure over limit", shrink=0.8)

@@ -68,7 +68,7 @@ def _pattern(found: Estimate, picture: bytes | None) -> Section | None:
         return None
     pitch = found.safety.settings.sensor.pixel_pitch
     text = f"""The exposure on the sensor at {words.metres(found.safety.laser.distance)} over the limit of the median
-        device, for the law that is named. Inside the white line the limit is exceeded; a pixel is {pitch * 1e6:.3g} um
+        device, for the law that is named. Where it is red the limit is exceeded; a pixel is {pitch * 1e6:.3g} um
         wide. A line, a cross or a lost frame is the damage of the circuits around this spot. {CERTIFICATE}"""
     rows = [[each.option, each.limit, each.peak, each.area, each.area / (pitch * 1e6) ** 2] for each in found.patterns]
     columns = ("protection", "limit", "peak over the limit", "area above the limit (um²)", "pixels")

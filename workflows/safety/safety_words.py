@@ -140,7 +140,9 @@ def laser_text(found: Estimate) -> str:
 def verdict(found: Estimate) -> list[str]:
     """Return one sentence for each limit behind the plain lens: where it is exceeded."""
     plain = [each for each in found.findings if each.option == found.options[0].name]
-    return [f"{each.limit.name}: exceeded {zones_text(each.zones)}." for each in plain]
+    return [
+        f"{each.limit.name}: exceeded {'from ' if each.zones.zones else ''}{zones_text(each.zones)}." for each in plain
+    ]
 
 
 def intervals_text(found: Estimate) -> str:
