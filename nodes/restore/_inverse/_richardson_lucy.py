@@ -20,7 +20,7 @@ _DARK = 1e-6  #: e-, least expected count, because the expectation is a divisor
 _GONE = 1e-30  #: e-, light below which a scene pixel stays dark; its gradient would grow with each step and overflow
 
 
-@node(rtol=3e-4, additive_inputs=[("glare",)])
+@node(rtol=3e-4, additive_inputs=[("glare",), ("ghosts",)])
 def richardson_lucy(
     electrons: Tensor,
     psf: Psf,
@@ -29,6 +29,7 @@ def richardson_lucy(
     bands: Bands,
     clipped: Tensor,
     glare: list[Tensor] | None = None,
+    ghosts: list[Tensor] | None = None,
     *,
     iterations: Annotated[int, Field(ge=1, le=1000)] = 40,
     read_noise: Electrons,
@@ -39,10 +40,10 @@ def richardson_lucy(
     raises the likelihood of Poisson counts. The scene stays nonnegative, so that no dark ring can balance the glare of
     a lamp, as it does in `restore.wiener`. Few steps keep the result smooth. The variance of the read noise is added to
     the counts. Clipped pixels, and the border beyond the edge, are unknown, and so is the strength of each pattern of
-    ``glare``, as in `restore.wiener`.
+    ``glare`` and ``ghosts``, as in `restore.wiener`.
 
     Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses (channel, band),
-            each glare (channel, at least y, at least x), cropped to the centre -> (channel, y, x).
+            each glare and ghost (channel, at least y, at least x), cropped to the centre -> (channel, y, x).
     Units:  e-; glare any; the result as behind a perfect lens without losses.
     Error:  a grey scene is assumed. The number of steps decides between blur and noise, and is no convergence: more
             steps restore finer detail and more noise. Without such lamps `restore.wiener` leaves less error.
@@ -53,11 +54,12 @@ def richardson_lucy(
             Hammoud and White, J. Opt. Soc. Am. A 10, 1014 (1993).
     """
     electrons = single(electrons)
+    glare = [*(glare or ()), *(ghosts or ())]
     refuse_other_pictures(electrons, psf, responses, clipped, glare)
     size = (electrons.shape[-2], electrons.shape[-1])
     kernels = effective_psf(psf, illuminant, responses, bands).to(electrons)
     known = _known(clipped, electrons)
-    patterns = [crop(pattern.to(electrons), shape=size) for pattern in glare or ()]
+    patterns = [crop(pattern.to(electrons), shape=size) for pattern in glare]
     patterns = [p / peak for p in patterns if (peak := float((p.detach().abs() * known).max())) > 0]
     wide = torus(size, edge(kernels, size))
     total = kernels.sum((-2, -1), keepdim=True)

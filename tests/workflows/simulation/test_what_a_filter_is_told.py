@@ -4,14 +4,14 @@ import pytest
 
 from neusee.workflows import load
 
-WIENER = ("wiener", "wiener_uncertain", "demonstration")
+WIENER = ("wiener", "wiener_uncertain", "demonstration", "richardson_lucy")
 
 
 @pytest.mark.parametrize("restorer", WIENER)
 def test_the_ghosts_of_a_dirty_windshield_are_told(restorer):
     step = load("dirty_windshield", [f"restore={restorer}"]).steps["deconvolved"]
     assert step.wires["ghosts"] == ("ghost_photons[mask,green]",)
-    assert step.params["doubt"] == 0
+    assert step.params.get("doubt", 0) == 0
 
 
 @pytest.mark.parametrize("restorer", WIENER)
