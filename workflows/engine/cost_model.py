@@ -23,6 +23,7 @@ from neusee.workflows.recipe.known_before_run import machine_memory
 _FASTER = 10.0  #: speed of another kind of device relative to the CPU, until both are measured
 _NEWEST = 5  #: number of earlier results that are used
 _LEAST = 1 << 25  #: bytes of a peak below which the memory of the process is mostly noise
+_FARTHEST = 8  #: how much larger a step of a node without a law may be than the largest one that was measured
 _SHORT = 1e-3  #: s of a step below which its time is mostly overhead
 
 Row = Mapping[str, Any]  #: a line of the journal
@@ -113,8 +114,8 @@ class Costs:
         law = shipped().get(path)
         if same:
             return self._repeated(same, kinds, size, law)
-        if law is None and not rows:
-            return self._guess(path, kinds, size)
+        if law is None and _FARTHEST * max((_extent(_size(row)) for row in rows), default=0.0) < _extent(size):
+            return self._guess(path, kinds, size, rows[-_NEWEST:])
         base = law or guess()
         factors = _scales(base, rows[-_NEWEST:], self._faster)
         peak = max(size.result, factors[0] * base.peak(size))
@@ -135,10 +136,14 @@ class Costs:
         spread = (_range(peaks, peak, usual[0]), _range([row["seconds"] for row in rows], None, usual[1]))
         return Estimate(seconds, result, peak - result, True, spread, size.bands if size else 0)
 
-    def _guess(self, path: str, kinds: Sequence[str], size: Size | None) -> Estimate:
-        """Predict the upper end of the costs of a step whose node was never measured or whose shape is unknown."""
+    def _guess(self, path: str, kinds: Sequence[str], size: Size | None, rows: Sequence[Row] = ()) -> Estimate:
+        """Predict the upper end of the costs of a step whose shape is unknown or whose node never ran at such a size.
+
+        ``rows`` has runs at sizes that are much smaller: a node that took more there than the law says takes more here.
+        """
         size, law = size or Size(0.0, 0.0, 0.0, 0.0, known=False), shipped().get(path) or guess()
-        on_cpu, peak = law.spread[1].most * law.time(size), law.spread[0].most * law.peak(size)
+        more = [max(1.0, factor) for factor in _scales(law, rows, self._faster)]
+        on_cpu, peak = more[1] * law.spread[1].most * law.time(size), more[0] * law.spread[0].most * law.peak(size)
         seconds = {kind: on_cpu / self._faster(kind) for kind in kinds}
         spread = (Range(size.result / peak if peak else 0.0, 1.0), Range(0.0, 1.0))
         return Estimate(seconds, size.result, peak - size.result, False, spread, size.bands, size.known)
@@ -207,6 +212,10 @@ def _size(row: Row) -> Any:
     found = row.get("size")
     valid = isinstance(found, list | tuple) and len(found) == 4 and all(isinstance(x, int | float) for x in found)
     return Size(*found) if valid else None  # type: ignore[misc]
+
+
+def _extent(size: Size) -> float:
+    return size.inputs + size.result
 
 
 def _alike(one: Size, other: Size) -> bool:

@@ -12,6 +12,7 @@ from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import device_kind, stream_seed
 from neusee.workflows.store.serialization import each_tensor, settle, tensors_in
+from neusee.workflows.store.stored_types import fits as fits_type
 
 
 def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
@@ -26,6 +27,11 @@ def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int
         raise RunError(step, inputs, error) from error
     if before != [x._version for x in tensors]:
         raise RunError(step, inputs, ValueError("the node changed its input in place: let the node clone the input"))
+    kind = step.node.hints.get("return", Any)
+    if not fits_type(value, kind):  # stored, such a value would count as damaged
+        name = getattr(kind, "__name__", kind)
+        text = f"the node returned a value of the type {type(value).__name__}, but its annotation says {name}"
+        raise RunError(step, inputs, TypeError(text))
     return value
 
 

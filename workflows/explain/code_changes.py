@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from pathlib import Path
 
 from neusee.workflows.keys.code_memo import read_parts
@@ -66,10 +67,34 @@ def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
     """Return one text clause for each changed, added or removed definition of a module."""
     file = _file(module)
     differ = [label for label in new if label in old and old[label] != new[label]]
-    changed = [f"{'code of ' + label if label.endswith('()') else _named(label)} in {file} changed" for label in differ]
+    lines = _lines(module) if differ else {}
+    at = {label: f" (line {lines[label]})" if label in lines else "" for label in differ}
+    changed = [
+        f"{'code of ' + label if label.endswith('()') else _named(label)} in {file} changed{at[label]}"
+        for label in differ
+    ]
     added = [f"{_named(label)} was added to {file}" for label in new if label not in old]
     removed = [f"{_named(label)} was removed from {file}" for label in old if label not in new]
     return changed + added + removed
+
+
+def _lines(module: str) -> dict[str, int]:
+    """Return the line of each function, hook, class and constant at the top of a module, as its file is now."""
+    path = source_file(module)
+    try:
+        body = ast.parse(path.read_bytes()).body if path else []
+    except (OSError, SyntaxError):
+        return {}
+    found = dict[str, int]()
+    for item in body:
+        if isinstance(item, ast.ClassDef):
+            found[f"class {item.name}"] = item.lineno
+        elif isinstance(item, ast.FunctionDef):
+            hooks = [ast.unparse(each) for each in item.decorator_list] if item.name == "_" else []
+            found |= {f"{name}()": item.lineno for name in hooks or [item.name]}
+        elif isinstance(item, ast.Assign):
+            found |= {f"constant {each.id}": item.lineno for each in item.targets if isinstance(each, ast.Name)}
+    return found
 
 
 def _named(label: str) -> str:

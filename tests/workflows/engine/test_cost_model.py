@@ -57,6 +57,18 @@ def test_the_costs_follow_the_size_and_not_the_name():
     assert larger.seconds["cpu"] == pytest.approx(1.5 * guess().time(LARGE) / guess().time(SMALL))
 
 
+def test_what_a_node_of_the_user_costs_at_a_size_far_above_all_its_runs_is_a_guess():
+    tiny, eighth, large = Size(5e6, 5e6, 0.0, 2e6), Size(2.5e7, 2.5e7, 0.0, 1e7), SMALL
+    quick = Costs([row("a", 1e-4, peak=1e6, of=tiny)], {"a": large}).of(step("a"), ["cpu"])
+    assert not quick.known
+    assert (quick.peak, quick.seconds["cpu"]) == (guess().peak(large), guess().time(large))
+    near = Costs([row("a", 5.0, of=eighth)], {"a": large}).of(step("a"), ["cpu"])
+    assert near.known
+    tenth = Costs([row("a", 100 * guess().time(tiny), of=tiny)], {"a": large}).of(step("a"), ["cpu"])
+    assert not tenth.known
+    assert tenth.seconds["cpu"] == pytest.approx(100 * guess().time(large))
+
+
 def test_a_shipped_law_is_scaled_by_the_runs_of_this_machine():
     law = shipped()["optics.psf"]
     psf = step("psf", optics.psf)

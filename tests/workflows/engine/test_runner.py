@@ -394,6 +394,18 @@ def test_a_node_that_changes_its_input_is_refused(store):
         run(recipe("f", s=(source,), f=(spoils, {"x": "s"})), store)
 
 
+@pytest.mark.parametrize("what", [None, (), 3.0])
+def test_a_result_of_another_type_than_annotated_ends_the_run_at_its_step(store, what):
+    @node()
+    def forgets(x) -> torch.Tensor:
+        return what
+
+    recipe_ = recipe("g", s=(source,), f=(forgets, {"x": "s"}), g=(noise, {"x": "f"}))
+    text = rf"f \(.*forgets\): TypeError: the node returned a value of the type {type(what).__name__}"
+    with pytest.raises(RunError, match=text + ", but its annotation says Tensor"):
+        run(replace(recipe_, tolerance=1e-3), store)
+
+
 def test_a_result_that_cannot_be_kept_is_refused(store):
     with pytest.raises(RunError, match=r"f \(.*must return tensors"):
         run(recipe("f", s=(source,), f=(strange, {"x": "s"})), store)

@@ -125,7 +125,7 @@ def test_declarations_that_come_and_go(lab):
     assert "file more.csv is declared now" in found
     assert "file table.csv is declared no more" in found
     assert "environment variable BESIDE is declared no more" in found
-    assert "code of make() in neusee/nodes/beside/__init__.py changed" in found
+    assert "code of make() in neusee/nodes/beside/__init__.py changed (line 9)" in found
 
 
 def test_a_package_that_is_used_no_longer(lab):
@@ -148,7 +148,7 @@ def test_a_value_of_the_function_around_a_node(lab):
     run(lab.recipe(), lab.store)
     lab.edit("__init__.py", "make(1.0)", "make(2.0)")
     assert lab.causes() == [
-        "constant value in neusee/nodes/beside/__init__.py changed",
+        "constant value in neusee/nodes/beside/__init__.py changed (line 16)",
         "a value that the function of the node holds from the function around it changed",
     ]
 

@@ -293,23 +293,23 @@ def test_two_changes_are_both_told_the_nearest_first(trial):
 CODE = {
     "a node's own function": (
         ("_light.py", "return light + sigma * torch", "return light + 2 * sigma * torch"),
-        "restored <- raw <- read: code of noise() in neusee/nodes/trial/_light.py changed",
+        "restored <- raw <- read: code of noise() in neusee/nodes/trial/_light.py changed (line 46)",
     ),
     "a helper": (
         ("_helper.py", "x / 2", "x / 4"),
-        "restored <- raw: code of half() in neusee/nodes/trial/_helper.py changed",
+        "restored <- raw: code of half() in neusee/nodes/trial/_helper.py changed (line 4)",
     ),
     "a constant": (
         ("_helper.py", "FALL = 2.0", "FALL = 3.0"),
-        "restored <- raw: constant FALL in neusee/nodes/trial/_helper.py changed",
+        "restored <- raw: constant FALL in neusee/nodes/trial/_helper.py changed (line 1)",
     ),
     "a bound": (
         ("_light.py", "return sigma / light.max", "return 2 * sigma / light.max"),
-        "code of noise.skip_bound() in neusee/nodes/trial/_light.py changed",
+        "code of noise.skip_bound() in neusee/nodes/trial/_light.py changed (line 51)",
     ),
     "a check": (
         ("_light.py", 'Check("even")', 'Check("flat")'),
-        "code of flat.check() in neusee/nodes/trial/_light.py changed",
+        "code of flat.check() in neusee/nodes/trial/_light.py changed (line 21)",
     ),
     "a new function": (
         ("_helper.py", "FALL = 2.0\n", "FALL = 2.0\n\n\ndef third(x):\n    return x / 3\n"),
