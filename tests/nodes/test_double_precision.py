@@ -360,16 +360,19 @@ _ELSEWHERE = {
         "restore.network", "restore.unet"),
     "draws": ("calibrate.expose", "optics.direction", "sensor.dark_current", "sensor.digitize", "sensor.photon_noise",
         "sensor.photon_transfer", "sensor.read_noise", "spectra.grain", "spectra.leaves", "spectra.metamers"),
-    "reads tables or files": ("calibrate.descriptor", "calibrate.frames", "calibrate.table", "restore.colour_matrix",
+    "reads tables or files": ("calibrate.descriptor", "calibrate.frames", "calibrate.point_source", "calibrate.table",
+        "restore.colour_matrix",
         "spectra.illuminant", "spectra.lift_lmmse", "spectra.lift_lmmse_mixture", "spectra.lift_mallett",
         "spectra.lift_mallett_mixture", "spectra.line_table", "spectra.reflectances", "spectra.render",
         "spectra.responses"),
     "is a fit or a likelihood, with tests of its own": ("calibrate.camera", "calibrate.camera_prior",
         "calibrate.density", "calibrate.least_squares", "calibrate.levels", "calibrate.prior", "calibrate.reduce",
-        "calibrate.sufficient", "restore.richardson_lucy", "restore.wiener", "spectra.compress"),
+        "calibrate.stray_light", "calibrate.stray_prior", "calibrate.sufficient",
+        "restore.richardson_lucy", "restore.wiener", "spectra.compress"),
     "copies, counts or states": ("metrics.saturated", "optics.stop", "restore.clipped", "sensor.crop", "sensor.limits",
         "spectra.filters"),
-    "has a stated error above 1e-11": ("metrics.quality", "metrics.spectral_error"),
+    "has a stated error above 1e-11": ("flare.stray_light", "flare.stray_shares", "metrics.quality",
+        "metrics.spectral_error"),
 }  # fmt: skip
 
 
