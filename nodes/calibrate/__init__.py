@@ -13,17 +13,24 @@ from neusee.nodes.calibrate._likelihood._linear_sensor import Likelihood
 from neusee.nodes.calibrate._likelihood._sufficient_statistics import Sufficient, sufficient
 from neusee.nodes.calibrate._prior._camera_prior import CAMERA_NAMES, CameraCoordinates, camera_prior
 from neusee.nodes.calibrate._prior._first_guess import guess, guess_camera
-from neusee.nodes.calibrate._prior._free_parameters import Prior
+from neusee.nodes.calibrate._prior._free_parameters import Prior, Ridge
 from neusee.nodes.calibrate._prior._sensor_prior import NAMES, Coordinates, prior
+from neusee.nodes.calibrate._scatter._point_source import Rings, point_source
+from neusee.nodes.calibrate._scatter._scatter_likelihood import guess_scatter, stray_light
+from neusee.nodes.calibrate._scatter._scatter_prior import SCATTER_NAMES, ScatterCoordinates, stray_prior
 
 __all__ = [
     "CAMERA_NAMES",
     "NAMES",
+    "SCATTER_NAMES",
     "CameraCoordinates",
     "Coordinates",
     "LeastSquares",
     "Likelihood",
     "Prior",
+    "Ridge",
+    "Rings",
+    "ScatterCoordinates",
     "Sufficient",
     "camera",
     "camera_prior",
@@ -33,10 +40,14 @@ __all__ = [
     "frames",
     "guess",
     "guess_camera",
+    "guess_scatter",
     "least_squares",
     "levels",
+    "point_source",
     "prior",
     "reduce",
+    "stray_light",
+    "stray_prior",
     "sufficient",
     "table",
 ]

@@ -14,6 +14,7 @@ from tests.nodes.test_contract import NODES
 
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
 DIAMETER = 8e-3
+SCATTER = {**LENS, "diameter": DIAMETER, "surfaces": {"lens": {"b0": 9.0, "l": 3e-3, "s": -1.7}}}
 
 
 def rand(*shape, dtype=torch.float32):
@@ -50,6 +51,11 @@ CASES = {
         ((pupil(512, 31),), {"shape": (256, 256)}),
         ((pupil(301, 4, height=0.0),), {"shape": (33, 47)}),  # few turns of phase: another path
         ((pupil(1080, 4, height=2e-5),), {"shape": (1000, 999)}),
+    ],
+    "flare.stray_light": [
+        ((as_psf(5, 21, 33), pupil(33, 5)), SCATTER),
+        ((as_psf(7, 40, 41), pupil(40, 7), torch.tensor([2e-4, 1e-4], dtype=torch.float64)), SCATTER),
+        ((as_psf(4, 64, 64), pupil(64, 4)), {**SCATTER, "scaling": "roughness"}),
     ],
     "metrics.bsr": [
         ((as_psf(5, 9, 9), rand(5, 17, 33)), {}),

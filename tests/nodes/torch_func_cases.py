@@ -79,6 +79,11 @@ def _levels():
 
 FRAMES, EACH, LEVELS = _levels()
 SUFFICIENT = calibrate.sufficient(LEVELS)
+_FAR = torch.linspace(20.0, 40.0, 12, dtype=torch.float64)
+_EIGHT, _SIXES = torch.full((8,), 300.0, dtype=torch.float64), torch.arange(12) % 8
+RINGS = calibrate.Rings(1e5 / _FAR[:8], _EIGHT, _SIXES, _FAR**2, 0 * _FAR + 100, _FAR[:2], _EIGHT[0], _FAR[:2])
+POINT = {"electrons": 3e8, "read_noise": 5.0, "gain": 0.5, "focal_length": 0.05, "diameter": 5e-3, "pixel_pitch": 5e-6,
+         "wavelength": 550e-9, "scatter": 0.01}  # fmt: skip
 
 
 def number(x):
@@ -130,6 +135,7 @@ CASES = {
     "calibrate.least_squares": Case("0.variance", (LEVELS,)),
     "calibrate.levels": Case("0.0.mean", (EACH,)),
     "calibrate.reduce": Case("0", (FRAMES,), {"photons": 500.0, "exposure": 0.1}),
+    "calibrate.stray_light": Case("b0", (RINGS,), {"b0": number(10.0), "l": 0.01, "s": -2.0, **POINT}),
     "calibrate.sufficient": Case("0.mean", (LEVELS,)),
     "doe.axicon": Case("waves", (STOP,), {"waves": number(2.0)}),
     "doe.cubic": Case("waves", (STOP,), {"waves": number(2.0)}),
@@ -258,7 +264,9 @@ NOTHING_TO_FOLLOW = {
     "calibrate.camera_prior": "states the prior that a recipe writes",
     "calibrate.descriptor": "reads a file",
     "calibrate.frames": "reads files",
+    "calibrate.point_source": "reads files",
     "calibrate.prior": "states the prior that a recipe writes",
+    "calibrate.stray_prior": "states the prior that a recipe writes",
     "calibrate.table": "reads a file",
     "doe.flat": "is 0 on every grid",
     "doe.pixelwise": "reads a file, or draws heights that are to be trained",

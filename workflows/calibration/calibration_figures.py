@@ -58,6 +58,40 @@ def transfer(measured: FloatArray, predicted: FloatArray, whole: NDArray[np.bool
 
 
 @drawn
+def rings(
+    radius: FloatArray, cut: FloatArray, measured: FloatArray, predicted: FloatArray, variance: FloatArray
+) -> Any:
+    """Draw the signal of the rings about an overexposed source over the radius, and its deviation from the prediction.
+
+    ``measured`` (ring,) and ``predicted`` and ``variance`` (draw, ring) are electrons of a pixel and their squares;
+    ``cut`` (cut,) are the radii of the rings that are cut off.
+    """
+    figure, axes = canvas(9.0, 7.2, 2, 1, sharex=True, height_ratios=(2.2, 1.0))
+    above, below = axes[0, 0], axes[1, 0]
+    low, middle, high = np.percentile(predicted, _BAND, axis=0)
+    above.fill_between(radius, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %")
+    above.plot(radius, middle, color=BLUE, linewidth=1.2, label="predicted, median")
+    seen = measured > 0
+    above.plot(radius[seen], measured[seen], "o", color=BLACK, markersize=4, label="measured")
+    if len(cut):
+        ends = float(cut.min()) - 0.5, float(cut.max()) + 0.5  # a ring is one pixel wide
+        above.axvspan(*ends, color=VERMILION, alpha=0.3, linewidth=0, label="cut off")
+    above.set(xscale="log", yscale="log", ylabel="signal (e- of a pixel)", title="Rings about the source")
+    above.legend(loc="lower left")
+    width = np.sqrt(predicted.var(0) + variance.mean(0))
+    below.axhspan(-2, 2, color=BLUE, alpha=0.12, linewidth=0)
+    below.axhline(0, color=BLUE, linewidth=1.0)
+    distance = (measured - predicted.mean(0)) / width
+    below.plot(radius, distance, "o", color=BLACK, markersize=4)
+    below.set(xlabel="distance from the source (pixels)", ylabel="distance in sd\nof the prediction")
+    below.xaxis.set_major_formatter("{x:g}")
+    below.xaxis.set_minor_formatter("{x:g}")
+    reach = max(3.5, 1.1 * float(np.abs(distance).max(initial=0.0)))
+    below.set_ylim(-reach, reach)
+    return figure
+
+
+@drawn
 def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -> Any:
     """Draw a corner plot of all pairs of parameters, with the recipe's own values in orange."""
     import corner

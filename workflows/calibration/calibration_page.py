@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from neusee.nodes.calibrate import Sufficient
+from neusee.nodes.calibrate import Rings, Sufficient
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration import calibration_figures as figures
 from neusee.workflows.calibration.identifiability import KINDS, Identifiability
@@ -26,7 +26,17 @@ if TYPE_CHECKING:
 
 _PREDICTED = 400  #: draws for the band of the predicted variance
 _CORNER = 20_000  #: draws for the picture of pairs
-_PURE = ("quantum_efficiency", "spread", "scatter", "lamp", "bend", "twist")  #: parameters without a unit
+_PURE = (
+    "quantum_efficiency",
+    "spread",
+    "scatter",
+    "lamp",
+    "bend",
+    "twist",
+    "l",
+    "s",
+    "core",
+)  #: without a unit
 
 
 @dataclass(frozen=True)
@@ -90,12 +100,12 @@ class CalibrationResult:
 
 
 def unit_of(name: str, params: Mapping[str, Any]) -> str:
-    """Return the unit of a parameter of the node `calibrate.density` or `calibrate.camera`."""
+    """Return the unit of a parameter of the likelihood: `calibrate.density`, `.camera` or `.stray_light`."""
     if name == "gain":
         return "DN/e-"
     if name == "dark_current":
         return f"e- in {params['dark_exposure']:g} s"
-    return {"dark_signal": "DN", "drift": "DN", **dict.fromkeys(_PURE, "")}.get(name, "e-")
+    return {"dark_signal": "DN", "drift": "DN", "b0": "1/sr", **dict.fromkeys(_PURE, "")}.get(name, "e-")
 
 
 def banner(result: CalibrationResult) -> str:
@@ -182,10 +192,12 @@ def _not_determined(result: CalibrationResult) -> Section:
 
 
 def _curve(result: CalibrationResult) -> Section:
+    if isinstance(result.problem.levels, Rings):
+        return _rings(result, result.problem.levels)
     rng = np.random.default_rng(1)
     flat = result.chains.flat
     look = result.problem.likelihood(flat[rng.integers(len(flat), size=_PREDICTED)])
-    levels = result.problem.levels
+    levels: Any = result.problem.levels
     mean, variance, freedom = look.mean.numpy(), look.variance.numpy(), levels.degrees_of_freedom.numpy()
     chance = rng.standard_normal(variance.shape) * np.sqrt(2 / freedom.clip(1))
     whole: NDArray[np.bool_] = np.asarray((variance > 0).all(0))
@@ -195,6 +207,22 @@ def _curve(result: CalibrationResult) -> Section:
         measurement. If a level is clipped by the well or the converter, or too coarse for a mean and a variance, each
         of its digital numbers enters the likelihood, and the level has no prediction here."""
     return Section("Photon-transfer curve", text, picture=picture)
+
+
+def _rings(result: CalibrationResult, rings: Rings) -> Section:
+    rng, flat = np.random.default_rng(1), result.chains.flat
+    look = result.problem.likelihood(flat[rng.integers(len(flat), size=_PREDICTED)])
+    picture = figures.rings(*ring_radii(rings), rings.mean.numpy(), look.mean.numpy(), look.variance.numpy())
+    text = """The mean signal of each ring about the source, and the prediction of the posterior for a repeated
+        measurement. Rings whose every pixel is cut off only bound the signal from below."""
+    return Section("Rings about the source", text, picture=picture)
+
+
+def ring_radii(rings: Rings) -> tuple[FloatArray, FloatArray]:
+    """Return the root mean square radius of each averaged ring, and of each ring that is cut off, in pixels."""
+    at, count = rings.ring.numpy(), rings.weight.numpy()
+    square = np.bincount(at, count * rings.square.numpy()) / np.bincount(at, count)
+    return np.sqrt(square), np.sqrt(rings.cut_square.numpy())
 
 
 def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:

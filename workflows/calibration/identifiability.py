@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from neusee.nodes.calibrate import Ridge
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
@@ -63,9 +64,21 @@ def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
             sentences.append(f"{_plain(name)}: {KINDS[kinds[name]]}{reason}")
         else:
             sentences.append(_together(parts))
+    for ridge in problem.coordinates.ridges(torch.from_numpy(mode.theta)):
+        if _as_good(problem, mode, ridge):
+            kinds |= ridge.kinds
+            sentences.append(ridge.text)
     count = f"{len(weak)} of {len(problem.names)} parameters cannot be determined from these frames"
     refused = f"{count}: {'; '.join(sentences)}" if 2 * len(weak) > len(problem.names) else ""
     return Identifiability(kinds, sentences, s.tolist(), refused)
+
+
+def _as_good(problem: SensorPosterior, mode: LaplaceFit, ridge: Ridge) -> bool:
+    """Return True if parameters far from the mode fit as well, the priors of the limited parameters left out."""
+    places = np.stack([ridge.place.numpy(), mode.theta])
+    limited = [problem.names.index(name) for name in ridge.kinds]
+    without = problem.log_posterior(places) + 0.5 * (problem.whitened(places)[:, limited] ** 2).sum(1)
+    return bool(without[1] - without[0] < _FALLS)
 
 
 def _own(s: FloatArray, v: FloatArray) -> FloatArray:

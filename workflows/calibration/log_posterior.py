@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neusee.nodes.calibrate import CameraCoordinates, Coordinates, Likelihood, Sufficient
+from neusee.nodes.calibrate import CameraCoordinates, Coordinates, Likelihood, Rings, ScatterCoordinates, Sufficient
 from neusee.nodes.values import Levels
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.local_executor import one_thread
@@ -26,9 +26,10 @@ if TYPE_CHECKING:
 
 _Function = Callable[[Mapping[str, Any]], dict[str, Any]]  #: from parameters to the likelihood by step name
 #: from the node of the likelihood to the node of the prior and the class of the coordinates
-_KINDS: dict[str, tuple[str, type[Coordinates] | type[CameraCoordinates]]] = {
+_KINDS: dict[str, tuple[str, type[Coordinates] | type[CameraCoordinates] | type[ScatterCoordinates]]] = {
     "calibrate.density": ("calibrate.prior", Coordinates),
     "calibrate.camera": ("calibrate.camera_prior", CameraCoordinates),
+    "calibrate.stray_light": ("calibrate.stray_prior", ScatterCoordinates),
 }
 
 
@@ -39,8 +40,8 @@ class SensorPosterior:
     recipe: Recipe
     step: str  #: name of the step that computes the likelihood
     key: str  #: digest of everything that decides the posterior
-    coordinates: Coordinates | CameraCoordinates
-    levels: Sufficient | Levels
+    coordinates: Coordinates | CameraCoordinates | ScatterCoordinates
+    levels: Sufficient | Levels | Rings  #: the data that the likelihood describes
     weigh: _Function
     weigh_in_full: _Function  #: also returns deviances and derivatives
 
@@ -50,7 +51,7 @@ class SensorPosterior:
         density = only_step(recipe, *_KINDS)
         prior_node, kind = _KINDS[density.node.path]
         prior = only_step(recipe, prior_node)
-        source = str(density.wires["levels"])
+        source = str(density.wires[density.node.inputs[0]])
         done = run(recipe, store, (density.name, prior.name, source))
         coordinates = kind.of(done[prior.name], density.params)
         free = [f"{density.name}.{name}" for name in coordinates.names]
@@ -107,6 +108,6 @@ def only_step(recipe: Recipe, *paths: str) -> Step:
         count = f"{len(steps)} steps" if steps else "no step"
         raise ValueError(
             f"{recipe.name} has {count} of the node {' or '.join(paths)}, but a calibration needs exactly one: see "
-            "`neusee run calibrate` and `neusee run calibrate_camera`"
+            "`neusee run calibrate`, `neusee run calibrate_camera` and `neusee run calibrate_stray_light`"
         )
     return steps[0]

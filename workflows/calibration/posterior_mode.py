@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from neusee.nodes.calibrate import guess, guess_camera
+from neusee.nodes.calibrate import Rings, guess, guess_camera, guess_scatter
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 
@@ -53,9 +53,7 @@ def initial_theta(problem: SensorPosterior) -> FloatArray:
     coordinates = problem.coordinates
     middle = coordinates.from_whitened(torch.zeros(len(problem.names), dtype=torch.float64))
     believed = {**coordinates.held, **{name: float(x) for name, x in middle.items()}}
-    params = problem.recipe.steps[problem.step].params
-    levels = problem.levels
-    guessed = guess_camera(levels, believed, params) if isinstance(levels, Levels) else guess(levels, believed, params)
+    guessed = _guessed(problem, believed)
     first, last = (problem.theta({name: x[name] for name in problem.names}) for x in (guessed, believed))
     samples = np.stack([first, *(last + (first - last) * share for share in _NARROWER), last])
     alive = np.isfinite(problem.log_posterior(samples))
@@ -66,6 +64,15 @@ def initial_theta(problem: SensorPosterior) -> FloatArray:
         )
     start: FloatArray = samples[int(alive.argmax())]
     return start
+
+
+def _guessed(problem: SensorPosterior, believed: dict[str, float]) -> dict[str, float]:
+    params, levels = problem.recipe.steps[problem.step].params, problem.levels
+    if isinstance(levels, Levels):
+        return guess_camera(levels, believed, params)
+    if isinstance(levels, Rings):
+        return guess_scatter(levels, believed, params)
+    return guess(levels, believed, params)
 
 
 def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit:
@@ -131,7 +138,7 @@ def _sides(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> Flo
 def _slopes(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return derivatives of light levels and prior by coordinate; their Gram matrix is Fisher's information."""
     rows = _differences(lambda p: problem.likelihood(p).scaled.numpy(), theta, step, _sides(problem, theta, step))
-    rounded = problem.recipe.steps[problem.step].params["rounding"] == "nearest"
+    rounded = problem.recipe.steps[problem.step].params.get("rounding") == "nearest"
     for name in problem.coordinates.edged.intersection(problem.names) if rounded else ():
         at = problem.names.index(name)  # levels depend on this parameter only at edges, where they have no derivative
         rows[:, at] = 0.0

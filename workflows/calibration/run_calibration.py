@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from neusee.nodes.calibrate import Rings
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration.calibration_page import CalibrationResult, banner, lead, sections
 from neusee.workflows.calibration.identifiability import identify
@@ -105,7 +106,8 @@ def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
 
 def _report(result: CalibrationResult, document: Mapping[str, Any]) -> StudyReport:
     parts = sections(result)
-    pictures = {name: part.picture for name, part in zip(("transfer", "corner", "chains"), parts[-3:], strict=True)}
+    curve = "rings" if isinstance(result.problem.levels, Rings) else "transfer"
+    pictures = {name: part.picture for name, part in zip((curve, "corner", "chains"), parts[-3:], strict=True)}
     files: dict[str, Content] = {
         "posterior.json": as_json(document),
         "draws.npz": _draws(result),

@@ -17,6 +17,14 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Pair = tuple[float, float]
 
 
+class Ridge(NamedTuple):
+    """Parameters far from a fit that may fit the same data as well, and what is known if they do."""
+
+    place: Tensor  #: (free,) coordinates
+    kinds: Mapping[str, str]  #: from a parameter to "upper" or "lower", the limit that is known
+    text: str  #: a sentence
+
+
 class Prior(NamedTuple):
     """Independent normal distributions, one for each parameter of a sensor; NaN stands for a fixed parameter."""
 
@@ -89,6 +97,10 @@ class Free:
         """Return the free parameters from logarithms, or from the values of parameters that may be 0 or negative."""
         pairs = zip(self.names, values.unbind(-1), strict=True)
         return {name: x if name in self.linear else x.exp() for name, x in pairs}
+
+    def ridges(self, place: Tensor) -> list[Ridge]:
+        """Return parameters far from ``place`` (free,) that some data cannot distinguish from it; by default none."""
+        return []
 
     @cached_property
     def _normals(self) -> Prior:

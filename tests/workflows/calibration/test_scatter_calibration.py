@@ -1,0 +1,132 @@
+"""The scatter of a lens from simulated pictures: coverage of the intervals, limits, and chains against weights."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import quad
+
+from neusee.nodes import calibrate
+from neusee.workflows.calibration import calibration_figures, emcee_sampler, importance_sampling
+from neusee.workflows.calibration.calibration_page import ring_radii, unit_of
+from neusee.workflows.calibration.identifiability import identify
+from neusee.workflows.calibration.importance_sampling import draw_samples, weights
+from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
+from tests.workflows.calibration.simulated_lenses import (
+    CAMERA,
+    LENS,
+    PRIOR,
+    TRUTH,
+    drawn_truth,
+    picture,
+    problem_of,
+    rings_of,
+)
+
+WIDE = {**PRIOR, "b0": (15.0, 30.0), "l": (0.004, 10.0), "s": (-2.5, 0.5)}
+SHAPE = ("b0", "l", "s")
+
+
+def fitted(truth, seed=1, prior=PRIOR, size=128):
+    problem = problem_of(rings_of(picture(truth, np.random.default_rng(seed), size)), prior)
+    return problem, find_mode(problem, initial_theta(problem))
+
+
+def shape_of(problem, samples):
+    """Return ln b0, ln l and s of samples (draw, free), as an array (draw, 3)."""
+    found = problem.parameters(samples)
+    return np.stack([found["b0"].log(), found["l"].log(), found["s"]], -1)
+
+
+def weighted(problem, mode, seed):
+    samples, log = draw_samples(problem, mode, np.random.default_rng(seed))
+    return shape_of(problem, samples), weights(log)
+
+
+def test_the_mean_of_a_ring_is_wing_and_scatter():
+    """Each expected mean against SciPy: the BSDF at the pixels, and what the lens scatters in all."""
+    rings = rings_of(picture(TRUTH, np.random.default_rng(1)))
+    fixed = {**LENS, "gain": CAMERA["gain"], "read_noise": CAMERA["read_noise"]}
+    found = calibrate.stray_light(rings, **TRUTH, **fixed).mean.numpy()
+    b0, l, s = (TRUTH[name] for name in SHAPE)  # noqa: E741
+    total = quad(lambda v: 2 * np.pi * b0 * (1 + np.exp(2 * v) / l**2) ** (s / 2) * np.exp(2 * v), -20, 0)[0]
+    ring, weight, part = (x.numpy() for x in (rings.ring, rings.weight, rings.square))
+    square = np.bincount(ring, weight * part) / np.bincount(ring, weight)
+    radius = np.sqrt(square) * LENS["pixel_pitch"]
+    fringe = LENS["wavelength"] * LENS["focal_length"] / LENS["diameter"]
+    core = (1 - total) * fringe * LENS["pixel_pitch"] ** 2 / (np.pi**3 * radius**3)
+    veil = (
+        b0
+        * (LENS["pixel_pitch"] / LENS["focal_length"]) ** 2
+        * (1 + (radius / LENS["focal_length"] / l) ** 2) ** (s / 2)
+    )
+    assert np.abs(found / (TRUTH["electrons"] * (core + veil)) - 1).max() < 3e-3  # a ring is one pixel wide
+
+
+def test_coordinates_are_one_to_one_and_their_density_is_that_of_the_prior():
+    coordinates = problem_of(rings_of(picture(TRUTH, np.random.default_rng(1)))).coordinates
+    place = coordinates.place(TRUTH)
+    back = coordinates.parameters(place)
+    assert all(float(back[name]) == pytest.approx(TRUTH[name], rel=1e-12) for name in coordinates.names)
+    jacobian = torch.autograd.functional.jacobian(lambda x: coordinates.scaled(coordinates.parameters(x)), place)
+    stretch = torch.linalg.det(jacobian).abs().log()
+    flat = -0.5 * coordinates.whitened(back).square().sum()
+    assert float(coordinates.log_prior(back)) == pytest.approx(float(flat + stretch), abs=1e-9)
+
+
+def test_a_lobe_within_the_saturated_pixels_gives_limits_and_no_value():
+    narrow = {**TRUTH, "b0": 15.0 * 20**2.2, "l": 0.004 / 20, "s": -2.2}
+    problem, mode = fitted(narrow, prior=WIDE | {"b0": (15.0 * 20**2.2, 30.0), "l": (2e-4, 10.0)})
+    found = identify(problem, mode)
+    assert (found.kinds["l"], found.kinds["b0"]) == ("upper", "lower")
+    assert "b0 and l only as b0 l^(-s): l lies within the saturated pixels" in found.directions
+    assert found.kinds["s"] == "estimate"
+
+
+def test_a_lobe_that_the_frame_shows_gives_values():
+    problem, mode = fitted({**TRUTH, "b0": 60.0}, prior=WIDE, size=192)
+    found = identify(problem, mode)
+    assert mode.settled
+    assert [found.kinds[name] for name in SHAPE] == ["estimate"] * 3
+
+
+def test_parameters_have_their_units():
+    assert [unit_of(name, {}) for name in ("b0", "l", "s", "electrons")] == ["1/sr", "", "", "e-"]
+
+
+@pytest.mark.slow
+def test_intervals_cover_the_truth(monkeypatch):
+    """200 lenses drawn from the prior, each with its picture: 90 % intervals of b0, l and s."""
+    monkeypatch.setattr(importance_sampling, "DRAWS", 800)
+    coordinates, held = problem_of(rings_of(picture(TRUTH, np.random.default_rng(1)))).coordinates, np.zeros(3)
+    for seed in range(200):
+        truth = drawn_truth(coordinates, seed)
+        problem = problem_of(rings_of(picture(truth, np.random.default_rng([7, seed]))))
+        draws, weight = weighted(problem, find_mode(problem, problem.theta(truth)), seed)
+        below = weight @ (draws < [np.log(truth["b0"]), np.log(truth["l"]), truth["s"]])
+        held += (below >= 0.05) & (below <= 0.95)
+    assert (held >= 165).all(), held
+    assert (held <= 192).all(), held
+
+
+@pytest.mark.slow
+def test_chains_agree_with_weighted_draws(tmp_path):
+    problem, mode = fitted({**TRUTH, "b0": 40.0}, seed=3)
+    chains = emcee_sampler.sample(problem, mode, tmp_path / "draws.h5", seed=1, walkers=32, wanted=300)
+    draws, weight = weighted(problem, mode, 1)
+    mean = weight @ draws
+    sd = np.sqrt(weight @ (draws - mean) ** 2)
+    chain = shape_of(problem, chains.flat)
+    assert np.abs((chain.mean(0) - mean) / sd).max() < 0.25
+    assert np.abs(chain.std(0) / sd - 1).max() < 0.2
+
+
+def test_the_figure_of_the_rings_can_be_read():
+    problem, mode = fitted({**TRUTH, "b0": 60.0, "electrons": 8e9}, size=192)
+    levels = problem.levels
+    assert len(levels.cut_square)
+    look = problem.likelihood(mode.draw(40, np.random.default_rng(1)))
+    given = (*ring_radii(levels), levels.mean.numpy(), look.mean.numpy(), look.variance.numpy())
+    calibration_figures.rings(*given)  # the watch on figures reads what is written
+    above = calibration_figures.rings.__wrapped__(*given).axes[0]
+    assert "cut off" in above.get_legend_handles_labels()[1]
+    assert float(ring_radii(levels)[1].max()) < float(ring_radii(levels)[0].min())
