@@ -7,109 +7,34 @@ import builtins
 import importlib
 import re
 import shlex
-import shutil
-import zlib
-from functools import partial
-from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
-import torch
 import typer
-from safetensors.torch import save_file
 from typer.main import get_command
 
-from neusee.nodes.restore._networks._nafnet import NAFNet
-from neusee.nodes.restore._networks._restorer import start_network
 from neusee.workflows.cli import app, catalogue
 from neusee.workflows.cli.command_frame import split
 from neusee.workflows.evaluation.pipelines import compose_pipelines, read_pipelines
 from neusee.workflows.placement.machine_file import read_machines
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import points, read_words
+from tests.guide_commands import GUIDE, PAGES, ROOT, WRITTEN, blocks, cases, lines, write_reader_files
 
-ROOT = Path(__file__).parents[1]
-GUIDE = ROOT / "recipes" / "guide"
 README = ROOT / "README.md"
-CONTRIBUTING = ROOT / "CONTRIBUTING.md"
-PAGES = sorted(GUIDE.glob("*.md"))
-WRITTEN = [README, CONTRIBUTING, *PAGES]
+
 COMMANDS = get_command(app.app)
-LOADS = {
-    "run",
-    "validate",
-    "plan",
-    "why",
-    "config",
-    "train",
-    "calibrate",
-    "evaluate",
-    "study",
-    "safety",
-}  #: a recipe in words
-SPOKEN = re.compile(r"(?:torchrun .* --no-python )?neusee (?P<words>[^#\n]*)")
+#: these commands take a recipe in words
+LOADS = {"run", "validate", "plan", "why", "config", "train", "calibrate", "evaluate", "study", "safety"}
 TERM = re.compile(r"- \*\*(?P<term>[^*]+)\*\*(?: \([^)]*(?:\([^)]*\))?[^)]*\))?: .+\. [^.].*\.")
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:typer")
 
 
-def lines(page: Path) -> list[str]:
-    """Return the commands of a page's indented lines."""
-    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-    indented = re.findall(r"^    (.*)$", text, re.MULTILINE)
-    found = [match["words"].strip() for line in indented if (match := SPOKEN.search(line))]
-    return [words for words in found if "[RECIPE]" not in words]
-
-
-def blocks(page: Path, language: str) -> list[str]:
-    """Return the fenced blocks of a language."""
-    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-
-
-def cases(found):
-    """Return one test case for each thing that is found on a page; what stands on several pages is one case."""
-    places = {x: f"{page.stem}-{n}" for page in reversed(WRITTEN) for n, x in reversed(list(enumerate(found(page))))}
-    return [pytest.param(x, id=place) for x, place in places.items()]
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A working folder with every file that the pages speak of: their own recipes, frames, photographs, weights."""
+    """A working folder with every file that the pages speak of."""
     folder = tmp_path_factory.mktemp("guide")
-    for text in (block for page in PAGES for block in blocks(page, "yaml")):
-        path = folder / re.match(r"# (my/[\w/]+\.yaml): .*\.\n", text)[1]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    for text in (block for page in PAGES for block in blocks(page, "csv")):
-        path = folder / re.match(r"# (my/[\w/]+\.csv): .*\.\n", text)[1]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    for text in (block for page in PAGES for block in blocks(page, "python")):
-        if named := re.match(r"# (my/\w+\.py)\n", text):
-            (folder / named[1]).write_text(text, encoding="utf-8")
-    draw = np.random.default_rng(1)
-    for level, photons in {"dark": 0, "dim": 1000, "half": 2000, "bright": 4000, "full": 9000}.items():
-        (folder / "my" / level).mkdir()
-        frames = 100 + 0.5 * draw.poisson(0.56 * photons + 100, (2, 64, 64))  # 0.5 DN/e-, and noise in the dark
-        np.save(folder / "my" / level / "frames.npy", frames.round().astype(np.uint16))
-    (folder / "my" / "set").mkdir()
-    shutil.copy(folder / "my" / "dark" / "frames.npy", folder / "my" / "set" / "dark.npy")
-    (folder / "my" / "set" / "EMVA1288_descriptor.txt").write_text("v 4.0\nn 12 64 64\nd 1000 0\n" + 2 * "i dark.npy\n")
-    shutil.copy(ROOT / "recipes" / "samples" / "camera_levels.csv", folder / "my.csv")
-    (folder / "camera.csv").write_text("wavelength,red,green,blue\n400,0,0,1\n550,0,1,0\n700,1,0,0\n")
-    network = start_network(partial(NAFNet, width=16), torch.Generator().manual_seed(0))
-    save_file(network.state_dict(), folder / "net.safetensors")
-    page = (GUIDE / "own_networks.md").read_text(encoding="utf-8")
-    names: dict[str, Any] = {}
-    exec(re.search(r"^```python\n(# my/smallnet.py\n.*?)^```", page, re.MULTILINE | re.DOTALL)[1], names)
-    save_file(names["SmallUNet"](16).state_dict(), folder / "smallnet.safetensors")
-    np.save(folder / "mask.npy", np.zeros((540, 540)))
-    (folder / "my_photographs").mkdir()
-    for name in ("holiday.jpg", "my_photographs/one.jpg"):
-        shutil.copy(ROOT / "recipes" / "samples" / "china.jpg", folder / name)
-    shutil.copy(ROOT / "recipes" / "samples" / "night.exr", folder / "street.exr")
+    write_reader_files(folder)
     return folder
 
 
@@ -145,94 +70,6 @@ def test_every_command_line_parses_and_its_recipe_loads(words, folder, monkeypat
         assert recipe.training or recipe.lifting
     if command == "evaluate":
         compose_pipelines(name, changes, read_pipelines(values["pipelines"], folder), folder)
-
-
-# --- the commands run -------------------------------------------------------------------------------------------------
-
-#: commands that compute little or nothing, and run as they are written
-QUICK = ("validate", "plan", "why", "config", "recipes", "nodes", "new", "check", "schema", "cache")
-#: pages whose runs are computed with the camera of `small_camera`; the packaged recipes have tests of their own
-RUN_HERE = ("tutorial", "recipes", "own_camera", "own_mask", "own_nodes", "own_photograph", "own_frames")
-SMALL = {
-    "optics/small": "optics: {samples: 128, pitch: 63.12 um, window: [64, 64]}",
-    "sensor/small": "sensor: {shape: [48, 48]}",
-    **{f"scene/{name}": "scene: {shape: [64, 64]}" for name in ("china", "siemens", "night")},
-}
-
-
-@pytest.fixture
-def small_camera(folder, tmp_path, monkeypatch):
-    """A stand-in for the packaged camera: options of the same names, with fewer samples and pixels, in its place."""
-    for name, text in SMALL.items():
-        path = tmp_path / "recipes" / f"{name}.yaml"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(f"# A small stand-in.\ndefaults: [{path.stem}]\n{text}\n", encoding="utf-8")
-    monkeypatch.setenv("NEUSEE_RECIPES", str(tmp_path / "recipes"))
-    monkeypatch.chdir(folder)
-
-
-@pytest.fixture(scope="module")
-def kept(tmp_path_factory):
-    return Store(tmp_path_factory.mktemp("store"))
-
-
-def quick(page):
-    """Return the commands of a page that run in no time, without those on keys and packages of the reader."""
-    mine = ("KEY", "mylab", "bloom.py")
-    return [words for words in lines(page) if words.split()[0] in QUICK and not any(each in words for each in mine)]
-
-
-def computed(page):
-    """Return the runs of a page that the small camera computes: without a cluster, and at no size of their own."""
-    sized = ("--", "[512,512]", "mask.npy", "demonstration", "camera.csv", "descriptor")
-    found = [words for words in lines(page) if words.split()[0] == "run" and page.stem in RUN_HERE]
-    return [words for words in found if not any(word in words for word in sized)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("words", cases(quick))
-def test_every_command_that_computes_little_runs(words, folder, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(folder)
-    monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
-    place = ["--in", str(tmp_path)] if words.startswith("new") else []
-    with pytest.raises(SystemExit) as end:
-        app.main([*shlex.split(words), *place])
-    assert end.value.code == 0
-    assert capsys.readouterr().out
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("words", cases(computed))
-def test_every_run_of_the_tutorial_and_the_how_tos_computes_its_outputs(words, small_camera, folder, kept):
-    name, changes, _ = split(shlex.split(words)[1:])
-    result = load(name, changes, folder).run(kept)
-    assert result.recipe.outputs
-    assert all(result[output] is not None for output in result.recipe.outputs)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("code", cases(lambda page: blocks(page, "python")))
-def test_every_python_block_runs_with_the_small_camera(code, small_camera, kept, tmp_path, monkeypatch):
-    monkeypatch.setenv("NEUSEE_CACHE", str(kept.root))
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / f"block_{zlib.crc32(code.encode()):x}.py"
-    path.write_text(code, encoding="utf-8")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    importlib.import_module(path.stem)
-
-
-def repeated(page):
-    """Return the sweeps of a page, and its studies of uncertainty."""
-    return [words for words in lines(page) if words.split()[0] == "sweep" or words.startswith("study uncertainty")]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("words", cases(repeated))
-def test_every_sweep_and_study_of_uncertainty_runs_with_the_small_camera(words, small_camera, tmp_path, monkeypatch):
-    monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
-    with pytest.raises(SystemExit) as end:
-        app.main([*shlex.split(words), "--out", str(tmp_path / "runs")])
-    assert end.value.code == 0
 
 
 # --- what pages say ---------------------------------------------------------------------------------------------------

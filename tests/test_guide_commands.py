@@ -1,0 +1,297 @@
+"""Every command and every block of the README and the guide runs: as it stands, or as a stand-in that says why."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from neusee.nodes import own_modules
+from neusee.workflows.cli import app
+from neusee.workflows.cli.handbook_reference import reference_pages
+from neusee.workflows.handbook import command_pictures
+from neusee.workflows.handbook.guide_pages import pictures_of, read_pages
+from neusee.workflows.handbook.site_build import build_handbook
+from neusee.workflows.recipe import node_families
+from neusee.workflows.report import run_pictures
+from neusee.workflows.report.figures import style
+from neusee.workflows.simulation import simulate_recipe
+from tests.guide_commands import (
+    GUIDE,
+    OTHER_LINES,
+    ROOT,
+    SMALL_OPTIONS,
+    STAND_INS,
+    WRITTEN,
+    NotDeclared,
+    StandIn,
+    blocks,
+    cases,
+    indented,
+    lines,
+    named_files,
+    stand_in,
+    typed,
+    write_reader_files,
+)
+
+pytestmark = [pytest.mark.filterwarnings("ignore::DeprecationWarning:typer"), pytest.mark.xdist_group("guide")]
+
+#: figures of a run that a page shows, by the words of the command; a test draws no others
+SHOWN: dict[tuple[str, ...], set[str]] = {}
+for _text in read_pages().values():
+    for _picture in pictures_of(_text):
+        SHOWN.setdefault(_picture.words, set()).add(Path(_picture.file).stem)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with the reader's files, small options of the packaged groups, and one cache for all commands."""
+    place = tmp_path_factory.mktemp("guide")
+    write_reader_files(place)
+    for name, text in SMALL_OPTIONS.items():
+        for folder, options in (("options", text), ("all_bands", text.replace(", bands: 9", ""))):
+            path = place / folder / f"{name}.yaml"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"# A small stand-in.\ndefaults: [{path.stem}]\n{options}\n", encoding="utf-8")
+    return place
+
+
+def small_png(figure) -> bytes:
+    """Return a figure as a small PNG without the search for a layout, which takes most of the time."""
+    from io import BytesIO
+
+    figure.set_layout_engine("none")
+    out = BytesIO()
+    figure.savefig(out, format="png", dpi=20)
+    return out.getvalue()
+
+
+@pytest.fixture
+def reader(place, monkeypatch, tmp_path):
+    """Stand in the folder of the reader, and forget afterwards which modules the commands imported from there."""
+    before, path = set(sys.modules), list(sys.path)
+    monkeypatch.chdir(place)
+    monkeypatch.setenv("NEUSEE_CACHE", str(place / "cache"))
+    monkeypatch.setattr(style, "png_of", small_png)
+    yield place
+    for name in set(sys.modules) - before:
+        if str(getattr(sys.modules[name], "__file__", None) or "").startswith((str(place), str(tmp_path))):
+            del sys.modules[name]
+    sys.path[:] = path
+    own_modules._files.clear()
+    node_families._family_of.clear()
+    node_families._installed.cache_clear()
+
+
+def carry_out(words: str, place: Path, monkeypatch, *more: str) -> None:
+    """Run a command of a page, or its stand-in, and ask for exit code 0."""
+    found = stand_in(words, place)
+    with monkeypatch.context() as patch, scheduler(found) as address:
+        if found:
+            patch.setenv("NEUSEE_RECIPES", str(place / "options"))
+        for name, value in (found.constants if found else {}).items():
+            module, _, attribute = name.partition(":")
+            patch.setattr(importlib.import_module(f"neusee.workflows.{module}"), attribute, value)
+        asked = SHOWN.get(tuple(typed(words, None)), set())
+        patch.setattr(simulate_recipe, "timeline", lambda result: None)  # no page shows it
+        patch.setattr(run_pictures, "FIGURES", [f for f in run_pictures.FIGURES if f.name in asked])
+        arguments = [address if word == "LOCAL" else word for word in typed(words, found)]
+        if found and found.processes > 1:
+            return together(arguments, found.processes)
+        with pytest.raises(SystemExit) as end:
+            app.main([*arguments, *more])
+        assert end.value.code == (found.code if found else 0)
+
+
+@contextlib.contextmanager
+def scheduler(found: StandIn | None) -> Iterator[str]:
+    """Start a scheduler of dask with one worker on this machine if a stand-in asks for one; yield its address."""
+    if not found or "LOCAL" not in found.instead.values():
+        yield ""
+        return
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+def together(arguments: list[str], count: int) -> None:
+    """Run a command in several processes of torchrun."""
+    start = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count), "-m"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / ".src")}
+    done = subprocess.run(
+        [*start, "neusee.workflows.cli", *arguments], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    print(done.stdout)
+
+
+ALONE = {"handbook"}  #: its test is that of the whole site
+
+
+def run_here(page):
+    """Return the commands of a page that a test of this file runs one by one."""
+    return [words for words in lines(page) if words not in ALONE]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", cases(run_here))
+def test_every_command_runs(words, place, reader, tmp_path, monkeypatch, capfd):
+    if words.split()[0] in ("new", "init", "check"):
+        shutil.copytree(place / "my", tmp_path / "my")
+        shutil.copytree(place / "mylab", tmp_path / "mylab") if words.startswith("check") else None
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.syspath_prepend(str(tmp_path))  # as if the package were installed
+        if words in ("check bloom.py", "check mylab.optics --json"):  # checked is what `neusee new` writes
+            carry_out("new node bloom", place, monkeypatch)
+            shutil.copy("bloom.py", tmp_path / "mylab" / "optics.py")
+    if words.startswith("compare"):
+        carry_out("run first_light", place, monkeypatch)
+        for name in set(re.findall(r"runs/\w+|\d{4}-\w+-\w+", words)):
+            shutil.copytree((place / "runs" / "latest").resolve(), place / "runs" / Path(name).name)
+    carry_out(words, place, monkeypatch)
+    assert capfd.readouterr().out
+
+
+# --- nothing is left out ----------------------------------------------------------------------------------------------
+
+EXPORTED = "my/restore/exported.yaml"  #: has a test of its own, because a file of torch.export takes seconds to write
+SPOKEN = [words for page in WRITTEN for words in lines(page)]
+
+
+def test_every_indented_line_is_a_command_or_says_who_runs_it():
+    there = [line for page in WRITTEN for line in indented(page)]
+    commands = sum(len(lines(page)) for page in WRITTEN)
+    others = [line for line in there if line in OTHER_LINES]
+    assert len(there) == commands + len(others) > 150
+    assert set(OTHER_LINES) == set(others)
+
+
+def test_every_command_is_run_as_it_stands_or_with_its_stand_in(place):
+    cased = {case.values[0] for case in cases(run_here)}
+    assert cased | ALONE == set(SPOKEN)
+    found = {words: stand_in(words, place) for words in cased}
+    assert all(each is None or each.why for each in found.values())
+    assert all(typed(words, each) for words, each in found.items())
+    assert set(STAND_INS) <= cased
+
+
+@pytest.mark.parametrize("words", ["train new", "evaluate first_light", "study stability", "calibrate my/frames.yaml"])
+def test_a_large_command_without_a_stand_in_is_refused(words, place):
+    with pytest.raises(NotDeclared, match=f"neusee {words}: say in STAND_INS how"):
+        stand_in(words, place)
+
+
+def test_a_word_that_a_stand_in_replaces_stands_in_the_command():
+    with pytest.raises(AssertionError, match="no word"):
+        typed("run first_light --scenes 3", StandIn("a minute", instead={"20": "1"}))
+
+
+def test_every_file_of_the_reader_is_used_by_a_command_or_by_another_file():
+    files = dict(named_files())
+    texts = "\n".join(
+        [*SPOKEN, *files.values(), *(each.values[0] for each in cases(lambda page: blocks(page, "python")))]
+    )
+    for path, text in files.items():
+        rest = texts.replace(text, "")
+        name = Path(path)
+        by_option = re.search(rf"\b{name.parent.name}(=|: ){name.stem}\b", rest)
+        assert by_option or name.name in rest or name.suffix == ".py" or path == EXPORTED, path  # Python blocks run
+
+
+# --- blocks -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("code", cases(lambda page: blocks(page, "python")))
+def test_every_python_block_runs(code, place, reader, tmp_path, monkeypatch):
+    monkeypatch.setenv("NEUSEE_RECIPES", str(place / "all_bands"))  # expected numbers name bands
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / f"block_{zlib.crc32(code.encode()):x}.py"
+    path.write_text(code, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    importlib.import_module(path.stem)
+    if 'torch.export.save(whole, "net.pt2")' in code:
+        monkeypatch.chdir(place)
+        shutil.copy(tmp_path / "net.pt2", place)
+        carry_out("run my/train_smallnet.yaml restore=exported restore.weights=net.pt2", place, monkeypatch)
+
+
+def test_the_package_of_the_page_on_nodes_has_a_family(reader, tmp_path, monkeypatch):
+    ((text,),) = [found for page in WRITTEN if (found := blocks(page, "toml"))]
+    written = tomllib.loads(text)
+    assert written["build-system"] == {"requires": ["hatchling"], "build-backend": "hatchling.build"}
+    project, site = written["project"], tmp_path / "site"
+    (site / "mylab").mkdir(parents=True)
+    (site / "mylab" / "__init__.py").touch()
+    shutil.copy(reader / "my" / "bloom.py", site / "mylab" / "nodes.py")
+    about = site / f"{project['name']}-{project['version']}.dist-info"  # as pip leaves it
+    about.mkdir()
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    points = project["entry-points"].items()
+    entries = [line for name, found in points for line in (f"[{name}]", *map(" = ".join, found.items()))]
+    (about / "entry_points.txt").write_text("\n".join(entries) + "\n")
+    monkeypatch.syspath_prepend(str(site))
+    importlib.invalidate_caches()
+    node_families._installed.cache_clear()
+    assert "mylab.bloom" in dict(node_families.all_nodes())
+
+
+@pytest.mark.parametrize("line", [line for line, who in OTHER_LINES.items() if who == "a shell"])
+def test_a_shell_takes_the_variable_and_the_program_knows_it(line):
+    name, _, value = line.removeprefix("export ").partition("=")
+    done = subprocess.run(["sh", "-euc", f"{line}\nenv"], capture_output=True, text=True, check=True)
+    assert f"{name}={value.strip(chr(34))}" in done.stdout.splitlines()
+    assert f"| `{name}` |" in (ROOT / "recipes" / "guide" / "cache.md").read_text(encoding="utf-8")
+
+
+# --- the site ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small_pictures(reader, monkeypatch):
+    """Let the build of the handbook draw its pictures by the stand-ins of the commands, in this process."""
+    written = {tuple(shlex.split(words)): words for words in SPOKEN}
+
+    def run(words, work, results):
+        monkeypatch.chdir(reader)
+        carry_out(written[words], reader, monkeypatch, "--out", str(results))
+        (folder,) = [path for path in results.iterdir() if path.is_dir() and not path.is_symlink()]
+        return folder
+
+    monkeypatch.setattr(command_pictures, "_run", run)
+    return reader
+
+
+@pytest.mark.slow
+def test_the_handbook_is_built_strictly_with_every_picture(small_pictures, tmp_path):
+    pytest.importorskip("material")
+    said: list[str] = []
+    page = build_handbook(tmp_path / "handbook", reference_pages(GUIDE.parent), True, said.append, strict=True)
+    wanted = {(p.words, p.file) for text in read_pages().values() for p in pictures_of(text)}
+    files = sorted((page.parent / "pictures").iterdir())
+    assert len(files) == len(wanted) > 40
+    for path in files:
+        with Image.open(path) as picture:
+            assert min(picture.size) > 30
+            assert len(picture.convert("L").getcolors()) > 10, path
+    shown = {
+        name for html in page.parent.rglob("*.html") for name in re.findall(r"pictures/(\w+\.png)", html.read_text())
+    }
+    assert shown == {path.name for path in files}
+    assert not [line for line in said if line.startswith("no picture")]
