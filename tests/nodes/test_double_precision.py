@@ -452,8 +452,8 @@ def test_the_error_in_float64(one):
 _ELSEWHERE = {
     "gives float32, as stated": ("doe.axicon", "doe.cubic", "doe.flat", "doe.half_rings", "doe.pixelwise",
         "doe.shade", "doe.spiral_axicon", "doe.unet", "doe.vortex", "doe.zernike", "flare.dirt", "scene.exr",
-        "scene.hyperspectral", "scene.photograph", "scene.targets", "spectra.lift_mst_plus_plus", "restore.fft_mamba", "restore.nafnet",
-        "restore.network", "restore.unet"),
+        "scene.hyperspectral", "scene.photograph", "scene.targets", "spectra.lift_mst_plus_plus", "restore.fft_mamba",
+        "restore.nafnet", "restore.network", "restore.unet"),
     "draws": ("calibrate.expose", "optics.direction", "sensor.dark_current", "sensor.digitize", "sensor.photon_noise",
         "sensor.photon_transfer", "sensor.read_noise", "spectra.grain", "spectra.leaves", "spectra.metamers"),
     "reads tables or files": ("calibrate.descriptor", "calibrate.frames", "calibrate.point_source", "calibrate.table",
