@@ -53,7 +53,10 @@ class ProtectionCamera:
     @property
     def lens(self) -> Mapping[str, Any]:
         """Return the parameters of the recipe's PSF."""
-        return self.recipe.steps["psf[mask]"].params
+        step = self.recipe.steps["psf[mask]"]
+        if step.node.path == "flare.stray_light":
+            step = self.recipe.steps[str(step.wires["psf"])]
+        return step.params
 
     @property
     def noise(self) -> Mapping[str, float]:
