@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +60,7 @@ def protect(
             shades[front] = _shade(recipe, changes, one, asked, store, folder)
             progress(f"{front}: peak {shades[front].alone:.3g}{shades[front].said or ', without a filter'}")
         except ValueError as error:
-            text = str(error).replace("choose the mask alone, such as doe=axicon", "take it out of --pipelines")
-            wrong[f"--equal-protection {asked.level:g}: {front} {text}"] = None
+            wrong[f"--equal-protection {asked.level:g}: {front} {error}"] = None
     if wrong:
         raise EvaluationRefused("\n".join(wrong))
     return compose_pipelines(
@@ -77,6 +77,8 @@ def _shade(
     folder: Path,
 ) -> EqualShade:
     dark = one.recipe(NONE)
+    if dark.steps["pupil[mask]"].wires.get("shade"):
+        raise EvaluationRefused("has a filter or a stop of its own: leave it out, because every pipeline gets one")
     camera = ProtectionCamera.of(dark, store, _BANDS)
 
     def peak_of(shade: EqualShade) -> float:
@@ -84,7 +86,7 @@ def _shade(
         (other,) = compose_pipelines(recipe, changes, [shaded], folder)
         return float(run(other.recipe(NONE), store, ["lsr[mask]"]).values["lsr[mask]"].max())
 
-    return equal_shade(camera, store, asked.level, asked.way, _scene_light(dark, store), peak_of)
+    return equal_shade(camera, store, asked.level, asked.way, partial(_scene_light, dark, store), peak_of)
 
 
 def _scene_light(recipe: Recipe, store: Store) -> float:

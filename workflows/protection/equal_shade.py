@@ -68,8 +68,10 @@ def stop_diameter(camera: ProtectionCamera, wanted: float) -> float:
 
     low, high = _LEAST_SAMPLES / int(camera.stop.samples), 1.0
     if (least := peak(low)) > wanted:
-        raise ValueError(f"needs a stop smaller than the samples of the pupil carry, which reach {least:.2g}: ask for more,"
-                         " or take filters with --by filter")  # fmt: skip
+        raise ValueError(
+            f"needs a smaller stop than the samples of the pupil carry: ask for {least:.2g} or more, or take filters "
+            "with --by filter"
+        )
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
         low, high = (low, middle) if peak(middle) >= wanted else (middle, high)
@@ -96,12 +98,13 @@ def equal_shade(
     store: Store,
     wanted: float,
     way: str,
-    electrons: float,
+    electrons: Callable[[], float],
     peak_of: Callable[[EqualShade], float],
 ) -> EqualShade:
     """Return the stop and the filter of one of the `WAYS` with which the peak is ``wanted``.
 
-    ``peak_of`` returns the peak behind a shade at the worst of all wavelengths, relative to the clear lens.
+    ``electrons`` returns the mean light of the scene, in e- a pixel behind the plain lens. ``peak_of`` returns the peak
+    behind a shade at the worst of all wavelengths, relative to the clear lens.
     """
     alone = peak_of(EqualShade(1.0))
     if wanted > alone * (1 + 1e-6):
@@ -110,6 +113,6 @@ def equal_shade(
     if way == "stop":
         diameter = stop_diameter(camera, wanted)
     elif way == "best":
-        diameter = best_diameter(camera, store, wanted, electrons)
+        diameter = best_diameter(camera, store, wanted, electrons())
     reached = alone if diameter == 1 else peak_of(EqualShade(alone, diameter))
     return EqualShade(alone, diameter, min(1.0, wanted / reached))
