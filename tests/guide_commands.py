@@ -243,6 +243,11 @@ STAND_INS = {
     f"{EVALUATE} --scenes 3 --strengths 1e2,1e4,1e6 "
     '--pipelines "flat+none, half_ring+none, five_half_rings+none"': StandIn(
         "a minute", instead={**FIELD, "3": "1", "1e2,1e4,1e6": "1e2,1e4"}),
+    f"{EVALUATE} --scenes 3 --strengths 1e4,1e6 "
+    '--pipelines "flat+wiener, half_ring+wiener, five_half_rings+wiener" --equal-protection 0.002': StandIn(
+        "minutes", more=("--by", "filter"),
+        instead={**FIELD, "3": "1", "1e4,1e6": "1e4", "0.002": "1e-5",
+                 "flat+wiener, half_ring+wiener, five_half_rings+wiener": "flat+none, five_half_rings+none"}),
     f'{EVALUATE} --data photographs --pipelines "flat+none, half_ring+wiener, pixelwise@mask.npy+wiener"': StandIn(
         "20 scenes", instead=FIELD, more=("--scenes", "1", "--strengths", "1e3")),
     f'{EVALUATE} --pipelines "flat+none, five_half_rings+nafnet@net.safetensors" --reference flat+none': StandIn(

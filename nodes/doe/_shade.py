@@ -31,9 +31,9 @@ def shade(
 
     Shapes: stop -> amplitude (v, u), notches (notch, 3).
     Units:  transmittance and depth shares of the light; diameter relative to the stop; width m.
-    Error:  area of the staircase rim 2 / samples. A notch is Gaussian in wavelength, taken at the centre of each band:
-            for bands as wide as the notch, the light that it removes is off by up to 6 %. A real notch moves to shorter
-            wavelengths at larger angles, which is left out.
+    Error:  amplitude 3e-8 (float32); area of the staircase rim 2 / samples. A notch is Gaussian in wavelength, taken
+            at the centre of each band: for bands as wide as the notch, the light that it removes is off by up to 6 %. A
+            real notch moves to shorter wavelengths at larger angles, which is left out.
     Raises: ParameterError before the run where ``width`` is wider than the spectrum of a notch centre.
     Source: by definition; Born and Wolf, Principles of Optics, 7th ed., section 8.5.2 (peak of a circular aperture).
     """

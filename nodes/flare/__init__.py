@@ -3,6 +3,7 @@
 from neusee.nodes.flare import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.flare._dirt import dirt
 from neusee.nodes.flare._ghosts import ghosts
+from neusee.nodes.flare._harvey_shack import surface_of
 from neusee.nodes.flare._stray_light import StrayShares, stray_light, stray_shares
 
-__all__ = ["StrayShares", "dirt", "ghosts", "stray_light", "stray_shares"]
+__all__ = ["StrayShares", "dirt", "ghosts", "stray_light", "stray_shares", "surface_of"]

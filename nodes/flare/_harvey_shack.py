@@ -43,6 +43,12 @@ def scattered_share(b0: Tensor, l: Tensor, s: Tensor) -> Tensor:  # noqa: E741
     return 2 * torch.pi * b0 * _enclosed(l, s, torch.ones_like(l))
 
 
+def surface_of(share: float, l: float = 0.01, s: float = -1.5) -> dict[str, float]:  # noqa: E741
+    """Return b0, l and s of a surface that scatters a share of the light; the share is proportional to b0."""
+    unit = scattered_share(*(torch.tensor(x, dtype=torch.float64) for x in (1.0, l, s)))
+    return {"b0": share / float(unit), "l": l, "s": s}
+
+
 def light_within(light: Lobe, radius: Tensor) -> Tensor:
     """Return the share of the light that a surface scatters to less than ``radius`` pixels from the source."""
     inside = torch.minimum(radius, light.end)

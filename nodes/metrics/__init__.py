@@ -7,7 +7,6 @@ from neusee.nodes.metrics._attacked_picture import (
     PixelNoise,
     attacked_picture,
     glare_levels,
-    scattered_light,
 )
 from neusee.nodes.metrics._detail_targets import TARGETS, detail_energy, detail_targets, detection_snr
 from neusee.nodes.metrics._filtered_picture import Filtered, channel_psf, decibels, filtered_picture, noise_variance
@@ -74,6 +73,5 @@ __all__ = [
     "radial_contrast",
     "remaining_error",
     "saturated",
-    "scattered_light",
     "spectral_error",
 ]

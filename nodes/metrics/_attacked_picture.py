@@ -1,6 +1,5 @@
 """A picture under attack: the glare of a laser by its level, and what a filter recovers of the pixels that are left."""
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -46,34 +45,6 @@ def glare_levels(light: Tensor, clear_peak: float) -> GlareLevels:
     mean = empty.index_add(0, at, relative) / count.clamp_min(1)
     held = count > 0
     return GlareLevels(mean[held], count[held] / len(relative))
-
-
-def scattered_light(
-    shape: tuple[int, int],
-    spot: tuple[float, float],
-    *,
-    focal_length: float,
-    pixel_pitch: float,
-    scatter: float,
-    shoulder: float = 0.01,
-    slope: float = -1.5,
-) -> Tensor:
-    """Return the share of a laser's light that a lens scatters into each pixel: (y, x) float64.
-
-    The lens scatters the share ``scatter`` of all light by one surface in the pupil, whose scatter function is
-    b0 (1 + (r / l)**2)**(s / 2) over the sine r of the angle, with the shoulder l and the slope s. A mask in the pupil
-    does not reduce scattered light. ``spot``: pixels (y, x) of the spot from the middle of the field.
-
-    Source: Peterson, Proc. SPIE 5178, 10.1117/12.509120 (2004); Harvey, Appl. Opt. 51 (three-parameter form).
-    """
-    power = slope + 2
-    ends = (shoulder**2 + 1) ** (power / 2) - shoulder**power
-    peak = scatter * shoulder**slope * power / (2 * math.pi * ends)
-    y, x = (torch.arange(n, dtype=torch.float64) - n // 2 - s for n, s in zip(shape, spot, strict=True))
-    angle = torch.hypot(y[:, None], x) * (pixel_pitch / focal_length)
-    sine = torch.sin(torch.atan(angle))
-    share: Tensor = peak * (1 + (sine / shoulder).square()) ** (slope / 2) * (pixel_pitch / focal_length) ** 2
-    return share
 
 
 def attacked_picture(

@@ -237,6 +237,60 @@ def wiener_loss(psf, illuminant, responses, bands, *, noise, colour, up_to):
     return np.mean(logs)
 
 
+def filtered(psf, illuminant, responses, bands, *, electrons, read_noise, glare, prnu, residual_glare, variance, up_to):
+    """Error, information, mean log NEQ and light of each channel, by sums over all frequencies."""
+    kernel, columns = exact(psf.intensity), []
+    square = sum(f**2 for f in frequencies(kernel.shape[1:]))
+    power = np.divide(1, square, out=np.zeros_like(square), where=square > 0)
+    power *= L(variance) / power.mean()
+    seen = exact(responses) * exact(illuminant) * exact(bands.centres)
+    for part in seen / seen.sum(1, keepdims=True):
+        otf = dft(np.tensordot(part, kernel, 1))
+        whole = L(electrons) * otf[0, 0].real + L(glare)
+        noise = whole + L(read_noise) ** 2 + (L(prnu) * whole) ** 2 + (L(residual_glare) * L(glare)) ** 2
+        neq = (L(electrons) * np.abs(otf)) ** 2 / noise
+        low = (square > 0) & (square <= L(up_to) ** 2)
+        error = (power / (1 + neq * power)).sum() / power.sum()
+        columns.append((error, np.log2(1 + neq * power).mean() / 2, np.log(neq[low]).mean(), otf[0, 0].real))
+    return np.array(columns, L).T
+
+
+def warmed(psf, plain, *, pixel_pitch, dwell):
+    """Heat of the hottest pixel over that of the clear lens: every pixel warms every pixel of silicon."""
+    import mpmath
+
+    y, x = psf.intensity.shape[1:]
+    at = np.stack(np.meshgrid(np.arange(y), np.arange(x), indexing="ij"), -1).reshape(-1, 2)
+    squares = ((at[:, None] - at) ** 2).sum(-1)
+    with mpmath.workdps(30):
+        reach, pitch = mpmath.sqrt(4 * mpmath.mpf(8.8e-5) * dwell), mpmath.mpf(pixel_pitch)
+        each = {int(n): mpmath.erfc(mpmath.sqrt(int(n)) * pitch / reach) / (mpmath.sqrt(int(n)) * pitch)
+                for n in np.unique(squares) if n}  # fmt: skip
+        disc = pitch / mpmath.sqrt(mpmath.pi)
+        each[0] = 2 * mpmath.pi * mpmath.quad(lambda r: mpmath.erfc(r / reach), [0, disc]) / pitch**2
+    kernel = np.array([L(str(each[n])) for n in squares.flat], L).reshape(squares.shape)
+    hottest = [(kernel @ exact(one.intensity).reshape(len(one.intensity), -1).T).max(0) for one in (psf, plain)]
+    return hottest[0] / hottest[1]
+
+
+def bounds(psf, *, electrons, read_noise, glare):
+    """Logarithms of value and bound of each inequality, from Parseval's sum of |OTF|**2; c = 0.45962."""
+    c, n, rows = L(0.45962), L(electrons), []
+    quiet, noise = L(read_noise) ** 2, n + L(glare) + L(read_noise) ** 2
+    for kernel, p0 in zip(exact(psf.intensity), exact(psf.clear_peak), strict=True):
+        fy, fx = frequencies(kernel.shape)
+        square = np.abs(dft(kernel)) ** 2
+        inside = square[np.sqrt(fy**2 + fx**2) <= np.sqrt(4 * p0 / PI)]
+        peak, lsr = kernel.max(), kernel.max() / p0
+        grey = n**2 * lsr**2 * c / 4 / (n * lsr + quiet)
+        stop = n**2 * lsr ** L(1.5) * c / 4 / (n * np.sqrt(lsr) + quiet)
+        mask, most = n**2 * inside.mean() / noise, n**2 * lsr / 4 / noise
+        both = max(grey, stop)
+        pairs = (kernel**2).sum(), peak, inside.mean() / (c / 4), lsr / c, mask / grey, most / grey, mask / both
+        rows.append([*np.log([*pairs, most / both]), np.log(n**2 * inside / noise).mean(), np.log(most)])
+    return np.array(rows, L).T
+
+
 def fused_silica(wavelength):
     square = (exact(wavelength) * L(10) ** 6) ** 2
     terms = ((0.6961663, 0.0684043), (0.4079426, 0.1162414), (0.8974794, 9.896161))
@@ -340,6 +394,11 @@ CASES = [
     case(metrics.bsr, (PSF, SCENE), share),
     case(metrics.encircled, (PSF,), encircled, {"pixel_pitch": 2.9e-6, "radius": 2.9e-6 * 3}),
     case(metrics.encircled, (WIDE,), encircled, {"pixel_pitch": 1e-6, "radius": 4.99999999e-6}),
+    case(metrics.filtered_picture, (WIDE, ILLUMINANT, RESPONSES, BANDS), filtered,
+         {"electrons": 70.0, "read_noise": 3.7, "glare": 11.0, "prnu": 0.013, "residual_glare": 0.03, "variance": 0.2,
+          "up_to": 0.41}, take=torch.stack),
+    case(metrics.heat_ratio, (WIDE, Psf(draw(4, 12, 13, seed=1) / 160, WIDE.clear_peak)), warmed,
+         {"pixel_pitch": 2.9e-6, "dwell": 3.1e-7}),
     case(metrics.light_outside, (PSF, PUPIL), outside),
     case(metrics.limits, (WIDE,), limits, take=torch.stack),
     case(laser.damage, (IMAGE, spectra.line(wavelength=532e-9)), pulse_over_thresholds,
@@ -347,6 +406,8 @@ CASES = [
     case(metrics.lsr, (PSF,), lambda p: exact(p.intensity).max((1, 2)) / exact(p.clear_peak)),
     case(metrics.mtf, (WIDE,), mtf_rms),
     case(metrics.peak_bsr, (IMAGE, SCENE), lambda x, y: exact(x).max((-2, -1)) / exact(y).max((-2, -1))),
+    case(metrics.protection_bounds, (WIDE,), bounds, {"electrons": 70.0, "read_noise": 3.7, "glare": 11.0},
+         take=lambda b: torch.cat([torch.stack(b[:8]).log(), torch.stack(b[8:])])),
     case(metrics.peak_irradiance, (IMAGE, BANDS, LEVEL, [SCENE], [BANDS]), wells, WELL),
     case(optics.image, (SCENE, PSF), convolved, {"border": "zero"}),
     case(optics.image, (SCENE, PSF), convolved, {"border": "reflect"}),
@@ -390,9 +451,9 @@ def test_the_error_in_float64(one):
 #: nodes without a case, with the reason
 _ELSEWHERE = {
     "gives float32, as stated": ("doe.axicon", "doe.cubic", "doe.flat", "doe.half_rings", "doe.pixelwise",
-        "doe.spiral_axicon", "doe.unet", "doe.vortex", "doe.zernike", "flare.dirt", "scene.exr", "scene.hyperspectral",
-        "scene.photograph", "scene.targets", "spectra.lift_mst_plus_plus", "restore.fft_mamba", "restore.nafnet",
-        "restore.network", "restore.unet"),
+        "doe.shade", "doe.spiral_axicon", "doe.unet", "doe.vortex", "doe.zernike", "flare.dirt", "scene.exr",
+        "scene.hyperspectral", "scene.photograph", "scene.targets", "spectra.lift_mst_plus_plus", "restore.fft_mamba",
+        "restore.nafnet", "restore.network", "restore.unet"),
     "draws": ("calibrate.expose", "optics.direction", "sensor.dark_current", "sensor.digitize", "sensor.photon_noise",
         "sensor.photon_transfer", "sensor.read_noise", "spectra.grain", "spectra.leaves", "spectra.metamers"),
     "reads tables or files": ("calibrate.descriptor", "calibrate.frames", "calibrate.point_source", "calibrate.table",

@@ -127,13 +127,16 @@ def evaluate(
     strengths: Sequence[float] | None = None,
     small: int = 256,
     reference: str = "",
+    equal_protection: float | None = None,
+    by: str = "best",
 ) -> Path:
     """Compare masks and restorers on the same scenes and laser strengths, and return the folder of results.
 
     Args: pipelines: a mask and a restorer each, ``"flat+none, five_half_rings+wiener"``. data: a folder of photographs;
     None means the recipe's own scene. scenes: number of scenes. strengths: of the laser, in multiples of saturation;
     None means the strengths in the paper. small: the shorter side in pixels of reduced pictures, also compared.
-    reference: the pipeline with which all others are compared.
+    reference: the pipeline with which all others are compared. equal_protection: the peak of a laser as a share
+    of that of the plain lens, to which filters and stops bring every pipeline; by: ``best``, ``filter`` or ``stop``.
     Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` if a step fails.
     """
     from neusee.workflows.evaluation import run_evaluation
@@ -148,6 +151,8 @@ def evaluate(
         strengths=run_evaluation.STRENGTHS if strengths is None else strengths,
         small=small,
         reference=reference,
+        protection=equal_protection,
+        by=by,
         store=store,
         runs=writable_folder(out),
         command=command,

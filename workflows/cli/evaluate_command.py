@@ -37,6 +37,13 @@ def evaluate(
     reference: Annotated[
         str, typer.Option("--reference", help="Pipeline that the others are compared with; by default the first.")
     ] = "",
+    equal_protection: Annotated[
+        float | None,
+        typer.Option(
+            "--equal-protection", help="Peak of a laser to which filters and stops bring each pipeline, 0 to 1."
+        ),
+    ] = None,
+    by: Annotated[str, typer.Option("--by", help="best (stop and filter), filter or stop, for that.")] = "best",
     device: OneDevice = "cpu",
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -47,12 +54,15 @@ def evaluate(
 
     A pipeline is a mask and a restorer. Every pipeline sees the same scenes, lasers and noise. The page has L1, PSNR
     and SSIM with 95 % confidence intervals, suppression by wavelength (LSR, BSR), the contrast that is left, and the
-    bound that no mask can pass. Values that the recipe gives as distributions are drawn for each scene. Run the
+    bound that no mask can pass. With --equal-protection each pipeline gets the filter and the stop that bring its peak
+    to one share of the plain lens's. Values that the recipe gives as distributions are drawn for each scene. Run the
     same command again to continue.
     """
     name, changes, _ = split(words)
     check_device(device)
     options = {"data": data, "scenes": scenes, "strengths": strengths, "small": small, "reference": reference}
+    if equal_protection is not None:
+        options |= {"equal-protection": equal_protection, "by": by}
     folder = _evaluate(
         name,
         changes=changes,
@@ -62,6 +72,8 @@ def evaluate(
         strengths=_numbers(strengths),
         small=small,
         reference=reference.replace(" ", ""),
+        equal_protection=equal_protection,
+        by=by,
         device=device,
         out=out,
         progress=progress_lines(quiet or as_json),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -56,7 +57,7 @@ def _power(strength: float) -> str:
 
 
 def _broken(name: str) -> str:
-    return name if len(name) <= _LETTERS else name.replace("+", "\n+ ").replace("@", "\n@ ")
+    return name if len(name) <= _LETTERS else re.sub(r" ?\+ ?", "\n+ ", name).replace(", ", ",\n").replace("@", "\n@ ")
 
 
 @drawn

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.evaluation import evaluation_figures as figures
 from neusee.workflows.evaluation.confidence_intervals import METRICS, Interval, mean
+from neusee.workflows.evaluation.equal_protection import protection_section
 from neusee.workflows.evaluation.pipelines import CASES
 from neusee.workflows.report.study_page import Mark, Section
 
@@ -68,14 +69,16 @@ def lead(result: EvaluationResult) -> str:
     uncertain = result.recipe.uncertain
     names = [name for name in (uncertain.names if uncertain else ()) if not name.startswith("lasers.")]
     drawn = f" These values are drawn for each scene: {', '.join(names)}." if names else ""
+    level = result.protection.level if result.protection else 0.0
+    equal = f" Filters and stops bring every pipeline to a peak of {level:g} of the plain lens's." if level else ""
     return f"""{len(result.scenes)} scenes, laser strengths {strengths} (1 saturates a pixel of the plain lens),
         {len(result.pipelines)} pipelines of a mask and a restorer. Lowest L1: {best.name}, {least}.
-        {few}{drawn}"""
+        {few}{drawn}{equal}"""
 
 
 def sections(result: EvaluationResult, shown: Mapping[str, bytes]) -> list[Section]:
     """Return all sections of the report page of an evaluation."""
-    parts = [_crossed(result), _numbers(result), _compared(result), *_mistold(result)]
+    parts = [*protection_section(result), _crossed(result), _numbers(result), _compared(result), *_mistold(result)]
     text = """Mean over scenes and its 95 % interval. A scene without a laser counts only at the strength none, so
         that every scene of the other points has a laser. The axis ends at most at three times the largest mean; an
         interval of few scenes may reach beyond."""

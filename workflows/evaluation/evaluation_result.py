@@ -13,6 +13,7 @@ from neusee.workflows.evaluation.evaluation_scenes import Scene
 from neusee.workflows.evaluation.mask_optics import MaskOptics
 from neusee.workflows.evaluation.pipelines import Pipeline
 from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.protection.equal_shade import EqualProtection
 
 
 @dataclass(frozen=True)
@@ -44,3 +45,4 @@ class EvaluationResult:
     panels: Sequence[Panel]
     pipelines: Sequence[Pipeline]
     mistold: Sequence[MistoldPoint] = ()
+    protection: EqualProtection | None = None  #: if all pipelines were brought to one peak

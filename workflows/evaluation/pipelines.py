@@ -11,11 +11,13 @@ from typing import Any
 
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.protection.equal_shade import EqualShade
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.composition import compose
 from neusee.workflows.recipe.text.overrides import Override
 
 NONE = "none"  #: name of the restorer that restores nothing, and of the case without a laser
+_FLAT = "flat"  #: option of `doe` without a mask
 BEAM = "beam"  #: name of the laser in every recipe of an evaluation
 
 #: the lasers of the paper with wavelengths in m: where the paper names only a colour, a common laser of this colour
@@ -43,16 +45,23 @@ class Pipeline:
     restorer: str  #: an option of `restore`, or none
     height_file: Path | None = None
     weights: Path | None = None
+    shade: EqualShade | None = None  #: filter and stop that make the protection of all pipelines equal
 
     @property
     def name(self) -> str:
-        """Return the name of a pipeline of mask and restorer, such as ``flat+none``; files appear without folders."""
+        """Return the name of a pipeline, such as ``flat+none`` or ``plain lens + filter 0.01, wiener``."""
+        if self.shade is not None:
+            return f"{self.front}, {'not restored' if self.restorer == NONE else self.back}"
         return f"{self.front}+{self.back}"
 
     @property
     def front(self) -> str:
-        """Return the name of the mask, followed by the name of its file if it has a file."""
-        return self.mask + (f"@{self.height_file.name}" if self.height_file else "")
+        """Return the name of the mask with that of its file, or in words with the filter and the stop that it has."""
+        file = f"@{self.height_file.name}" if self.height_file else ""
+        if self.shade is None:
+            return self.mask + file
+        spoken = "plain lens" if self.mask == _FLAT else self.mask.replace("half_ring", "half-ring").replace("_", " ")
+        return spoken + file + self.shade.said
 
     @property
     def back(self) -> str:
@@ -147,7 +156,7 @@ def _words(pipeline: Pipeline, takes: Callable[[str, str], str]) -> list[str]:
         words.append(f"restore={pipeline.restorer}")
     if pipeline.weights:
         words.append(f"restore.{takes('restore', pipeline.restorer)}={pipeline.weights.absolute()}")
-    return words
+    return words + (pipeline.shade.words if pipeline.shade else [])
 
 
 def _takes(recipe: str, changes: Sequence[str | Override], folder: Path, group: str, option: str) -> str:

@@ -16,8 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from neusee.workflows.evaluation import equal_protection
 from neusee.workflows.evaluation.comparison_pictures import panels
 from neusee.workflows.evaluation.confidence_intervals import METRICS, compare_with, metric_table
+from neusee.workflows.evaluation.equal_protection import protect, read_protection
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointNumbers, PointRequest
 from neusee.workflows.evaluation.evaluation_result import EvaluationResult
 from neusee.workflows.evaluation.evaluation_scenes import Scene, refuse_directions, scenes
@@ -54,6 +56,8 @@ def evaluate(
     strengths: Sequence[float] = STRENGTHS,
     small: int = SMALL,
     reference: str = "",
+    protection: float | None = None,
+    by: str = "best",
     store: Store | None = None,
     runs: Path = Path("runs"),
     command: Sequence[str] = (),
@@ -65,12 +69,18 @@ def evaluate(
 
     Args: recipe, changes: the camera, as for `load`. data: a folder of photographs, by default the scene of the recipe.
     small: shorter side of the reduced pictures, which are compared too. reference: the pipeline with which all other
-    pipelines are compared, by default the first pipeline. progress: receives a line for each scene.
+    pipelines are compared, by default the first pipeline. protection: the share of the plain lens's peak to which each
+    pipeline is brought by filter and stop; by: `best`, `filter` or `stop`. progress: receives a line for each scene.
     Raises: `EvaluationRefused` with every mistake before anything runs.
     """
-    store, place = store or open_store(), folder or Path.cwd()
+    store, place, equal = store or open_store(), folder or Path.cwd(), read_protection(protection, by)
     each = compose_pipelines(recipe, changes, pipelines, place)
     strengths, reference = _strengths(strengths), _reference(reference, pipelines)
+    if equal is not None:
+        at = [pipeline.name for pipeline in pipelines].index(reference)
+        each = protect(recipe, changes, each, equal, store, place, progress)
+        pipelines = [one.pipeline for one in each]
+        reference = pipelines[at].name
     base = load(recipe, changes, place)
     study_run = StudyRun("evaluate", base, command)
     shown, broken = scenes(base, store, data, count)
@@ -86,7 +96,7 @@ def evaluate(
     tables = {name: metric_table(own, strengths) for name, own in points.items()}
     least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
     more = {name: compare_with(own, tables[reference], base.seed) for name, own in tables.items()}
-    rest = (reference, points, tables, more, optics, drawn, list(pipelines), mistold)
+    rest = (reference, points, tables, more, optics, drawn, list(pipelines), mistold, equal)
     result = EvaluationResult(base, shown, broken, strengths, least, *rest)
     document = study_run.document(_document(result, bench))
     return study_run.write(runs, digest(document["summary"]), document, _report(result))
@@ -148,6 +158,7 @@ def _document(result: EvaluationResult, bench: EvaluationPoints) -> dict[str, An
         "strengths": list(result.strengths),
         "small": result.small,
         "reference": result.reference,
+        **equal_protection.as_document(result),
         "computed": bench.computed,
         "seconds a point": bench.seconds / bench.computed if bench.computed else None,
         "summary": summary(result),
@@ -164,6 +175,8 @@ def _report(result: EvaluationResult) -> StudyReport:
         "mistold.csv": ((*_POINT[:1], "told", *_POINT[3:], *METRICS), mistold_rows(result.mistold)),
         "suppression.csv": (("mask", "wavelength (nm)", "lsr", "bsr", "floor"), _curve_rows(result)),
     }
+    if result.protection is not None:
+        tables["protection.csv"] = equal_protection.COLUMNS, equal_protection.protection_rows(result)
     shown = ("command", "date", "seconds", "computed", "seconds a point", "reference", "versions")
     title = f"{result.recipe.name}: evaluated"
     return StudyReport(title, lead(result), sections(result, pictures), pictures, tables, shown=shown)

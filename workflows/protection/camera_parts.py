@@ -11,9 +11,9 @@ from torch import Tensor
 
 from neusee.nodes import Node, metrics, optics
 from neusee.nodes.doe import shade
-from neusee.nodes.flare import dirt
+from neusee.nodes.flare import dirt, stray_light
 from neusee.nodes.metrics import PixelNoise
-from neusee.nodes.values import Bands, Psf, Stop
+from neusee.nodes.values import Bands, Psf, Pupil, Stop
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.distributions.unknown_conditions import Condition
@@ -53,7 +53,10 @@ class ProtectionCamera:
     @property
     def lens(self) -> Mapping[str, Any]:
         """Return the parameters of the recipe's PSF."""
-        return self.recipe.steps["psf[mask]"].params
+        step = self.recipe.steps["psf[mask]"]
+        if step.node.path == "flare.stray_light":
+            step = self.recipe.steps[str(step.wires["psf"])]
+        return step.params
 
     @property
     def noise(self) -> Mapping[str, float]:
@@ -67,7 +70,20 @@ class ProtectionCamera:
 
     def psf(self, masked: bool, diameter: float, bands: Bands, condition: Condition | None = None, **more: Any) -> Psf:
         """Return the PSF with or without the mask, in a stop of a relative ``diameter``, under a condition."""
-        notches = {"notches": more.pop("notches", ()), "depth": more.pop("depth", 0.99)}
+        notches = {name: more.pop(name) for name in ("notches", "depth") if name in more}
+        found: Psf = optics.psf(self._front(masked, diameter, bands, condition, **notches), **{**self.lens, **more})
+        return found
+
+    def laser_psf(self, masked: bool, diameter: float, line: Bands, condition: Condition, **more: Any) -> Psf:
+        """Return the PSF of a laser from the ``angle`` of its direction, with the light that the lens scatters."""
+        notches = {name: more.pop(name) for name in ("notches", "depth") if name in more}
+        front, lens = self._front(masked, diameter, line, condition, **notches), {**self.lens, **more}
+        sizes = {name: lens[name] for name in ("focal_length", "pixel_pitch", "angle")}
+        whole = float(self.stop.diameter)
+        found: Psf = stray_light(optics.psf(front, **lens), front, surfaces=condition.surfaces, diameter=whole, **sizes)
+        return found
+
+    def _front(self, masked: bool, diameter: float, bands: Bands, condition: Condition | None, **notches: Any) -> Pupil:
         pupil = self.recipe.steps["pupil[mask]"]
         index = self.recipe.steps[str(pupil.wires["index"])]
         height = self.height if masked else self.flat
@@ -77,8 +93,9 @@ class ProtectionCamera:
             given["defocus"] = float(given.get("defocus", 0.0)) + condition.defocus
             film = self._film(condition)
         shaded = shade(self.stop, diameter=diameter, **notches)
-        front = optics.pupil(height, index.node(bands, **index.params), bands, self.stop, film, shade=shaded, **given)
-        found: Psf = optics.psf(front, **{**self.lens, **more})
+        found: Pupil = optics.pupil(
+            height, index.node(bands, **index.params), bands, self.stop, film, shade=shaded, **given
+        )
         return found
 
     def _film(self, condition: Condition) -> Any:
@@ -101,7 +118,16 @@ class ProtectionCamera:
     def nodes(self) -> tuple[Node, ...]:
         """Return the nodes whose code determines a PSF, or a measure of it."""
         index = self.recipe.steps[str(self.recipe.steps["pupil[mask]"].wires["index"])].node
-        own = (optics.psf, optics.pupil, shade, dirt, metrics.lsr, metrics.heat_ratio, metrics.filtered_picture)
+        own = (
+            optics.psf,
+            optics.pupil,
+            shade,
+            dirt,
+            stray_light,
+            metrics.lsr,
+            metrics.heat_ratio,
+            metrics.filtered_picture,
+        )
         return (*own, index, self.recipe.steps["responses"].node)
 
 

@@ -23,7 +23,6 @@ from neusee.nodes.metrics import (
     glare_levels,
     picture_spectrum,
     radial_contrast,
-    scattered_light,
 )
 from neusee.nodes.values import Bands, Psf
 from neusee.workflows.keys.cache_key import digest, plain
@@ -46,6 +45,11 @@ class Front:
     diameter: float = 1.0
     notch: float | None = None  #: m, centre of a notch filter
     depth: float = 0.0  #: of the notch
+
+    @property
+    def notches(self) -> dict[str, Any]:
+        """Return the parameters of `doe.shade` for the notch filter, if there is one."""
+        return {} if self.notch is None else {"notches": (self.notch,), "depth": self.depth}
 
 
 @dataclass(frozen=True)
@@ -112,8 +116,10 @@ class FrontBench:
         return self._psfs[front]
 
     def _psf(self, front: Front, bands: Bands, condition: Condition | None, **more: Any) -> Psf:
-        notch = {} if front.notch is None else {"notches": (front.notch,), "depth": front.depth}
-        return self.camera.psf(front.masked, front.diameter, bands, condition, **notch, **more)
+        return self.camera.psf(front.masked, front.diameter, bands, condition, **front.notches, **more)
+
+    def _laser_psf(self, front: Front, line: Bands, condition: Condition, **more: Any) -> Psf:
+        return self.camera.laser_psf(front.masked, front.diameter, line, condition, **front.notches, **more)
 
     def _heat(self, known: Psf) -> Tensor:
         if self.settings.dwell is None:
@@ -130,22 +136,19 @@ class FrontBench:
         """
         camera = self.camera
         line = camera.laser_line(condition.wavelength)
-        sizes = {name: camera.lens[name] for name in ("focal_length", "pixel_pitch")}
         found = {"colour": camera.laser_colour(line)}
         reach = min(self.settings.fields)
         spot = (condition.direction[0] * reach, condition.direction[1] * reach)
-        scale = sizes["pixel_pitch"] / sizes["focal_length"]
+        scale = camera.lens["pixel_pitch"] / camera.lens["focal_length"]
         for side in self.settings.fields if condition.direction == (0.0, 0.0) else (reach,):
             shape, angle = (side, side), (spot[0] * scale, spot[1] * scale)
             try:
-                focused = self._psf(front, line, condition, shape=shape, angle=angle)
+                light = self._laser_psf(front, line, condition, shape=shape, angle=angle)
             except ValueError:  # the pupil is too coarse
                 if side == reach:
                     raise
                 continue
-            scattered = scattered_light(shape, spot, **sizes, scatter=condition.scatter)
-            light = (1 - condition.scatter) * focused.intensity[0].double() + front.diameter**2 * scattered
-            levels = glare_levels(light, float(focused.clear_peak))
+            levels = glare_levels(light.intensity[0], float(light.clear_peak))
             found |= {f"level.{side}": levels.level, f"share.{side}": levels.share}
         return found
 

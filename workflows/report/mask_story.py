@@ -1,4 +1,4 @@
-"""What a mask buys and what it costs in a run, as two sentences with the numbers of the run."""
+"""What a mask buys and what it costs in a run, in sentences with the numbers of the run, and what could replace it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from typing import Any
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report.result_numbers import Value, arms, lines_of, suppressed
 
-SENTENCES = ("buys", "costs")
+SENTENCES = ("buys", "costs", "rival")
 PLAIN, MASK, RESTORED = "plain lens", "with mask", "restored"
 _PEAK, _QUALITY, _LOST = "peak/I_sat", "PSNR (dB)", "saturated px"
 _EQUAL = 0.01  #: relative difference of two peaks below which the mask changes nothing
+_LEAST = 0.9  #: LSR above which there is nothing to replace
 _TIMES = 2.0  #: ratio of two peaks below which their difference is told in percent
 
 Arm = Mapping[str, float]
@@ -23,6 +24,8 @@ def story(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, An
     numbers = {name: _known(cells) for name, cells in arms(recipe, keys, value).items()}
     lsr = suppressed(recipe, keys, value)
     said = sentences(numbers, lsr, bool(lines_of(recipe, keys)))
+    shaded = "pupil[mask]" in recipe.steps and recipe.steps["pupil[mask]"].wires.get("shade")
+    said |= {} if shaded or not said else rival(lsr)
     return {**said, "numbers": {name: numbers[name] for name in numbers if said}, "lsr": lsr if said else {}}
 
 
@@ -36,7 +39,20 @@ def sentences(numbers: Mapping[str, Arm], lsr: Mapping[str, float], laser: bool)
     if not plain or not mask:
         return {}
     texts = _buys(plain, mask, lsr, laser), _costs(plain, mask, numbers.get(RESTORED, {}), laser)
-    return {name: text for name, text in zip(SENTENCES, texts, strict=True) if text}
+    return {name: text for name, text in zip(SENTENCES[:2], texts, strict=True) if text}
+
+
+def rival(lsr: Mapping[str, float]) -> dict[str, str]:
+    """Return the sentence ``rival``: the grey filter that weakens each laser at least as much, if the mask does at all.
+
+    Its picture is that of another run, which takes as long as this one: no step of this run computes it.
+    """
+    share = max(lsr.values(), default=1.0)
+    if share >= _LEAST:
+        return {}
+    grey = f"{share:.3g}"
+    text = f"A grey filter that passes {grey} of the light weakens the laser as much: for its picture, restored alike, "
+    return {"rival": f"{text}run this recipe with doe=grey_filter doe.transmittance={grey}."}
 
 
 def _known(cells: Arm) -> dict[str, float]:

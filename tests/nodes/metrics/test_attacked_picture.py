@@ -18,7 +18,6 @@ from neusee.nodes.metrics import (
     noise_variance,
     picture_spectrum,
     remaining_error,
-    scattered_light,
 )
 from neusee.nodes.spectra import bands
 from neusee.nodes.values import Psf
@@ -68,23 +67,6 @@ def test_a_laser_too_weak_to_matter_leaves_the_quiet_picture_and_a_strong_one_le
     assert found.seen.tolist() == [1.0, 0.0]
     assert float(found.error[1]) == 1.0
     assert float(found.information[1]) == 0.0
-
-
-def test_all_scattered_light_lies_in_the_half_space():
-    """The share over a plane out to a sine of 1, ring by ring, with the area of a pixel seen from the lens."""
-    rest = {"focal_length": 0.01, "pixel_pitch": 1e-5, "scatter": 0.03, "shoulder": 0.02, "slope": -1.6}
-    line = scattered_light((1, 40001), (0.0, 0.0), **rest)[0, 20000:].numpy()
-    tangent = np.arange(len(line)) * 1e-3
-    sine, cosine = np.sin(np.arctan(tangent)), np.cos(np.arctan(tangent))
-    rings = line / (1e-3) ** 2 * 2 * np.pi * sine * np.gradient(sine)
-    assert cosine[-1] < 0.06
-    assert rings.sum() == pytest.approx(0.03, rel=0.02)  # to 87 degrees
-
-
-def test_a_mask_does_not_reduce_scattered_light():
-    rest = {"focal_length": 0.1, "pixel_pitch": 3e-6, "scatter": 0.01}
-    off = scattered_light((9, 9), (2.0, -1.0), **rest)
-    assert int(off.argmax()) == (4 + 2) * 9 + 4 - 1
 
 
 def test_the_heat_of_a_pulse_is_its_peak_and_that_of_continuous_light_falls_less_with_a_wider_spot():

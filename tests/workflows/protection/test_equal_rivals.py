@@ -1,6 +1,7 @@
 """Rivals of equal protection: equal peaks, the best of the candidates, and values that are those of the nodes."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -89,3 +90,20 @@ def test_the_colour_of_a_laser_is_relative_to_the_channel_that_responds_most(ben
     assert int(colour.argmax()) == 1
     at = bench.camera.laser_colour(bench.camera.laser_line(usual_condition().wavelength))
     assert torch.equal(bench.measure(Front(False), usual_condition()).colour, at)
+
+
+def test_the_lens_scatters_the_same_veil_behind_every_front(bench):
+    """The veil, without the core, by Harvey and Shack's law in the middle of a pixel; a stop passes less of it."""
+    usual = replace(usual_condition(), scatter=0.3)
+    (surface,), line = usual.surfaces.values(), bench.camera.laser_line(550e-9)
+    scale = bench.camera.lens["pixel_pitch"] / bench.camera.lens["focal_length"]
+    at = np.hypot(*np.meshgrid(*[np.arange(64) - 32] * 2)) * scale
+    law = surface["b0"] * (1 + (at / surface["l"]) ** 2) ** (surface["s"] / 2) * scale**2
+    far = at > 20 * scale
+    for masked, diameter in ((False, 1.0), (True, 1.0), (True, 0.5)):
+        whole, core = (one.intensity[0].double().numpy() for one in (
+            bench.camera.laser_psf(masked, diameter, line, usual, angle=(0.0, 0.0)),
+            bench.camera.psf(masked, diameter, line, usual, angle=(0.0, 0.0)),
+        ))  # fmt: skip
+        veil = whole - (1 - usual.scatter) * core
+        assert veil[far] == pytest.approx(diameter**2 * law[far], rel=0.03, abs=5e-10)

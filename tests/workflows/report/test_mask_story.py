@@ -241,3 +241,12 @@ def test_the_page_leads_with_the_pictures_and_the_story(document):
     wrong = run_page.page(document | {"failed": ["a check"]}, {"overview": b"png"})
     assert wrong.index("Right.") < wrong.index(document["story"]["buys"])
     assert "What the camera sees" not in run_page.page(document | {"story": {}}, {})
+
+
+def test_the_rival_of_a_mask_is_the_grey_filter_of_its_least_suppressed_laser():
+    (text,) = mask_story.rival({"410 nm": 0.0012, "690 nm": 0.0022}).values()
+    assert text == (
+        "A grey filter that passes 0.0022 of the light weakens the laser as much: for its picture, restored alike, run "
+        "this recipe with doe=grey_filter doe.transmittance=0.0022."
+    )
+    assert mask_story.rival({}) == mask_story.rival({"530 nm": 0.95}) == {}

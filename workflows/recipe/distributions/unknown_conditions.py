@@ -1,7 +1,8 @@
 """What nobody knows of an attack before it comes, as probability distributions, and one sampler of all of them.
 
 Studies and trainings draw the same conditions for the same seed: the wavelength and the direction of the laser, the
-defocus of the lens, the grease on the window, and the light that the lens scatters.
+defocus of the lens, the grease on the window, and the light that the lens scatters. A study draws a list, and a
+training, which imports the same sampler, draws the condition of one iteration at a time.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from neusee.workflows.recipe.distributions.scalar import read_law
+
+_MOST_SCATTER = 0.99  #: share of the light; a lens that scatters all light has no picture
 
 
 @dataclass(frozen=True)
@@ -38,16 +41,26 @@ class Condition:
     seed: int  #: of the pattern of the grease
 
     @property
+    def surfaces(self) -> dict[str, dict[str, float]]:
+        """Return the parameter ``surfaces`` of `flare.stray_light` for a lens that scatters this share of the light."""
+        from neusee.nodes.flare import surface_of
+
+        return {"lens": surface_of(self.scatter)}
+
+    @property
     def plain(self) -> dict[str, float | list[float]]:
         """Return the condition as a JSON value."""
         return {**asdict(self), "direction": list(self.direction)}
 
 
-def draw_conditions(count: int, seed: int, laws: UnknownLaws | None = None) -> list[Condition]:
-    """Return ``count`` independent draws of the conditions; a larger ``count`` begins with the same draws."""
+def draw_conditions(count: int, seed: int, laws: UnknownLaws | None = None, first: int = 0) -> list[Condition]:
+    """Return ``count`` independent draws of the conditions, from the number ``first`` on.
+
+    The draw of a number depends only on the seed and the laws, so that a larger ``count`` begins with the same draws.
+    """
     given: Mapping[str, str] = asdict(laws or UnknownLaws())
     read = {name: read_law(text) for name, text in given.items()}
-    z = np.random.default_rng([seed, 4]).standard_normal((count, len(read)))
+    z = np.random.default_rng([seed, 4]).standard_normal((first + count, len(read)))[first:]
     columns = {name: law.at(z[:, i]).tolist() for i, (name, law) in enumerate(read.items())}
     return [
         Condition(
@@ -55,8 +68,8 @@ def draw_conditions(count: int, seed: int, laws: UnknownLaws | None = None) -> l
             direction=(columns["direction_y"][i], columns["direction_x"][i]),
             defocus=columns["defocus"][i],
             grease=columns["grease"][i],
-            scatter=min(columns["scatter"][i], 1.0),
-            seed=seed + i,
+            scatter=min(columns["scatter"][i], _MOST_SCATTER),
+            seed=seed + first + i,
         )
         for i in range(count)
     ]

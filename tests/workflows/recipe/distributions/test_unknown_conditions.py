@@ -42,3 +42,16 @@ def test_the_usual_condition_is_the_median_with_a_clean_window():
 def test_a_law_that_is_no_distribution_is_refused():
     with pytest.raises(ValueError, match="write kind"):
         draw_conditions(1, 0, dataclasses.replace(UnknownLaws(), defocus="0.3 waves"))
+
+
+def test_the_draw_of_an_iteration_is_that_of_the_list():
+    assert draw_conditions(3, 5, first=7) == draw_conditions(10, 5)[7:]
+
+
+def test_the_surface_of_a_draw_scatters_its_share_of_the_light():
+    """The closed form of the total integrated scatter, with l = 0.01 and s = -1.5."""
+    (one,) = draw_conditions(1, 5)
+    (surface,) = one.surfaces.values()
+    beta = (np.arange(200_000) + 0.5) / 200_000
+    density = surface["b0"] * (1 + (beta / surface["l"]) ** 2) ** (surface["s"] / 2)
+    assert (2 * np.pi * beta * density).mean() == pytest.approx(one.scatter, rel=1e-5)
