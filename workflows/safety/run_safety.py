@@ -62,10 +62,12 @@ def key_of(recipe: Recipe, prepared: Prepared, store: Store) -> str:
     modules = [code.digest(f"neusee.nodes.{family}") for family in ("laser", "sensor")]
     draws = {name: values.tobytes().hex() for name, values in prepared.draws.values.items()}
     spots = [(each.option, each.pitch, each.light.tobytes().hex()) for each in prepared.spots]
+    ranked = [(each.arm, each.held, each.stray, *(x.tobytes().hex() for x in (each.count, each.level, each.smooth)))
+              for each in prepared.ranked]  # fmt: skip
     options = [asdict(each) for each in prepared.options]
     laws = [tuple(law) for law in prepared.safety.laws]
     values = (recipe.name, recipe.title, recipe.config.to_yaml(), recipe.seed, prepared.safety.settings.draws)
-    key = digest("safety", values, draws, spots, options, laws, modules, engine("safety.run_safety"))
+    key = digest("safety", values, draws, spots, ranked, options, laws, modules, engine("safety.run_safety"))
     code.save()
     return key
 
