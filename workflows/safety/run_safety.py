@@ -13,6 +13,7 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.report.study_folder import StudyReport, StudyRun
 from neusee.workflows.report.study_page import Section
+from neusee.workflows.safety.dazzle_curves import Dazzled
 from neusee.workflows.safety.safety_estimate import CERTIFICATE, Estimate, Finding, Prepared, complete, prepare
 from neusee.workflows.safety.safety_page import report
 from neusee.workflows.safety.safety_text import paragraphs
@@ -97,8 +98,20 @@ def document(found: Estimate) -> dict[str, Any]:
         "draws": found.draws.count,
         "laws": dict(found.draws.laws),
         "limits": [_finding(each) for each in found.findings],
+        "dazzled": [_dazzled(each) for each in found.dazzled],
+        "stray_light": any(each.stray for each in found.ranked),
+        "dead_pixels": [{name: value for name, value in vars(each).items() if name != "frame"} for each in found.dead],
         "eye": asdict(found.eye) if found.eye else None,
         "not_said": list(found.unsaid),
+    }
+
+
+def _dazzled(each: Dazzled) -> dict[str, Any]:
+    return {
+        "protection": each.option,
+        "pixels": asdict(each.pixels) if each.pixels else None,
+        "share": each.share,
+        "times_plain_lens": each.times,
     }
 
 

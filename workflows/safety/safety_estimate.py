@@ -15,7 +15,9 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.blocks.safety_block import Safety
 from neusee.workflows.recipe.distributions.scalar import FloatArray
 from neusee.workflows.safety.damage_pattern import DamagePattern, Spot, damage_patterns, spots_of, step_of
+from neusee.workflows.safety.dazzle_curves import Dazzled, dazzled
 from neusee.workflows.safety.dazzled_area import Area, Ranked, area_of, ranked_of
+from neusee.workflows.safety.dead_pixels import DeadPixels, dead_pixels
 from neusee.workflows.safety.distance_zones import QUANTILES, Spread, Zones, zones_of
 from neusee.workflows.safety.exposures import (
     Emission,
@@ -75,12 +77,20 @@ class Estimate:
     eye: EyeFinding | None
     unsaid: tuple[str, ...]  #: what the estimate does not say, with the reason
     patterns: tuple[DamagePattern, ...] = ()
-    areas: tuple[Area, ...] = ()  #: dazzled area behind each protection for which it is known
+    dazzled: tuple[Dazzled, ...] = ()  #: behind each protection for which the dazzled area is known
+    dead: tuple[DeadPixels, ...] = ()  #: examples of damage in a raw frame
+    ranked: tuple[Ranked, ...] = ()
 
     @property
     def at(self) -> int:
         """Return the index of the distance of the recipe among all distances."""
         return self.exposures.at(self.safety.laser.distance)
+
+    @property
+    def mean_at_lens(self) -> float:
+        """Return the nominal irradiance at the lens at the distance of the recipe, the mean over one exposure, W/m2."""
+        mean = mean_in_frame(self.exposures, self.safety.settings.sensor.exposure or 1.0)
+        return float(mean[0, 0] * self.exposures.lens[0, self.at])
 
 
 def estimate(recipe: Recipe, store: Store | None = None) -> Estimate:
@@ -122,8 +132,14 @@ def complete(recipe: Recipe, prepared: Prepared) -> Estimate:
     eye, faults = _eye(safety, exposures)
     unsaid = (*unsaid_of_damage(safety, findings), *unsaid_of_dazzle(safety, known, findings), *faults)
     patterns = tuple(damage_patterns(prepared.spots, findings))
+    mean = mean_in_frame(exposures, safety.settings.sensor.exposure or 1.0)
+    filled = dazzled(safety, draws, exposures, areas, mean)
+    dead = tuple(dead_pixels(safety, prepared.spots, findings, exposures))
     emission = emission_of(safety.laser.beam())
-    return Estimate(recipe, safety, emission, options, draws, exposures, findings, eye, unsaid, patterns, areas)
+    return Estimate(
+        recipe, safety, emission, options, draws, exposures, findings, eye, unsaid, patterns, filled, dead,
+        prepared.ranked,
+    )  # fmt: skip
 
 
 def settings_of(recipe: Recipe) -> Safety:
