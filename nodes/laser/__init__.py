@@ -16,6 +16,7 @@ from neusee.nodes.laser._beam import (
     share_through,
     underfilled,
 )
+from neusee.nodes.laser._bright_pixels import BrightPixels, bright_pixels
 from neusee.nodes.laser._damage_distances import (
     airy_diameter,
     defocus_of_source,
@@ -42,6 +43,7 @@ from neusee.nodes.laser._dazzle_area import (
     dazzle_exposure_limit,
     dazzle_strength,
     dazzled_pixels,
+    peak_light,
     pixel_share,
     veil_limit,
 )
@@ -62,6 +64,7 @@ __all__ = [
     "KINDS",
     "PUBLISHED_DAMAGE",
     "Beam",
+    "BrightPixels",
     "Convention",
     "Damage",
     "DamageLaw",
@@ -75,6 +78,7 @@ __all__ = [
     "axis_irradiance",
     "beam",
     "beam_radius",
+    "bright_pixels",
     "counted_pixels",
     "curvature_radius",
     "damage",
@@ -100,6 +104,7 @@ __all__ = [
     "light",
     "matching_laws",
     "nominal_ocular_hazard_distance",
+    "peak_light",
     "peak_on_sensor",
     "pixel_share",
     "power_through",

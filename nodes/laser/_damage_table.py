@@ -56,6 +56,8 @@ def read_damage_laws(file: Path) -> tuple[DamageLaw, ...]:
     Raises ValueError, with line and column, for a column or a unit that is missing or unknown, for a cell that is not a
     positive number, for a range whose end is before its start, and for a factor without a median factor.
     """
+    if file.suffix.lower() in (".yaml", ".yml", ".json", ".xlsx"):
+        raise ValueError(f"{file.name} is no CSV file: thresholds are read from a table with one law a row; {_FORM}")
     rows = list(csv_rows(file))
     if len(rows) < 2:
         raise ValueError(f"{file.name} has no laws of damage below a header: {_FORM}")

@@ -25,6 +25,11 @@ def pixel_share(spread: float) -> float:
     return float(_airy_over_pixels(spread, 1)[0, 0])
 
 
+def peak_light(spread: float) -> float:
+    """Return the share of the light of a clear round pupil in a pixel as bright everywhere as the Airy peak."""
+    return math.pi / (4 * spread**2)
+
+
 def dazzled_pixels(strength: float, spread: float, sampling: Sampling = "integrated") -> float:
     """Return the number of pixels that a laser behind a clear round pupil fills, by the mean of the Airy pattern.
 

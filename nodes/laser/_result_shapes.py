@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neusee.nodes.laser._bright_pixels import RANKS, BrightPixels, bright_pixels
 from neusee.nodes.laser._damage_pixels import damaged_pixels
 from neusee.nodes.laser._damage_spot import SpotDamage, damage, laws_before
 from neusee.nodes.laser._dazzle_curve import DECADES, DazzleCurve, dazzle_curve
@@ -55,3 +56,15 @@ def _(psf: Psf, bands: Bands, *, strengths: tuple[float, ...] = DECADES, **param
 def _(result: DazzleCurve, psf: Psf, *inputs: Any, **params: Any) -> tuple[float, float]:
     pixels = float(psf.intensity[0].numel())
     return 40.0 * pixels, 2.0 * psf.intensity.numel() + 20 * pixels
+
+
+@bright_pixels.shape
+def _(psf: Psf, bands: Bands, **params: Any) -> BrightPixels:
+    column = double(RANKS)
+    return BrightPixels(column, column, column, column)
+
+
+@bright_pixels.work
+def _(result: BrightPixels, psf: Psf, *inputs: Any, **params: Any) -> tuple[float, float]:
+    samples = float(psf.intensity[0].numel())
+    return 24.0 * samples, 2.0 * psf.intensity.numel() + 30 * samples

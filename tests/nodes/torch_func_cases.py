@@ -154,6 +154,9 @@ CASES = {
         "0", (RAW, [RAW]), {"shape": (8, 8), "full_well": 25500.0, "quantum_efficiency": 0.56, "read_noise": 5.0}
     ),
     "laser.dazzle_curve": Case("0.intensity", (Psf(rand(3, 9, 9), rand(3)), LINE)),
+    "laser.bright_pixels": Case(
+        "0.intensity", (Psf(rand(3, 9, 9), rand(3)), LINE), {"shape": (9, 9), "pixel_pitch": 2.9e-6}
+    ),
     "laser.light": Case("power", (LINE, STOP), {**BEAM, "power": number(5e-3), "focal_length": 0.11, "exposure": 0.1}),
     "laser.wavefront": Case("distance", (LINE,), {**BEAM, "distance": number(100.0)}),
     "flare.stray_light": Case("0.intensity", (PSF, PUPIL), STRAY),

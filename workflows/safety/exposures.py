@@ -28,6 +28,7 @@ class Option:
     diameter: float | None = None  #: m, of a smaller stop; None: that of the lens
     passing: float = 1.0  #: transmittance of a filter
     peak: float = 1.0  #: peak of the PSF over that of the clear lens
+    masked: bool = False  #: whether the mask is in front of the lens
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ def options_of(safety: Safety, mask: float | None) -> tuple[Option, ...]:
     protection = safety.settings.protection
     found = [Option("plain lens")]
     if mask is not None:
-        found.append(Option("mask", peak=mask))
+        found.append(Option("mask", peak=mask, masked=True))
     if protection.filter is not None:
         found.append(Option(f"grey filter {protection.filter:g}", passing=protection.filter))
     if protection.stop is not None:

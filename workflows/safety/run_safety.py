@@ -13,6 +13,7 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
 from neusee.workflows.report.study_folder import StudyReport, StudyRun
 from neusee.workflows.report.study_page import Section
+from neusee.workflows.safety.dazzle_curves import Dazzled
 from neusee.workflows.safety.safety_estimate import CERTIFICATE, Estimate, Finding, Prepared, complete, prepare
 from neusee.workflows.safety.safety_page import report
 from neusee.workflows.safety.safety_text import paragraphs
@@ -62,10 +63,12 @@ def key_of(recipe: Recipe, prepared: Prepared, store: Store) -> str:
     modules = [code.digest(f"neusee.nodes.{family}") for family in ("laser", "sensor")]
     draws = {name: values.tobytes().hex() for name, values in prepared.draws.values.items()}
     spots = [(each.option, each.pitch, each.light.tobytes().hex()) for each in prepared.spots]
+    ranked = [(each.arm, each.held, each.stray, *(x.tobytes().hex() for x in (each.count, each.level, each.smooth)))
+              for each in prepared.ranked]  # fmt: skip
     options = [asdict(each) for each in prepared.options]
     laws = [tuple(law) for law in prepared.safety.laws]
     values = (recipe.name, recipe.title, recipe.config.to_yaml(), recipe.seed, prepared.safety.settings.draws)
-    key = digest("safety", values, draws, spots, options, laws, modules, engine("safety.run_safety"))
+    key = digest("safety", values, draws, spots, ranked, options, laws, modules, engine("safety.run_safety"))
     code.save()
     return key
 
@@ -95,8 +98,20 @@ def document(found: Estimate) -> dict[str, Any]:
         "draws": found.draws.count,
         "laws": dict(found.draws.laws),
         "limits": [_finding(each) for each in found.findings],
+        "dazzled": [_dazzled(each) for each in found.dazzled],
+        "stray_light": any(each.stray for each in found.ranked),
+        "dead_pixels": [{name: value for name, value in vars(each).items() if name != "frame"} for each in found.dead],
         "eye": asdict(found.eye) if found.eye else None,
         "not_said": list(found.unsaid),
+    }
+
+
+def _dazzled(each: Dazzled) -> dict[str, Any]:
+    return {
+        "protection": each.option,
+        "pixels": asdict(each.pixels) if each.pixels else None,
+        "share": each.share,
+        "times_plain_lens": each.times,
     }
 
 

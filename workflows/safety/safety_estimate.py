@@ -12,9 +12,12 @@ from neusee.nodes.laser import eye_limit, frame_power, nominal_ocular_hazard_dis
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.recipe.blocks.safety_block import SATURATION, Safety
+from neusee.workflows.recipe.blocks.safety_block import Safety
 from neusee.workflows.recipe.distributions.scalar import FloatArray
 from neusee.workflows.safety.damage_pattern import DamagePattern, Spot, damage_patterns, spots_of, step_of
+from neusee.workflows.safety.dazzle_curves import Dazzled, dazzled
+from neusee.workflows.safety.dazzled_area import Area, Ranked, area_of, ranked_of
+from neusee.workflows.safety.dead_pixels import DeadPixels, dead_pixels
 from neusee.workflows.safety.distance_zones import QUANTILES, Spread, Zones, zones_of
 from neusee.workflows.safety.exposures import (
     Emission,
@@ -24,8 +27,9 @@ from neusee.workflows.safety.exposures import (
     emission_of,
     options_of,
 )
-from neusee.workflows.safety.sensor_limits import Limit, damage_limits, dazzle_limits, veil_level
+from neusee.workflows.safety.sensor_limits import Limit, damage_limits, dazzle_limits
 from neusee.workflows.safety.uncertain_values import SettingDraws, draw_settings
+from neusee.workflows.safety.unsaid_parts import unsaid_of_damage, unsaid_of_dazzle
 from neusee.workflows.store.result_store import Store
 
 CERTIFICATE = "An estimate, no certificate: neusee decides nothing about eyes or sensors."
@@ -73,11 +77,20 @@ class Estimate:
     eye: EyeFinding | None
     unsaid: tuple[str, ...]  #: what the estimate does not say, with the reason
     patterns: tuple[DamagePattern, ...] = ()
+    dazzled: tuple[Dazzled, ...] = ()  #: behind each protection for which the dazzled area is known
+    dead: tuple[DeadPixels, ...] = ()  #: examples of damage in a raw frame
+    ranked: tuple[Ranked, ...] = ()
 
     @property
     def at(self) -> int:
         """Return the index of the distance of the recipe among all distances."""
         return self.exposures.at(self.safety.laser.distance)
+
+    @property
+    def mean_at_lens(self) -> float:
+        """Return the nominal irradiance at the lens at the distance of the recipe, the mean over one exposure, W/m2."""
+        mean = mean_in_frame(self.exposures, self.safety.settings.sensor.exposure or 1.0)
+        return float(mean[0, 0] * self.exposures.lens[0, self.at])
 
 
 def estimate(recipe: Recipe, store: Store | None = None) -> Estimate:
@@ -97,6 +110,7 @@ class Prepared:
     draws: SettingDraws
     options: tuple[Option, ...]
     spots: tuple[Spot, ...]
+    ranked: tuple[Ranked, ...]
 
 
 def prepare(recipe: Recipe, store: Store | None) -> Prepared:
@@ -104,19 +118,28 @@ def prepare(recipe: Recipe, store: Store | None) -> Prepared:
     safety = _with_stop(recipe, settings_of(recipe), store)
     draws = draw_settings(recipe, safety)
     spots = spots_of(recipe, safety, store)
-    return Prepared(safety, draws, options_of(safety, _mask_peak(recipe, safety, store)), spots)
+    ranked = ranked_of(recipe, safety, store)
+    return Prepared(safety, draws, options_of(safety, _mask_peak(recipe, safety, store)), spots, ranked)
 
 
 def complete(recipe: Recipe, prepared: Prepared) -> Estimate:
     """Return the estimate from everything that decides it."""
     safety, draws, options = prepared.safety, prepared.draws, prepared.options
     exposures = compute_exposures(safety, draws, options)
-    findings = tuple(_findings(safety, draws, options, exposures))
+    known = {option.name: area_of(safety, option, prepared.ranked) for option in options}
+    areas = tuple(area for area in known.values() if isinstance(area, Area)) if safety.settings.dazzle else ()
+    findings = tuple(_findings(safety, draws, options, exposures, areas))
     eye, faults = _eye(safety, exposures)
-    unsaid = (*_unsaid(safety, findings), *faults)
+    unsaid = (*unsaid_of_damage(safety, findings), *unsaid_of_dazzle(safety, known, findings), *faults)
     patterns = tuple(damage_patterns(prepared.spots, findings))
+    mean = mean_in_frame(exposures, safety.settings.sensor.exposure or 1.0)
+    filled = dazzled(safety, draws, exposures, areas, mean)
+    dead = tuple(dead_pixels(safety, prepared.spots, findings, exposures))
     emission = emission_of(safety.laser.beam())
-    return Estimate(recipe, safety, emission, options, draws, exposures, findings, eye, unsaid, patterns)
+    return Estimate(
+        recipe, safety, emission, options, draws, exposures, findings, eye, unsaid, patterns, filled, dead,
+        prepared.ranked,
+    )  # fmt: skip
 
 
 def settings_of(recipe: Recipe) -> Safety:
@@ -156,12 +179,20 @@ def _mask_peak(recipe: Recipe, safety: Safety, store: Store | None) -> float | N
 
 
 def _findings(
-    safety: Safety, draws: SettingDraws, options: tuple[Option, ...], exposures: Exposures
+    safety: Safety,
+    draws: SettingDraws,
+    options: tuple[Option, ...],
+    exposures: Exposures,
+    areas: tuple[Area, ...],
 ) -> Iterator[Finding]:
     """Yield what each limit says behind each option."""
     for option in options:
-        for limit in (*damage_limits(safety, option, exposures, draws), *dazzle_limits(safety, option, draws)):
+        for limit in damage_limits(safety, option, exposures, draws):
             yield _finding(safety, option, limit, exposures)
+        for area in areas:
+            if area.option == option:
+                for limit in dazzle_limits(safety, area, draws):
+                    yield _finding(safety, option, limit, exposures)
 
 
 def _finding(safety: Safety, option: Option, limit: Limit, exposures: Exposures) -> Finding:
@@ -228,38 +259,3 @@ def _eye(safety: Safety, exposures: Exposures) -> tuple[EyeFinding | None, tuple
     return EyeFinding(
         duration, limit, quantity, Spread.of(float(here[0]), here[1:]), Spread.of(float(reach[0]), reach[1:])
     ), ()
-
-
-def _unsaid(safety: Safety, findings: tuple[Finding, ...]) -> tuple[str, ...]:
-    """Return sentences on what the estimate does not say."""
-    laser, damage = safety.laser, safety.settings.damage
-    said = () if any(each.limit.effect == "damage" for each in findings) else (
-        f"Nothing is said of damage: no threshold is known for {damage.device} at {laser.wavelength * 1e9:.4g} nm and "
-        "this exposure. Give a table of your own: safety.damage.file.",
-    )  # fmt: skip
-    return (*said, *_unsaid_of_dazzle(safety))
-
-
-def _unsaid_of_dazzle(safety: Safety) -> Iterator[str]:
-    """Yield sentences on what the estimate does not say of dazzle."""
-    dazzle, sensor = safety.settings.dazzle, safety.settings.sensor
-    if dazzle is None:
-        lacking = [name.replace("_", " ") for name in SATURATION if getattr(sensor, name) is None]
-        reason = "the recipe does not ask for it (safety.dazzle)"
-        if lacking:
-            reason = f"the recipe gives no {', '.join(lacking)} of the sensor at this wavelength"
-        yield f"Nothing is said of dazzle: {reason}."
-        return
-    if safety.settings.protection.mask is not None:
-        yield (
-            "Nothing is said of dazzle behind the mask: a mask spreads the light over more pixels, and the closed form "
-            "of the dazzled area holds for a clear pupil only."
-        )
-    level = veil_level(dazzle)
-    if level <= 0:
-        yield "The feature of safety.dazzle is lost without any laser, so that no veil is stated."
-    elif level >= (sensor.full_well or 0.0):
-        yield (
-            f"The feature of safety.dazzle is seen through {level:.3g} e- of veiling light a pixel, more than the full "
-            "well: a pixel is lost when it saturates, and no veil is stated."
-        )

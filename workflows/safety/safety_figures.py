@@ -9,6 +9,7 @@ import numpy as np
 
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn
 from neusee.workflows.safety.damage_pattern import DamagePattern
+from neusee.workflows.safety.dead_pixels import DeadPixels
 from neusee.workflows.safety.distance_zones import QUANTILES
 from neusee.workflows.safety.safety_estimate import Estimate, Finding
 
@@ -91,4 +92,38 @@ def zones(found: Estimate) -> Any:
     axis.set(xscale="log", xlabel="distance (m)", xlim=(at[0], at[-1]), ylim=(len(labels) - 0.4, -0.6))
     axis.set_yticks(range(len(labels)), labels)
     axis.grid(False, axis="y")
+    return figure
+
+
+@drawn
+def dazzled_share(found: Estimate) -> Any:
+    """Draw the share of the picture that the laser saturates against the mean irradiance at the lens."""
+    figure, axes = canvas(9.0, 4.4)
+    axis = axes[0, 0]
+    for i, each in enumerate(found.dazzled):
+        shown = each.curve > 0
+        look = {"color": (BLUE, *_COLOURS)[i], "linestyle": _DASHES[i % len(_DASHES)]}
+        axis.plot(each.at_lens[shown], each.curve[shown], label=each.option, **look)
+    assert found.safety.settings.dazzle is not None
+    axis.axhline(found.safety.settings.dazzle.share, color=BLACK, linewidth=0.8, linestyle=":")
+    axis.axvline(found.mean_at_lens, color=BLACK, linewidth=0.8)
+    axis.set(
+        xscale="log", yscale="log", xlabel="mean irradiance at the lens (W/m2)", ylabel="share of saturated pixels"
+    )
+    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
+
+
+@drawn
+def dead_frames(dead: Sequence[DeadPixels]) -> Any:
+    """Draw a part of the raw frame of an evenly grey scene with its dead pixels, behind each protection."""
+    figure, axes = canvas(3.6 * len(dead), 3.8, 1, len(dead))
+    for axis, each in zip(axes[0], dead, strict=True):
+        half = each.frame.shape[0] / 2
+        axis.imshow(each.frame, cmap="gray", vmin=0, vmax=1, extent=(-half, half, -half, half), interpolation="nearest")
+        axis.set(title=f"{each.option}\n{', '.join(each.kinds) or 'no damage'}", xlabel="pixels", ylabel="pixels")
+        if "frame" in each.kinds:
+            box = {"facecolor": "white", "edgecolor": "none"}
+            axis.text(0.5, 0.9, "no valid frame", transform=axis.transAxes, ha="center", va="center", bbox=box)
+        axis.grid(False)
     return figure

@@ -7,6 +7,7 @@ from neusee.workflows.report.study_page import Mark, Section
 from neusee.workflows.safety import safety_figures as figures
 from neusee.workflows.safety import safety_words as words
 from neusee.workflows.safety.safety_estimate import CERTIFICATE, Estimate, Finding
+from neusee.workflows.safety.unsaid_parts import stray_text
 
 _CSV = ("protection", "limit", "effect", "quantity", "limit on the sensor", "5 %", "95 %", "limit at the lens", "5 %",
         "95 %", "ratio", "probability", "zones", "probability of nowhere", "probability here", "source")  # fmt: skip
@@ -17,11 +18,15 @@ def report(found: Estimate) -> StudyReport:
     shown = {"irradiance": figures.over_distance(found)}
     if found.findings or found.eye:
         shown["distances"] = figures.zones(found)
-    patterns = found.patterns
-    if patterns:
-        shown["pattern"] = figures.spots(patterns)
+    if found.dazzled:
+        shown["dazzle"] = figures.dazzled_share(found)
+    if found.patterns:
+        shown["pattern"] = figures.spots(found.patterns)
+    if found.dead:
+        shown["dead_pixels"] = figures.dead_frames(found.dead)
     sections = [_limits(found), _distances(found, shown.get("distances")), _curve(shown["irradiance"])]
-    sections += [_pattern(found, shown.get("pattern")), _eye(found), _unsaid(found), _assumed(found), _sources(found)]
+    sections += [_dazzled(found, shown.get("dazzle")), _pattern(found, shown.get("pattern"))]
+    sections += [_dead(found, shown.get("dead_pixels")), _eye(found), _unsaid(found), _assumed(found), _sources(found)]
     return StudyReport(
         f"{found.recipe.name}: damage, dazzle and distance",
         "\n\n".join([CERTIFICATE, found.recipe.title, words.laser_text(found), " ".join(words.verdict(found))]),
@@ -63,6 +68,39 @@ def _curve(picture: bytes) -> Section:
     return Section("Exposure over distance", text, picture=picture)
 
 
+def _dazzled(found: Estimate, picture: bytes | None) -> Section | None:
+    if picture is None or found.safety.settings.dazzle is None:
+        return None
+    text = f"""{words.enlarged_text(found)} The figure shows the share of saturated pixels against the irradiance at the
+        lens, the mean over one exposure. The dotted line is the share that may be lost,
+        {100 * found.safety.settings.dazzle.share:g} %, and the vertical line the irradiance at
+        {words.metres(found.safety.laser.distance)}. A curve ends where the window of the point-spread function does not
+        hold the saturated pixels.
+
+        {stray_text(found.ranked)} {CERTIFICATE}"""
+    rows = [words.dazzled_cells(each) for each in found.dazzled]
+    return Section("Dazzled area", text, words.DAZZLE_COLUMNS, rows, picture)
+
+
+def _dead(found: Estimate, picture: bytes | None) -> Section | None:
+    """Return the section of the dead pixels; without a picture, that no distance damages the median device."""
+    if not found.patterns:
+        return None
+    heading = "Example of damage in the raw frame"
+    if picture is None:
+        text = "No picture: at no distance does the laser damage the median device behind the plain lens."
+        return Section(heading, f"{text} {CERTIFICATE}")
+    distance = words.metres(found.dead[0].distance)
+    text = f"""An example pattern and no prediction: the raw frame of an evenly grey scene around the spot, after the
+        laser has hit the median device at {distance}. A point is white, a destroyed pixel black; lines and crosses are
+        black rows and columns (white columns of a CCD). A sensor that gives no valid frame shows nothing of it: the
+        picture then shows what else is damaged. Which lines go with a damaged pixel differs from device to device.
+        {CERTIFICATE}"""
+    columns = ("protection", "damage", "pixels in the light")
+    rows = [[each.option, ", ".join(each.kinds) or "none", each.pixels] for each in found.dead]
+    return Section(heading, text, columns, rows, picture)
+
+
 def _pattern(found: Estimate, picture: bytes | None) -> Section | None:
     if picture is None:
         return None
@@ -93,15 +131,16 @@ def _assumed(found: Estimate) -> Section:
     elif laser.visibility is not None:
         air = f"Air with a visibility of {words.metres(laser.visibility)} by the law of {laser.haze.capitalize()}."
     text = f"""The beam is Gaussian, hits the middle of the lens and is in focus at every distance: a camera that is
-        focused elsewhere receives less at the peak. The lens is limited by diffraction and scatters no light: a real
-        lens scatters, and is dazzled from farther away than is said here. {air}
+        focused elsewhere receives less at the peak. {stray_text(found.ranked)} {air}
 
         Continuous light stays on one place of the sensor for {found.safety.settings.damage.dwell:g} s. A pulse train
         is compared by each pulse and by its mean; heat that pulses leave behind is not added up. Behind a mask the
         threshold of continuous light is that of the published spot, and its largest peak counts.
 
         Dazzle counts light in a frame that catches a pulse. The wings of a beam that is narrower than the lens are
-        weaker than is assumed."""
+        weaker than is assumed. Pixels are counted in the point-spread function of a sampled pupil: at n wavelengths
+        times f-number from the spot a pupil of 8 n samples across is 1 to 5 % too bright there, and one of 4 n samples
+        up to 20 %."""
     return Section("What is assumed", text)
 
 

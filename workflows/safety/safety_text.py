@@ -19,6 +19,11 @@ def paragraphs(found: Estimate) -> list[list[str]]:
     parts = [[f"{found.recipe.name}: {found.recipe.title}", CERTIFICATE, ""], [words.laser_text(found)]]
     if rows:
         parts += [_table("limits", words.LIMIT_COLUMNS, rows), _table("distances", words.ZONE_COLUMNS, zones)]
+    if found.dazzled:
+        here = words.metres(found.safety.laser.distance)
+        cells = [words.dazzled_cells(each) for each in found.dazzled]
+        parts += [_table(f"dazzled area at {here}", words.DAZZLE_COLUMNS, cells)]
+        parts += [[text] for text in [words.enlarged_text(found)] if text]
     if found.eye:
         parts += [["", "eye"], [words.eye_text(found.eye)]]
     parts += [["", "not said"], *([text] for text in found.unsaid)] if found.unsaid else []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from neusee.workflows.safety.dazzle_curves import Dazzled
 from neusee.workflows.safety.distance_zones import Spread, Zone, Zones
 from neusee.workflows.safety.safety_estimate import Estimate, EyeFinding, Finding
 
@@ -14,6 +15,7 @@ _NEVER = 1e-4  #: smallest share that is written as a number
 UNITS = {"irradiance": "W", "fluence": "J"}
 
 LIMIT_COLUMNS = ("protection", "limit", "on the sensor", "of it now", "limit at the lens", "probability")
+DAZZLE_COLUMNS = ("protection", "saturated pixels", "of the picture", "times the plain lens")
 ZONE_COLUMNS = ("protection", "limit", "exceeded from … to …", "probability of nowhere", "probability here")
 
 
@@ -153,3 +155,59 @@ def intervals_text(found: Estimate) -> str:
         f"In brackets: the middle 90 % of {found.draws.count} draws of all that is uncertain:{named} the published "
         "thresholds and their spread from device to device."
     )
+
+
+def dazzled_cells(each: Dazzled) -> list[str]:
+    """Return the row of a protection in the table of the dazzled area."""
+    if each.pixels is None or each.share is None:
+        return [each.option, "more than the window of the point-spread function holds", "–", "–"]
+    low, high = (_pixels(x) for x in (each.pixels.low, each.pixels.high))
+    number = _pixels(each.pixels.value)
+    text = number if low == high else f"{number} ({low} to {high})"
+    return [each.option, text, share(each.share), "–" if each.times is None else f"{each.times:.3g}"]
+
+
+def _pixels(number: float) -> str:
+    """Return a number of pixels with three digits, or a dash for one that is not known."""
+    if math.isnan(number):
+        return "–"
+    return f"{float(f'{number:.3g}'):.0f}"
+
+
+def enlarged_text(found: Estimate) -> str:
+    """Return whether the mask makes the dazzled area larger than the plain lens, and by how much; empty: not known."""
+    parts = [text for text in (_counted_text(found), _sooner_text(found)) if text]
+    mask = _both(found)[1]
+    larger = mask.times > 1 if mask and mask.times else any("less light" in text for text in parts)
+    return " ".join(["The mask enlarges the dazzled area.", *parts] if larger else parts)
+
+
+def _both(found: Estimate) -> tuple[Dazzled | None, Dazzled | None]:
+    """Return the dazzled area behind the plain lens and behind the mask."""
+    return next(iter(found.dazzled), None), next((each for each in found.dazzled if each.masked), None)
+
+
+def _counted_text(found: Estimate) -> str:
+    """Return the filled pixels behind mask and plain lens at the distance of the recipe."""
+    plain, mask = _both(found)
+    if plain is None or mask is None or plain.pixels is None or mask.pixels is None:
+        return ""
+    counts = (
+        f"{_pixels(mask.pixels.value)} pixels behind the mask and {_pixels(plain.pixels.value)} behind the plain lens"
+    )
+    times = "" if mask.times is None else f", {mask.times:.3g} times as many"
+    return f"At {metres(found.safety.laser.distance)} the laser fills {counts}{times}."
+
+
+def _sooner_text(found: Estimate) -> str:
+    """Return by how much less light at the lens the stated share of the picture is lost behind the mask."""
+    plain, mask = _both(found)
+    limits = [
+        next((f for f in found.findings if each and f.option == each.option and f.limit.effect == "dazzle"), None)
+        for each in (plain, mask)
+    ]
+    if limits[0] is None or limits[1] is None:
+        return ""
+    factor = limits[0].at_lens.value / limits[1].at_lens.value
+    compared = f"{factor:.3g} times less light" if factor > 1 else f"{1 / factor:.3g} times more light"
+    return f"Behind the mask {compared} at the lens than behind the plain lens gives: {limits[1].limit.name}."

@@ -13,20 +13,21 @@ from neusee.nodes.laser import (
     Beam,
     DamageLaw,
     damage_threshold,
-    dazzle_exposure_limit,
     matching_laws,
-    spot_in_pixels,
     veil_limit,
 )
 from neusee.nodes.sensor import saturation
 from neusee.nodes.values import Bands
 from neusee.workflows.recipe.blocks.safety_block import Dazzle, Safety
 from neusee.workflows.recipe.distributions.scalar import FloatArray
+from neusee.workflows.safety.dazzled_area import Area
 from neusee.workflows.safety.exposures import Exposures, Option
 from neusee.workflows.safety.uncertain_values import SettingDraws
 
 _SPOTS = 64  #: diameters between which a threshold is interpolated
 Quantity = Literal["irradiance", "fluence"]
+_COUNTED = "pixels counted in the point-spread function (nodes.laser.bright_pixels)"
+_STRAY = ", with the light that the lens scatters"
 _AIRY = "Airy pattern of a clear round pupil, derived in neusee (nodes.laser.dazzle_exposure_limit)"
 
 
@@ -89,22 +90,22 @@ def _threshold(law: DamageLaw, safety: Safety, option: Option, exposures: Exposu
     return np.exp(np.interp(np.log(spots), np.log(known), np.log(limits))), note
 
 
-def dazzle_limits(safety: Safety, option: Option, draws: SettingDraws) -> Iterator[Limit]:
+def dazzle_limits(safety: Safety, area: Area, draws: SettingDraws) -> Iterator[Limit]:
     """Yield the limits of saturation and of veil over the share of the picture that may be lost, behind one option."""
-    dazzle, sensor, lens = safety.settings.dazzle, safety.settings.sensor, safety.settings.lens
-    if dazzle is None or option.peak != 1.0:
+    dazzle, sensor = safety.settings.dazzle, safety.settings.sensor
+    if dazzle is None:
         return
     pixels = dazzle.share * sensor.shape[0] * sensor.shape[1]
-    diameter = min(option.diameter or np.inf, lens.diameter)
-    spread = spot_in_pixels(safety.laser.wavelength, lens.focal_length, diameter, sensor.pixel_pitch)
-    times = dazzle_exposure_limit(1.0, 1.0, pixels, spread)
     full = saturating(safety, draws)
     share = f"{100 * dazzle.share:g} % of the picture"
     part = veil_level(dazzle) / (sensor.full_well or 1.0)
+    source = _AIRY if area.ranked is None else _COUNTED + (_STRAY if area.ranked.stray else "")
     found = [("saturated", 1.0)] + ([("veiled", part)] if 0 < part < 1 else [])
     for word, part in found:
-        values = (full * times * part)[:, None]
-        yield Limit(f"{word}: {share}", "dazzle", "irradiance", values, np.ones_like(values), None, _AIRY)
+        times = area.limit(pixels, word == "veiled")
+        if times is not None:
+            values = (full * times * part)[:, None]
+            yield Limit(f"{word}: {share}", "dazzle", "irradiance", values, np.ones_like(values), None, source)
 
 
 def veil_level(dazzle: Dazzle) -> float:

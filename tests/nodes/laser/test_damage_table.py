@@ -72,3 +72,10 @@ def test_a_mistake_is_told_with_line_and_column(write, old, new, message):
     assert old in text
     with pytest.raises(ValueError, match=message):
         read_damage_laws(write(text.replace(old, new)))
+
+
+@pytest.mark.parametrize("name", ["mine.yaml", "mine.YML", "mine.json"])
+def test_thresholds_in_yaml_are_refused_with_the_form_of_a_table(tmp_path, name):
+    (tmp_path / name).write_text("- {device: CMOS, threshold: 1 J/cm2}\n- {device: CCD, threshold: 1 J/cm2}\n")
+    with pytest.raises(ValueError, match=r"is no CSV file: .* write a header such as device,damage"):
+        read_damage_laws(tmp_path / name)

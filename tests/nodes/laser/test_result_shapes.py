@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neusee.nodes.laser import SpotDamage, damage, damaged_pixels, dazzle, dazzle_curve
+from neusee.nodes.laser import SpotDamage, bright_pixels, damage, damaged_pixels, dazzle, dazzle_curve
 from neusee.nodes.values import Bands, LaserLight, Psf
 
 LINE = Bands(*(torch.tensor(x, dtype=torch.float64) for x in ([531e-9, 533e-9], [1e-9, 1e-9], [0.5, 0.5])))
@@ -30,6 +30,7 @@ def empty_pattern():
     (dazzle, (RAW, [RAW]), PICTURE),
     (dazzle_curve, (Psf(SPOT, torch.ones(2, dtype=torch.float64)), LINE), {"strengths": (1.0, 2.0, 3.0)}),
     (dazzle_curve, (Psf(SPOT, torch.ones(2, dtype=torch.float64)), LINE), {}),
+    (bright_pixels, (Psf(SPOT, torch.ones(2, dtype=torch.float64)), LINE), {"shape": (6, 20), "pixel_pitch": 2.9e-6}),
 ])  # fmt: skip
 def test_the_told_shape_is_that_of_the_result(node, inputs, params):
     found, told = node(*inputs, **params), node.hooks.shape(*inputs, **params)

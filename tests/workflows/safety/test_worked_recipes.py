@@ -142,7 +142,7 @@ PULSES = {
 @pytest.fixture(scope="module", params=SITUATIONS)
 def worked(request):
     """The situation, and what neusee says behind the plain lens, without the mask, which takes time."""
-    recipe = load(request.param, ["safety.protection.mask=null", "safety.draws=100"])
+    recipe = load(request.param, ["safety.protection.mask=null", "safety.draws=100", "optics.samples=512"])
     said = document(estimate(recipe))
     plain = [each for each in said["limits"] if each["protection"] == "plain lens"]
     return request.param, SITUATIONS[request.param], said, plain
@@ -216,7 +216,15 @@ def test_the_ends_of_the_show_have_the_interval_of_their_laws():
     """Far away the end of a zone is proportional to sqrt(power / limit) / divergence, all of them lognormal."""
     said = document(
         estimate(
-            load("safety_show", ["safety.protection.mask=null", "safety.draws=4000", "safety.protection.stop=null"])
+            load(
+                "safety_show",
+                [
+                    "safety.protection.mask=null",
+                    "safety.draws=4000",
+                    "safety.protection.stop=null",
+                    "optics.samples=512",
+                ],
+            )
         )
     )
     far = said["limits"][0]["zones"][0]["far"]
@@ -228,7 +236,9 @@ def test_the_ends_of_the_show_have_the_interval_of_their_laws():
 
 def test_a_filter_and_a_stop_move_the_limits_as_they_must():
     here = SITUATIONS["safety_laboratory"]
-    said = document(estimate(load("safety_laboratory", ["safety.protection.mask=null", "safety.draws=100"])))
+    said = document(
+        estimate(load("safety_laboratory", ["safety.protection.mask=null", "safety.draws=100", "optics.samples=512"]))
+    )
     first = {each["protection"]: each for each in reversed(said["limits"]) if each["limit"] == "damage: point"}
     plain, filtered, stopped = (
         first[name]["exposure"]["value"] for name in ("plain lens", "grey filter 0.0001", "stop 1 mm")
@@ -238,7 +248,7 @@ def test_a_filter_and_a_stop_move_the_limits_as_they_must():
 
 
 def test_the_mask_divides_the_peak_by_its_ratio():
-    recipe = load("safety_pointer", ["safety.draws=100"])
+    recipe = load("safety_pointer", ["safety.draws=100", "optics.samples=512", "safety.dazzle=null"])
     found = estimate(recipe)
     result = recipe.run(outputs=[f"laser_lsr[{arm},pointer]" for arm in ("plain", "mask")])
     ratio = float(result["laser_lsr[mask,pointer]"].max() / result["laser_lsr[plain,pointer]"].max())

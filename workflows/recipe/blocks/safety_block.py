@@ -77,7 +77,7 @@ class Lens(SettingsBlock):
 
 
 class Spots(SettingsBlock):
-    """Steps that return the PSFs of the pattern of damage, at the wavelength of the laser.
+    """Steps for the plain lens and the mask, at the wavelength of the laser: PSFs, or pixels ranked by their light.
 
     ``laser_psf`` means ``laser_psf[plain,pointer]`` and ``laser_psf[mask,pointer]`` for the laser ``pointer``.
     """
@@ -92,7 +92,8 @@ class Protection(SettingsBlock):
     mask: str | None = None  #: step of the laser suppression ratio (LSR) at the wavelength of the laser, as in `Spots`
     filter: Passing | None = None  #: transmittance
     stop: PositiveLength | None = None  #: diameter
-    spots: Spots = Spots()
+    spots: Spots = Spots()  #: PSFs of the pattern of damage
+    pixels: Spots = Spots()  #: steps of `laser.bright_pixels`, which give the dazzled area
 
 
 class SensorFacts(SettingsBlock):
