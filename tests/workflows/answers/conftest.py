@@ -1,0 +1,16 @@
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A command with a recipe and files of its own, whose answer is already stored."""
+    spec = importlib.util.spec_from_file_location("answered", Path(__file__).with_name("answered.py"))
+    answered = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(answered)
+    found = answered.Place(tmp_path, monkeypatch)
+    assert found.again()
+    assert not found.again()
+    return found
