@@ -33,8 +33,10 @@ if TYPE_CHECKING:
 
 running: list[Command] = []  #: the command of this process, if its answer may be kept
 _SYSTEM = ("/proc", "/sys", "/dev")
+_OUT = "runs"  #: folder of results where the command names none
 _RECIPES = (".yaml", ".yml")
-_BYTECODE = (".pyc", ".so")  #: suffixes of files that Python imports, in place of their sources or beside them
+#: files that are made of others: bytecode, compiled modules, and the list of fonts that matplotlib keeps
+_DERIVED = re.compile(r"\.pyc$|\.so$|/fontlist-v[^/]*$")
 _PART = re.compile(r"/\.[^/]*\.part(/|$)")  #: in the path of a folder of results that is not complete
 _TICK = 20_000_000  #: ns, longer than a tick of the clock of a file system
 _IMPORTED = 2_000_000_000  #: ns before the command began in which its modules may have been imported
@@ -72,13 +74,14 @@ class Command:
         Raises `OSError` if the folder of results cannot be written.
         """
         answer = read_answer(self._disk, self.name)
-        if answer is None or answer.state != self._state.digest or not hold(answer.witnesses) or not _fits(answer):
-            running[:] = [self]
-            self._opened.listen()
-            return None
-        used(self._disk, self.name)
-        folder = write_again(answer, time.perf_counter() - self._began)
-        return printed(answer, folder / "report.html")
+        if answer and answer.state == self._state.digest and self._fits(answer) and hold(answer.witnesses):
+            with suppress(ValueError, KeyError, TypeError, AttributeError):  # a document that is none
+                folder = write_again(answer, time.perf_counter() - self._began)
+                used(self._disk, self.name)
+                return printed(answer, folder / "report.html")
+        running[:] = [self]
+        self._opened.listen()
+        return None
 
     def doubt(self) -> None:
         """Keep no answer: the command has said something that its text does not hold, such as a warning."""
@@ -101,6 +104,19 @@ class Command:
             if write_answer(self._disk, self.name, answer):
                 make_room(self._disk, budget_bytes(None))
 
+    def _fits(self, answer: Answer) -> bool:
+        """Return True if the folder of an answer is the one that the command names, and if it can be written.
+
+        If it cannot be written, the command itself says why.
+        """
+        if answer.out not in (_OUT, *(str(Path(word.removeprefix("--out="))) for word in self._words)):
+            return False
+        try:
+            writable_folder(answer.out)
+        except ValueError:
+            return False
+        return True
+
     def _is_doubtful(self) -> bool:
         """Return True if the program may have changed since the command began, or if the command said more."""
         state = program_state()
@@ -116,7 +132,7 @@ class Command:
         recipes = _recipe_folders(self._words)
         ignored = Folders([*_installed(), *_SYSTEM, self._disk.folder, *(ROOT / name for name in SOURCES)])
         cache = Folders([self._disk.folder])
-        opened = [path for path in self._opened.files if not path.endswith(_BYTECODE)]
+        opened = [path for path in self._opened.files if not _DERIVED.search(path)]
         files = [path for path in opened if path.endswith(_RECIPES) or path not in ignored]
         if any(path in cache for path in (os.getcwd(), *files)):
             raise Unsettled("a recipe is in the folder of the cache")
@@ -127,15 +143,6 @@ class Command:
             if not {folder, os.path.dirname(folder)} & above and folder not in ignored and not _PART.search(folder)
         ]
         return witnesses_of([*files, *inputs], recipes, listed, self._started - _TICK)
-
-
-def _fits(answer: Answer) -> bool:
-    """Return True if the folder of results can be written; if not, the command itself says why."""
-    try:
-        writable_folder(answer.out)
-    except ValueError:
-        return False
-    return True
 
 
 def _parts(folder: str) -> tuple[str, str]:

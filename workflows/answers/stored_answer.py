@@ -52,7 +52,7 @@ def read_answer(disk: Disk, name: str) -> Answer | None:
         return None
     except OSError:
         return None
-    except (ValueError, TypeError, KeyError, RecursionError):
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         disk.put_aside(path)
         return None
 
@@ -92,23 +92,34 @@ def packed(name: str, answer: Answer) -> bytes:
 def unpacked(name: str, raw: bytes) -> Answer:
     """Return the answer in the content of a file.
 
-    Raises `NotRead` for another format version or a missing signature, and `ValueError`, `TypeError` or `KeyError` for
-    any other content.
+    Raises `NotRead` for another format version or a missing signature, and `ValueError`, `TypeError`, `KeyError` or
+    `AttributeError` for any other content.
     """
     seal, _, content = raw.partition(b"\n")
     head, _, rest = unseal_file(f"{FOLDER}/{name}", seal, content).partition(b"\n")
     fields: dict[str, Any] = json.loads(head)
     files, at = {}, 0
     for file, size in fields.pop("files"):
-        files[_checked(_FILE, file)] = rest[at : at + size]
-        at += size
+        files[_checked(_FILE, file)] = rest[at : at + abs(size)]
+        at += abs(size)
     if at != len(rest):
         raise ValueError("the files of the answer are not as long as it says")
     witnesses = Witnesses(**fields.pop("witnesses"))
     answer = Answer(**fields, witnesses=witnesses, files=files)
     for value in (answer.label, answer.key):
         _checked(_LABEL, value)
+    _refuse_other_types(answer)
     return answer
+
+
+def _refuse_other_types(answer: Answer) -> None:
+    """Raise ValueError if a field of an answer is not of its type."""
+    files, absent, recipes, listed = answer.witnesses
+    texts = [answer.state, answer.text, answer.out]
+    for mapping in (files, recipes, listed):
+        texts += [*mapping, *mapping.values()]
+    if not isinstance(absent, list) or not all(isinstance(text, str) for text in [*texts, *absent]):
+        raise ValueError("a field of the answer is not of its type")
 
 
 def _checked(form: re.Pattern[str], text: str) -> str:

@@ -30,7 +30,7 @@ class Place:
 
     def __init__(self, root: Path, monkeypatch) -> None:
         self.root, self.work, self.program = root, root / "work", root / "program"
-        self.words, self.terminal, self.warns = list(WORDS), list(TERMINAL), False
+        self.words, self.terminal, self.warns, self.out = list(WORDS), list(TERMINAL), False, Path("runs")
         self.report: PlainReport | StudyReport = PlainReport()
         self.computed = 0  #: how often the command was computed
         for name, text in {
@@ -93,9 +93,9 @@ class Place:
         document = run.document({"warnings": ["full"]} if self.warns else {"numbers": [1.5, None]})
         document["warnings"] = ["full"] if self.warns else []
         report = self.report
-        folder = run.write(Path("runs"), KEY, document, report)
+        folder = run.write(self.out, KEY, document, report)
         text = recipe.config.to_yaml() + "page {}"
-        command.keep(text.format("@neusee-page@"), False, Path("runs"), folder, report, recipe)
+        command.keep(text.format("@neusee-page@"), False, self.out, folder, report, recipe)
         return text.format(folder / "report.html")
 
     def again(self, meanwhile=lambda: None) -> bool:

@@ -4,10 +4,12 @@ import json
 import os
 import sys
 import time
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
-from neusee.workflows.answers import installed_program, repeated_command
+from neusee.workflows.answers import installed_program, repeated_command, stored_answer
 from neusee.workflows.report.run_crate import CRATE
 
 
@@ -233,3 +235,32 @@ def test_a_folder_of_results_that_cannot_be_written_is_left_to_the_command(place
     (place.work / "runs").write_text("not a folder")
     command = repeated_command.Command(place.words, place.terminal, place.disk)
     assert command.answer() is None
+
+
+def forge(place, **changed):
+    """Write the stored answer again with other fields, under a seal that is right."""
+    disk, name = place.disk, place.stored.stem
+    stored_answer.write_answer(disk, name, replace(stored_answer.read_answer(disk, name), **changed))
+
+
+@pytest.mark.parametrize("where", ["..", "/tmp", "runs/../..", "", "runs2"])
+def test_an_answer_that_names_another_folder_of_results_is_not_given(place, where):
+    forge(place, out=where)
+    assert place.again()
+
+
+@pytest.mark.parametrize("document", [b"", b"[]", b"{}{", b"\xff", b'{"seconds": "long", "date": 3, "versions": 1}'])
+def test_an_answer_with_a_document_that_is_none_is_not_given(place, document):
+    files = dict(stored_answer.read_answer(place.disk, place.stored.stem).files)
+    forge(place, files=files | {"provenance.json": document})
+    assert place.again()
+    assert not list((place.work / "runs").glob(".*.part"))
+
+
+@pytest.mark.parametrize("words", [["--out", "there"], ["--out=there"], ["--out", "there/"], ["--out", "./there"]])
+def test_a_named_folder_of_results_is_used_again(place, words):
+    place.words += words
+    place.out = Path("there")
+    assert place.again()
+    assert not place.again()
+    assert len(list((place.work / "there").glob("2*"))) == 2
