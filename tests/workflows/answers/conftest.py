@@ -3,6 +3,8 @@ from pathlib import Path
 
 import pytest
 
+from neusee.workflows.answers import opened_files
+
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
@@ -13,4 +15,5 @@ def place(tmp_path, monkeypatch):
     found = answered.Place(tmp_path, monkeypatch)
     assert found.again()
     assert not found.again()
-    return found
+    yield found
+    opened_files._listeners.clear()
