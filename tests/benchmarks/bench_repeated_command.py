@@ -1,9 +1,9 @@
-"""A repeated `neusee safety`, with and without its stored answer: processor and wall seconds, as a table in RESULTS.md.
+"""Repeated commands, with and without its stored answer: processor and wall seconds, as a table in RESULTS.md.
 
     python tests/benchmarks/bench_repeated_command.py [--times 9]
 
 Each command is a process of its own with one thread. Without the answer: the folder of answers is removed first, so
-that the command reads the recipe, takes the estimate from the store and keeps its answer. The two take turns in one
+that the command reads the recipe, takes an estimate from the store and keeps its answer. The two take turns in one
 run, beside `neusee --help` and a bare `import torch`, and the load of the machine is recorded.
 """
 
@@ -21,9 +21,12 @@ RESULTS = Path(__file__).with_name("RESULTS.md")
 HEAD = "## A repeated command (`bench_repeated_command.py`)"
 COLUMNS = "| command | processor, s: least (median) | wall, s: least (median) |\n|---|---|---|\n"
 RECIPE = ["-m", "neusee", "safety", "safety_pointer", "--quiet"]
+VALIDATE = ["-m", "neusee", "validate", "first_light"]
 COMMANDS = {
     "`neusee safety safety_pointer`, repeated, no stored answer": RECIPE,
     "`neusee safety safety_pointer`, repeated": RECIPE,
+    "`neusee validate first_light`, repeated, no stored answer": VALIDATE,
+    "`neusee validate first_light`, repeated": VALIDATE,
     "`neusee --help`": ["-m", "neusee", "--help"],
     "`import torch` alone": ["-c", "import torch"],
 }

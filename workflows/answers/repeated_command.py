@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neusee.workflows.answers.answer_upkeep import make_room
 from neusee.workflows.answers.installed_program import ROOT, SITES, SOURCES, program_state, standard_library
@@ -58,6 +58,14 @@ def begin(words: Sequence[str], terminal: Sequence[object]) -> Command | None:
         return None
 
 
+class Results(NamedTuple):
+    """The folder of results of a command."""
+
+    folder: Path  #: complete
+    out: Path  #: the folder that has it
+    report: StudyReport  #: that was written there
+
+
 class Command:
     """A command whose answer may be stored, from its begin."""
 
@@ -76,9 +84,9 @@ class Command:
         answer = read_answer(self._disk, self.name)
         if answer and answer.state == self._state.digest and self._fits(answer) and hold(answer.witnesses):
             with suppress(ValueError, KeyError, TypeError, AttributeError):  # a document that is none
-                folder = write_again(answer, time.perf_counter() - self._began)
+                folder = write_again(answer, time.perf_counter() - self._began) if answer.key else None
                 used(self._disk, self.name)
-                return printed(answer, folder / "report.html")
+                return printed(answer, folder / "report.html") if folder else answer.text
         running[:] = [self]
         self._opened.listen()
         return None
@@ -87,20 +95,22 @@ class Command:
         """Keep no answer: the command has said something that its text does not hold, such as a warning."""
         self._doubtful = True
 
-    def keep(self, text: str, as_json: bool, out: Path, folder: Path, report: StudyReport, recipe: Recipe) -> None:
+    def keep(self, text: str, as_json: bool, recipe: Recipe, results: Results | None = None) -> None:
         """Keep the answer of a command that has ended well; do so only if nothing that it rests on is in doubt.
 
-        Args: text: of the terminal, with `results_folder.PAGE` for the path of the page. folder: the complete folder of
-        results in the folder ``out``. report: the report that was written there. recipe: that of the command.
+        Args: text: of the terminal, with `results_folder.PAGE` for the path of the page. recipe: that of the command.
+        results: None for a command that writes nothing; such a command makes no cache either.
         """
         self._opened.end()
         with suppress(OSError, ValueError, KeyError, TypeError):
-            witnesses = self._witnesses(out, _input_files(recipe))
-            if self._is_doubtful():
+            witnesses = self._witnesses(results.out if results else None, _input_files(recipe))
+            if self._is_doubtful() or not (results or os.path.isdir(self._disk.folder)):
                 return
-            label, key = _parts(folder.name)
-            files = kept_files(folder, report)
-            answer = Answer(self._state.digest, witnesses, text, as_json, str(out), label, key, files)
+            of_folder: tuple[str, str, str, dict[str, bytes]] = "", "", "", {}
+            if results:
+                files = kept_files(results.folder, results.report)
+                of_folder = (str(results.out), *_parts(results.folder.name), files)
+            answer = Answer(self._state.digest, witnesses, text, as_json, *of_folder)
             if write_answer(self._disk, self.name, answer):
                 make_room(self._disk, budget_bytes(None))
 
@@ -109,6 +119,8 @@ class Command:
 
         If it cannot be written, the command itself says why.
         """
+        if not answer.key:
+            return not answer.files
         if answer.out not in (_OUT, *(str(Path(word.removeprefix("--out="))) for word in self._words)):
             return False
         try:
@@ -128,20 +140,17 @@ class Command:
             or any(_own_code())
         )
 
-    def _witnesses(self, out: Path, inputs: Iterable[str]) -> Witnesses:
+    def _witnesses(self, out: Path | None, inputs: Iterable[str]) -> Witnesses:
+        """Return the witnesses of the answer; folders of results in ``out`` are no witnesses."""
         recipes = _recipe_folders(self._words)
         ignored = Folders([*_installed(), *_SYSTEM, self._disk.folder, *(ROOT / name for name in SOURCES)])
-        cache = Folders([self._disk.folder])
+        cache, written = Folders([self._disk.folder]), os.path.abspath(out) if out else None
         opened = [path for path in self._opened.files if not _DERIVED.search(path)]
         files = [path for path in opened if path.endswith(_RECIPES) or path not in ignored]
-        if any(path in cache for path in (os.getcwd(), *files)):
-            raise Unsettled("a recipe is in the folder of the cache")
-        above = {*map(os.path.abspath, sys.path), *recipes, os.path.abspath(out)}
-        listed = [
-            folder
-            for folder in self._opened.folders
-            if not {folder, os.path.dirname(folder)} & above and folder not in ignored and not _PART.search(folder)
-        ]
+        if any(path in cache for path in (os.getcwd(), *files)) or written in recipes:
+            raise Unsettled("a recipe is in the folder of the cache or of results")
+        folders = [path for path in self._opened.folders if path not in ignored and not _PART.search(path)]
+        listed = [path for path in folders if path != written]
         return witnesses_of([*files, *inputs], recipes, listed, self._started - _TICK)
 
 

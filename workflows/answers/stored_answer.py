@@ -34,7 +34,7 @@ class Answer:
     as_json: bool  #: whether the text is JSON
     out: str  #: folder in which the command makes its folder of results
     label: str  #: recipe and kind in the name of this folder
-    key: str  #: of the result, in the name of this folder
+    key: str  #: of the result, in the name of this folder; empty for a command that writes no folder
     files: Mapping[str, bytes]  #: of this folder by name, with marks in place of date and seconds
 
 
@@ -106,8 +106,9 @@ def unpacked(name: str, raw: bytes) -> Answer:
         raise ValueError("the files of the answer are not as long as it says")
     witnesses = Witnesses(**fields.pop("witnesses"))
     answer = Answer(**fields, witnesses=witnesses, files=files)
-    for value in (answer.label, answer.key):
-        _checked(_LABEL, value)
+    if answer.key or answer.label:
+        _checked(_LABEL, answer.label)
+        _checked(_LABEL, answer.key)
     _refuse_other_types(answer)
     return answer
 
@@ -115,7 +116,7 @@ def unpacked(name: str, raw: bytes) -> Answer:
 def _refuse_other_types(answer: Answer) -> None:
     """Raise ValueError if a field of an answer is not of its type."""
     files, absent, recipes, listed = answer.witnesses
-    texts = [answer.state, answer.text, answer.out]
+    texts = [answer.state, answer.text, answer.out, answer.label, answer.key]
     for mapping in (files, recipes, listed):
         texts += [*mapping, *mapping.values()]
     if not isinstance(absent, list) or not all(isinstance(text, str) for text in [*texts, *absent]):

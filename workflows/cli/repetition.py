@@ -30,6 +30,13 @@ def say_stored_answer(words: Sequence[str]) -> bool:
     return True
 
 
+def say_and_keep(text: str, recipe: Recipe) -> None:
+    """Print the text of a command that writes nothing, and keep this text as the answer of the command."""
+    print(text, flush=True)
+    for command in repeated_command.running:
+        command.keep(text, False, recipe)
+
+
 def keep_answer(
     text: Callable[[str], str], as_json: bool, out: Path, folder: Path, report: StudyReport, recipe: Recipe
 ) -> None:
@@ -40,7 +47,7 @@ def keep_answer(
     from neusee.workflows.answers.results_folder import PAGE
 
     for command in repeated_command.running:
-        command.keep(text(PAGE), as_json, out, folder, report, recipe)
+        command.keep(text(PAGE), as_json, recipe, repeated_command.Results(folder, out, report))
 
 
 def doubt_answer() -> None:

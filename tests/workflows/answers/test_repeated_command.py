@@ -264,3 +264,45 @@ def test_a_named_folder_of_results_is_used_again(place, words):
     assert place.again()
     assert not place.again()
     assert len(list((place.work / "there").glob("2*"))) == 2
+
+
+def test_a_command_that_only_prints_has_an_answer_without_a_folder(place):
+    place.says_only = True
+    place.words[0] = "config"
+    before = set((place.work / "runs").iterdir())
+    text = place.ask()
+    assert not place.again()
+    assert place.ask() == text
+    assert set((place.work / "runs").iterdir()) == before
+    (place.work / "mine.yaml").write_text("title: yours\n")
+    assert "yours" in place.ask()
+
+
+def test_a_command_that_only_prints_makes_no_cache(place):
+    place.says_only = True
+    (place.root / "cache").rename(place.root / "gone")
+    assert place.again()
+    assert place.again()
+    assert not (place.root / "cache").exists()
+
+
+@pytest.mark.parametrize("change", ["label", "files"])
+def test_an_answer_without_a_folder_has_neither_label_nor_files(place, change):
+    forge(place, key="", **({"files": {}} if change == "label" else {"label": ""}))
+    assert place.again()
+
+
+def test_a_folder_that_was_listed_is_a_witness(place):
+    (place.work / "frames").mkdir()
+    place.words.append("frames=frames")
+    assert place.again(lambda: os.listdir("frames"))
+    assert not place.again()
+    (place.work / "frames" / "one.png").write_bytes(b"")
+    assert place.again(lambda: os.listdir("frames"))
+
+
+def test_results_in_the_folder_of_the_recipe_are_not_kept(place):
+    place.words += ["--out", "."]
+    place.out = Path(".")
+    assert place.again()
+    assert place.again()

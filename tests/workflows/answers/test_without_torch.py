@@ -89,3 +89,10 @@ def test_a_recipe_with_a_mistake_or_code_of_its_own_has_no_stored_answer(neusee,
         assert neusee("safety", *words)[0] == code
         assert refuses(neusee("safety", *words, light=True))
     assert not (tmp_path / "cache" / "answers").exists()
+    for words in (("validate", "first_light"), ("validate", "first_light", "--json"), ("config", "first_light")):
+        first = neusee(*words)
+        assert first[0] == 0
+        assert neusee(*words, light=True) == first
+    (tmp_path / "sensor").mkdir()
+    (tmp_path / "sensor" / "neusee.yaml").write_text((ROOT / "recipes/sensor/neusee.yaml").read_text())
+    assert refuses(neusee("config", "first_light", light=True))
