@@ -31,7 +31,7 @@ ROOMS = (
     "training.parallel", "training.mask_design", "training", "training.lift", "evaluation", "calibration", "studies",
     "studies.accuracy", "studies.stability", "studies.leave_out", "studies.uncertainty", "studies.calibration",
     "studies.protection", "api",
-    "handbook", "cli",
+    "handbook", "answers", "cli",
 )  # fmt: skip
 DOOR = ""  #: neusee.workflows itself, which offers names of all rooms: no room imports it
 

@@ -9,7 +9,7 @@ import warnings
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.cli.command_list import BAD, COLUMNS, DONE, FAILED, INTERRUPTED, TYPED, help_page
+from neusee.workflows.cli.command_list import BAD, COLUMNS, DONE, FAILED, INTERRUPTED, REPEATED, TYPED, help_page
 
 if TYPE_CHECKING:
     import typer
@@ -49,6 +49,11 @@ def _run(arguments: list[str]) -> int:
     if arguments in (["--help"], ["-h"]) and not completes and get_terminal_size().columns >= COLUMNS:
         print(help_page())
         return DONE
+    if not completes and arguments[:1] and arguments[0] in REPEATED:
+        from neusee.workflows.cli.repetition import say_stored_answer
+
+        if say_stored_answer(arguments):
+            return DONE
     from neusee.workflows.cli.interruption import print_warning
     from neusee.workflows.cli.typer_program import run_program
 

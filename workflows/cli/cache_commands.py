@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from neusee.workflows.answers import answer_upkeep
 from neusee.workflows.cli.command_frame import failing, say, the_store
 from neusee.workflows.cli.command_list import MISSED
 from neusee.workflows.report.text_table import columns
@@ -14,7 +15,7 @@ from neusee.workflows.store.byte_sizes import format_size, parse_size
 from neusee.workflows.store.metadata import is_kept
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from neusee.workflows.store.derived_files import DerivedFiles
     from neusee.workflows.store.result_store import Store
@@ -109,6 +110,7 @@ def ls_lines(store: Store) -> Iterator[str]:
     last = f"{_count(kept, 'result')}, {format_size(size)}, in {store.root}"
     if kept < len(rows):
         last += f"; of {_count(len(rows) - kept, 'more result')} the receipt alone"
+    last += _answers_text(answer_upkeep.answers(store.disk))
     if store.budget is not None:
         last += f"; the budget is {format_size(store.budget)}"
     yield last
@@ -127,7 +129,9 @@ def verify_lines(store: Store) -> tuple[list[str], int]:
             damaged.append(f"{entry.key}  {about.get('step') or '?'}  {problem}")
         elif is_kept(about):
             sizes.append(_size(about))
-    last = f"{_count(len(sizes), 'result')}, {format_size(sum(sizes))}, as written"
+    answers, broken = answer_upkeep.check(store.disk)
+    damaged += [f"{each.name}  the answer of a command, which is not what was written" for each in broken]
+    last = f"{_count(len(sizes), 'result')}, {format_size(sum(sizes))}{_answers_text(answers)}, as written"
     if damaged:
         last += f"; {len(damaged)} damaged, put aside in {store.root / 'bad'}: the next run computes those it needs"
     return [*damaged, last], len(damaged)
@@ -139,13 +143,17 @@ def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list
     Raises `ValueError` for a budget that is not a size.
     """
     swept = store.gc(None if budget is None else parse_size(budget), dry)
+    full = budget is not None and swept.left + sum(map(_bytes, answer_upkeep.answers(store.disk))) > parse_size(budget)
+    old = answer_upkeep.sweep(store.disk, dry, everything=full)
     abouts = ((key, store.about(key)) for key in swept.evicted)  # the receipts of what went
     rows = [[*_row(key, about, False)[1:4], key[:8]] for key, about in abouts if about is not None]
     went = f"{_count(len(swept.evicted), 'value')} and {_count(swept.orphans, 'file')} that belonged to no result"
     freed, left = format_size(swept.freed), format_size(swept.left)
     last = f"{went} {'would go' if dry else 'went'}: {freed}; {left} stay in {store.root}"
     refused = f"{_count(len(swept.refused), 'value')} of other users could not be removed"
-    return [*(columns(rows) if rows else []), *([refused] if swept.refused else []), last]
+    of_answers = f"{_answers_text(old)[2:]} {'would go' if dry else 'went'}"
+    more = [*([refused] if swept.refused else []), *([of_answers] if old else [])]
+    return [*(columns(rows) if rows else []), *more, last]
 
 
 def pin_lines(store: Store, prefix: str, pin: bool = True) -> list[str]:
@@ -181,6 +189,16 @@ def _size(about: dict[str, Any]) -> int:
     """Return the size in bytes of a cached result, or of a stored picture."""
     size: int = about.get("file_bytes") or about.get("bytes") or 0
     return size
+
+
+def _answers_text(answers: Sequence[answer_upkeep.Kept]) -> str:
+    """Return how many stored answers there are and their bytes, after a comma, or an empty text without answers."""
+    size = format_size(sum(map(_bytes, answers)))
+    return f", {_count(len(answers), 'answer')} of commands of {size}" if answers else ""
+
+
+def _bytes(answer: answer_upkeep.Kept) -> int:
+    return answer.size
 
 
 def _count(count: int, what: str) -> str:

@@ -62,7 +62,12 @@ def kept_training(out: Path, recipe: str) -> str:
 
 def say_json(document: dict[str, Any]) -> None:
     """Print the result of a command as one JSON object on one line of stdout; a number that is not finite is null."""
-    say([json.dumps(_finite(document), ensure_ascii=False, default=str, allow_nan=False)])
+    say([json_line(document)])
+
+
+def json_line(document: dict[str, Any]) -> str:
+    """Return the result of a command as one JSON object on one line; a number that is not finite is null."""
+    return json.dumps(_finite(document), ensure_ascii=False, default=str, allow_nan=False)
 
 
 def _finite(value: Any) -> Any:
@@ -85,4 +90,7 @@ def say_folder(folder: Path, as_json: bool, *more: str) -> None:
 
 def print_warning(message: Warning | str, *where: object, **more: object) -> None:
     """Print a warning as one line on stderr, in place of Python's form, which shows a line of source code."""
+    from neusee.workflows.cli.repetition import doubt_answer
+
+    doubt_answer()
     print(f"warning: {message}", file=sys.stderr, flush=True)

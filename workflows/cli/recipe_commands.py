@@ -24,7 +24,8 @@ from neusee.workflows.cli.command_options import (
     executor_of,
     memory_limit,
 )
-from neusee.workflows.cli.interruption import kept_in, print_warning, resumable, say_json
+from neusee.workflows.cli.interruption import json_line, kept_in, print_warning, resumable, say_json
+from neusee.workflows.cli.repetition import say_and_keep
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -134,9 +135,10 @@ def validate(words: Words = None, as_json: AsJson = False, debug: Debug = False)
     from neusee.workflows.report.console import contents_of, opening
 
     if as_json:
-        say_json({"valid": True, "command": shlex.join(command), **contents_of(recipe)})
+        text = json_line({"valid": True, "command": shlex.join(command), **contents_of(recipe)})
     else:
-        say(opening(recipe, shlex.join(command[1:])))
+        text = "\n".join(opening(recipe, shlex.join(command[1:])))
+    say_and_keep(text, recipe)
 
 
 def plan(
@@ -200,7 +202,7 @@ def config(words: Words = None, debug: Debug = False) -> None:
     recipe, _ = load(words)
     from neusee.workflows.simulation.simulate_recipe import recipe_text
 
-    say(recipe_text(recipe).splitlines())
+    say_and_keep("\n".join(recipe_text(recipe).splitlines()), recipe)
 
 
 def report(

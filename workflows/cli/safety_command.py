@@ -7,7 +7,8 @@ from pathlib import Path
 from neusee.workflows.cli.command_frame import failing, load, refusing, say, the_store
 from neusee.workflows.cli.command_list import FAILED
 from neusee.workflows.cli.command_options import AsJson, Debug, Out, Quiet, Words
-from neusee.workflows.cli.interruption import say_json
+from neusee.workflows.cli.interruption import json_line
+from neusee.workflows.cli.repetition import keep_answer
 
 
 def safety(
@@ -31,8 +32,11 @@ def safety(
 
     with refusing(), failing(RunError, code=FAILED):
         folder, found = assess(recipe, store, out, command)
-    page = folder / "report.html"
-    if as_json:
-        say_json({"report": str(page), **found.document})
-    else:
-        say([str(page)] if quiet else [*lines(found.paragraphs), "", f"page   {page}"])
+
+    def text(page: str) -> str:
+        if as_json:
+            return json_line({"report": page, **found.document})
+        return page if quiet else "\n".join([*lines(found.paragraphs), "", f"page   {page}"])
+
+    say([text(str(folder / "report.html"))])
+    keep_answer(text, as_json, out, folder, found.report, recipe)

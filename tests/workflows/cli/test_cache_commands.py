@@ -1,9 +1,14 @@
 """What `neusee cache` prints."""
 
+import re
+
 import pytest
 import torch
 
+from neusee.workflows.answers.stored_answer import Answer, write_answer
+from neusee.workflows.answers.witnesses import Witnesses
 from neusee.workflows.cli import cache_commands
+from neusee.workflows.store.byte_sizes import format_size
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 
@@ -93,3 +98,25 @@ def test_a_value_is_pinned_by_the_beginning_of_its_key(store):
         cache_commands.pin_lines(store, "ab1", pin=False)
     assert cache_commands.pin_lines(store, "ab0", pin=False) == [f"no longer pinned: {KEYS[0]}  s0"]
     assert store.pinned() == set()
+
+
+def test_the_answers_of_commands_are_listed_verified_and_removed(store):
+    for name in ("ab" + "0" * 30, "cd" + "0" * 30):
+        write_answer(store.disk, name, Answer("s", Witnesses({}, [], {}, {}), "x" * 20_000, False, "o", "l", "k", {}))
+    sizes = [each.stat().st_size for each in (store.root / "answers").rglob("*.answer")]
+    words = f"2 answers of commands of {format_size(sum(sizes))}"
+    assert list(cache_commands.ls_lines(store))[-1].startswith(f"2 results, 40 kB, in {store.root}")
+    assert words in list(cache_commands.ls_lines(store))[-1]
+    assert cache_commands.verify_lines(store) == ([f"2 results, 40 kB, {words}, as written"], 0)
+    path = next((store.root / "answers").rglob("cd*.answer"))
+    path.write_bytes(path.read_bytes()[:-1])
+    lines, bad = cache_commands.verify_lines(store)
+    assert (bad, lines[0]) == (1, f"{'cd' + '0' * 30}  the answer of a command, which is not what was written")
+    assert cache_commands.gc_lines(store)[0].startswith("0 values and 0 files")
+    assert len(list((store.root / "answers").rglob("*.answer"))) == 1, "one that was used this week stays"
+    assert cache_commands.gc_lines(store, "1 MB")[-1].startswith("0 values")
+    assert re.fullmatch(
+        "1 answer of commands of 20.* kB would go", cache_commands.gc_lines(store, "60 kB", dry=True)[0]
+    )
+    assert re.fullmatch("1 answer of commands of 20.* kB went", cache_commands.gc_lines(store, "60 kB")[0])
+    assert not list((store.root / "answers").rglob("*.answer"))

@@ -1,0 +1,84 @@
+"""Repeated commands, with and without its stored answer: processor and wall seconds, as a table in RESULTS.md.
+
+    python tests/benchmarks/bench_repeated_command.py [--times 9]
+
+Each command is a process of its own with one thread. Without the answer: the folder of answers is removed first, so
+that the command reads the recipe, takes an estimate from the store and keeps its answer. The two take turns in one
+run, beside `neusee --help` and a bare `import torch`, and the load of the machine is recorded.
+"""
+
+import argparse
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+RESULTS = Path(__file__).with_name("RESULTS.md")
+HEAD = "## A repeated command (`bench_repeated_command.py`)"
+COLUMNS = "| command | processor, s: least (median) | wall, s: least (median) |\n|---|---|---|\n"
+RECIPE = ["-m", "neusee", "safety", "safety_pointer", "--quiet"]
+VALIDATE = ["-m", "neusee", "validate", "first_light"]
+COMMANDS = {
+    "`neusee safety safety_pointer`, repeated, no stored answer": RECIPE,
+    "`neusee safety safety_pointer`, repeated": RECIPE,
+    "`neusee validate first_light`, repeated, no stored answer": VALIDATE,
+    "`neusee validate first_light`, repeated": VALIDATE,
+    "`neusee --help`": ["-m", "neusee", "--help"],
+    "`import torch` alone": ["-c", "import torch"],
+}
+
+
+def measured(words: list[str], place: Path) -> tuple[float, float]:
+    """Return the processor and the wall seconds of one process."""
+    env = {**os.environ, "NEUSEE_CACHE": str(place / "cache"), "OMP_NUM_THREADS": "1"}
+    began = time.perf_counter()
+    process = subprocess.Popen([sys.executable, *words], env=env, cwd=place, stdout=subprocess.DEVNULL)
+    _, status, used = os.wait4(process.pid, 0)
+    if status:
+        raise SystemExit(f"{' '.join(words)} ended with status {status}")
+    return used.ru_utime + used.ru_stime, time.perf_counter() - began
+
+
+def shown(seconds: list[float]) -> str:
+    """Return the least and the median of some times."""
+    return f"{min(seconds):.2f} ({statistics.median(seconds):.2f})"
+
+
+def write(lines: list[str], about: str) -> None:
+    """Write the section of this script in RESULTS.md anew."""
+    before, _, rest = RESULTS.read_text(encoding="utf-8").partition(HEAD)
+    _, mark, after = rest.partition("\n## ")
+    section = f"{HEAD}\n\n{about}\n\n{COLUMNS}{''.join(lines)}"
+    RESULTS.write_text(f"{before.rstrip()}\n\n{section}{mark}{after}", encoding="utf-8")
+
+
+def main() -> None:
+    """Measure the commands in turn, and record them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--times", type=int, default=9)
+    times = parser.parse_args().times
+    found: dict[str, list[tuple[float, float]]] = {name: [] for name in COMMANDS}
+    loads = [os.getloadavg()[0]]
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        measured(RECIPE, place)  # the estimate itself
+        for _ in range(times):
+            for name, words in COMMANDS.items():
+                if name.endswith("no stored answer"):
+                    shutil.rmtree(place / "cache" / "answers", ignore_errors=True)
+                found[name].append(measured(words, place))
+            loads.append(os.getloadavg()[0])
+    lines = [
+        f"| {name} | {' | '.join(map(shown, map(list, zip(*rows, strict=True))))} |\n" for name, rows in found.items()
+    ]
+    load = f"load of the machine {min(loads):.1f} to {max(loads):.1f} with {os.cpu_count()} cores"
+    write(lines, f"Whole processes of one thread, {times} of each in turns; {load}.")
+    print("".join(lines), load)
+
+
+if __name__ == "__main__":
+    main()

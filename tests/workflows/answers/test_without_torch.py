@@ -1,0 +1,98 @@
+"""`neusee safety` in processes of its own: the repeated command imports no torch, and says and writes the same."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[3]
+LIGHT = """
+import sys
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("torch", "numpy", "pydantic", "ruamel", "typer", "jinja2", "rich"):
+            raise RuntimeError(f"{name} is imported")
+
+sys.meta_path.insert(0, Refuse())
+from neusee.workflows.cli.app import main
+main()
+"""
+QUICK = ("safety.draws=100", "safety.protection={filter: 1e-2}")
+
+
+class Terminal:
+    """A working folder with a cache, in which commands run in processes of their own."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.env = {**os.environ, "NEUSEE_CACHE": str(folder / "cache"), "HOME": str(folder), "OMP_NUM_THREADS": "1"}
+        self.env |= {"PYTHONPATH": str(ROOT / ".src"), "PYTEST_CURRENT_TEST": ""}
+
+    def __call__(self, *words, light=False):
+        """Run a command; ``light`` refuses the import of torch and other large packages."""
+        start = [sys.executable, "-c", LIGHT] if light else [sys.executable, "-c", LIGHT.replace("sys.meta_path", "#")]
+        done = subprocess.run(
+            [*start, *words], cwd=self.folder, env=self.env, capture_output=True, text=True, check=False
+        )
+        return done.returncode, done.stdout, done.stderr
+
+
+@pytest.fixture
+def neusee(tmp_path):
+    return Terminal(tmp_path)
+
+
+def refuses(done):
+    return done[0] == 1 and "is imported" in done[2]
+
+
+def plain(text):
+    """The text of a command without the number at the end of its folder."""
+    return re.sub(r"(_[0-9a-f]{8})(_\d+)?/", r"\1/", text)
+
+
+@pytest.mark.slow
+def test_a_repeated_estimate_is_the_same_without_torch_and_a_new_option_ends_it(neusee, tmp_path):
+    words = ("safety", "safety_pointer", *QUICK)
+    first = neusee(*words)
+    assert first[0] == 0, first
+    again = neusee(*words, light=True)
+    assert (again[0], plain(again[1]), again[2]) == (0, plain(first[1]), "")
+    one, two = (tmp_path / text.rstrip().rpartition(" ")[2] for text in (first[1], again[1]))
+    assert one != two
+    for name in ("limits.csv", "recipe.yaml", "figures/irradiance.png", "figures/distances.png"):
+        assert (one.parent / name).read_bytes() == (two.parent / name).read_bytes(), name
+    said = [json.loads((page.parent / "provenance.json").read_text()) for page in (one, two)]
+    assert said[0] | {"date": 0, "seconds": 0} == said[1] | {"date": 0, "seconds": 0}
+    assert refuses(neusee(*words, "--json", light=True)), "another command"
+    document = json.loads(neusee(*words, "--json")[1])
+    repeated = json.loads(neusee(*words, "--json", light=True)[1])
+    assert Path(tmp_path, repeated["report"]).is_file()
+    assert repeated | {"report": 0} == document | {"report": 0}
+    assert refuses(neusee(*words, "--help", light=True))
+    (tmp_path / "optics").mkdir()
+    (tmp_path / "optics" / "lens_only.yaml").write_text((ROOT / "recipes/optics/lens_only.yaml").read_text())
+    assert refuses(neusee(*words, light=True)), "an option beside the recipe hides a packaged one"
+
+
+@pytest.mark.slow
+def test_a_recipe_with_a_mistake_or_code_of_its_own_has_no_stored_answer(neusee, tmp_path):
+    text = (ROOT / "recipes/safety_pointer.yaml").read_text()
+    (tmp_path / "mine.py").write_text("from neusee.nodes import node\n\n@node()\ndef twice(x):\n    return 2 * x\n")
+    (tmp_path / "mine.yaml").write_text(f"{text}\nnodes: [mine.py]\n")
+    for words, code in ((("mine.yaml", *QUICK), 0), (("safety_pointer", "safety.draws=-1"), 2)):
+        assert neusee("safety", *words)[0] == code
+        assert refuses(neusee("safety", *words, light=True))
+    assert not (tmp_path / "cache" / "answers").exists()
+    for words in (("validate", "first_light"), ("validate", "first_light", "--json"), ("config", "first_light")):
+        first = neusee(*words)
+        assert first[0] == 0
+        assert neusee(*words, light=True) == first
+    (tmp_path / "sensor").mkdir()
+    (tmp_path / "sensor" / "neusee.yaml").write_text((ROOT / "recipes/sensor/neusee.yaml").read_text())
+    assert refuses(neusee("config", "first_light", light=True))

@@ -1,0 +1,129 @@
+"""File of a stored answer in the folder ``answers/`` of the cache: sealed as every file there, and never half written.
+
+The first line is the seal, which names the answer; the second line is a JSON object; then follow the files of the
+folder of results. An answer that is damaged, of another format or without the signature that is asked for is missing.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+from neusee.workflows.answers.witnesses import Witnesses
+from neusee.workflows.keys.seal import NotRead, seal_file, unseal_file
+from neusee.workflows.store.shared_folder import Disk, read_file
+
+FOLDER, SUFFIX = "answers", ".answer"
+MOST = 32 << 20  #: bytes of the largest answer that is kept
+_LABEL = re.compile(r"\w[\w.-]*")
+_FILE = re.compile(r"\w[\w.-]*(/\w[\w.-]*)*")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a command printed and wrote, and what must be as it was for the answer to be right."""
+
+    state: str  #: digest of the installed program
+    witnesses: Witnesses
+    text: str  #: of the terminal, with a mark in place of the path of the page
+    as_json: bool  #: whether the text is JSON
+    out: str  #: folder in which the command makes its folder of results
+    label: str  #: recipe and kind in the name of this folder
+    key: str  #: of the result, in the name of this folder; empty for a command that writes no folder
+    files: Mapping[str, bytes]  #: of this folder by name, with marks in place of date and seconds
+
+
+def answer_path(disk: Disk, name: str) -> str:
+    """Return the path of the answer ``name``."""
+    return f"{disk.folder}/{FOLDER}/{name[:2]}/{name}{SUFFIX}"
+
+
+def read_answer(disk: Disk, name: str) -> Answer | None:
+    """Return the answer ``name``, or None if it is missing, damaged, of another format or not signed."""
+    path = answer_path(disk, name)
+    try:
+        return unpacked(name, read_file(path, MOST))
+    except NotRead:
+        return None
+    except OSError:
+        return None
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        disk.put_aside(path)
+        return None
+
+
+def write_answer(disk: Disk, name: str, answer: Answer) -> bool:
+    """Write the answer ``name`` under a temporary name and rename it; return False for one that is too large.
+
+    Raises `OSError` if the folder cannot be written.
+    """
+    raw, path = packed(name, answer), answer_path(disk, name)
+    if len(raw) > MOST:
+        return False
+    with disk.temporary(f"{name[:8]}{SUFFIX}") as (part, file):
+        file.write(raw)
+        file.flush()
+        disk.make_folder(f"{disk.folder}/{FOLDER}")
+        disk.share(part)
+        disk.rename(part, path)
+    return True
+
+
+def used(disk: Disk, name: str) -> None:
+    """Note that an answer was used, so that it stays longer than others."""
+    with suppress(OSError):
+        os.utime(answer_path(disk, name), follow_symlinks=False)
+
+
+def packed(name: str, answer: Answer) -> bytes:
+    """Return the content of the file of an answer."""
+    fields = {key: value for key, value in vars(answer).items() if key not in ("files", "witnesses")}
+    sizes = [[file, len(content)] for file, content in answer.files.items()]
+    head = json.dumps({**fields, "witnesses": answer.witnesses._asdict(), "files": sizes}).encode()
+    content = b"".join([head, b"\n", *answer.files.values()])
+    return seal_file(f"{FOLDER}/{name}", content) + b"\n" + content
+
+
+def unpacked(name: str, raw: bytes) -> Answer:
+    """Return the answer in the content of a file.
+
+    Raises `NotRead` for another format version or a missing signature, and `ValueError`, `TypeError`, `KeyError` or
+    `AttributeError` for any other content.
+    """
+    seal, _, content = raw.partition(b"\n")
+    head, _, rest = unseal_file(f"{FOLDER}/{name}", seal, content).partition(b"\n")
+    fields: dict[str, Any] = json.loads(head)
+    files, at = {}, 0
+    for file, size in fields.pop("files"):
+        files[_checked(_FILE, file)] = rest[at : at + abs(size)]
+        at += abs(size)
+    if at != len(rest):
+        raise ValueError("the files of the answer are not as long as it says")
+    witnesses = Witnesses(**fields.pop("witnesses"))
+    answer = Answer(**fields, witnesses=witnesses, files=files)
+    if answer.key or answer.label:
+        _checked(_LABEL, answer.label)
+        _checked(_LABEL, answer.key)
+    _refuse_other_types(answer)
+    return answer
+
+
+def _refuse_other_types(answer: Answer) -> None:
+    """Raise ValueError if a field of an answer is not of its type."""
+    files, absent, recipes, listed = answer.witnesses
+    texts = [answer.state, answer.text, answer.out, answer.label, answer.key]
+    for mapping in (files, recipes, listed):
+        texts += [*mapping, *mapping.values()]
+    if not isinstance(absent, list) or not all(isinstance(text, str) for text in [*texts, *absent]):
+        raise ValueError("a field of the answer is not of its type")
+
+
+def _checked(form: re.Pattern[str], text: str) -> str:
+    if not form.fullmatch(text):
+        raise ValueError(f"{text!r} is no name of a file in a folder of results")
+    return text

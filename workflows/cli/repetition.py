@@ -1,0 +1,56 @@
+"""The stored answer of a command that is repeated: printed before the command is imported, and kept after it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from shutil import get_terminal_size
+from typing import TYPE_CHECKING
+
+from neusee.workflows.answers import repeated_command
+
+if TYPE_CHECKING:
+    from neusee.workflows.graph.recipe_graph import Recipe
+    from neusee.workflows.report.study_folder import StudyReport
+
+_COMPUTED = {"-h", "--help", "--debug"}  #: words of a command that no stored answer answers
+
+
+def say_stored_answer(words: Sequence[str]) -> bool:
+    """Print the stored answer of a command, and write its folder of results again; return False if there is none."""
+    if _COMPUTED & set(words):
+        return False
+    shown = [[stream.isatty(), stream.encoding] for stream in (sys.stdout, sys.stderr)]
+    command = repeated_command.begin(words, [*get_terminal_size(), *shown])
+    text = command.answer() if command else None
+    if text is None:
+        return False
+    print(text, flush=True)
+    return True
+
+
+def say_and_keep(text: str, recipe: Recipe) -> None:
+    """Print the text of a command that writes nothing, and keep this text as the answer of the command."""
+    print(text, flush=True)
+    for command in repeated_command.running:
+        command.keep(text, False, recipe)
+
+
+def keep_answer(
+    text: Callable[[str], str], as_json: bool, out: Path, folder: Path, report: StudyReport, recipe: Recipe
+) -> None:
+    """Keep what a command has printed and written, if the command is one whose answer is kept.
+
+    ``text`` returns the text of the command for the path of its page.
+    """
+    from neusee.workflows.answers.results_folder import PAGE
+
+    for command in repeated_command.running:
+        command.keep(text(PAGE), as_json, recipe, repeated_command.Results(folder, out, report))
+
+
+def doubt_answer() -> None:
+    """Keep no answer of the command that runs, because it has printed a warning."""
+    for command in repeated_command.running:
+        command.doubt()
