@@ -22,6 +22,12 @@ from neusee.workflows.cli.command_options import (
 )
 from neusee.workflows.cli.interruption import kept_in, resumable, say_folder
 
+EqualPeak = Annotated[
+    float | None,
+    typer.Option("--equal-protection", help="Peak of a laser to which filters and stops bring each pipeline, 0 to 1."),
+]
+By = Annotated[str, typer.Option("--by", help="What brings it there: best (stop and filter), filter or stop.")]
+
 
 def evaluate(
     words: Words = None,
@@ -37,13 +43,8 @@ def evaluate(
     reference: Annotated[
         str, typer.Option("--reference", help="Pipeline that the others are compared with; by default the first.")
     ] = "",
-    equal_protection: Annotated[
-        float | None,
-        typer.Option(
-            "--equal-protection", help="Peak of a laser to which filters and stops bring each pipeline, 0 to 1."
-        ),
-    ] = None,
-    by: Annotated[str, typer.Option("--by", help="best (stop and filter), filter or stop, for that.")] = "best",
+    equal_protection: EqualPeak = None,
+    by: By = "best",
     device: OneDevice = "cpu",
     as_json: AsJson = False,
     quiet: Quiet = False,
