@@ -83,6 +83,7 @@ def test_a_mask_that_protects_more_than_is_asked_and_one_with_a_filter_are_refus
     assert said[1].startswith("--equal-protection 0.1: grey_filter has a filter or a stop of its own: leave it out")
 
 
+@pytest.mark.slow
 def test_a_stop_below_the_samples_of_the_pupil_is_refused(store):
     with pytest.raises(
         EvaluationRefused, match="flat needs a smaller stop than the samples of the pupil carry: ask for"
