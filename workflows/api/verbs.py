@@ -140,6 +140,7 @@ def evaluate(
     Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` if a step fails.
     """
     from neusee.workflows.evaluation import run_evaluation
+    from neusee.workflows.evaluation.equal_protection import read_protection
 
     here = Path.cwd()
     return run_evaluation.evaluate(
@@ -151,8 +152,7 @@ def evaluate(
         strengths=run_evaluation.STRENGTHS if strengths is None else strengths,
         small=small,
         reference=reference,
-        protection=equal_protection,
-        by=by,
+        equal=read_protection(equal_protection, by),
         store=store,
         runs=writable_folder(out),
         command=command,

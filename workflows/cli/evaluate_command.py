@@ -22,28 +22,30 @@ from neusee.workflows.cli.command_options import (
 )
 from neusee.workflows.cli.interruption import kept_in, resumable, say_folder
 
+Pipelines = Annotated[
+    str, typer.Option("--pipelines", help="MASK[@file]+RESTORER[@weights], …; none restores nothing.")
+]
+Strengths = Annotated[str, typer.Option("--strengths", help="Strengths of the laser, multiples of saturation.")]
+Reference = Annotated[
+    str, typer.Option("--reference", help="Pipeline that the others are compared with; by default the first.")
+]
+EqualPeak = Annotated[
+    float | None,
+    typer.Option("--equal-protection", help="Peak of a laser to which filters and stops bring each pipeline, 0 to 1."),
+]
+By = Annotated[str, typer.Option("--by", help="What brings it there: best (stop and filter), filter or stop.")]
+
 
 def evaluate(
     words: Words = None,
-    pipelines: Annotated[
-        str, typer.Option("--pipelines", help="MASK[@file]+RESTORER[@weights], …; none restores nothing.")
-    ] = "flat+none, five_half_rings+wiener",
+    pipelines: Pipelines = "flat+none, five_half_rings+wiener",
     data: Annotated[str, typer.Option("--data", help="Folder of photographs; else the recipe's own scene.")] = "",
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of scenes.")] = 20,
-    strengths: Annotated[
-        str, typer.Option("--strengths", help="Strengths of the laser, multiples of saturation.")
-    ] = "0,1e1,1e2,1e3,1e4,1e5,1e6",
+    strengths: Strengths = "0,1e1,1e2,1e3,1e4,1e5,1e6",
     small: Annotated[int, typer.Option("--small", min=11, help="Shorter side of the reduced pictures.")] = 256,
-    reference: Annotated[
-        str, typer.Option("--reference", help="Pipeline that the others are compared with; by default the first.")
-    ] = "",
-    equal_protection: Annotated[
-        float | None,
-        typer.Option(
-            "--equal-protection", help="Peak of a laser to which filters and stops bring each pipeline, 0 to 1."
-        ),
-    ] = None,
-    by: Annotated[str, typer.Option("--by", help="best (stop and filter), filter or stop, for that.")] = "best",
+    reference: Reference = "",
+    equal_protection: EqualPeak = None,
+    by: By = "best",
     device: OneDevice = "cpu",
     as_json: AsJson = False,
     quiet: Quiet = False,

@@ -13,7 +13,7 @@ from neusee.workflows.evaluation.evaluation_result import EvaluationResult
 from neusee.workflows.evaluation.pipelines import NONE, EvaluationRefused, PipelineRecipes, compose_pipelines
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.protection.camera_parts import ProtectionCamera
-from neusee.workflows.protection.equal_shade import WAYS, EqualProtection, EqualShade, equal_shade
+from neusee.workflows.protection.equal_shade import WAYS, EqualProtection, EqualShade, shade_equally
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.study_folder import Progress
 from neusee.workflows.report.study_page import Section
@@ -86,7 +86,7 @@ def _shade(
         (other,) = compose_pipelines(recipe, changes, [shaded], folder)
         return float(run(other.recipe(NONE), store, ["lsr[mask]"]).values["lsr[mask]"].max())
 
-    return equal_shade(camera, store, asked.level, asked.way, partial(_scene_light, dark, store), peak_of)
+    return shade_equally(camera, store, asked.level, asked.way, partial(_scene_light, dark, store), peak_of)
 
 
 def _scene_light(recipe: Recipe, store: Store) -> float:

@@ -19,7 +19,7 @@ import numpy as np
 from neusee.workflows.evaluation import equal_protection
 from neusee.workflows.evaluation.comparison_pictures import panels
 from neusee.workflows.evaluation.confidence_intervals import METRICS, compare_with, metric_table
-from neusee.workflows.evaluation.equal_protection import protect, read_protection
+from neusee.workflows.evaluation.equal_protection import protect
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointNumbers, PointRequest
 from neusee.workflows.evaluation.evaluation_result import EvaluationResult
 from neusee.workflows.evaluation.evaluation_scenes import Scene, refuse_directions, scenes
@@ -34,6 +34,7 @@ from neusee.workflows.evaluation.pipelines import (
     read_pipelines,
 )
 from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.protection.equal_shade import EqualProtection
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport, StudyRun, silent
@@ -56,8 +57,7 @@ def evaluate(
     strengths: Sequence[float] = STRENGTHS,
     small: int = SMALL,
     reference: str = "",
-    protection: float | None = None,
-    by: str = "best",
+    equal: EqualProtection | None = None,
     store: Store | None = None,
     runs: Path = Path("runs"),
     command: Sequence[str] = (),
@@ -69,25 +69,20 @@ def evaluate(
 
     Args: recipe, changes: the camera, as for `load`. data: a folder of photographs, by default the scene of the recipe.
     small: shorter side of the reduced pictures, which are compared too. reference: the pipeline with which all other
-    pipelines are compared, by default the first pipeline. protection: the share of the plain lens's peak to which each
-    pipeline is brought by filter and stop; by: `best`, `filter` or `stop`. progress: receives a line for each scene.
+    pipelines are compared, by default the first pipeline. equal: the peak to which filters and stops bring every
+    pipeline. progress: receives a line for each scene.
     Raises: `EvaluationRefused` with every mistake before anything runs.
     """
-    store, place, equal = store or open_store(), folder or Path.cwd(), read_protection(protection, by)
+    store, place = store or open_store(), folder or Path.cwd()
     each = compose_pipelines(recipe, changes, pipelines, place)
     strengths, reference = _strengths(strengths), _reference(reference, pipelines)
-    if equal is not None:
-        at = [pipeline.name for pipeline in pipelines].index(reference)
-        each = protect(recipe, changes, each, equal, store, place, progress)
-        pipelines = [one.pipeline for one in each]
-        reference = pipelines[at].name
+    each = protect(recipe, changes, each, equal, store, place, progress) if equal else each
+    reference = {old.name: new.name for old, new in zip(pipelines, each, strict=True)}[reference]
     base = load(recipe, changes, place)
     study_run = StudyRun("evaluate", base, command)
     shown, broken = scenes(base, store, data, count)
     refuse_directions(each[0], shown)
-    names = ", ".join(pipeline.name for pipeline in pipelines)
-    progress(f"{len(shown)} scenes, {len(strengths)} strengths, {len(pipelines)} pipelines: {names}")
-    _report_broken(broken, progress)
+    _report_scenes(shown, broken, strengths, each, progress)
     bench = EvaluationPoints(store, small, device)
     points = _points(bench, each, shown, strengths, progress)
     mistold = told_with_errors(bench, each, shown, strengths, progress)
@@ -96,7 +91,7 @@ def evaluate(
     tables = {name: metric_table(own, strengths) for name, own in points.items()}
     least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
     more = {name: compare_with(own, tables[reference], base.seed) for name, own in tables.items()}
-    rest = (reference, points, tables, more, optics, drawn, list(pipelines), mistold, equal)
+    rest = (reference, points, tables, more, optics, drawn, [p.pipeline for p in each], mistold, equal)
     result = EvaluationResult(base, shown, broken, strengths, least, *rest)
     document = study_run.document(_document(result, bench))
     return study_run.write(runs, digest(document["summary"]), document, _report(result))
@@ -117,7 +112,15 @@ def _reference(reference: str, pipelines: Sequence[Pipeline]) -> str:
     return reference or names[0]
 
 
-def _report_broken(broken: Sequence[tuple[Path, str]], progress: Progress) -> None:
+def _report_scenes(
+    shown: Sequence[Scene],
+    broken: Sequence[tuple[Path, str]],
+    strengths: Sequence[float],
+    each: Sequence[PipelineRecipes],
+    progress: Progress,
+) -> None:
+    names = ", ".join(pipeline.name for pipeline in each)
+    progress(f"{len(shown)} scenes, {len(strengths)} strengths, {len(each)} pipelines: {names}")
     for path, reason in broken[:5]:
         progress(f"not read: {path.name}: {reason}")
     if len(broken) > 5:

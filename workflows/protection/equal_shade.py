@@ -93,7 +93,7 @@ def best_diameter(camera: ProtectionCamera, store: Store, wanted: float, electro
     return best(each, wanted, electrons, camera.pixel(0.0, 0.0))["error"][1].front.diameter
 
 
-def equal_shade(
+def shade_equally(
     camera: ProtectionCamera,
     store: Store,
     wanted: float,

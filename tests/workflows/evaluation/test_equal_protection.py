@@ -83,6 +83,7 @@ def test_a_mask_that_protects_more_than_is_asked_and_one_with_a_filter_are_refus
     assert said[1].startswith("--equal-protection 0.1: grey_filter has a filter or a stop of its own: leave it out")
 
 
+@pytest.mark.slow
 def test_a_stop_below_the_samples_of_the_pupil_is_refused(store):
     with pytest.raises(
         EvaluationRefused, match="flat needs a smaller stop than the samples of the pupil carry: ask for"
@@ -111,7 +112,7 @@ def test_a_wrong_option_is_refused_by_the_command(words, said, tmp_path, monkeyp
 def test_the_table_the_page_and_the_document_compare_at_equal_protection(store, tmp_path):
     how = {"count": 1, "strengths": [1e4], "small": 16, "store": store, "reference": "five_half_rings+none"}
     asked = read_pipelines(PAIR, HERE)
-    folder = evaluate("first_light", asked, SMALL, runs=tmp_path, protection=5e-4, by="filter", **how)
+    folder = evaluate("first_light", asked, SMALL, runs=tmp_path, equal=EqualProtection(5e-4, "filter"), **how)
     document = json.loads((folder / "provenance.json").read_text())
     equal = document["equal protection"]
     assert (equal["peak"], equal["by"]) == (5e-4, "filter")

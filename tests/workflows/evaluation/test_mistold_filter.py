@@ -87,7 +87,7 @@ def test_what_is_copied_is_what_the_error_changes():
         wrong = mistold(recipe, error)
         copies = {name.removeprefix(TOLD).partition("[")[0] for name in wrong.steps if name.startswith(TOLD)}
         glare = {"laser_psf", "spot", "laser_photons"}
-        line = {"line", "laser_index", "laser_pupil", "laser_responses"}
+        line = {"line", "laser_index", "laser_pupil", "laser_responses", "light", "wavefront"}
         own = {"direction": {"direction"}, "wavelength": line, "defocus": {"pupil", "psf", "laser_pupil"}}
         assert copies == glare | own[text.partition(" ")[0]]
         assert {name: step for name, step in wrong.steps.items() if name in recipe.steps and name != "deconvolved"} == {
