@@ -33,7 +33,7 @@ class DeadPixels:
     frame: FloatArray  #: (y, x) from 0 to 1; of a lost frame, what else is damaged, or all black
 
 
-def dead_pixels(
+def damaged_frames(
     safety: Safety, spots: Sequence[Spot], findings: Sequence[Finding], exposures: Exposures
 ) -> Iterator[DeadPixels]:
     """Yield the frame behind each protection whose spot is known, at one distance for all; none if nothing is damaged.

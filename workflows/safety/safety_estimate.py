@@ -17,7 +17,7 @@ from neusee.workflows.recipe.distributions.scalar import FloatArray
 from neusee.workflows.safety.damage_pattern import DamagePattern, Spot, damage_patterns, spots_of, step_of
 from neusee.workflows.safety.dazzle_curves import Dazzled, dazzled
 from neusee.workflows.safety.dazzled_area import Area, Ranked, area_of, ranked_of
-from neusee.workflows.safety.dead_pixels import DeadPixels, dead_pixels
+from neusee.workflows.safety.dead_pixels import DeadPixels, damaged_frames
 from neusee.workflows.safety.distance_zones import QUANTILES, Spread, Zones, zones_of
 from neusee.workflows.safety.exposures import (
     Emission,
@@ -134,7 +134,7 @@ def complete(recipe: Recipe, prepared: Prepared) -> Estimate:
     patterns = tuple(damage_patterns(prepared.spots, findings))
     mean = mean_in_frame(exposures, safety.settings.sensor.exposure or 1.0)
     filled = dazzled(safety, draws, exposures, areas, mean)
-    dead = tuple(dead_pixels(safety, prepared.spots, findings, exposures))
+    dead = tuple(damaged_frames(safety, prepared.spots, findings, exposures))
     emission = emission_of(safety.laser.beam())
     return Estimate(
         recipe, safety, emission, options, draws, exposures, findings, eye, unsaid, patterns, filled, dead,

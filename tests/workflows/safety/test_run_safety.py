@@ -9,7 +9,7 @@ from neusee.workflows.safety import run_safety
 from neusee.workflows.safety.distance_zones import Spread
 from neusee.workflows.safety.safety_words import metres, scaled, share, with_ends
 
-QUICK = ["safety.draws=100", "optics.samples=128", "optics.window=[96, 96]", "safety.protection.filter=null",
+QUICK = ["safety.draws=100", "optics.samples=256", "optics.window=[96, 96]", "safety.protection.filter=null",
          "wide.window=[303, 303]", "safety.dazzle.share=0.001"]  # fmt: skip
 
 
@@ -37,7 +37,7 @@ def test_an_estimate_is_computed_once_and_has_its_pictures_and_table(store, tmp_
 
 @pytest.mark.slow
 def test_the_key_changes_with_the_table_of_thresholds_and_with_the_distance(store, tmp_path):
-    table, few = tmp_path / "mine.csv", ["safety.draws=100", "safety.protection={}", "optics.samples=128"]
+    table, few = tmp_path / "mine.csv", ["safety.draws=100", "safety.protection={}"]
     spans = "wavelength from (nm),wavelength to (nm),duration from (ns),duration to (ns)"
     keys = set()
     for joules, metres_ in ((1, 2), (2, 2), (2, 3), (2, 3)):
