@@ -7,6 +7,8 @@ import sys
 from collections.abc import Iterable
 from typing import Any
 
+from neusee.workflows.answers.witnesses import Listing, listing
+
 _LISTS = ("os.listdir", "os.scandir")
 _WRITES = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
 _listeners: list[Opened] = []  #: at most one; the hook of a process cannot be removed
@@ -18,7 +20,8 @@ class Opened:
 
     def __init__(self) -> None:
         self.files: dict[str, None] = {}
-        self.folders: dict[str, None] = {}
+        self.folders: dict[str, Listing] = {}  #: as each was when it was listed first
+        self._lists = False
 
     def listen(self) -> None:
         """Begin the record; another record of this process ends."""
@@ -38,9 +41,18 @@ class Opened:
         if not isinstance(path, str | bytes | os.PathLike):
             return
         if event in _LISTS:
-            self.folders[os.path.abspath(os.fsdecode(path))] = None
+            self._list(os.path.abspath(os.fsdecode(path)))
         elif not _is_written(*arguments[1:3]):
             self.files[os.path.abspath(os.fsdecode(path))] = None
+
+    def _list(self, folder: str) -> None:
+        if self._lists or folder in self.folders:
+            return
+        self._lists = True  # listing is an event too
+        try:
+            self.folders[folder] = listing(folder)
+        finally:
+            self._lists = False
 
 
 class Folders:

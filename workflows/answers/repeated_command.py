@@ -150,7 +150,7 @@ class Command:
         if any(path in cache for path in (os.getcwd(), *files)) or written in recipes:
             raise Unsettled("a recipe is in the folder of the cache or of results")
         folders = [path for path in self._opened.folders if path not in ignored and not _PART.search(path)]
-        listed = [path for path in folders if path != written]
+        listed = {path: self._opened.folders[path] for path in folders if path != written}
         return witnesses_of([*files, *inputs], recipes, listed, self._started - _TICK)
 
 

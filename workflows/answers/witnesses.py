@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 
@@ -22,11 +22,30 @@ class Witnesses(NamedTuple):
     listed: dict[str, str]  #: by another folder that was listed: digest of all names in it
 
 
-def witnesses_of(files: Iterable[str], recipes: Iterable[str], listed: Iterable[str], before: int) -> Witnesses:
+class Listing(NamedTuple):
+    """The names in a folder, and when the folder last changed (ns); 0 for a folder that is missing."""
+
+    names: list[str]
+    changed: int
+
+
+def listing(folder: str) -> Listing:
+    """Return the names in a folder as they are now."""
+    try:
+        about = os.stat(folder)
+    except OSError:
+        return Listing(all_names(folder), 0)
+    return Listing(all_names(folder), max(about.st_mtime_ns, about.st_ctime_ns))
+
+
+def witnesses_of(files: Iterable[str], recipes: Iterable[str], listed: Mapping[str, Listing], before: int) -> Witnesses:
     """Return witnesses for these paths as they are now; a path without a file is a witness of its absence.
 
-    Raises `Unsettled` for a file that changed after the time ``before`` (ns), and for a folder in place of a file.
+    Raises `Unsettled` for what changed after the time ``before`` (ns), and for a folder in place of a file.
     """
+    for folder, then in listed.items():
+        if then.changed > before or all_names(folder) != then.names:
+            raise Unsettled(f"{folder} changed while the command ran")
     found: dict[str, str] = {}
     absent = []
     for path in sorted(set(files)):
@@ -37,7 +56,7 @@ def witnesses_of(files: Iterable[str], recipes: Iterable[str], listed: Iterable[
         except OSError as error:
             raise Unsettled(f"{path} cannot be read: {error}") from None
     names = {folder: _digest(recipe_names(folder)) for folder in sorted(set(recipes))}
-    return Witnesses(found, absent, names, {folder: _digest(all_names(folder)) for folder in sorted(set(listed))})
+    return Witnesses(found, absent, names, {folder: _digest(all_names(folder)) for folder in sorted(listed)})
 
 
 def hold(witnesses: Witnesses) -> bool:

@@ -306,3 +306,21 @@ def test_results_in_the_folder_of_the_recipe_are_not_kept(place):
     place.out = Path(".")
     assert place.again()
     assert place.again()
+
+
+def test_a_folder_that_changes_after_it_was_listed_is_not_kept(place):
+    def meanwhile():
+        os.listdir("laser")
+        (place.work / "laser" / "new.yaml").write_text("")
+
+    assert doubtful(place, None, meanwhile)
+
+
+def test_a_folder_that_changed_before_it_was_listed_is_not_kept(place):
+    def meanwhile():
+        time.sleep(0.02)  # a tick of the clock of the file system
+        (place.work / "laser" / "brief.yaml").write_text("")
+        (place.work / "laser" / "brief.yaml").unlink()
+        os.listdir("laser")
+
+    assert doubtful(place, None, meanwhile)

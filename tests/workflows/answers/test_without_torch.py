@@ -26,11 +26,13 @@ QUICK = ("safety.draws=100", "safety.protection={filter: 1e-2}")
 
 
 class Terminal:
-    """A working folder with a cache, in which commands run in processes of their own."""
+    """A working folder, a home and a cache, in which commands run in processes of their own."""
 
-    def __init__(self, folder):
-        self.folder = folder
-        self.env = {**os.environ, "NEUSEE_CACHE": str(folder / "cache"), "HOME": str(folder), "OMP_NUM_THREADS": "1"}
+    def __init__(self, root):
+        self.folder, self.cache, home = root / "work", root / "cache", root / "home"
+        for folder in (home, self.cache, self.folder / "runs"):  # made while a command runs, they would be a change
+            folder.mkdir(parents=True)
+        self.env = {**os.environ, "NEUSEE_CACHE": str(self.cache), "HOME": str(home), "OMP_NUM_THREADS": "1"}
         self.env |= {"PYTHONPATH": str(ROOT / ".src"), "PYTEST_CURRENT_TEST": ""}
 
     def __call__(self, *words, light=False):
@@ -57,13 +59,13 @@ def plain(text):
 
 
 @pytest.mark.slow
-def test_a_repeated_estimate_is_the_same_without_torch_and_a_new_option_ends_it(neusee, tmp_path):
+def test_a_repeated_estimate_is_the_same_without_torch_and_a_new_option_ends_it(neusee):
     words = ("safety", "safety_pointer", *QUICK)
     first = neusee(*words)
     assert first[0] == 0, first
     again = neusee(*words, light=True)
     assert (again[0], plain(again[1]), again[2]) == (0, plain(first[1]), "")
-    one, two = (tmp_path / text.rstrip().rpartition(" ")[2] for text in (first[1], again[1]))
+    one, two = (neusee.folder / text.rstrip().rpartition(" ")[2] for text in (first[1], again[1]))
     assert one != two
     for name in ("limits.csv", "recipe.yaml", "figures/irradiance.png", "figures/distances.png"):
         assert (one.parent / name).read_bytes() == (two.parent / name).read_bytes(), name
@@ -72,27 +74,29 @@ def test_a_repeated_estimate_is_the_same_without_torch_and_a_new_option_ends_it(
     assert refuses(neusee(*words, "--json", light=True)), "another command"
     document = json.loads(neusee(*words, "--json")[1])
     repeated = json.loads(neusee(*words, "--json", light=True)[1])
-    assert Path(tmp_path, repeated["report"]).is_file()
+    assert Path(neusee.folder, repeated["report"]).is_file()
     assert repeated | {"report": 0} == document | {"report": 0}
     assert refuses(neusee(*words, "--help", light=True))
-    (tmp_path / "optics").mkdir()
-    (tmp_path / "optics" / "lens_only.yaml").write_text((ROOT / "recipes/optics/lens_only.yaml").read_text())
+    (neusee.folder / "optics").mkdir()
+    (neusee.folder / "optics" / "lens_only.yaml").write_text((ROOT / "recipes/optics/lens_only.yaml").read_text())
     assert refuses(neusee(*words, light=True)), "an option beside the recipe hides a packaged one"
 
 
 @pytest.mark.slow
-def test_a_recipe_with_a_mistake_or_code_of_its_own_has_no_stored_answer(neusee, tmp_path):
+def test_a_recipe_with_a_mistake_or_code_of_its_own_has_no_stored_answer(neusee):
     text = (ROOT / "recipes/safety_pointer.yaml").read_text()
-    (tmp_path / "mine.py").write_text("from neusee.nodes import node\n\n@node()\ndef twice(x):\n    return 2 * x\n")
-    (tmp_path / "mine.yaml").write_text(f"{text}\nnodes: [mine.py]\n")
+    (neusee.folder / "mine.py").write_text(
+        "from neusee.nodes import node\n\n@node()\ndef twice(x):\n    return 2 * x\n"
+    )
+    (neusee.folder / "mine.yaml").write_text(f"{text}\nnodes: [mine.py]\n")
     for words, code in ((("mine.yaml", *QUICK), 0), (("safety_pointer", "safety.draws=-1"), 2)):
         assert neusee("safety", *words)[0] == code
         assert refuses(neusee("safety", *words, light=True))
-    assert not (tmp_path / "cache" / "answers").exists()
+    assert not (neusee.cache / "answers").exists()
     for words in (("validate", "first_light"), ("validate", "first_light", "--json"), ("config", "first_light")):
         first = neusee(*words)
         assert first[0] == 0
         assert neusee(*words, light=True) == first
-    (tmp_path / "sensor").mkdir()
-    (tmp_path / "sensor" / "neusee.yaml").write_text((ROOT / "recipes/sensor/neusee.yaml").read_text())
+    (neusee.folder / "sensor").mkdir()
+    (neusee.folder / "sensor" / "neusee.yaml").write_text((ROOT / "recipes/sensor/neusee.yaml").read_text())
     assert refuses(neusee("config", "first_light", light=True))
