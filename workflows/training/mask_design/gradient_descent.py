@@ -112,7 +112,7 @@ def descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
         file.write(state)
     best = shape_of(terms, state["best"]["start"])
     best.load_state_dict(state["best"]["shape"])
-    diameter = float(best.round.diameter()) if isinstance(best, Stopped) else None
+    diameter = float(best.round.diameter().detach()) if isinstance(best, Stopped) else None
     return LearntMask(best, state["best"]["loss"], _few(best), state["history"], diameter)
 
 

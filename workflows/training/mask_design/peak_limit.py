@@ -32,7 +32,14 @@ def against_stops(terms: Terms, height: Tensor) -> dict[str, Any]:
         own = {**terms.passed(), "limit": None if limit is None else limit * peaks[0] / worst}
         lights = sorted({*_LIGHTS, exposure["light"]})
         rows = [_row(terms, psf, {**exposure, "light": light}, own) for light in lights]
-    return {"limit": limit, "lsr": worst, "filter": 1.0 if limit is None else min(1.0, limit / worst), "rows": rows}
+    stop = 1.0 if terms.shade is None else terms.recipe.steps[terms.shade.step].params["diameter"]
+    return {
+        "limit": limit,
+        "lsr": worst,
+        "stop": stop,
+        "filter": 1.0 if limit is None else min(1.0, limit / worst),
+        "rows": rows,
+    }
 
 
 def _row(terms: Terms, psf: Any, exposure: dict[str, Any], own: dict[str, Any]) -> dict[str, float]:
@@ -51,7 +58,7 @@ def section(found: dict[str, Any]) -> Section:
     limit = "no peak limit" if found["limit"] is None else f"a peak of at most {found['limit']:.3g} of the clear lens"
     text = f"""Error of the Wiener-filtered picture of a natural scene over its variance, and information per frequency,
         both for {limit}. The mask has an LSR of {found["lsr"]:.3g} in its worst band and in the worst state of what
-        is uncertain, and a grey filter of
+        is uncertain, a stop of {found["stop"]:.3g} and a grey filter of
         {found["filter"]:.3g}. The rival is the round stop, as a share of the aperture, with the grey filter that has
         the least error at the same limit. A gain above 0 is in favour of the mask. Unknown glare and clipping are
         neglected."""

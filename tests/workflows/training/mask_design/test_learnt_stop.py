@@ -42,7 +42,7 @@ def test_the_loss_falls_with_mask_and_stop_and_the_recipe_repeats_it(kind, recip
     given, said = how(kind=kind, iterations=12, learning_rate=0.1), []
     terms = Terms(recipe, given, store)
     start = gradient_descent.shape_of(terms, 0)
-    before = float(terms.total(gradient_descent._parts(terms, start)))
+    before = float(terms.total(gradient_descent._parts(terms, start)).detach())
     folder = design(recipe, given, store, tmp_path, said.append)
     found = json.loads((folder / "mask.json").read_text())
     assert found["loss"] < before
@@ -53,6 +53,10 @@ def test_the_loss_falls_with_mask_and_stop_and_the_recipe_repeats_it(kind, recip
     figures = mask_figures(Terms(again, how(learn_stop=False), store), height)
     assert figures["bands"]["lsr"] == pytest.approx(found["bands"]["lsr"])
     assert figures["protected"]["rows"] == found["protected"]["rows"]
+    assert figures["protected"]["stop"] == found["stop"]
+    assert f"a stop of {found['stop']:.3g} and a grey filter" in " ".join(
+        next(folder.glob("*.html")).read_text().split()
+    )
 
 
 def test_the_light_that_a_stop_takes_lowers_signal_and_noise(recipe, store):
