@@ -166,6 +166,7 @@ TRAINING = (
     "optics.samples=48", "optics.pitch=168.27 um", "optics.bands=5", "optics.window=[40, 40]", "scene.shape=[40, 40]",
     "sensor.shape=[32, 32]", "train.network.width=4", "train.critics.width=4",
 )  # fmt: skip
+LIMITED = "train.mask={kind: polynomial, learn_stop: true, limit: 0.01, weights: {filtered_error: 1, lsr: 0, bsr: 0}}"
 PAPER_TRAINING = (*TRAINING, *ONE, "train.size=null", "train.stages.1.batch=2", "train.stages.2.batch=2")
 DEMONSTRATION = (
     *TRAINING[:-2], "train.network.width=4", "train.mask.iterations=2", "train.stages.2.iterations=1", "train.pool=2",
@@ -214,6 +215,8 @@ STAND_INS = {
     "train train train.photographs=my_photographs --device cuda --mesh 4x2": StandIn(
         "days on eight GPUs: two processes, and gloo", more=PAPER_TRAINING, instead={"cuda": "cpu", "4x2": "2x1"},
         processes=2),
+    f'train train_small doe=shaded "{LIMITED}" --stage mask': StandIn(
+        "an hour", more=TRAINING, instead={LIMITED: LIMITED.replace("{kind", "{iterations: 2, kind")}),
     "train train_demonstration --stage mask": StandIn("half an hour", more=DEMONSTRATION),
     "train train_demonstration --stage 2": StandIn("half an hour", more=DEMONSTRATION),
     "train my/train_smallnet.yaml": StandIn("minutes", more=(*TRAINING[:-2], "train.stages.2.iterations=2",

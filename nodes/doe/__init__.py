@@ -7,6 +7,7 @@ from neusee.nodes.doe._glass_table import index_rows
 from neusee.nodes.doe._height_map_files import read_height_map
 from neusee.nodes.doe._minimum_feature import smooth
 from neusee.nodes.doe._parametrisations import PARAMETRISATIONS, Drawn, Modes, Pixels, Rings, Written
+from neusee.nodes.doe._polynomial_height_maps import LearntStop, Polynomials, Streak
 from neusee.nodes.doe._refractive_index import Glass, Material, index_curve, material, wave_height
 from neusee.nodes.doe._sampled_height_map import height_map, pixelwise
 from neusee.nodes.doe._shade import shade
@@ -16,10 +17,13 @@ __all__ = [
     "PARAMETRISATIONS",
     "Drawn",
     "Glass",
+    "LearntStop",
     "Material",
     "Modes",
     "Pixels",
+    "Polynomials",
     "Rings",
+    "Streak",
     "Written",
     "axicon",
     "cubic",

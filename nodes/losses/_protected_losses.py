@@ -61,7 +61,7 @@ def filtered_error(
     Shapes: psf.intensity (band, y, x), responses (channel, band) -> ().
     Units:  none; natural logarithm of a share, 0 if nothing is seen. light, veil and read_noise e- in a pixel behind
             the clear lens without a filter; transmittance: share of the light that the pupil behind the mask lets
-            through; up_to cycles per pixel.
+            through, a tensor () if it is learnt; up_to cycles per pixel.
     Error:  1e-6 in float32. Clipped pixels, edges and unknown glare are neglected. Light that leaves the window counts
             as noise, because as much comes from outside. The norm is up to n^(1/power) above the maximum.
     Raises: ValueError where the inputs differ in the number of bands.

@@ -105,6 +105,10 @@ def test_more_light_and_a_higher_limit_are_better_and_a_veil_is_worse(loss):
 def test_gradient(loss):
     kernel = kernels(2, 5, 6).requires_grad_()
     assert torch.autograd.gradcheck(lambda k: loss(*given(k), **HOW, power=8.0), (kernel,))
+    share = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda k, t: loss(*given(k), **HOW, power=8.0, transmittance=t), (kernel, share), nondet_tol=0
+    )
     own, truth = (torch.autograd.grad(f(*given(kernel), **HOW, power=8.0), kernel)[0]
                   for f in (loss, loss.hooks.reference))  # fmt: skip
     torch.testing.assert_close(own, truth)

@@ -32,8 +32,8 @@ def composed(text, *more):
     return compose_pipelines("first_light", [*SMALL, *more], read_pipelines(text, HERE), HERE)
 
 
-def green(*more):
-    line = "wavelength: 532 nm, fwhm: 10 nm, strength: 1e4, angle: [0.1 mrad, 0.2 mrad]"
+def green(*more, light="strength: 1e4"):
+    line = f"wavelength: 532 nm, fwhm: 10 nm, {light}, angle: [0.1 mrad, 0.2 mrad]"
     return load("first_light", [*SMALL, f"lasers={{beam: {{{line}}}}}", *more])
 
 
@@ -64,6 +64,25 @@ def test_the_camera_stays_and_the_filter_is_told_what_another_camera_would_know(
             assert float((mine - hand).abs().max()) <= 1e-6 * float(hand.abs().max())
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [{"line[beam].wavelength": 20e-9}, {"direction[beam].angle": (HALF, HALF)}])
+def test_a_laser_in_watts_that_is_mistold_is_that_of_a_recipe_by_hand(error, store):
+    """A Gaussian beam without a stated divergence: how much light the lens collects depends on the wavelength."""
+    light = "power: 5 mW, waist: 1 mm, distance: 100 m"
+    recipe, (place, by) = green(light=light), *error.items()
+    hand = {"line[beam].wavelength": "lasers.beam.wavelength=552 nm",
+            "direction[beam].angle": BY_HAND["direction 0.5 px off"]}  # fmt: skip
+    name = "laser_photons[mask,beam]"
+    wrong = mistold(recipe, {place: by})
+    told = run(wrong, store, [TOLD + name, name])
+    expected = run(green(hand[place], light=light), store, [name])[name]
+    assert float((told[TOLD + name] - expected).abs().max()) <= 1e-6 * float(expected.max())
+    assert float((told[TOLD + name] - told[name]).abs().max()) > 1e-3 * float(expected.max())
+    if "wavelength" in place:
+        collected, told_power = (run(wrong, store, [step])[step] for step in ("light[beam]", f"{TOLD}light[beam]"))
+        assert collected != told_power
+
+
 def test_dirt_is_not_told_and_ghosts_stay_those_of_the_camera(store):
     recipe = green("flare=dirty_windshield")
     errors = errors_of(recipe, Mismatch(pixels=0, wavelength="0 nm", defocus="0 waves"))
@@ -87,7 +106,7 @@ def test_what_is_copied_is_what_the_error_changes():
         wrong = mistold(recipe, error)
         copies = {name.removeprefix(TOLD).partition("[")[0] for name in wrong.steps if name.startswith(TOLD)}
         glare = {"laser_psf", "spot", "laser_photons"}
-        line = {"line", "laser_index", "laser_pupil", "laser_responses", "light", "wavefront"}
+        line = {"line", "light", "wavefront", "laser_index", "laser_pupil", "laser_responses"}
         own = {"direction": {"direction"}, "wavelength": line, "defocus": {"pupil", "psf", "laser_pupil"}}
         assert copies == glare | own[text.partition(" ")[0]]
         assert {name: step for name, step in wrong.steps.items() if name in recipe.steps and name != "deconvolved"} == {

@@ -18,12 +18,13 @@ from neusee.nodes.losses import (
     PeakLimit,
     SceneLight,
 )
-from neusee.nodes.units import Count, DataFile, Electrons, PositiveLength, Wavelength, Waves
+from neusee.nodes.units import Angle, Count, DataFile, Electrons, Length, PositiveLength, Wavelength, Waves
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.recipe.blocks.settings_block import SettingsBlock, Weight
 
-Kind = Literal["pixelwise", "recipe_mask", "zernike", "rings", "unet", "five_half_rings"]
-_RATE = {"pixelwise": 0.05, "recipe_mask": 4e-3, "zernike": 0.1, "rings": 0.1, "unet": 2e-3, "five_half_rings": 1.0}
+Kind = Literal["pixelwise", "recipe_mask", "zernike", "polynomial", "streak", "rings", "unet", "five_half_rings"]
+_RATE = {"pixelwise": 0.05, "recipe_mask": 4e-3, "zernike": 0.1, "polynomial": 0.02, "streak": 0.02, "rings": 0.1,
+         "unet": 2e-3, "five_half_rings": 1.0}  # fmt: skip
 
 
 def half_cosine(angle: float) -> float:
@@ -80,6 +81,9 @@ class MaskSettings(SettingsBlock):
     veil: Electrons = 0.0  #: even light of a laser behind the clear lens
     contrast_variance: ContrastVariance = 0.1  #: of the scene, relative
     defocus_spread: Waves = 0.0  #: standard deviation of the defocus, drawn at each iteration
+    wavelength_spread: Annotated[Length, Field(ge=0)] = 0.0  #: the same of all wavelengths together
+    direction_spread: Annotated[Angle, Field(ge=0)] = 0.0  #: the same of the direction of the laser, on each axis
+    learn_stop: bool = False  #: the diameter of `doe.shade` is learnt with the mask
     bands: Count | None = 7  #: number of bands of the recipe in one iteration; None: all bands
     seed: int = 0
     starts: Count = 1  #: independent starts; the result is the best mask on all bands
@@ -93,7 +97,8 @@ class MaskSettings(SettingsBlock):
     start: DataFile | None = None  #: pixelwise: a height map to start from, such as one of another kind
     width: Count = 16  #: unet: channels of its first layer
     modes: Count = 100  #: zernike: number of polynomials, from Noll's number 4 on
-    waves: Annotated[float, Field(gt=0)] = 5.0  #: zernike: root mean square of the initial mask in waves
+    waves: Annotated[float, Field(gt=0)] = 5.0  #: zernike, polynomial, streak: root mean square of the initial mask
+    degree: Annotated[int, Field(ge=2, le=30)] = 8  #: polynomial, streak: greatest degree
     rings: Count = 40  #: rings: annuli of equal area
     sided: bool = True  #: rings: heights are odd about the axis, like half-rings
     noise: Annotated[float, Field(ge=0)] = 1.0  #: rings: random part of each slope of the initial mask, in waves
@@ -115,6 +120,13 @@ class MaskSettings(SettingsBlock):
         if self.limit is not None and not self.weights.protected:
             text = "set weights.filtered_error or weights.information, or remove limit; of weights.lsr, `enough` is it"
             raise ValueError(f"limit = {self.limit:g} acts on no term of the loss: {text}")
+        if self.learn_stop and not self.weights.protected:
+            text = "only weights.filtered_error and weights.information know what a stop costs: set one, or remove it"
+            raise ValueError(f"learn_stop = true: {text}")
+        if self.learn_stop and self.kind == "five_half_rings":
+            raise ValueError(
+                "learn_stop = true: kind five_half_rings has no gradient: choose another kind, or remove it"
+            )
         return self
 
     @property

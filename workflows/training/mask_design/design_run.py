@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import losses, metrics
-from neusee.nodes.doe import PARAMETRISATIONS, half_rings
+from neusee.nodes.doe import PARAMETRISATIONS, Polynomials, half_rings
 from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.final_values import flow
@@ -35,10 +35,11 @@ from neusee.workflows.report.study_folder import StudyReport
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.loop.checkpoint import StateFile
 from neusee.workflows.training.loop.resumable_loop import Progress
-from neusee.workflows.training.mask_design.design_terms import Terms
+from neusee.workflows.training.mask_design.design_terms import Fabrication, Terms
 from neusee.workflows.training.mask_design.differential_evolution import evolve
 from neusee.workflows.training.mask_design.gradient_descent import descend
 from neusee.workflows.training.mask_design.learnt_mask import LearntMask
+from neusee.workflows.training.mask_design.learnt_shade import stopped
 from neusee.workflows.training.mask_design.peak_limit import against_stops, line
 
 __all__ = ["DesignError", "MaskTraining", "Weights", "design", "mask_figures"]
@@ -48,6 +49,7 @@ _LEARNT_WITH = {
     used.__module__
     for used in (
         half_rings,
+        Polynomials,
         PARAMETRISATIONS["doe.pixelwise"],
         losses.contrast,
         losses.suppression_loss,
@@ -130,14 +132,16 @@ class DesignedMask:
     ) -> DesignedMask:
         """Optimise a mask, or continue from the checkpoint ``kept``, and compute the figures of merit of the mask."""
         learning = Terms(_at(recipe, settings), settings, store, device)
-        full = Terms(recipe, settings, store, device) if settings.at else learning
-        progress(f"fabrication: {full.fabrication}")
+        progress(f"fabrication: {Fabrication.of(recipe, settings)}")
         optimise = evolve if learning.settings.kind == "five_half_rings" else descend
         learnt = optimise(learning, kept, progress)
+        full = _full(learning, learnt, recipe, settings, store, device)
         with torch.no_grad():
             height = learnt.height(full.stop).detach().to("cpu", torch.float32).contiguous()
             figures = mask_figures(full, height.to(full.device))
         progress(summary_line(figures))
+        if learnt.diameter is not None:
+            progress(f"learnt stop: {learnt.diameter:.3g} of the diameter of the lens")
         if figures["protected"]:
             progress(line(figures["protected"]))
         return cls(full, learnt, height, figures)
@@ -156,6 +160,7 @@ class DesignedMask:
         folder.said |= provenance
         self._report(tuple(provenance)).write(folder, provenance | {"config": recipe.config.to_yaml()})
         document = {"recipe": recipe.name, "kind": settings.kind, "loss": learnt.loss, **self.figures,
+                    **({} if learnt.diameter is None else {"stop": learnt.diameter}),
                     "fabrication": self.terms.fabrication.values, "numbers": learnt.numbers}  # fmt: skip
         folder.write("mask.json", json.dumps(document, indent=1))
 
@@ -173,6 +178,15 @@ class DesignedMask:
         parts = sections(self.figures, terms.fabrication, drawings)
         files = {"mask.safetensors": save({"height": self.height})}
         return StudyReport(title, f"{terms.settings.kind}: {lead}.", parts, drawings, tables, files, shown)
+
+
+def _full(
+    learning: Terms, learnt: LearntMask, recipe: Recipe, settings: MaskTraining, store: Store | None, device: str
+) -> Terms:
+    """Return the terms of the recipe itself, with the stop that was learnt."""
+    if learnt.diameter is not None and learning.shade is not None:
+        recipe = stopped(recipe, learning.shade.step, learnt.diameter)
+    return Terms(recipe, settings, store, device) if settings.at or learnt.diameter is not None else learning
 
 
 def _at(recipe: Recipe, settings: MaskTraining) -> Recipe:

@@ -17,10 +17,11 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining, need_steps
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.training.mask_design.camera_laws import NOMINAL, CameraLaws, State
+from neusee.workflows.training.mask_design.learnt_shade import LearntShade
 
 _PRIME = 1_000_003
 _FREE = "not limited"
-_HERMITE = [(-(3**0.5), 1 / 6), (0.0, 2 / 3), (3**0.5, 1 / 6)]  #: standard deviations and weights of a normal law
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,10 @@ class Terms:
         self.fabrication = Fabrication.of(recipe, settings)
         self.recipe = replace(recipe, exact=True)  # because the error bound of a cheaper step has no gradient
         self._bands = _bands_step(self.recipe, settings.psf)
-        self._defocus = _defocus_of(self.recipe, settings)
-        free = [settings.height, self._bands, *self._defocus]
+        self.laws = CameraLaws.of(self.recipe, settings)
+        self.shade = LearntShade.of(self.recipe, settings, store, device)
+        self._learnt = [self.shade.step] if self.shade and self.shade.learnt else []
+        free = [settings.height, self._bands, *self._learnt, *self.laws.free]
         self._function = as_function(self.recipe, *free, outputs=[settings.psf], store=store, device=device)
         seen = [settings.illuminant, settings.responses] if settings.weights.coloured else []
         stop = self.mask_step.wires.get("stop")
@@ -84,13 +87,21 @@ class Terms:
             raise DesignError(f"height: the step {self.settings.height} has no input `stop`: name the step of a mask")
         return self._stop
 
-    def psf(self, height: Tensor, chosen: Sequence[int] | None = None, further: float = 0.0) -> Psf:
+    def psf(
+        self,
+        height: Tensor,
+        chosen: Sequence[int] | None = None,
+        state: State = NOMINAL,
+        stop: Tensor | None = None,
+    ) -> Psf:
         """Return the PSF of a mask from its height map, for the spectral bands ``chosen`` or for all bands.
 
-        ``further`` is added to the defocus of the recipe, in standard deviations.
+        ``state`` moves what is uncertain, in standard deviations. ``stop`` is the amplitude of a learnt stop.
         """
-        values: dict[str, Any] = {self.settings.height: height, self._bands: _some(self.bands, chosen)}
-        values |= {name: at + further * self.settings.defocus_spread for name, at in self._defocus.items()}
+        bands = self.laws.moved(_some(self.bands, chosen), state)
+        values: dict[str, Any] = {self.settings.height: height, self._bands: bands, **self.laws.values(state)}
+        if self.shade is not None and self._learnt:
+            values[self.shade.step] = self.shade.behind(stop)
         psf: Psf = self._function(values)[self.settings.psf]
         return psf
 
@@ -109,21 +120,27 @@ class Terms:
         return psf
 
     def parts(
-        self, height: Tensor, chosen: Sequence[int] | None = None, number: int | None = None
+        self,
+        height: Tensor,
+        chosen: Sequence[int] | None = None,
+        number: int | None = None,
+        stop: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """Return the terms of the mask loss that have a weight above 0, by name, each as a mean over spectral bands.
 
-        If the defocus is uncertain, it is drawn for the iteration ``number``; for None the terms are means over the law
-        of the defocus, by Gauss-Hermite quadrature of three points.
+        What is uncertain is drawn for the iteration ``number``; for None the terms are means over its laws, by a
+        quadrature of 2 d + 1 points for d uncertain numbers. ``stop`` is the amplitude of a learnt stop.
         """
-        if not self._defocus:
-            return self._parts(self.psf(height, chosen), chosen)
-        points = [(self._drawn_defocus(number), 1.0)] if number is not None else _HERMITE
-        each = [(self._parts(self.psf(height, chosen, at), chosen), share) for at, share in points]
+        points = self.laws.points() if number is None else [(self.laws.drawn(number), 1.0)]
+        if self.laws.certain:
+            points = [(NOMINAL, 1.0)]
+        each = [(self._parts(height, chosen, state, stop), share) for state, share in points]
         return {name: torch.stack([share * part[name] for part, share in each]).sum() for name in each[0][0]}
 
-    def _parts(self, psf: Psf, chosen: Sequence[int] | None) -> dict[str, Tensor]:
-        settings, weights = self.settings, self.settings.weights
+    def _parts(
+        self, height: Tensor, chosen: Sequence[int] | None, state: State, stop: Tensor | None
+    ) -> dict[str, Tensor]:
+        settings, weights, psf = self.settings, self.settings.weights, self.psf(height, chosen, state, stop)
         sums = {}
         if weights.lsr:
             sums["lsr"] = self._suppression(psf)
@@ -138,8 +155,13 @@ class Terms:
             )
         for name in ("filtered_error", "information"):
             if getattr(weights, name):
-                terms[name] = getattr(losses, name)(psf, *self.seen(chosen), **self.exposure(), power=settings.power)
+                shared = {**self.exposure(), **self.passed(stop), "power": settings.power}
+                terms[name] = getattr(losses, name)(psf, *self.seen(chosen), **shared)
         return terms
+
+    def passed(self, stop: Tensor | None = None) -> dict[str, Any]:
+        """Return the share of the light that a shade in front of the mask lets through, as a parameter of a loss."""
+        return {} if self.shade is None else {"transmittance": self.shade.passed(stop)}
 
     def exposure(self) -> dict[str, Any]:
         """Return the parameters that `losses.filtered_error`, `losses.information` and `losses.best_stop` share."""
@@ -151,10 +173,6 @@ class Terms:
         """Return illuminant, responses and bands, for the spectral bands ``chosen`` or for all bands."""
         light, responses = (x if chosen is None else x[..., list(chosen)] for x in self._seen)
         return light, responses, _some(self.bands, chosen)
-
-    def _drawn_defocus(self, number: int) -> float:
-        rng = torch.Generator().manual_seed(self.settings.seed * _PRIME - number - 1)
-        return float(torch.randn((), generator=rng, dtype=torch.float64))
 
     def _suppression(self, psf: Psf) -> Tensor:
         """Return the laser suppression loss summed over bands, which is constant below the setting ``enough``."""
@@ -191,16 +209,6 @@ def _bands_step(recipe: Recipe, psf: str) -> str:
         text = f"{psf} depends on {len(names)} steps of spectra.bands ({', '.join(names)}), not on one step"
         raise DesignError(f"psf: {text}")
     return names[0]
-
-
-def _defocus_of(recipe: Recipe, settings: MaskTraining) -> dict[str, float]:
-    """Return the parameter with the defocus of the mask's pupil and its value, or nothing if the defocus is certain."""
-    if not settings.defocus_spread:
-        return {}
-    name = recipe.steps[settings.psf].wires.get("pupil")
-    if not isinstance(name, str) or "defocus" not in recipe.steps[name].params:
-        raise DesignError(f"defocus_spread: the pupil of {settings.psf} has no defocus: remove it, or name another psf")
-    return {f"{name}.defocus": float(recipe.steps[name].params["defocus"])}
 
 
 def _some(value: Any, chosen: Sequence[int] | None) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -12,12 +13,16 @@ from torch import Tensor, nn
 from neusee.nodes.doe import (
     PARAMETRISATIONS,
     Drawn,
+    LearntStop,
     Modes,
     Pixels,
+    Polynomials,
     Rings,
+    Streak,
     Written,
     read_height_map,
 )
+from neusee.nodes.values import Stop
 from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining, half_cosine
 from neusee.workflows.training.loop.checkpoint import StateFile
 from neusee.workflows.training.loop.resumable_loop import Progress
@@ -31,7 +36,22 @@ def shape_of(terms: Terms, start: int) -> nn.Module:
     """Return a trainable mask with the random initial parameters of the optimisation number ``start``."""
     settings = terms.settings
     shape = _free(terms, torch.Generator().manual_seed(settings.seed + _APART * start))
-    return shape if settings.feature is None else Written(shape, settings.feature)
+    if settings.feature is not None:
+        shape = Written(shape, settings.feature)
+    return Stopped(shape) if settings.learn_stop else shape
+
+
+class Stopped(nn.Module):
+    """A trainable mask in a round stop whose diameter is learnt too."""
+
+    def __init__(self, shape: nn.Module) -> None:
+        super().__init__()
+        self.shape, self.round = shape, LearntStop()
+
+    def forward(self, stop: Stop) -> Tensor:
+        """Return the height map (v, u) on the pupil grid of ``stop``."""
+        height: Tensor = self.shape(stop)
+        return height
 
 
 def _free(terms: Terms, rng: torch.Generator) -> nn.Module:
@@ -44,6 +64,11 @@ def _free(terms: Terms, rng: torch.Generator) -> nn.Module:
         return Pixels(settings.grid, settings.max_height, settings.scale, rng, _start(settings))
     if settings.kind == "zernike":
         return Modes(settings.modes, settings.waves, settings.wavelength, settings.material, rng)
+    few = (settings.degree, settings.waves, settings.wavelength, settings.material, rng)
+    if settings.kind == "polynomial":
+        return Polynomials(*few)
+    if settings.kind == "streak":
+        return Streak(*few)
     if settings.kind == "rings":
         return Rings(settings.rings, settings.sided, settings.noise, settings.wavelength, settings.material, rng)
     return Drawn(settings.width, settings.grid, settings.max_height, rng)
@@ -75,7 +100,7 @@ def descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
         shape = shape_of(terms, start).to(terms.device)
         _one_start(terms, shape, start, state, file, progress)
         with torch.no_grad():
-            loss = float(terms.total(terms.parts(shape(terms.stop))))
+            loss = float(terms.total(_parts(terms, shape)))
         progress(f"start {start + 1} of {settings.starts}: {loss:.5g} on all bands")
         if not math.isfinite(loss):
             raise DesignError(f"start {start + 1}: the loss on all bands is NaN or infinite: lower the learning rate")
@@ -87,7 +112,8 @@ def descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
         file.write(state)
     best = shape_of(terms, state["best"]["start"])
     best.load_state_dict(state["best"]["shape"])
-    return LearntMask(best, state["best"]["loss"], _few(best), state["history"])
+    diameter = float(best.round.diameter().detach()) if isinstance(best, Stopped) else None
+    return LearntMask(best, state["best"]["loss"], _few(best), state["history"], diameter)
 
 
 def _one_start(
@@ -112,7 +138,7 @@ def _one_start(
 
 def _step(terms: Terms, shape: nn.Module, adam: torch.optim.Adam, start: int, number: int) -> dict[str, float]:
     adam.zero_grad()
-    parts = terms.parts(shape(terms.stop), terms.drawn(number), number)
+    parts = _parts(terms, shape, terms.drawn(number), number)
     loss = terms.total(parts)
     row = {"start": start, "iteration": number, "loss": float(loss.detach())}
     row |= {name: float(term.detach()) for name, term in parts.items()}
@@ -127,12 +153,22 @@ def _step(terms: Terms, shape: nn.Module, adam: torch.optim.Adam, start: int, nu
     return row
 
 
+def _parts(
+    terms: Terms, shape: nn.Module, chosen: Sequence[int] | None = None, number: int | None = None
+) -> dict[str, Tensor]:
+    """Return the terms of the loss of a trainable mask, in its stop if this is learnt."""
+    stop = shape.round(terms.stop) if isinstance(shape, Stopped) else None
+    return terms.parts(shape(terms.stop), chosen, number, stop)
+
+
 def _losses_line(row: dict[str, float]) -> str:
     return ", ".join(f"{name} {value:.5g}" for name, value in row.items() if name not in ("start", "iteration"))
 
 
 def _few(shape: nn.Module) -> dict[str, Any]:
     """Return the parameters of a mask as lists by name, without matrices and vectors of more than 1000 numbers."""
-    inner: Any = shape.shape if isinstance(shape, Written) else shape
+    inner: Any = shape
+    while isinstance(inner, (Stopped, Written)):
+        inner = inner.shape
     state = {} if isinstance(inner, Drawn) else inner.state_dict()
     return {name: x.tolist() for name, x in state.items() if x.numel() <= 1000 and x.dim() == 1}

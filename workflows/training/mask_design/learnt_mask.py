@@ -19,3 +19,4 @@ class LearntMask:
     loss: float
     numbers: dict[str, Any]  #: the parameters, if the mask has few parameters
     history: list[dict[str, float]]
+    diameter: float | None = None  #: of a learnt stop, as a share of that of the lens

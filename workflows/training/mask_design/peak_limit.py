@@ -27,17 +27,26 @@ def against_stops(terms: Terms, height: Tensor) -> dict[str, Any]:
         return {}
     with torch.no_grad():
         psf, exposure = terms.psf(height), terms.exposure()
-        worst = float(metrics.lsr(psf).max())
-        limit = exposure["limit"]
+        peaks = [float(metrics.lsr(terms.psf(height, None, state)).max()) for state, _ in terms.laws.points()]
+        limit, worst = exposure["limit"], max(peaks)
+        own = {**terms.passed(), "limit": None if limit is None else limit * peaks[0] / worst}
         lights = sorted({*_LIGHTS, exposure["light"]})
-        rows = [_row(terms, psf, {**exposure, "light": light}) for light in lights]
-    return {"limit": limit, "lsr": worst, "filter": 1.0 if limit is None else min(1.0, limit / worst), "rows": rows}
+        rows = [_row(terms, psf, {**exposure, "light": light}, own) for light in lights]
+    stop = 1.0 if terms.shade is None else terms.recipe.steps[terms.shade.step].params["diameter"]
+    return {
+        "limit": limit,
+        "lsr": worst,
+        "stop": stop,
+        "filter": 1.0 if limit is None else min(1.0, limit / worst),
+        "rows": rows,
+    }
 
 
-def _row(terms: Terms, psf: Any, exposure: dict[str, Any]) -> dict[str, float]:
+def _row(terms: Terms, psf: Any, exposure: dict[str, Any], own: dict[str, Any]) -> dict[str, float]:
+    """Return error and information of a mask, whose own limit is lower by what is uncertain, and of the best stop."""
     seen, found = terms.seen(), {"light": exposure["light"]}
     for name in ("filtered_error", "information"):
-        found[name] = float(getattr(losses, name)(psf, *seen, **exposure))
+        found[name] = float(getattr(losses, name)(psf, *seen, **{**exposure, **own}))
         found[f"{name} of the stop"], width, passed = losses.best_stop(terms.plain(), *seen, **exposure, measure=name)
         if name == "filtered_error":
             found |= {"stop": width, "filter of the stop": passed}
@@ -48,7 +57,8 @@ def section(found: dict[str, Any]) -> Section:
     """Return the section of the report page that compares a mask with the best stop at the same peak limit."""
     limit = "no peak limit" if found["limit"] is None else f"a peak of at most {found['limit']:.3g} of the clear lens"
     text = f"""Error of the Wiener-filtered picture of a natural scene over its variance, and information per frequency,
-        both for {limit}. The mask has an LSR of {found["lsr"]:.3g} in its worst band and a grey filter of
+        both for {limit}. The mask has an LSR of {found["lsr"]:.3g} in its worst band and in the worst state of what
+        is uncertain, a stop of {found["stop"]:.3g} and a grey filter of
         {found["filter"]:.3g}. The rival is the round stop, as a share of the aperture, with the grey filter that has
         the least error at the same limit. A gain above 0 is in favour of the mask. Unknown glare and clipping are
         neglected."""

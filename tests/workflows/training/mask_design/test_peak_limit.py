@@ -85,7 +85,7 @@ def test_a_law_of_defocus_is_drawn_in_learning_and_averaged_in_the_end(recipe, s
     assert float(exact) == pytest.approx(_by_numpy(terms, height), abs=1e-6)
     whole = float(terms.parts(height)["filtered_error"])
     assert whole != pytest.approx(sharp, abs=1e-6)
-    far = [float(terms._parts(terms.psf(height, None, x), None)["filtered_error"]) for x in (-(3**0.5), 3**0.5)]
+    far = [float(terms._parts(height, None, (x, 0, 0, 0), None)["filtered_error"]) for x in (-(3**0.5), 3**0.5)]
     assert whole == pytest.approx(2 / 3 * sharp + sum(far) / 6, abs=1e-5)
 
 
