@@ -249,6 +249,22 @@ def test_cancellation_counts_in_each_scalar_of_a_result(picture):
     assert judge_step(step_of(wrong), [signed], BY_NAME["usual"], 0).mark == "fail"
 
 
+@pytest.mark.parametrize(("off", "mark"), [(0.0, "pass"), (1e-3, "fail")])
+def test_a_picture_that_is_white_in_place_of_black_has_a_psnr_of_zero_decibels(off, mark, monkeypatch):
+    """4e-7 dB beside 1e-16 dB are a rounding; a thousandth of a dB is a fault."""
+    quality = find_node("metrics.quality")
+    fn = quality.fn
+
+    def changed(estimate, truth, **params):
+        found = fn(estimate, truth, **params)
+        return found._replace(psnr=found.psnr + off * (estimate.dtype == torch.float32))
+
+    monkeypatch.setattr(quality, "fn", changed)
+    step = Step("quality", quality, quality.params().model_dump(), {}, None, {})
+    cell = judge_step(step, [torch.ones(3, 12, 12), torch.zeros(3, 12, 12)], extreme_cases.USUAL, 0)
+    assert cell.mark == mark
+
+
 def test_no_result_is_excused_by_the_rounding_of_its_inputs(picture):
     @node(rtol=1e-6)
     def steep(x: torch.Tensor) -> torch.Tensor:
