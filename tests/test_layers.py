@@ -124,6 +124,18 @@ def parsed(path):
     return ast.parse(path.read_text())
 
 
+@functools.cache
+def items_of(tree):
+    """Every node of a syntax tree; the rules ask for the same trees again and again."""
+    return tuple(ast.walk(tree))
+
+
+@functools.cache
+def calls_of(tree):
+    """Every call of a syntax tree, with the text of what is called."""
+    return tuple((item, ast.unparse(item.func)) for item in items_of(tree) if isinstance(item, ast.Call))
+
+
 def house():
     """The files of workflows: syntax trees by path."""
     return {path.relative_to(HOUSE).as_posix(): parsed(path) for path in WORKFLOWS}
@@ -191,11 +203,13 @@ def exits(files):
         if home(file) == "cli":
             continue
         yield from (f"{file}:{e.line}: {e.full}" for e in imports(tree) if outer(e.full) in ("typer", "click"))
-        for item in ast.walk(tree):
-            called = ast.unparse(item.func) if isinstance(item, ast.Call) else ""
+        for item, called in calls_of(tree):
+            if called in ("sys.exit", "os._exit", "exit", "quit"):
+                yield f"{file}:{item.lineno}: {called}"
+        for item in items_of(tree):
             raised = ast.unparse(item.exc) if isinstance(item, ast.Raise) and item.exc else ""
-            if called in ("sys.exit", "os._exit", "exit", "quit") or raised.startswith("SystemExit"):
-                yield f"{file}:{item.lineno}: {called or raised}"
+            if raised.startswith("SystemExit"):
+                yield f"{file}:{item.lineno}: {raised}"
 
 
 def terminal(files):
@@ -205,8 +219,8 @@ def terminal(files):
             continue
         names = [e for e in imports(tree) if outer(e.full) == "rich" or e.full in ("sys.stdout", "sys.stderr")]
         yield from (f"{file}:{e.line}: {e.full}" for e in names)
-        for item in ast.walk(tree):
-            said = ast.unparse(item.func) if isinstance(item, ast.Call) else ast.unparse(item) if _dotted(item) else ""
+        streams = [(item, f"{item.value.id}.{item.attr}") for item in items_of(tree) if _dotted(item)]
+        for item, said in (*calls_of(tree), *streams):
             if said in ("print", "input", "sys.stdout", "sys.stderr", "sys.__stdout__", "sys.__stderr__"):
                 yield f"{file}:{item.lineno}: {said}"
 
@@ -233,8 +247,7 @@ def private(files):
 def dynamic(files, allowed=DYNAMIC):
     """Calls that import a module by a name, but for those that are allowed."""
     for file, tree in files.items():
-        for item in ast.walk(tree):
-            called = ast.unparse(item.func) if isinstance(item, ast.Call) else ""
+        for item, called in calls_of(tree):
             if called.rpartition(".")[2] in ("import_module", "__import__") and file not in allowed:
                 yield f"{file}:{item.lineno}: {called}"
 
@@ -250,7 +263,7 @@ def formulas(files, allowed=PI):
         for each in imports(tree):
             if each.full.startswith(("neusee.nodes.constants", "scipy.constants")) or each.full == "math.pi":
                 yield f"{file}:{each.line}: {each.full}"
-        for item in ast.walk(tree):
+        for item in items_of(tree):
             if isinstance(item, ast.Attribute) and item.attr == "pi" and file not in allowed:
                 yield f"{file}:{item.lineno}: {ast.unparse(item)}"
             if isinstance(item, ast.BinOp) and isinstance(item.op, ast.Mult | ast.Div | ast.Pow):

@@ -18,7 +18,7 @@ from neusee.workflows.keys.cache_key import Key
 
 LARGE = 1 << 20  #: bytes; a larger result is written during the next step
 _ROOM = 1 << 29  #: bytes that may wait; a larger result waits alone
-_NICE = 10  #: priority of the writing thread, from 0 (normal) to 19 (lowest)
+_NICE = 10  #: how much nicer the writing thread is; 19 is the nicest
 
 
 class WriteBehind:
@@ -63,4 +63,5 @@ def _lower_priority() -> None:
     """Lower the priority of the writing thread, so that the computing threads run first."""
     if sys.platform == "linux":  # on other systems the call would affect the whole process
         with suppress(OSError):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+            thread = threading.get_native_id()
+            os.setpriority(os.PRIO_PROCESS, thread, min(os.getpriority(os.PRIO_PROCESS, thread) + _NICE, 19))

@@ -77,7 +77,7 @@ class ProtectionCamera:
             given["defocus"] = float(given.get("defocus", 0.0)) + condition.defocus
             film = self._film(condition)
         shaded = shade(self.stop, diameter=diameter, **notches)
-        front = optics.pupil(height, index.node(bands, **index.params), bands, self.stop, film, shaded, **given)
+        front = optics.pupil(height, index.node(bands, **index.params), bands, self.stop, film, shade=shaded, **given)
         found: Psf = optics.psf(front, **{**self.lens, **more})
         return found
 

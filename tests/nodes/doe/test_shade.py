@@ -23,7 +23,7 @@ SMALL = ["scene.shape=[64, 64]", "sensor.shape=[48, 48]", "optics.samples=64", "
 
 def shaded(**given):
     height = torch.zeros(270, 270)
-    return pupil(height, 0.46 + 0 * BANDS.centres, BANDS, STOP, None, shade(STOP, **given))
+    return pupil(height, 0.46 + 0 * BANDS.centres, BANDS, STOP, shade=shade(STOP, **given))
 
 
 def test_a_filter_passes_its_share_and_a_stop_the_fourth_power_of_its_diameter():
@@ -51,8 +51,8 @@ def test_a_notch_passes_what_its_formula_says_at_each_wavelength_and_no_colour_c
 def test_the_fast_transform_of_a_shaded_pupil_agrees_with_the_definition(sampling):
     small = stop(samples=32, pitch=252.5e-6, diameter=8.08e-3)
     height = 2e-6 * torch.rand(32, 32, generator=torch.Generator().manual_seed(3))
-    given = pupil(height, 0.46 + 0 * BANDS.centres, BANDS, small, None,
-                  shade(small, transmittance=0.3, diameter=0.7, notches=(540e-9,), width=70e-9))  # fmt: skip
+    given = pupil(height, 0.46 + 0 * BANDS.centres, BANDS, small,
+                  shade=shade(small, transmittance=0.3, diameter=0.7, notches=(540e-9,), width=70e-9))  # fmt: skip
     lens = {**LENS, "shape": (12, 12), "sensor": sampling}
     fast, slow = psf(given, **lens, precision="double"), psf.hooks.reference(given, **lens)
     assert (fast.intensity - slow.intensity).abs().max() < 1e-5 * slow.intensity.max()
@@ -109,4 +109,4 @@ def test_a_notch_wider_than_its_centre_is_refused():
 def test_a_shade_of_another_grid_is_refused():
     other = shade(stop(samples=32, pitch=252.5e-6, diameter=8.08e-3))
     with pytest.raises(ValueError, match=r"shade is .* and height is"):
-        pupil(torch.zeros(270, 270), 0.46 + 0 * BANDS.centres, BANDS, STOP, None, other)
+        pupil(torch.zeros(270, 270), 0.46 + 0 * BANDS.centres, BANDS, STOP, shade=other)

@@ -45,7 +45,7 @@ MASKS = {
 
 def psf_of(height=None, **given):
     height = torch.zeros(540, 540) if height is None else height
-    return optics.psf(optics.pupil(height, doe.material(GREEN), GREEN, STOP, None, doe.shade(STOP, **given)), **LENS)
+    return optics.psf(optics.pupil(height, doe.material(GREEN), GREEN, STOP, shade=doe.shade(STOP, **given)), **LENS)
 
 
 def spectrum_of(one, known=None):
