@@ -238,8 +238,9 @@ def _veil(lobes: list[tuple[Tensor, Lobe, Tensor]], centre: tuple[float, float],
 
 def _transmitted(pupil: Pupil) -> Tensor:
     """Return the share of the clear pupil's light that mask and dirt transmit, float64."""
-    lit, clear = (torch.linalg.vector_norm(x, dtype=torch.float64).square() for x in (pupil.amplitude, pupil.aperture))
-    return lit / clear
+    lit, clear = (x.double().square().sum() for x in (pupil.amplitude, pupil.aperture))
+    share: Tensor = lit / clear
+    return share
 
 
 def _same_bands(psf: Psf, pupil: Pupil) -> None:

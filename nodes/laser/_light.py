@@ -58,9 +58,9 @@ def wavefront(
 
     Shapes: -> taper, curvature ().
     Units:  taper 1/m2; curvature 1/m.
-    Error:  exact for one Gaussian beam; a beam with M2 above 1 is taken as a wider Gaussian beam of one mode. The rim of
-            the pupil grid is a staircase: the spot of a laser that is W waves out of focus is off by 1.5 W / samples of
-            its peak at most, and usually by 0.4 W / samples: 0.4 % at 2 m for 8 mm and 540 samples.
+    Error:  exact for one Gaussian beam; a beam with M2 above 1 is taken as a wider Gaussian beam of one mode. The rim
+            of the pupil grid is a staircase: the spot of a laser that is W waves out of focus is off by 1.5 W / samples
+            of its peak at most, and usually by 0.4 W / samples: 0.4 % at 2 m for 8 mm and 540 samples.
     Raises: ParameterError for a waist, a divergence and an M2 that disagree, and for a distance without a width.
     Source: Siegman, Lasers (1986), chapter 17; ISO 11146-1 (beam of any M2).
     """

@@ -1,4 +1,4 @@
-"""Overexposed pictures of a point source, simulated by NumPy and SciPy alone, and the posterior of their scatter without an engine."""
+"""Overexposed pictures of a point source, by NumPy and SciPy alone, and the posterior of their scatter."""
 
 from functools import cache
 
@@ -56,7 +56,9 @@ def picture(truth, draw, size=128, centre=None, lens=LENS, more=(), band=20e-9):
         veil, total = scattered(*surface, size, centre, lens["pixel_pitch"] / lens["focal_length"] / beam)
         light, left = light + left * veil, left * (1 - total)
     mean = truth["electrons"] * (left * airy_light(size, centre, lens, band) + light) + truth["background"]
-    electrons = draw.poisson(np.clip(mean, 0, 1e8)) + CAMERA["offset"] + draw.normal(0, CAMERA["read_noise"], mean.shape)
+    electrons = (
+        draw.poisson(np.clip(mean, 0, 1e8)) + CAMERA["offset"] + draw.normal(0, CAMERA["read_noise"], mean.shape)
+    )
     return np.clip(np.round(np.minimum(electrons, CAMERA["full_well"]) * CAMERA["gain"]), 0, 2 ** CAMERA["bits"] - 1)
 
 

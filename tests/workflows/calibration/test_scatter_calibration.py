@@ -76,7 +76,7 @@ def test_coordinates_are_one_to_one_and_their_density_is_that_of_the_prior():
 
 def test_a_lobe_within_the_saturated_pixels_gives_limits_and_no_value():
     narrow = {**TRUTH, "b0": 15.0 * 20**2.2, "l": 0.004 / 20, "s": -2.2}
-    problem, mode = fitted(narrow, prior=WIDE | {"b0": (15.0 * 20**2.2, 30.0), "l": (2e-4, 10.0)})
+    problem, mode = fitted(narrow, prior=WIDE | {"b0": (15.0 * 20**2.2, 30.0), "l": (2e-4, 10.0)}, size=256)
     found = identify(problem, mode)
     assert (found.kinds["l"], found.kinds["b0"]) == ("upper", "lower")
     assert "b0 and l only as b0 l^(-s): l lies within the saturated pixels" in found.directions
