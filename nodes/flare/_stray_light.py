@@ -79,6 +79,8 @@ def stray_light(
     ``strength``: the brightest source that this PSF shows, in multiples of saturation; a tolerance may then omit the
     step. Without a value the step is always computed.
 
+    Heights and paths of the pupil have no effect, not even where they are NaN.
+
     Shapes: psf.intensity (band, y, x), pupil (v, u), direction (2,) rad -> as psf.
     Units:  as psf, share of the clear pupil's light per pixel; b0 1/sr, radius m.
     Error:  energy in the window 1e-8 of the captured light, before the precision of the PSF; each pixel is integrated,
@@ -122,7 +124,8 @@ def stray_shares(
 ) -> StrayShares:
     """Account for the light of a point source: not scattered, scattered into the window, and scattered elsewhere.
 
-    ``psf`` has stray light and ``core`` is the same PSF without; the parameters are those of `stray_light`.
+    ``psf`` has stray light and ``core`` is the same PSF without; the parameters are those of `stray_light`. Heights and
+    paths of the pupil have no effect, not even where they are NaN.
 
     Shapes: psf, core (band, y, x), pupil (v, u) -> three of (band,).
     Units:  shares of the light through the clear pupil; their sum is the share that the pupil transmits.
@@ -235,8 +238,9 @@ def _veil(lobes: list[tuple[Tensor, Lobe, Tensor]], centre: tuple[float, float],
 
 def _transmitted(pupil: Pupil) -> Tensor:
     """Return the share of the clear pupil's light that mask and dirt transmit, float64."""
-    lit, clear = (x.square().sum(1).sum(dtype=torch.float64) for x in (pupil.amplitude, pupil.aperture))
-    return lit / clear
+    lit, clear = (x.double().square().sum() for x in (pupil.amplitude, pupil.aperture))
+    share: Tensor = lit / clear
+    return share
 
 
 def _same_bands(psf: Psf, pupil: Pupil) -> None:

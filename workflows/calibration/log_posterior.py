@@ -106,8 +106,9 @@ def only_step(recipe: Recipe, *paths: str) -> Step:
     steps = [step for step in recipe.steps.values() if step.node.path in paths]
     if len(steps) != 1:
         count = f"{len(steps)} steps" if steps else "no step"
+        names = " or ".join(filter(None, (", ".join(paths[:-1]), paths[-1])))
         raise ValueError(
-            f"{recipe.name} has {count} of the node {' or '.join(paths)}, but a calibration needs exactly one: see "
+            f"{recipe.name} has {count} of the node {names}, but a calibration needs exactly one: see "
             "`neusee run calibrate`, `neusee run calibrate_camera` and `neusee run calibrate_stray_light`"
         )
     return steps[0]

@@ -90,6 +90,25 @@ def test_light_that_dirt_absorbs_is_not_scattered():
     assert_close(sum(shares), torch.full((3,), 0.25, dtype=torch.float64))
 
 
+def test_the_share_of_a_very_faint_pupil_keeps_its_digits():
+    """Amplitudes of 1e-40: their squares are zero in single precision."""
+    source = pupil()
+    core, found = veiled(source, THREE)
+    faint = source._replace(amplitude=source.amplitude * 1e-40, aperture=source.aperture * 1e-40)
+    again = flare.stray_light(core, faint, surfaces=THREE, **LENS)
+    assert_close(again.intensity, found.intensity, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("field", ["height", "path"])
+def test_heights_and_paths_have_no_effect_and_a_hole_in_the_amplitude_is_seen(field):
+    source = pupil()
+    core, found = veiled(source, THREE)
+    broken = source._replace(**{field: torch.full((128, 128), torch.nan)})
+    assert_close(flare.stray_light(core, broken, surfaces=THREE, **LENS).intensity, found.intensity, rtol=0, atol=0)
+    dark = source._replace(amplitude=torch.full((128, 128), torch.nan))
+    assert flare.stray_light(core, dark, surfaces=THREE, **LENS).intensity.isnan().all()
+
+
 def test_a_mask_does_not_reduce_the_veil():
     """Blurring the scatter by the mask's own PSF, as the light does, changes the veil by less than 2 % far away."""
     one = WAVES[1:2]

@@ -8,6 +8,7 @@ import torch
 from scipy import integrate
 
 from neusee.nodes import ParameterError, doe, laser, optics, spectra
+from tests.workflows.simulation import radiometry
 
 LINE = spectra.line(wavelength=532e-9, fwhm=1e-9)
 STOP = optics.stop(samples=128, pitch=62.5e-6, diameter=8e-3)
@@ -90,6 +91,26 @@ def test_a_near_laser_is_as_far_out_of_focus_as_waves_of_defocus_say(distance):
     assert waves == pytest.approx(7.27 if distance == 2.0 else 0.145, rel=0.01)
 
 
+@pytest.mark.parametrize(("samples", "distance"), [(540, 2.0), (540, 5.0), (540, 20.0), (128, 8.0)])
+def test_the_spot_of_a_near_laser_is_as_exact_as_stated(samples, distance):
+    """The Hankel integral of a beam of 30 mrad, by SciPy, for the lens of `radiometry`."""
+    size, focal, pixel = radiometry.LENS["diameter"], radiometry.LENS["focal"], radiometry.PIXEL
+    stop = optics.stop(samples=samples, pitch=size / samples, diameter=size)
+    wave = laser.wavefront(LINE, divergence=0.03, distance=distance)
+    pupil = optics.pupil(torch.zeros(samples, samples), doe.material(LINE), LINE, stop, None, wave)
+    psf = optics.psf(pupil, shape=(32, 32), focal_length=focal, pixel_pitch=pixel)
+    middle = len(LINE.centres) // 2
+    at = (np.arange(32) - 16) * pixel
+    beam = {"power": 1.0, "divergence": 0.03, "distance": distance}
+    colour, away = float(LINE.centres[middle]), np.hypot(at[:, None], at[None]).ravel()
+    wanted = radiometry.irradiance(colour, beam | {"wavelength": colour}, away, 1.0).reshape(32, 32)
+    axis = float(laser.axis_irradiance(laser.beam(532e-9, power=1.0, divergence=0.03), distance))
+    light = 0.9 * axis * float(pupil.aperture.sum()) * float(stop.pitch) ** 2 / pixel**2
+    off = np.abs(psf.intensity[middle].double().numpy() * light - wanted).max() / wanted.max()
+    waves = size**2 / (8 * distance) / 550e-9
+    assert off < 1.5 * waves / samples
+
+
 @pytest.mark.parametrize("distance", [2.0, 60.0])
 def test_a_laser_that_is_out_of_focus_is_told_with_the_defocus_that_focuses_it(distance):
     params = {each: field.default for each, field in laser.light.params.model_fields.items()}
@@ -100,6 +121,7 @@ def test_a_laser_that_is_out_of_focus_is_told_with_the_defocus_that_focuses_it(d
         return
     (note,) = notes
     assert note.startswith("a laser at 2 m is 7.27 waves out of focus for a lens focused at infinity")
+    assert "(its spot is exact to 0.085 of its peak)" in note  # of 128 samples
     assert note.endswith(': optics.defocus="-7.27 waves" focuses it')
     wave = laser.wavefront(LINE, divergence=0.1, distance=2.0)
     focused = optics.pupil(torch.zeros(128, 128), doe.material(LINE), LINE, STOP, None, wave, defocus=-7.27)

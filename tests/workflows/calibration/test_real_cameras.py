@@ -144,7 +144,8 @@ def test_pixels_that_are_all_alike_have_no_models_of_a_response(store):
 
 
 def test_a_recipe_that_calibrates_nothing_says_what_is_missing(store):
-    with pytest.raises(ValueError, match=r"no step of the node calibrate\.density or calibrate\.camera, but a calib"):
+    told = r"no step of the node calibrate\.density, calibrate\.camera or calibrate\.stray_light, but a calib"
+    with pytest.raises(ValueError, match=told):
         SensorPosterior.of(load("plain_lens"), store)
 
 

@@ -43,6 +43,7 @@ _STEEPER = 10.0  #: ratio of the bound of a gradient to the bound of the result
 _DIM = 1e-3  #: share of the brightest element below which an element is dim
 _LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.add_photons")  #: nodes that must keep dim parts
 _LARGEST = ("metrics.peak_irradiance", "sensor.level")  #: nodes whose gradient is that of a largest element
+_DECIBELS = frozenset({("metrics.quality", "psnr")})  #: results in dB, whose error is one of a ratio: at least of 1 dB
 _HUGE = 1e30  #: the large number with which infinity is compared
 _ROUNDINGS = 10  #: random roundings of the inputs that are tried
 
@@ -100,10 +101,14 @@ def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
     coarse = max((HALVES.get(x.dtype, 0.0) for x in tensors_in(inputs)), default=0.0)  # of a gradient, as of its input
     slope_bound, moved = max(SLOPE, _STEEPER * bound, 2 * coarse), 0.0
     dim = case.expect == "dim part" and step.node.path.startswith(_LIGHT)
-    error, slope = _dim_error(value, truth) if dim else _error(value, truth), slope_error(step, inputs, seed)
+    floors = _floors(step, truth)
+    error, slope = _dim_error(value, truth) if dim else _error(value, truth, floors), slope_error(step, inputs, seed)
     if error > bound and all(x.ndim == 0 for x in tensors_in(truth)):
-        scalars = enumerate(zip(tensors_in(value), tensors_in(truth), strict=True))
-        error = max(over(a, b, LEAST) * cancelled(step, inputs, b, i, seed) for i, (a, b) in scalars)
+        scalars = enumerate(zip(tensors_in(value), tensors_in(truth), floors, strict=True))
+        error = max(
+            over(a, b, floor) * (cancelled(step, inputs, b, i, seed) if floor == LEAST else 1.0)
+            for i, (a, b, floor) in scalars
+        )
     if slope is not None and slope > slope_bound and not coarse and step.node.path in _LARGEST:
         moved = moved_slopes(step, inputs, seed, _ROUNDINGS)
     cell = _marked(error, bound, slope, max(slope_bound, moved))
@@ -127,10 +132,17 @@ def _marked(error: float, bound: float, slope: float | None, steeper: float) -> 
     return Cell(mark, "near its bound" * near, error, bound, slope, None if slope is None else steeper)
 
 
-def _error(value: Any, truth: Any) -> float:
+def _error(value: Any, truth: Any, floors: Sequence[float]) -> float:
     """Return the largest difference of a result from the reference, relative to the reference's largest element."""
-    pairs = list(zip(tensors_in(value), tensors_in(truth), strict=True))
-    return max((over(a, b, LEAST) for a, b in pairs), default=0.0)
+    pairs = list(zip(tensors_in(value), tensors_in(truth), floors, strict=True))
+    return max((over(a, b, floor) for a, b, floor in pairs), default=0.0)
+
+
+def _floors(step: Step, truth: Any) -> list[float]:
+    """Return the least number to which the error of each tensor of a result relates: 1 of decibels, else tiny."""
+    names = getattr(truth, "_fields", ())
+    decibels = [name for name in names if (step.node.path, name) in _DECIBELS]
+    return [1.0 if decibels and names[i] in decibels else LEAST for i in range(len(list(tensors_in(truth))))]
 
 
 def _dim_error(value: Any, truth: Any) -> float:

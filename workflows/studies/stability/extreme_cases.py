@@ -52,6 +52,8 @@ _STATED = {
     ("restore.clipped", "NaN"): "so is what is not a number",
     ("metrics.light_outside", "NaN"): "have no effect, not even where they are NaN",
     ("metrics.saturated", "NaN"): "so does a pixel that is NaN",
+    ("flare.stray_light", "NaN"): "have no effect, not even where they are NaN",
+    ("flare.stray_shares", "NaN"): "have no effect, not even where they are NaN",
 }
 
 

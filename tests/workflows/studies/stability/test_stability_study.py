@@ -189,7 +189,7 @@ def test_what_is_stated_counts_only_as_long_as_the_docstring_states_it(monkeypat
 )
 def test_what_holds_by_less_than_twice_warns(error, slope, mark):
     cell = case_result._marked(error, 1.0, slope, 4.0)
-    assert cell.mark == mark
+    assert cell.mark == mark, cell
     assert (cell.bound, cell.slope_bound) == (1.0, None if slope is None else 4.0)
     assert [cell.error, cell.slope] == pytest.approx([error, slope], nan_ok=True)
 
@@ -247,6 +247,22 @@ def test_cancellation_counts_in_each_scalar_of_a_result(picture):
 
     assert judge_step(step_of(exact), [signed], BY_NAME["usual"], 0).mark != "fail"
     assert judge_step(step_of(wrong), [signed], BY_NAME["usual"], 0).mark == "fail"
+
+
+@pytest.mark.parametrize(("off", "mark"), [(0.0, "pass"), (1e-2, "fail")])
+def test_a_picture_that_is_white_in_place_of_black_has_a_psnr_of_zero_decibels(off, mark, monkeypatch):
+    """4e-7 dB beside 1e-16 dB are a rounding; a hundredth of a dB is a fault."""
+    quality = find_node("metrics.quality")
+    fn, params = quality.fn, quality.params().model_dump()
+
+    def changed(estimate, truth, **params):
+        found = fn(estimate, truth, **params)
+        return found._replace(psnr=found.psnr + off * (estimate.dtype == torch.float32))
+
+    monkeypatch.setattr(quality, "fn", changed)
+    step = Step("quality", quality, params, {}, Location("test"), {})
+    cell = judge_step(step, [torch.ones(3, 12, 12), torch.zeros(3, 12, 12)], extreme_cases.USUAL, 0)
+    assert cell.mark == mark, cell
 
 
 def test_no_result_is_excused_by_the_rounding_of_its_inputs(picture):
