@@ -141,8 +141,8 @@ def run_here(page):
 
 
 def timed(found):
-    """Return test cases of which those that compute more than a recipe's plan are marked slow."""
-    quick = {*LIGHT} - {"compare", "handbook"}
+    """Return test cases of which those that simulate a picture are marked slow."""
+    quick = {*LIGHT, "safety"} - {"compare", "handbook"}
     return [
         pytest.param(*case.values, id=case.id, marks=[] if case.values[0].split()[0] in quick else [pytest.mark.slow])
         for case in found
