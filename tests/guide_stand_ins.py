@@ -17,7 +17,7 @@ from neusee.workflows.studies.stability import stability_study
 from neusee.workflows.studies.stability.extreme_cases import CASES
 from tests.guide_commands import ROOT
 
-SMALL_LENS = "optics: {samples: 96, pitch: 84.15 um, window: [48, 48], bands: 9}"
+SMALL_LENS = "optics: {samples: 128, pitch: 63.11 um, window: [48, 48], bands: 9}"
 SMALL_SENSOR = "sensor: {shape: [24, 24]}"
 #: options of packaged groups that a small option of the same name hides
 SMALL_OPTIONS = {
