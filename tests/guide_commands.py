@@ -1,28 +1,25 @@
-"""What the README and the guide tell a reader to type, the reader's files, and how a test runs each command.
-
-A command runs as it stands, or as a stand-in: the same words with small sizes, counts and machines instead of the large
-ones. `STAND_INS` says which words change and why; `NotDeclared` is raised for a large command without a stand-in.
-"""
+"""What the README and the guide tell a reader to type, and the files of the reader."""
 
 from __future__ import annotations
 
+import contextlib
 import re
-import shlex
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
+from neusee.nodes import own_modules
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
-from neusee.workflows.studies.stability import stability_study
-from neusee.workflows.studies.stability.extreme_cases import CASES
+from neusee.workflows.recipe import node_families
 
 ROOT = Path(__file__).parents[1]
 GUIDE = ROOT / "recipes" / "guide"
@@ -35,6 +32,7 @@ SYNTAX = "neusee COMMAND [RECIPE] [a.b=1] [+a.b=1] [~a.b] [group=option]"
 OTHER_LINES = {
     'pip install -e ".[test]" && pytest': "continuous integration, as its second command",
     "pip install -e . && neusee run": "continuous integration, as its first command",
+    "python3 -m venv ~/neusee_env && . ~/neusee_env/bin/activate": "continuous integration, in another folder",
     "pip install -e .": "continuous integration, before its first run",
     'export NEUSEE_CACHE_SECRET="a long text that only you and your group know"': "a shell",
     'export NEUSEE_CACHE_SECRET="a long text that only your group knows"': "a shell",
@@ -65,6 +63,20 @@ def cases(found: Callable[[Path], list[str]]) -> list[Any]:
     """Return one test case for each thing that is found on a page; what stands on several pages is one case."""
     places = {x: f"{page.stem}-{n}" for page in reversed(WRITTEN) for n, x in reversed(list(enumerate(found(page))))}
     return [pytest.param(x, id=place) for x, place in places.items()]
+
+
+@contextlib.contextmanager
+def forgotten_modules(*folders: Path) -> Iterator[None]:
+    """Forget at the end what was imported from these folders: another folder has other files of these names."""
+    before, path = set(sys.modules), list(sys.path)
+    yield
+    for name in set(sys.modules) - before:
+        if str(getattr(sys.modules[name], "__file__", None) or "").startswith(tuple(map(str, folders))):
+            del sys.modules[name]
+    sys.path[:] = path
+    own_modules._files.clear()
+    node_families._family_of.clear()
+    node_families._installed.cache_clear()
 
 
 # --- the files of the reader ------------------------------------------------------------------------------------------
@@ -117,176 +129,3 @@ def _write_frames(folder: Path) -> None:
             np.save(folder / "set" / f"{level}_{number}.npy", frame)
             described.append(f"i {level}_{number}.npy")
     (folder / "set" / "EMVA1288_descriptor.txt").write_text("\n".join(described) + "\n")
-
-
-# --- the stand-ins ----------------------------------------------------------------------------------------------------
-
-SMALL_LENS = "optics: {samples: 128, pitch: 63.11 um, window: [64, 64], bands: 9}"
-SMALL_SENSOR = "sensor: {shape: [32, 32]}"
-#: options of packaged groups that a small option of the same name hides
-SMALL_OPTIONS = {
-    **{f"optics/{name}": SMALL_LENS for name in ("small", "neusee")},
-    "sensor/small": SMALL_SENSOR,
-    **{f"scene/{name}": "scene: {shape: [36, 36]}" for name in ("china", "siemens", "night")},
-}
-LARGEST = {"optics.samples": 128, "optics.bands": 31, "scene.shape": 96, "sensor.shape": 64}  #: of a small camera
-
-#: commands that compute little or nothing, and run as they are written
-LIGHT = (
-    "validate", "plan", "why", "config", "recipes", "nodes", "new", "init", "check", "schema", "cache", "compare",
-    "handbook",
-)  # fmt: skip
-#: commands that run as they are written, but for the small options that hide those of the packaged camera
-SIZED = ("run", "sweep")
-
-
-class NotDeclared(LookupError):
-    """Error for a command of a page that is too large for a test and has no stand-in."""
-
-
-class StandIn(NamedTuple):
-    """Small sizes, counts and machines with which a test runs a command of a page, and the reason."""
-
-    why: str
-    more: tuple[str, ...] = ()  #: words after those of the page
-    instead: Mapping[str, str] = {}  #: words in the place of words of the page
-    constants: Mapping[str, Any] = {}  #: ``module:name`` of a number of the program that is made small
-    processes: int = 1  #: of torchrun
-    code: int = 0  #: the exit code
-
-
-PITCH = "doe.pitch=14.96 um"
-FULL_MASK = StandIn("the height map has the 540 samples of the full pupil", more=(PITCH,))
-FIELD = {"sensor.shape=[512,512]": "sensor.shape=[32,32]", "scene.shape=[576,576]": "scene.shape=[36,36]"}
-EVALUATE = 'evaluate first_light "sensor.shape=[512,512]" "scene.shape=[576,576]"'
-SIX = "train train_small train.stages.1.iterations=6 train.stages.2.iterations=6"
-SHORT = {f"train.stages.{stage}.iterations=6": f"train.stages.{stage}.iterations=1" for stage in (1, 2)}
-ONE = tuple(SHORT.values())
-TRAINING = (
-    "optics.samples=48", "optics.pitch=168.27 um", "optics.bands=5", "optics.window=[40, 40]", "scene.shape=[40, 40]",
-    "sensor.shape=[32, 32]", "train.network.width=4", "train.critics.width=4",
-)  # fmt: skip
-LIMITED = "train.mask={kind: polynomial, learn_stop: true, limit: 0.01, weights: {filtered_error: 1, lsr: 0, bsr: 0}}"
-PAPER_TRAINING = (*TRAINING, *ONE, "train.size=null", "train.stages.1.batch=2", "train.stages.2.batch=2")
-DEMONSTRATION = (
-    *TRAINING[:-2], "train.network.width=4", "train.mask.iterations=2", "train.stages.2.iterations=1", "train.pool=2",
-    "train.size=null",
-)  # fmt: skip
-
-
-def without_walk(problem: Any, mode: Any, seed: int, *_: Any, **how: Any) -> Any:
-    """Draw from the posterior of a sensor by weights, which takes a hundredth of the time of a walk."""
-    from tests.workflows.studies.calibration.test_calibration_study import resampled
-
-    return resampled(problem, mode, seed)
-
-
-CLUSTER = "tcp://scheduler:8786"
-TWO_LASERS = ("~lasers.blue", "~lasers.cyan", "~lasers.yellow", "~lasers.red")
-FEW_DRAWS = ("--draws", "100", "--walkers", "16")
-CUT = {"calibration.emcee_sampler:_LONGEST": 250}  #: steps; the command says that its chains are cut, by exit code 3
-
-STAND_INS = {
-    "run demonstration": StandIn(
-        "the trained mask has the 540 samples of the full pupil", more=(
-            "+steps.height.with.pitch=14.96 um", "+steps.height.with.between=nearest")
-    ),
-    "run first_light doe=pixelwise doe.file=mask.npy": FULL_MASK,
-    "run doe=pixelwise doe.file=mask.npy": FULL_MASK,
-    "run paper_table1": StandIn(
-        "the camera of the paper has 2160 x 2160 samples", more=("scene.shape=[36,36]", "sensor.shape=[32,32]")),
-    'run first_light "scene.shape=[512,512]" "sensor.shape=[384,384]"': StandIn(
-        "a field of 512 x 512", instead={"scene.shape=[512,512]": "scene.shape=[28,28]",
-                                         "sensor.shape=[384,384]": "sensor.shape=[24,24]"}
-    ),
-    'run train optics=small sensor=small "scene.shape=[768,768]"': StandIn(
-        "a field of 768 x 768", instead={"scene.shape=[768,768]": "scene.shape=[36,36]"}
-    ),
-    "run six_lasers": StandIn("two of the six lasers", more=TWO_LASERS),
-    "run six_lasers --executor dask:2": StandIn("two of the six lasers, and other noise", more=(*TWO_LASERS, "seed=8")),
-    f"run six_lasers --executor {CLUSTER}": StandIn(
-        "a scheduler and a worker on this machine", more=(*TWO_LASERS, "seed=9"), instead={CLUSTER: "LOCAL"}
-    ),
-    "train train_small": StandIn("a training of an hour", more=(*TRAINING, *ONE)),
-    "train train_small train=as_printed": StandIn("a training of an hour", more=(*TRAINING, *ONE)),
-    f"{SIX}": StandIn("a training of 20 s", more=TRAINING, instead=SHORT),
-    f"{SIX} --mesh 1x2": StandIn("a training of 20 s", more=TRAINING, instead=SHORT, processes=2),
-    "train train --device cuda": StandIn("days on a GPU", more=PAPER_TRAINING, instead={"cuda": "cpu"}),
-    "train train train.photographs=my_photographs --device cuda --mesh 4x2": StandIn(
-        "days on eight GPUs: two processes, and gloo", more=PAPER_TRAINING, instead={"cuda": "cpu", "4x2": "2x1"},
-        processes=2),
-    f'train train_small doe=shaded "{LIMITED}" --stage mask': StandIn(
-        "an hour", more=TRAINING, instead={LIMITED: LIMITED.replace("{kind", "{iterations: 2, kind")}),
-    "train train_demonstration --stage mask": StandIn("half an hour", more=DEMONSTRATION),
-    "train train_demonstration --stage 2": StandIn("half an hour", more=DEMONSTRATION),
-    "train my/train_smallnet.yaml": StandIn("minutes", more=(*TRAINING[:-2], "train.stages.2.iterations=2",
-                                                             "train.critics.width=4")),
-    "train train_lift": StandIn("hours", more=(
-        "patch.shape=[8, 8]", "patch.leaves=8", "train_lift.iterations=4", "train_lift.batch=1", "train_lift.keep=2",
-        "train_lift.warmup=2", "train_lift.validation_batches=2")),
-    "study accuracy first_light --quick": StandIn("minutes", more=(
-        "laser=none", "outputs=[raw,lsr]", "--seeds", "1")),
-    "study stability first_light": StandIn("minutes: the first two of the extreme cases", constants={
-        "studies.stability.stability_study:study": partial(stability_study.study, cases=CASES[:2])}),
-    "study uncertainty my/uncertain.yaml --error 0.1 --points sobol": StandIn(
-        "a thousand draws", instead={"0.1": "0.9"}, more=("--most", "64", "outputs=[saturated]")),
-    "study leave-out first_light": StandIn(
-        "minutes: what simpler scenes cost is not measured", more=("outputs=[raw,lsr]",), constants={
-            "studies.leave_out.leave_out_study:measure_scenes": lambda *_: []}),
-    "study calibration calibrate --simulations 100": StandIn(
-        "minutes: 20 sensors of 32 x 32 pixels, and draws without a walk", more=("flats.shape=[32,32]",
-            "sensor.gain=0.37 DN/e-"), instead={"100": "20"},
-        constants={"studies.calibration.calibration_study:PIXELS": 32,
-                   "studies.calibration.calibration_study:walk_draws": without_walk}),
-    "calibrate calibrate": StandIn("minutes", more=("flats.shape=[32,32]", *FEW_DRAWS), constants=CUT, code=3),
-    "calibrate calibrate_camera table.file=my.csv": StandIn("minutes", more=FEW_DRAWS, constants=CUT, code=3),
-    "calibrate calibrate_camera": StandIn("minutes", more=FEW_DRAWS, constants=CUT, code=3),
-    f"{EVALUATE} --scenes 3 --strengths 0,1e3,1e6": StandIn(
-        "a minute", instead={**FIELD, "3": "1", "0,1e3,1e6": "0,1e3"}),
-    f"{EVALUATE} --scenes 3 --strengths 1e2,1e4,1e6 "
-    '--pipelines "flat+none, half_ring+none, five_half_rings+none"': StandIn(
-        "a minute", instead={**FIELD, "3": "1", "1e2,1e4,1e6": "1e2,1e4"}),
-    f"{EVALUATE} --scenes 3 --strengths 1e4,1e6 "
-    '--pipelines "flat+wiener, half_ring+wiener, five_half_rings+wiener" --equal-protection 0.002': StandIn(
-        "minutes", more=("--by", "filter"),
-        instead={**FIELD, "3": "1", "1e4,1e6": "1e4", "0.002": "1e-5",
-                 "flat+wiener, half_ring+wiener, five_half_rings+wiener": "flat+none, five_half_rings+none"}),
-    f'{EVALUATE} --data photographs --pipelines "flat+none, half_ring+wiener, pixelwise@mask.npy+wiener"': StandIn(
-        "20 scenes", instead=FIELD, more=("--scenes", "1", "--strengths", "1e3")),
-    f'{EVALUATE} --pipelines "flat+none, five_half_rings+nafnet@net.safetensors" --reference flat+none': StandIn(
-        "20 scenes", instead=FIELD, more=("--scenes", "1", "--strengths", "1e3")),
-    "evaluate my/train_smallnet.yaml --pipelines flat+none,five_half_rings+smallnet@smallnet.safetensors": StandIn(
-        "20 scenes", more=("--scenes", "1", "--strengths", "1e3")),
-}  # fmt: skip
-
-
-def stand_in(words: str, folder: Path) -> StandIn | None:
-    """Return the stand-in of a command, or None if it runs as it stands; raise `NotDeclared` if it is too large."""
-    kind, declared = words.split()[0], STAND_INS.get(words)
-    if kind in LIGHT:
-        return declared
-    if declared is None and kind not in SIZED and not words.startswith("study uncertainty"):
-        raise NotDeclared(f"neusee {words}: say in STAND_INS how a test runs this command")
-    text = _recipe_text(words, folder)
-    if declared is None and not re.search(r"^ *- optics: ", text, re.MULTILINE):
-        return None
-    found = declared or StandIn("the camera is small; expected numbers are those of the full camera")
-    numbers = re.search(r"^expect:", text, re.MULTILINE) and re.search(r"^ *- optics: ", text, re.MULTILINE)
-    return found._replace(more=(*found.more, *(["~expect"] if numbers else [])))
-
-
-def _recipe_text(words: str, folder: Path) -> str:
-    """Return the text of the recipe that a command names, that of first light if it names none."""
-    named = [word for word in shlex.split(words)[1:] if not re.search(r"[=~]|^-", word)]
-    name = next((word for word in named if word.endswith(".yaml") or (ROOT / f"recipes/{word}.yaml").is_file()), None)
-    own = name is not None and name.endswith(".yaml")
-    return (folder / str(name) if own else ROOT / f"recipes/{name or 'first_light'}.yaml").read_text(encoding="utf-8")
-
-
-def typed(words: str, found: StandIn | None) -> list[str]:
-    """Return the words of a command as a test types them."""
-    found = found or StandIn("")
-    own = shlex.split(words)
-    missing = [word for word in found.instead if word not in own]
-    assert not missing, f"{words}: no word {missing} to replace"
-    return [*(found.instead.get(word, word) for word in own), *found.more]

@@ -18,7 +18,17 @@ from neusee.workflows.evaluation.pipelines import compose_pipelines, read_pipeli
 from neusee.workflows.placement.machine_file import read_machines
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.sweeps.axes import points, read_words
-from tests.guide_commands import GUIDE, PAGES, ROOT, WRITTEN, blocks, cases, lines, write_reader_files
+from tests.guide_commands import (
+    GUIDE,
+    PAGES,
+    ROOT,
+    WRITTEN,
+    blocks,
+    cases,
+    forgotten_modules,
+    lines,
+    write_reader_files,
+)
 
 README = ROOT / "README.md"
 
@@ -35,7 +45,8 @@ def folder(tmp_path_factory):
     """A working folder with every file that the pages speak of."""
     folder = tmp_path_factory.mktemp("guide")
     write_reader_files(folder)
-    return folder
+    with forgotten_modules(folder):
+        yield folder
 
 
 def parsed(words: list[str]) -> tuple[str, dict]:

@@ -18,7 +18,6 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from neusee.nodes import own_modules
 from neusee.workflows.cli import app
 from neusee.workflows.cli.handbook_reference import reference_pages
 from neusee.workflows.handbook import command_pictures
@@ -32,20 +31,16 @@ from tests.guide_commands import (
     GUIDE,
     OTHER_LINES,
     ROOT,
-    SMALL_OPTIONS,
-    STAND_INS,
     WRITTEN,
-    NotDeclared,
-    StandIn,
     blocks,
     cases,
+    forgotten_modules,
     indented,
     lines,
     named_files,
-    stand_in,
-    typed,
     write_reader_files,
 )
+from tests.guide_stand_ins import LIGHT, SMALL_OPTIONS, STAND_INS, NotDeclared, StandIn, stand_in, typed
 
 pytestmark = [pytest.mark.filterwarnings("ignore::DeprecationWarning:typer"), pytest.mark.xdist_group("guide")]
 
@@ -61,8 +56,9 @@ def place(tmp_path_factory):
     """A folder with the reader's files, small options of the packaged groups, and one cache for all commands."""
     place = tmp_path_factory.mktemp("guide")
     write_reader_files(place)
+    Image.new("L", (2, 2)).save(place / "no_graph.png")
     for name, text in SMALL_OPTIONS.items():
-        for folder, options in (("options", text), ("all_bands", text.replace(", bands: 9", ""))):
+        for folder, options in (("options", text), ("all_bands", re.sub(", bands: [0-9]+", "", text))):
             path = place / folder / f"{name}.yaml"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(f"# A small stand-in.\ndefaults: [{path.stem}]\n{options}\n", encoding="utf-8")
@@ -82,18 +78,11 @@ def small_png(figure) -> bytes:
 @pytest.fixture
 def reader(place, monkeypatch, tmp_path):
     """Stand in the folder of the reader, and forget afterwards which modules the commands imported from there."""
-    before, path = set(sys.modules), list(sys.path)
     monkeypatch.chdir(place)
     monkeypatch.setenv("NEUSEE_CACHE", str(place / "cache"))
     monkeypatch.setattr(style, "png_of", small_png)
-    yield place
-    for name in set(sys.modules) - before:
-        if str(getattr(sys.modules[name], "__file__", None) or "").startswith((str(place), str(tmp_path))):
-            del sys.modules[name]
-    sys.path[:] = path
-    own_modules._files.clear()
-    node_families._family_of.clear()
-    node_families._installed.cache_clear()
+    with forgotten_modules(place, tmp_path):
+        yield place
 
 
 def carry_out(words: str, place: Path, monkeypatch, *more: str) -> None:
@@ -108,6 +97,8 @@ def carry_out(words: str, place: Path, monkeypatch, *more: str) -> None:
         asked = SHOWN.get(tuple(typed(words, None)), set())
         patch.setattr(simulate_recipe, "timeline", lambda result: None)  # no page shows it
         patch.setattr(run_pictures, "FIGURES", [f for f in run_pictures.FIGURES if f.name in asked])
+        if "graph" not in asked:
+            patch.setattr(run_pictures, "_graph", lambda *_: place / "no_graph.png")
         arguments = [address if word == "LOCAL" else word for word in typed(words, found)]
         if found and found.processes > 1:
             return together(arguments, found.processes)
@@ -149,8 +140,16 @@ def run_here(page):
     return [words for words in lines(page) if words not in ALONE]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("words", cases(run_here))
+def timed(found):
+    """Return test cases of which those that simulate a picture are marked slow."""
+    quick = {*LIGHT, "safety"} - {"compare", "handbook"}
+    return [
+        pytest.param(*case.values, id=case.id, marks=[] if case.values[0].split()[0] in quick else [pytest.mark.slow])
+        for case in found
+    ]
+
+
+@pytest.mark.parametrize("words", timed(cases(run_here)))
 def test_every_command_runs(words, place, reader, tmp_path, monkeypatch, capfd):
     if words.split()[0] in ("new", "init", "check"):
         shutil.copytree(place / "my", tmp_path / "my")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.comparison.differences import NumberDifference, ValueDifference, largest
@@ -34,21 +34,31 @@ def report(found: RunComparison) -> StudyReport:
 
 def summary(found: RunComparison) -> list[str]:
     """Return sentences that count what differs between two runs."""
-    differ = [each for each in found.numbers if each.relative > 0]
     drawn, data = ([each for each in files if each.state != "same"] for files in (found.figures, found.data))
     code = "The left or the right folder records no digests of code." if found.code is None else (
         f"{_counted(len(found.code), 'difference')} in the code." if found.code else "The code is the same."
     )  # fmt: skip
     return [
-        f"{len(differ)} of {_counted(len(found.numbers), 'number')} differ{_by(differ)}."
-        if differ
-        else f"All {_counted(len(found.numbers), 'number')} are the same.",
+        *_compared(found.numbers),
         f"{len(drawn)} of {_counted(len(found.figures), 'picture')} differ.",
         f"{len(data)} of {_counted(len(found.data), 'data file')} and tensors differ.",
         f"{_counted(len(found.recipe), 'value')} of the recipe differ{'s' * (len(found.recipe) == 1)}."
         if found.recipe
         else "The recipe is the same.",
         code,
+    ]
+
+
+def _compared(numbers: Sequence[NumberDifference]) -> list[str]:
+    """Return how many numbers of both runs differ, and how many numbers only one run has."""
+    both = [each for each in numbers if each.left is not None and each.right is not None]
+    differ = [each for each in both if each.relative > 0]
+    counted = _counted(len(both), "number")
+    said = f"{len(differ)} of {counted} differ{_by(differ)}." if differ else f"All {counted} are the same."
+    alone = {"left": sum(each.right is None for each in numbers), "right": sum(each.left is None for each in numbers)}
+    return [
+        *([said] if both or not numbers else ["The runs have no number in common."]),
+        *(f"Only the {side} run has {_counted(count, 'further number')}." for side, count in alone.items() if count),
     ]
 
 

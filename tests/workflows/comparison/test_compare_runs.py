@@ -12,6 +12,7 @@ from PIL import Image
 from safetensors.numpy import save_file
 
 from neusee.workflows.comparison.compare_runs import compare, document, write_comparison
+from neusee.workflows.comparison.comparison_page import summary
 from neusee.workflows.comparison.comparison_text import lines
 from neusee.workflows.comparison.differences import NumberDifference
 from neusee.workflows.comparison.picture_differences import data_files, figures
@@ -101,6 +102,20 @@ def test_the_folder_of_a_comparison_holds_page_table_pictures_and_document(two):
     about = json.loads((folder / "provenance.json").read_text())
     assert {name: about[name] for name in document(found)} == json.loads(json.dumps(document(found)))
     assert (folder / "figures" / "drawn.png").is_file()
+
+
+def test_numbers_that_one_run_lacks_are_counted_apart(two):
+    edited(two / "right/provenance.json", lambda content: content["metrics"].clear())
+    first = compared(two)
+    alone = len(first.numbers)
+    assert alone > 1
+    said = ["The runs have no number in common.", f"Only the left run has {alone} further numbers."]
+    assert summary(first)[:2] == said
+    edited(two / "left/provenance.json", lambda content: content["metrics"].append(["new", "", 0, 1.0]))
+    kept = json.loads((two / "left/provenance.json").read_text())["metrics"]
+    edited(two / "right/provenance.json", lambda content: content["metrics"].extend(kept[:-1]))
+    said = summary(compared(two))
+    assert said[:2] == [f"All {len(kept) - 1} numbers are the same.", "Only the left run has 1 further number."]
 
 
 @pytest.mark.parametrize(
