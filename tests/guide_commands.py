@@ -104,7 +104,8 @@ def write_reader_files(folder: Path) -> None:
     names: dict[str, Any] = {}
     exec((folder / "my" / "smallnet.py").read_text(encoding="utf-8"), names)
     save_file(names["SmallUNet"](16).state_dict(), folder / "smallnet.safetensors")
-    np.save(folder / "mask.npy", 5e-6 * (1 + np.cos(40 * np.hypot(*np.mgrid[-1:1:540j, -1:1:540j]))))
+    for name, n in {"mask": 540j, "mask_128": 128j}.items():
+        np.save(folder / f"{name}.npy", 5e-6 * (1 + np.cos(40 * np.hypot(*np.mgrid[-1:1:n, -1:1:n]))))
     (folder / "my_photographs").mkdir()
     for name in ("holiday.jpg", "my_photographs/one.jpg"):
         shutil.copy(ROOT / "recipes" / "samples" / "china.jpg", folder / name)

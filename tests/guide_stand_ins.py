@@ -54,6 +54,7 @@ class StandIn(NamedTuple):
 PITCH = "doe.pitch=14.96 um"
 FULL_MASK = StandIn("the height map has the 540 samples of the full pupil", more=(PITCH,))
 FIELD = {"sensor.shape=[512,512]": "sensor.shape=[32,32]", "scene.shape=[576,576]": "scene.shape=[36,36]"}
+PIPELINES = "flat+none, half_ring+wiener, pixelwise@mask.npy+wiener"
 EVALUATE = 'evaluate first_light "sensor.shape=[512,512]" "scene.shape=[576,576]"'
 SIX = "train train_small train.stages.1.iterations=6 train.stages.2.iterations=6"
 SHORT = {f"train.stages.{stage}.iterations=6": f"train.stages.{stage}.iterations=1" for stage in (1, 2)}
@@ -173,7 +174,8 @@ STAND_INS = {
     '--pipelines "flat+none, half_ring+none, five_half_rings+none"': StandIn(
         "a minute", instead={**FIELD, "3": "1", "1e2,1e4,1e6": "1e2,1e4"}),
     f'{EVALUATE} --data photographs --pipelines "flat+none, half_ring+wiener, pixelwise@mask.npy+wiener"': StandIn(
-        "20 scenes", instead=FIELD, more=("--scenes", "1", "--strengths", "1e3")),
+        "20 scenes, a mask of 540 samples", instead={**FIELD, PIPELINES: PIPELINES.replace("mask", "mask_128")},
+        more=("--scenes", "1", "--strengths", "1e3")),
     f'{EVALUATE} --pipelines "flat+none, five_half_rings+nafnet@net.safetensors" --reference flat+none': StandIn(
         "20 scenes", instead=FIELD, more=("--scenes", "1", "--strengths", "1e3")),
     "evaluate my/train_smallnet.yaml --scenes 3 --strengths 0,1e3 --pipelines "
