@@ -81,7 +81,7 @@ def without_walk(problem: Any, mode: Any, seed: int, *_: Any, **how: Any) -> Any
 
 #: of the fine grid of the pupil in front of which `neusee safety` puts a laser, and the fewest draws that it takes
 SAFETY = ("safety.draws=100", "optics.samples=128", "optics.window=[128, 128]")
-DAZZLE = ("wide.window=[183, 183]", "safety.dazzle.share=0.001")  #: behind the mask, with so few samples
+DAZZLE = ("wide.window=[99, 99]", "safety.dazzle.share=0.001")  #: behind the mask, with so few samples
 PROTECTION = (
     "optics.samples=128", "optics.pitch=63.11 um", "optics.bands=3", "optics.window=[64, 64]", "scene.shape=[64, 64]",
     "sensor.shape=[48, 48]", "--bands", "2",
@@ -150,10 +150,10 @@ STAND_INS = {
     "calibrate calibrate_camera": StandIn("minutes", more=FEW_DRAWS, constants=CUT, code=3),
     "calibrate calibrate_stray_light": StandIn("minutes", more=FEW_DRAWS, constants=CUT, code=3),
     **{f"safety {words}": StandIn("a fine grid of the spot, and a thousand draws", more=SAFETY) for words in (
-        "safety_car_lidar_1550", "safety_car_lidar_1550 --json", "my/pointer.yaml")},
-    **{f"safety {words}": StandIn("fine grids of the spot, and a thousand draws", more=(*SAFETY, *DAZZLE)) for words in (
+        "safety_car_lidar_1550", "safety_car_lidar_1550 --json")},
+    **{f"safety {words}": StandIn("fine grids, and a thousand draws", more=(*SAFETY, *DAZZLE)) for words in (
         "safety_pointer", "safety_car_lidar", "safety_drone_dazzler", "safety_laboratory", "safety_show",
-        'safety_show safety.protection.filter=1e-3 "lasers.show.distance=20 m"')},
+        "my/pointer.yaml", 'safety_show safety.protection.filter=1e-3 "lasers.show.distance=20 m"')},
     "safety first_light laser=pointer +safety=camera": StandIn("a thousand draws", more=SAFETY[:1]),
     'safety first_light laser=pointer +safety=camera doe=vortex "lasers.pointer.power=uniform(1 mW, 5 mW)"': StandIn(
         "a thousand draws", more=SAFETY[:1]),
