@@ -67,12 +67,34 @@ def guarded() -> Iterator[None]:
     try:
         yield
     finally:
-        with _guard:
-            told = _inside.pop(here)
-            if told:
-                _raise_in(ctypes.c_ulong(here), None)  # not yet delivered: the code below raises it
+        try:
+            told = _leave(here)
+        except MemoryLimit:  # told at the last moment, and delivered only now
+            told = _leave(here)
     if told:
         raise MemoryLimit
+
+
+def _leave(here: int) -> bool:
+    """Watch a thread no longer; return True if it was told to stop, with no exception left to be delivered."""
+    with _guard:
+        told = _inside.pop(here, True)
+        if told:
+            _deliver(here)
+    return told
+
+
+def _deliver(here: int) -> None:
+    """Let the exception that this thread was told arrive here.
+
+    To withdraw it is not enough: CPython 3.11 and 3.12 would go on looking for it at every call, and hang under a tracer.
+    """
+    try:
+        _raise_in(ctypes.c_ulong(here), ctypes.py_object(MemoryLimit))  # in the place of one that is on its way
+        while True:
+            pass
+    except MemoryLimit:
+        return
 
 
 def _look() -> None:
