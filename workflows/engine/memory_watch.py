@@ -87,7 +87,7 @@ def _leave(here: int) -> bool:
 def _deliver(here: int) -> None:
     """Let the exception that this thread was told arrive here.
 
-    To withdraw it is not enough: CPython 3.11 and 3.12 would go on looking for it at every call, and hang under a tracer.
+    To withdraw it is not enough: CPython 3.11 and 3.12 would go on to look for it at every call, and hang if traced.
     """
     try:
         _raise_in(ctypes.c_ulong(here), ctypes.py_object(MemoryLimit))  # in the place of one that is on its way
