@@ -137,6 +137,8 @@ STAND_INS = {
         "studies.stability.stability_study:study": partial(stability_study.study, cases=CASES[:2])}),
     "study uncertainty my/uncertain.yaml --error 0.1 --points sobol": StandIn(
         "a thousand draws", instead={"0.1": "0.9"}, more=("--most", "64", "outputs=[saturated]")),
+    'study uncertainty first_light sensor.read_noise="normal(10.5 e-, 0.5 e-)"': StandIn(
+        "minutes: hundreds of draws of every output", more=("--most", "64", "outputs=[saturated]")),
     "study leave-out first_light": StandIn(
         "minutes: what simpler scenes cost is not measured", more=("outputs=[raw,lsr]",), constants={
             "studies.leave_out.leave_out_study:measure_scenes": lambda *_: []}),
@@ -175,7 +177,7 @@ STAND_INS = {
         "a minute", instead={**FIELD, "3": "1", "1e2,1e4,1e6": "1e2,1e4"}),
     f'{EVALUATE} --data photographs --pipelines "flat+none, half_ring+wiener, pixelwise@mask.npy+wiener"': StandIn(
         "20 scenes, a mask of 540 samples", instead={**FIELD, PIPELINES: PIPELINES.replace("mask", "mask_128")},
-        more=("--scenes", "1", "--strengths", "1e3")),
+        more=("--scenes", "1", "--strengths", "1e3", "+evaluate={mismatch: null}")),
     f'{EVALUATE} --pipelines "flat+none, five_half_rings+nafnet@net.safetensors" --reference flat+none': StandIn(
         "20 scenes", instead=FIELD, more=("--scenes", "1", "--strengths", "1e3")),
     "evaluate my/train_smallnet.yaml --scenes 3 --strengths 0,1e3 --pipelines "
