@@ -39,7 +39,11 @@ def test_the_terminal_has_limits_distances_eye_and_sources(neusee, tmp_path):
     text = page.read_text(encoding="utf-8")
     assert text.count("An estimate, no certificate") >= 5
     assert (page.parent / "limits.csv").read_text().startswith("protection,limit,effect")
-    assert {path.name for path in (page.parent / "figures").iterdir()} == {"irradiance.png", "distances.png"}
+    assert {path.name for path in (page.parent / "figures").iterdir()} == {
+        "irradiance.png",
+        "distances.png",
+        "dazzle.png",
+    }
 
 
 def test_json_is_one_object_and_says_why_there_is_no_dazzle_at_1550_nm(neusee):
@@ -65,7 +69,7 @@ def test_without_thresholds_the_estimate_says_that_damage_is_not_known():
 def test_a_mistake_ends_with_2_and_its_place(neusee):
     code, out, err = neusee("safety", "safety_pointer", "~lasers.pointer.distance")
     assert (code, out) == (2, "")
-    assert err.startswith("safety_pointer.yaml:7:3   lasers.pointer   needs distance\n1 problem, nothing was run")
+    assert err.startswith("safety_pointer.yaml:9:3   lasers.pointer   needs distance\n1 problem, nothing was run")
     code, _, err = neusee("safety", "train_small")
     assert code == 2
     assert "add the block safety" in err

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
@@ -194,6 +194,7 @@ def read_safety(
         diagnostics.append(Diagnostic(block.mark, KEY, f"must be a mapping of settings, not {kind(block)}"))
         return None
     before = len(diagnostics)
+    block = _located_in(block, root.mark.file)
     settings = _validated(SafetySettings, block, diagnostics)
     item = _laser_of(root, block, references, diagnostics)
     laser = None if item is None or broken(item) else _laser(item, diagnostics)
@@ -227,6 +228,17 @@ def _validated(model: type[Model], block: Value, diagnostics: list[Diagnostic]) 
     except ValidationError as error:
         diagnostics += (located(block, model, each) for each in error.errors())
         return None
+
+
+def _located_in(value: Value, file: str) -> Value:
+    """Return a mapping with the place where a file writes into it, in place of that in an option that came before."""
+    if not isinstance(value.data, dict):
+        return value
+    items = {key: _located_in(item, file) for key, item in value.data.items()}
+    own = next((item.key for item in items.values() if item.key.file == file), None)
+    if own is None or value.key.file == file:
+        return replace(value, data=items)
+    return replace(value, data=items, key=own, mark=own)
 
 
 def _laser_of(root: Value, block: Value, references: References, diagnostics: list[Diagnostic]) -> Value | None:

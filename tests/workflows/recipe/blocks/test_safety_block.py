@@ -43,7 +43,7 @@ MISTAKES = [
     ("unknown spot", ["+safety.damage.spot=wide"], "safety.damage.spot", "'diffraction' or 'published'"),
     ("no such table", ["+safety.damage.file=lost.csv"], "safety.damage.file", "no such file"),
     ("too many draws", ["+safety.draws=1000000"], "safety.draws", "less than or equal to 10000"),
-    ("no mapping", ["safety=5"], "safety", "must be a mapping of settings, not a number"),
+    ("no such option", ["safety=5"], "safety", "no option 5 in safety; there are: camera, masked_dazzle"),
 ]  # fmt: skip
 
 
@@ -73,8 +73,13 @@ def test_a_mask_that_is_no_step_is_found_before_anything_runs():
         estimate(load("safety_pointer", ["safety.protection.mask=lsr"]))
 
 
+def test_a_block_that_is_no_mapping_is_a_mistake():
+    with pytest.raises(RecipeError, match=r"safety +must be a mapping of settings, not a number"):
+        load("safety_car_lidar_1550", ["safety=5"])
+
+
 def test_null_is_no_estimate_and_a_run_needs_no_block():
-    assert load("safety_pointer", ["safety=null", "lasers.pointer={wavelength: 532 nm}"]).safety is None
+    assert load("safety_car_lidar_1550", ["safety=null", "lasers.lidar={wavelength: 1550 nm}"]).safety is None
     assert load("laser_free").safety is None
 
 
