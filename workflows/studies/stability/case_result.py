@@ -6,7 +6,8 @@ gradient is 1e-4 of its largest element, or ten times ``rtol`` if that is more.
 
 The gradient of a largest element is ill-conditioned, which is a warning, if a change of the inputs by at most four
 roundings to single precision alone changes it by its error or more: rounding decides which of several elements is the
-largest. No other gradient and no result is excused, because such a change of a height of 10 mm hides a phase in single
+largest. Another gradient is excused only where roundings to double precision do so: then nobody knows the reference.
+No other gradient and no result is, because roundings to single precision of a height of 10 mm hide a phase in single
 precision: a step computes its inputs as they are given.
 """
 
@@ -26,7 +27,9 @@ from neusee.workflows.store.serialization import each_tensor, tensors_in
 from neusee.workflows.studies.stability.extreme_cases import Case, stated_words
 from neusee.workflows.studies.stability.gradient_error import LEAST, cancelled, finite, moved_slopes, over, slope_error
 from neusee.workflows.studies.stability.step_runs import (
+    DOUBLE,
     HALVES,
+    SINGLE,
     Refused,
     as_used,
     in_double,
@@ -109,11 +112,12 @@ def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
             over(a, b, floor) * (cancelled(step, inputs, b, i, seed) if floor == LEAST else 1.0)
             for i, (a, b, floor) in scalars
         )
-    if slope is not None and slope > slope_bound and not coarse and step.node.path in _LARGEST:
-        moved = moved_slopes(step, inputs, seed, _ROUNDINGS)
+    precision, unit = ("single", SINGLE) if step.node.path in _LARGEST else ("double", DOUBLE)
+    if slope is not None and slope > slope_bound and not coarse:
+        moved = moved_slopes(step, inputs, seed, _ROUNDINGS, unit)
     cell = _marked(error, bound, slope, max(slope_bound, moved))
-    if moved and cell.mark != "fail":
-        changes = f"four roundings of the inputs alone change the gradient by {moved:.1e}"
+    if moved > slope_bound and cell.mark != "fail":
+        changes = f"four roundings of the inputs in {precision} precision alone change the gradient by {moved:.1e}"
         return replace(cell, mark="warn", note=f"ill-conditioned: {changes}")
     return cell
 

@@ -31,11 +31,11 @@ def slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
     return _apart(usual, truth, inputs)
 
 
-def moved_slopes(step: Step, inputs: list[Any], seed: int, draws: int) -> float:
-    """Return the largest change of the reference gradient by random roundings of the inputs."""
+def moved_slopes(step: Step, inputs: list[Any], seed: int, draws: int, unit: float) -> float:
+    """Return the largest change of the reference gradient by random roundings of the inputs by up to four ``unit``."""
     with torch.enable_grad():
         truth = true_slopes(step, inputs, seed)
-        each = [true_slopes(step, inputs, seed, draw=draw) for draw in range(draws)]
+        each = [true_slopes(step, inputs, seed, moved=(draw, unit)) for draw in range(draws)]
     return max((_apart(slopes, truth, inputs) for slopes in each if slopes and finite(slopes)), default=0.0)
 
 
@@ -57,10 +57,10 @@ def _slight(picture: Tensor) -> float:
 
 
 def true_slopes(
-    step: Step, inputs: list[Any], seed: int, part: int | None = None, draw: int | None = None
+    step: Step, inputs: list[Any], seed: int, part: int | None = None, moved: tuple[int, float] | None = None
 ) -> list[Tensor] | None:
-    """Return the gradients of the reference in float64: of a ``part`` of the result, at inputs rounded by ``draw``."""
-    wide = each_tensor(lambda x: x.double() if is_picture(x) else x, inputs) if draw is None else rounded(inputs, draw)
+    """Return the gradients of the reference in float64: of a ``part`` of the result, at inputs that `rounded` moved."""
+    wide = rounded(inputs, *moved) if moved else each_tensor(lambda x: x.double() if is_picture(x) else x, inputs)
     leaves = [id(w) for w, x in zip(tensors_in(wide), tensors_in(inputs), strict=True) if is_picture(x)]
     reference = step.node.hooks.reference
     ways = [partial(run, step, reference), partial(in_double, step)] if reference else [partial(in_double, step)]

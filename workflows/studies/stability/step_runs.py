@@ -13,6 +13,7 @@ from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.store.serialization import each_tensor, tensors_in
 
+SINGLE, DOUBLE = 2.0**-24, 2.0**-53  #: largest relative rounding
 HALVES = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}  #: largest relative rounding
 
 
@@ -57,13 +58,13 @@ def in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
         return run(step, step.node.fn, wide, seed, **precise)
 
 
-def rounded(inputs: Sequence[Any], draw: int) -> list[Any]:
-    """Return a step's inputs in float64, each element moved at random by up to four roundings in float32."""
+def rounded(inputs: Sequence[Any], draw: int, unit: float) -> list[Any]:
+    """Return a step's inputs in float64, each element moved at random by up to four roundings of ``unit``."""
     rng = torch.Generator().manual_seed(draw)
 
     def move(x: Tensor) -> Tensor:
         off = 2 * torch.rand(x.shape, generator=rng, dtype=torch.float64) - 1
-        return x.double() * (1 + 4 * 2.0**-24 * off)
+        return x.double() * (1 + 4 * unit * off)
 
     moved: list[Any] = each_tensor(lambda x: move(x) if is_picture(x) else x, list(inputs))
     return moved

@@ -276,6 +276,18 @@ def test_no_result_is_excused_by_the_rounding_of_its_inputs(picture):
     assert cell.bound == 1e-6
 
 
+@pytest.mark.parametrize(("turns", "off", "mark"), [(1e17, 2.0**-48, "warn"), (1e4, 2.0**-24, "fail")])
+def test_a_gradient_that_nobody_knows_in_double_precision_is_a_warning(turns, off, mark, picture):
+    @node()
+    def wavy(x: torch.Tensor) -> torch.Tensor:
+        phase = turns * x.double() * (1 + off * (x.dtype == torch.float32))
+        return (x.double() + torch.sin(phase) / turns).to(x.dtype)  # the gradient is 1 + cos(phase)
+
+    cell = judge_step(step_of(wavy), [picture], USUAL, 0)
+    assert cell.mark == mark, cell
+    assert ("in double precision" in cell.note) == (mark == "warn")
+
+
 def _plate(side=24):
     """The pupil of a mask of 10 mm, whose phase turns some 8600 times."""
     steps = torch.arange(side) - (side - 1) / 2
