@@ -45,7 +45,7 @@ def test_no_cell_of_a_shipped_recipe_fails(recipe, store, tmp_path):
         ("laser_free", "400 nm", "outside[plain]", "pass"),  # the difference of 1 and a sum in float32
         ("laser_free", "1 pixel", "loss background_loss of bsr[mask]", "pass"),  # a gradient of 0 in a loss of 1e4
         ("plain_lens", "700 nm", "spectral", "pass"),  # PSFs in float32 that differ by 1e-6
-        ("plain_lens", "huge", "deconvolved", "pass"),  # float32 around the dense solve lost the digits
+        ("plain_lens", "huge", "deconvolved", "warn"),  # roundings in float64 alone change the gradient
         ("axicon", "steps past pi", "level", "pass"),  # the maximum of two elements that rounding makes equal
         ("train_small", "two levels", "laser_psf[mask,drawn]", "warn"),  # 2.1e-6 in speckle
     ],
