@@ -109,12 +109,17 @@ def check_gradient(call: Call) -> Iterator[Finding]:
 
 def _slope_fault(function: Callable[[Tensor], tuple[Tensor, ...]], zero: Tensor) -> str:
     """Return what is wrong with the slopes of a function at ``zero``; no text if they are those of differences."""
-    results = [y for y in function(zero) if y.requires_grad]
+    follow = [y.requires_grad for y in function(zero)]
+
+    def followed(x: Tensor) -> tuple[Tensor, ...]:  # gradcheck pairs results wrongly where one of them has no slope
+        return tuple(y for y, has_slope in zip(function(x), follow, strict=True) if has_slope)
+
+    results = followed(zero)
     slope = torch.autograd.grad(results, zero, [torch.ones_like(y) for y in results])[0]
     if bad := int((~slope.isfinite()).sum()):
         return f"NaN or infinite for {bad} of {slope.numel()} values: see where a root, a logarithm or a quotient is 0"
     try:
-        gradcheck(function, (zero,), eps=_STEP, atol=_ATOL, rtol=_RTOL, fast_mode=True)
+        gradcheck(followed, (zero,), eps=_STEP, atol=_ATOL, rtol=_RTOL, fast_mode=True)
     except GradcheckError as error:
         both = _SLOPES.search(str(error))
         if both is None:
@@ -163,9 +168,17 @@ def check_shape(call: Call) -> Iterator[Finding]:
     if hook is None:
         return
     known = [each_tensor(lambda x: x.to("meta") if x.numel() > _FEW else x, value) for value in call.inputs]
-    told, there = tensors_in(hook(*known, **call.params)), tensors_in(call.result())
+    told, there = (_every_tensor(value) for value in (hook(*known, **call.params), call.result()))
     same = [tuple(x.shape) for x in told] == [tuple(x.shape) for x in there]
     yield Finding("shape", same, f"told {_shapes(told)}, is {_shapes(there)}")
+
+
+def _every_tensor(value: Any) -> list[Tensor]:
+    """Return the tensors in ``value``, one that stands at two places twice: a shape that is told may be shared."""
+    if isinstance(value, Tensor):
+        return [value]
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, (tuple, list)) else ()
+    return [x for each in inner for x in _every_tensor(each)]
 
 
 def _scaled(
