@@ -42,7 +42,7 @@ from tests.guide_commands import (
 )
 from tests.guide_stand_ins import LIGHT, SMALL_OPTIONS, STAND_INS, NotDeclared, StandIn, stand_in, typed
 
-pytestmark = [pytest.mark.filterwarnings("ignore::DeprecationWarning:typer"), pytest.mark.xdist_group("guide")]
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:typer")
 
 #: figures of a run that a page shows, by the words of the command; a test draws no others
 SHOWN: dict[tuple[str, ...], set[str]] = {}
@@ -128,7 +128,7 @@ def together(arguments: list[str], count: int) -> None:
     done = subprocess.run(
         [*start, "neusee.workflows.cli", *arguments], env=environment, capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.returncode == 0, done.stderr[-6000:]
     print(done.stdout)
 
 
@@ -163,6 +163,8 @@ def test_every_command_runs(words, place, reader, tmp_path, monkeypatch, capfd):
         carry_out("run first_light", place, monkeypatch)
         for name in set(re.findall(r"runs/\w+|\d{4}-\w+-\w+", words)):
             shutil.copytree((place / "runs" / "latest").resolve(), place / "runs" / Path(name).name)
+    if words == "train train_demonstration --stage 2":
+        carry_out("train train_demonstration --stage mask", place, monkeypatch)
     carry_out(words, place, monkeypatch)
     assert capfd.readouterr().out
 

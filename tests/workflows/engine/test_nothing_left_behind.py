@@ -28,7 +28,7 @@ steps:
     with: {material: fused silica, max_height: 1.2 um}
 outputs: [cone, made]
 """
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("growth")]  # one program, which draws and counts every object
+pytestmark = pytest.mark.slow
 COUNTED = (
     "files",
     "handlers",

@@ -154,5 +154,8 @@ def joined(text: str, device: str) -> Iterator[Mesh]:
     else:
         dist.init_process_group("gloo")
     groups = [dist.new_group(list(range(row * band, (row + 1) * band))) for row in range(data)]
-    yield Mesh(data, band, rank, groups[rank // band])
+    mesh = Mesh(data, band, rank, groups[rank // band])
+    yield mesh
+    object.__setattr__(mesh, "group", None)  # threads of a group that is held would run on while Python shuts down
+    groups.clear()
     dist.destroy_process_group()  # not after an error, because this process would wait for processes that have ended

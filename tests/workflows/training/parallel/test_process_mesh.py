@@ -173,6 +173,36 @@ def test_torchrun_starts_it_and_stops_all_where_one_fails(tmp_path):
     assert "--mesh 2x2 is for 4 processes and there are 2" in wrong.stderr
 
 
+LEAVES = """
+import sys
+from pathlib import Path
+import torch
+import torch.distributed as dist
+from neusee.workflows.training.parallel.process_mesh import joined
+
+def threads():
+    return [path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")]
+
+with joined("1x2", "cpu") as mesh:
+    dist.all_reduce(torch.ones(3), group=mesh.group)
+    assert "pt_gloo_runloop" in threads()
+Path(sys.argv[1], str(mesh.rank)).write_text(" ".join(threads()))  # the mesh is held
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads the names of threads from /proc")
+def test_no_thread_of_a_mesh_runs_on_after_it(tmp_path):
+    """Such a thread may ask for Python's lock while Python shuts down, and then ends the process with SIGABRT."""
+    (tmp_path / "leaves.py").write_text(LEAVES)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / ".src")}
+    start = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    done = subprocess.run([*start, tmp_path / "leaves.py", tmp_path], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for rank in "01":
+        assert "gloo" not in (tmp_path / rank).read_text()
+
+
 @pytest.mark.parametrize(("text", "world", "shape"), [("", 1, (1, 1)), ("", 4, (4, 1)), ("2x4", 8, (2, 4))])
 def test_a_mesh_is_read(text, world, shape):
     assert shape_of(text, world) == shape
