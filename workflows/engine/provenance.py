@@ -19,10 +19,10 @@ def versions() -> dict[str, str]:
 
 
 def version_of(package: str) -> str:
-    """Return the version of an installed package, or an empty string if the package is not installed."""
+    """Return the version of an installed package, or an empty string if it or its description is not there."""
     try:
-        return version(package)
-    except PackageNotFoundError:
+        return version(package) or ""
+    except (PackageNotFoundError, FileNotFoundError):  # the second comes from the package importlib_metadata
         return ""
 
 

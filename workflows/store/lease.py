@@ -123,7 +123,7 @@ class Leases:
         self._seen.pop(path, None)
         with _guard:
             _held.add(lease)
-            if _thread is None:
+            if _thread is None or not _thread.is_alive():
                 _thread = threading.Thread(target=_beat, name="neusee-leases", daemon=True)
                 _thread.start()
         return lease

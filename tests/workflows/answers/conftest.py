@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 
 from neusee.workflows.answers import opened_files
+from neusee.workflows.engine.provenance import versions
 
 
 @pytest.fixture
@@ -12,6 +13,7 @@ def place(tmp_path, monkeypatch):
     spec = importlib.util.spec_from_file_location("answered", Path(__file__).with_name("answered.py"))
     answered = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(answered)
+    versions()  # kept for the whole process, and not those of the packages that are made up here
     found = answered.Place(tmp_path, monkeypatch)
     assert found.again()
     assert not found.again()

@@ -240,6 +240,16 @@ def test_the_store_may_be_removed_under_a_run(tmp_path):
     assert Store(tmp_path / "cache").has(KEY)
 
 
+def test_a_heartbeat_that_ended_early_starts_again(tmp_path, monkeypatch):
+    ended = threading.Thread(target=list, name="neusee-leases ended")
+    ended.start()
+    ended.join()
+    monkeypatch.setattr(lease_module, "_thread", ended)
+    with Store(tmp_path).claim(KEY):
+        assert lease_module._thread is not ended
+        assert lease_module._thread.is_alive()
+
+
 def test_heartbeats_are_seen_while_a_lease_is_held_and_end_after_it(tmp_path, monkeypatch):
     monkeypatch.setattr(lease_module, "BEAT", 0.01)
     while any(t.name == "neusee-leases" for t in threading.enumerate()):
