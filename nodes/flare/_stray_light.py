@@ -12,7 +12,7 @@ from torch import Tensor
 from typing_extensions import TypedDict
 
 from neusee.nodes import Check, ParameterError, TensorStats, node
-from neusee.nodes._half_precision import single
+from neusee.nodes._half_precision import refuse_not_finite, single
 from neusee.nodes.flare._harvey_shack import NEAR, Lobe, lobe, on_pixels, scattered_share
 from neusee.nodes.units import Angle, PositiveLength, Wavelength
 from neusee.nodes.values import Psf, Pupil
@@ -89,7 +89,8 @@ def stray_light(
             that exceed the width of the core, and too sharp nearer, where l f is below that width.
             Scatter is taken as shift invariant, incidence as normal.
     Raises: ParameterError before the run for surfaces that scatter all light, and for a beam that is only some pixels
-            wide on the sensor; ValueError for these at any other wavelength, and for a PSF of other bands.
+            wide on the sensor; ValueError for these at any other wavelength, for a PSF of other bands, and for
+            an aperture that is not finite.
     Source: Peterson, Proc. SPIE 5178 (2004), 184 (in-field scatter of each surface by its beam); Harvey, thesis,
             Univ. of Arizona (1976); roughness: Stover, Optical Scattering, 3rd ed., ch. 4.
     """
@@ -130,7 +131,8 @@ def stray_shares(
     Shapes: psf, core (band, y, x), pupil (v, u) -> three of (band,).
     Units:  shares of the light through the clear pupil; their sum is the share that the pupil transmits.
     Error:  2e-7 of the captured light, from float32 PSFs.
-    Raises: ValueError for a PSF of other bands, and for surfaces that scatter all light.
+    Raises: ValueError for a PSF of other bands, for surfaces that scatter all light, and for an aperture that is not
+            finite.
     Source: energy conservation; total integrated scatter as in `stray_light`.
     """
     _same_bands(psf, pupil)
@@ -239,6 +241,7 @@ def _veil(lobes: list[tuple[Tensor, Lobe, Tensor]], centre: tuple[float, float],
 def _transmitted(pupil: Pupil) -> Tensor:
     """Return the share of the clear pupil's light that mask and dirt transmit, float64."""
     lit, clear = (x.double().square().sum() for x in (pupil.amplitude, pupil.aperture))
+    refuse_not_finite("no share of its light can be taken", aperture=clear)
     share: Tensor = lit / clear
     return share
 

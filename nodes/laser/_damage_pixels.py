@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
+from neusee.nodes._half_precision import single
 from neusee.nodes.laser._damage_laws import KINDS, Kind
 from neusee.nodes.laser._damage_spot import SpotDamage
 from neusee.nodes.sensor._digitization import Bits, crop
@@ -30,7 +31,8 @@ def damaged_pixels(
     `point` is a white pixel, `destruction` a black pixel, `line` a black row of a CMOS or a white column of a CCD,
     `cross` a black row and a black column, and `frame` a black frame. What stands later here covers what stands before.
 
-    Shapes: raw (channel, y, x), each pattern (y, x) of at least that size -> (channel, y, x).
+    Shapes: raw (channel, y, x), each pattern (y, x) of at least that size -> (channel, y, x), float32 for half
+            precision, which cannot hold the white of 16 bits.
     Units:  DN.
     Error:  a drawing of the published kinds of damage. Which neighbours a line takes with it, how bright a dead column
             is, and what changes later are left out.
@@ -43,7 +45,7 @@ def damaged_pixels(
     for each in damages or ():
         pattern |= crop(each.pattern, shape=shape).to(raw.device)
     white = float(max(1, min(2**bits - 1, int(full_well * gain - 0.5))))
-    drawn = raw.masked_fill(_of(pattern, "point"), white).masked_fill(_of(pattern, "destruction"), 0.0)
+    drawn = single(raw).masked_fill(_of(pattern, "point"), white).masked_fill(_of(pattern, "destruction"), 0.0)
     if device.casefold() == "ccd":
         drawn = drawn.masked_fill(_of(pattern, "line").any(-2, keepdim=True), white)
     else:

@@ -10,6 +10,8 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
+from neusee.nodes._half_precision import refuse_not_finite
+from neusee.nodes.torch_func import transformed
 from neusee.nodes.values import Bands, Psf
 
 Strengths = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...], Field(min_length=1)]
@@ -44,6 +46,7 @@ def dazzle_curve(
     Error:  light outside the window of the PSF counts nothing: choose a window that holds the area. `clear` is within
             7 % of the count for S from 1e4 where lambda N / p is above 2.5 or pixels sample a point, and is 0 for S up
             to 1; smaller spots that pixels average need `dazzled_pixels`.
+    Raises: ValueError for a PSF that is not finite.
     Source: Born and Wolf, Principles of Optics, 7th ed., section 8.5.2 (the Airy pattern and its far rings).
     """
     weights = bands.weights.double() * bands.centres.double()  # photons of each wavelength, whose wells they fill
@@ -51,6 +54,8 @@ def dazzle_curve(
     for weight, band in zip(weights.tolist(), psf.intensity.detach(), strict=True):
         light = light + weight * band.flatten().double()
     peak = float((weights * psf.clear_peak.detach().cpu()).sum())
+    if not transformed():
+        refuse_not_finite("its pixels cannot be counted", psf=light.sum(), clear_peak=peak)
     at = torch.tensor(strengths, dtype=torch.float64)
     ordered = light.sort().values.cpu()
     pixels = (len(ordered) - torch.searchsorted(ordered, level * peak / at)).double()

@@ -10,9 +10,11 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from neusee.nodes import Check, node
+from neusee.nodes._half_precision import refuse_not_finite
 from neusee.nodes.laser._dazzle_area import Rule, veil_limit
 from neusee.nodes.sensor._digitization import crop
 from neusee.nodes.sensor._saturation import Efficiency, Well
+from neusee.nodes.torch_func import transformed
 from neusee.nodes.units import Count, Electrons, Shape
 
 
@@ -52,12 +54,15 @@ def dazzle(
     Units:  photons, electrons and pixels.
     Error:  mean numbers without noise; 1e-6 of a threshold, so that a pixel there may fall on either side. Patterns of
             the sensor under the veil (PRNU) and the search of a viewer are left out.
+    Raises: ValueError for light that is not finite.
     Source: Rose, J. Opt. Soc. Am. 38, 196 (1948), for the threshold 5; Weber contrast by definition.
     """
     scene = crop(photons.detach(), shape=shape).double() * quantum_efficiency
     veil = torch.zeros_like(scene)
     for light in (*(lasers or ()), *(ghosts or ())):
         veil += crop(light.detach(), shape=shape).double() * quantum_efficiency
+    if not transformed():
+        refuse_not_finite("its dazzled pixels cannot be counted", photons=scene.sum(), laser=veil.sum())
     room = full_well - offset
     lost, filled = (scene >= room).any(-3), (scene + veil >= room).any(-3)
     background, mean = _over_feature(scene, feature), _over_feature(veil, feature)

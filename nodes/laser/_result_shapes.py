@@ -11,7 +11,7 @@ from neusee.nodes.laser._damage_spot import SpotDamage, damage, laws_before
 from neusee.nodes.laser._dazzle_curve import DECADES, DazzleCurve, dazzle_curve
 from neusee.nodes.laser._dazzle_picture import Dazzle, dazzle
 from neusee.nodes.laser._light import light, wavefront
-from neusee.nodes.shape_rules import blank, double, known, scalars, transform_operations
+from neusee.nodes.shape_rules import at_least_single, blank, double, known, scalars, transform_operations
 from neusee.nodes.values import Bands, LaserLight, Psf, Stop, Wavefront
 
 dazzle.shape(scalars(Dazzle))
@@ -43,7 +43,7 @@ def _(result: SpotDamage, spot: Tensor, *inputs: Any, **params: Any) -> tuple[fl
 
 @damaged_pixels.shape
 def _(raw: Tensor, *inputs: Any, **params: Any) -> Tensor:
-    return blank(*raw.shape, dtype=raw.dtype)
+    return blank(*raw.shape, dtype=at_least_single(raw))
 
 
 @dazzle_curve.shape

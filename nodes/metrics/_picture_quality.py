@@ -81,7 +81,10 @@ def _shown(picture: Tensor, domain: str) -> Tensor:
     from kornia.color import linear_rgb_to_rgb
 
     inside = picture.clamp(0, 1)
-    return linear_rgb_to_rgb(inside) if domain == "encoded" else inside
+    if domain == "linear":
+        return inside
+    encoded: Tensor = linear_rgb_to_rgb(inside)
+    return encoded.where(inside < 1, encoded - encoded.detach() + 1)  # float32 rounds 1.055 - 0.055 to less than 1
 
 
 def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:

@@ -184,7 +184,7 @@ CASES = {
     "metrics.peak_bsr": Case("0", (SCENE, PLAIN)),
     "metrics.peak_irradiance": Case("0", (SCENE, BANDS, LEVEL), WELL),
     "metrics.protection_bounds": Case("0.intensity", (WIDE,), {"electrons": 50.0, "read_noise": 3.0}),
-    "metrics.quality": Case("0", (PICTURE.float(), OTHER.float())),
+    "metrics.quality": Case("0", (PICTURE, OTHER)),
     "metrics.saturated": Case("0", (RAW,), ADC),
     "metrics.spectral_error": Case("0.height", (PUPIL, BANDS, LIGHT, RESPONSES), LENS),
     "optics.direction": Case("focal_length", (), {**LENS, "focal_length": number(0.11), "shape": (64, 64)}),

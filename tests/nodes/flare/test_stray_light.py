@@ -109,6 +109,15 @@ def test_heights_and_paths_have_no_effect_and_a_hole_in_the_amplitude_is_seen(fi
     assert flare.stray_light(core, dark, surfaces=THREE, **LENS).intensity.isnan().all()
 
 
+def test_a_pupil_without_end_is_refused():
+    source = pupil()
+    core, found = veiled(source, ONE)
+    source.aperture[3, 4] = torch.inf
+    for node, psfs in ((flare.stray_light, (core,)), (flare.stray_shares, (found, core))):
+        with pytest.raises(ValueError, match="aperture holds values that are not finite: no share of its light"):
+            node(*psfs, source, surfaces=ONE, **LENS)
+
+
 def test_a_mask_does_not_reduce_the_veil():
     """Blurring the scatter by the mask's own PSF, as the light does, changes the veil by less than 2 % far away."""
     one = WAVES[1:2]

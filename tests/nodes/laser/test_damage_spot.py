@@ -189,6 +189,14 @@ def test_each_kind_of_damage_has_its_pattern_in_the_frame(places, device, white,
         np.testing.assert_array_equal(channel.numpy(), expected)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_a_frame_in_half_precision_holds_the_white_of_sixteen_bits(dtype):
+    raw = torch.full((1, 5, 7), 100.0, dtype=dtype)
+    found = damaged_pixels(raw, [pattern(point=(2, 3))], full_well=1e6, gain=1.0)
+    assert found.dtype == torch.float32
+    assert float(found.max()) == 2**16 - 1
+
+
 def test_a_cross_is_a_row_and_a_column_and_lasers_add_up():
     raw = torch.full((1, 5, 7), 100.0)
     found = damaged_pixels(raw, [pattern(cross=(2, 3)), pattern(point=(4, 5))], full_well=1e6, gain=1.0, bits=8)[0]

@@ -75,6 +75,14 @@ def test_the_psf_of_the_clear_lens_dazzles_the_same_pixels(spread, half, points)
     np.testing.assert_allclose(found.pixels.numpy(), expected, rtol=0.02)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_psf_that_is_not_finite_has_no_curve(value):
+    found = psf(PAPER, 33)
+    found.intensity[0, 4, 5] = value
+    with pytest.raises(ValueError, match="psf holds values that are not finite: its pixels cannot be counted"):
+        dazzle_curve(found, LINE)
+
+
 def test_the_area_of_the_papers_camera_grows_with_the_power_0_64():
     strengths = tuple(np.logspace(1, 6, 21))
     pattern = airy(PAPER, 116, 1)

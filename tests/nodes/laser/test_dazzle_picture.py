@@ -93,3 +93,15 @@ def test_at_the_limit_the_veil_leaves_just_the_threshold(rule):
     left = 0.2 * background / (background + veil)
     snr = 0.2 * background * 10 / (background + veil + 64).sqrt()
     torch.testing.assert_close(left if rule == "contrast" else snr, torch.full_like(left, choice["threshold"]))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_light_that_is_not_finite_is_refused_and_named(value):
+    scene, light = torch.full((2, 24, 30), 600.0), spot(4000.0)
+    broken = scene.clone()
+    broken[1, 4, 5] = value
+    with pytest.raises(ValueError, match="photons holds values that are not finite: its dazzled pixels"):
+        dazzle(broken, [light], **SENSOR)
+    for lasers, ghosts in (([light, broken], None), ([light], [broken])):
+        with pytest.raises(ValueError, match="laser holds values that are not finite"):
+            dazzle(scene, lasers, ghosts, **SENSOR)

@@ -27,6 +27,7 @@ def empty_pattern():
     (damage, (SPOT, LINE, light(1.0)), SENSOR | {"pulse_duration": 1e-8}),
     (damage, (SPOT, LINE, light(30.0)), SENSOR | {"pulse_duration": 1e-8}),
     (damaged_pixels, (RAW, [empty_pattern()]), DEAD),
+    (damaged_pixels, (RAW.half(), [empty_pattern()]), DEAD),
     (dazzle, (RAW, [RAW]), PICTURE),
     (dazzle_curve, (Psf(SPOT, torch.ones(2, dtype=torch.float64)), LINE), {"strengths": (1.0, 2.0, 3.0)}),
     (dazzle_curve, (Psf(SPOT, torch.ones(2, dtype=torch.float64)), LINE), {}),

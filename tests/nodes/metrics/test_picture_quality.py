@@ -66,6 +66,20 @@ def test_both_are_clipped_to_what_can_be_shown():
     assert float(quality(-bright, white).psnr) == pytest.approx(0.0, abs=1e-5)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("bright", [1.0, 50.0])
+def test_white_in_place_of_black_is_an_error_of_exactly_one(bright, dtype):
+    """1.055 - 0.055 is 1 - 6e-8 in single precision: PSNR would be 3e-7 dB in place of 0 dB."""
+    found = quality(torch.full((3, 70, 12), bright, dtype=dtype), torch.zeros(3, 70, 12, dtype=dtype))
+    assert (float(found.l1), float(found.psnr)) == (1.0, 0.0)
+
+
+def test_white_has_the_gradient_of_the_curve_of_srgb():
+    white = torch.ones(3, 12, 12, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(quality(white, torch.zeros(3, 12, 12)).l1 * white.numel(), white)
+    torch.testing.assert_close(slope, torch.full_like(slope, 1.055 / 2.4))
+
+
 def test_the_border_does_not_count():
     truth = torch.rand(3, 21, 23)
     wrong = truth.clone()

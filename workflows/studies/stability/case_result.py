@@ -25,7 +25,7 @@ from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.report.study_page import Mark
 from neusee.workflows.store.serialization import each_tensor, tensors_in
 from neusee.workflows.studies.stability.extreme_cases import Case, stated_words
-from neusee.workflows.studies.stability.gradient_error import LEAST, cancelled, finite, moved_slopes, over, slope_error
+from neusee.workflows.studies.stability.gradient_error import LEAST, finite, moved_slopes, over, slope_error, terms
 from neusee.workflows.studies.stability.step_runs import (
     DOUBLE,
     HALVES,
@@ -46,7 +46,6 @@ _STEEPER = 10.0  #: ratio of the bound of a gradient to the bound of the result
 _DIM = 1e-3  #: share of the brightest element below which an element is dim
 _LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.add_photons")  #: nodes that must keep dim parts
 _LARGEST = ("metrics.peak_irradiance", "sensor.level")  #: nodes whose gradient is that of a largest element
-_DECIBELS = frozenset({("metrics.quality", "psnr")})  #: results in dB, whose error is one of a ratio: at least of 1 dB
 _HUGE = 1e30  #: the large number with which infinity is compared
 _ROUNDINGS = 10  #: random roundings of the inputs that are tried
 
@@ -104,14 +103,10 @@ def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
     coarse = max((HALVES.get(x.dtype, 0.0) for x in tensors_in(inputs)), default=0.0)  # of a gradient, as of its input
     slope_bound, moved = max(SLOPE, _STEEPER * bound, 2 * coarse), 0.0
     dim = case.expect == "dim part" and step.node.path.startswith(_LIGHT)
-    floors = _floors(step, truth)
-    error, slope = _dim_error(value, truth) if dim else _error(value, truth, floors), slope_error(step, inputs, seed)
+    error, slope = _dim_error(value, truth) if dim else _error(value, truth), slope_error(step, inputs, seed)
     if error > bound and all(x.ndim == 0 for x in tensors_in(truth)):
-        scalars = enumerate(zip(tensors_in(value), tensors_in(truth), floors, strict=True))
-        error = max(
-            over(a, b, floor) * (cancelled(step, inputs, b, i, seed) if floor == LEAST else 1.0)
-            for i, (a, b, floor) in scalars
-        )
+        scalars = enumerate(zip(tensors_in(value), tensors_in(truth), strict=True))
+        error = max(over(a, b, max(LEAST, terms(step, inputs, b, i, seed))) for i, (a, b) in scalars)
     precision, unit = ("single", SINGLE) if step.node.path in _LARGEST else ("double", DOUBLE)
     if slope is not None and slope > slope_bound and not coarse:
         moved = moved_slopes(step, inputs, seed, _ROUNDINGS, unit)
@@ -136,17 +131,10 @@ def _marked(error: float, bound: float, slope: float | None, steeper: float) -> 
     return Cell(mark, "near its bound" * near, error, bound, slope, None if slope is None else steeper)
 
 
-def _error(value: Any, truth: Any, floors: Sequence[float]) -> float:
+def _error(value: Any, truth: Any) -> float:
     """Return the largest difference of a result from the reference, relative to the reference's largest element."""
-    pairs = list(zip(tensors_in(value), tensors_in(truth), floors, strict=True))
-    return max((over(a, b, floor) for a, b, floor in pairs), default=0.0)
-
-
-def _floors(step: Step, truth: Any) -> list[float]:
-    """Return the least number to which the error of each tensor of a result relates: 1 of decibels, else tiny."""
-    names = getattr(truth, "_fields", ())
-    decibels = [name for name in names if (step.node.path, name) in _DECIBELS]
-    return [1.0 if decibels and names[i] in decibels else LEAST for i in range(len(list(tensors_in(truth))))]
+    pairs = list(zip(tensors_in(value), tensors_in(truth), strict=True))
+    return max((over(a, b, LEAST) for a, b in pairs), default=0.0)
 
 
 def _dim_error(value: Any, truth: Any) -> float:

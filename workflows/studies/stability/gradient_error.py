@@ -110,16 +110,16 @@ def _near(x: Tensor) -> float:
     return 10.0 ** round(math.log10(top) + 0.123) if LEAST < top < math.inf else 1.0
 
 
-def cancelled(step: Step, inputs: list[Any], truth: Tensor, part: int, seed: int) -> float:
-    """Return the inverse condition number of a scalar result f(x), |f| / sum |x df/dx|, but at most 1.
+def terms(step: Step, inputs: list[Any], truth: Tensor, part: int, seed: int) -> float:
+    """Return the sum of the terms of a scalar result f(x), sum |x df/dx|, beside which their rounding counts.
 
-    ``part`` is the position of ``truth`` among the scalars that the step returns.
+    Where terms cancel, f is smaller than this sum, which is 0 if it is not finite. ``part`` is the position of
+    ``truth`` among the scalars that the step returns.
     """
     with torch.enable_grad():
         slopes = true_slopes(step, inputs, seed, part) or []
     moved = sum(float((x.double() * g).abs().sum()) for x, g in zip(pictures_in(inputs), slopes, strict=False))
-    counted = float(_weight(truth)) * abs(float(truth)) / _near(truth)
-    return min(1.0, counted / moved) if moved > 0 else 1.0
+    return moved * _near(truth) / float(_weight(truth)) if math.isfinite(moved) else 0.0
 
 
 def over(a: Tensor, b: Tensor, floor: float) -> float:

@@ -30,8 +30,8 @@ _HOW = """Each step has the inputs of the recipe, at a small size, with one chan
 result of an earlier step, or the pictures among the inputs of the step. A random height map of the same depth takes the
 place of a mask from a file, whose samples do not fit the small pupil. The result is compared with the node's own
 reference, or with the same function on the same inputs in float64. The error is the largest difference over the
-largest element, and the bound is the node's rtol (at least 1.2e-7, the rounding of single precision). A result in dB
-counts with at least 1 dB, because 0 dB is a ratio of 1.
+largest element, and the bound is the node's rtol (at least 1.2e-7, the rounding of single precision). A
+single number f in which terms cancel counts with the sum of its terms, sum |x df/dx| over the pictures.
 
 The second error is that of the gradient of a weighted sum of the result with respect to every picture, over the
 gradient's largest element; the bound is 1e-4, or ten times the node's rtol if that is more. An error above half of its

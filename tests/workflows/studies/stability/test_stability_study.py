@@ -234,8 +234,9 @@ def test_a_slope_beyond_the_type_of_its_picture_is_no_fault_of_the_step(picture)
     assert judge_step(step_of(steep), [picture], BY_NAME["float16"], 0).mark == "pass"
 
 
-def test_cancellation_counts_in_each_scalar_of_a_result(picture):
-    signed = torch.cat([picture, -picture.flip(-1) * (1 + 1e-6)])
+@pytest.mark.parametrize("left", [1e-6, 0.0])
+def test_cancellation_counts_in_each_scalar_of_a_result(left, picture):
+    signed = torch.cat([picture, -picture.flip(-1) * (1 + left)])
 
     @node()
     def exact(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -243,15 +244,17 @@ def test_cancellation_counts_in_each_scalar_of_a_result(picture):
 
     @node()
     def wrong(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return x.abs().mean(), x.sum() + (1e-3 * x.abs().sum() if x.dtype == torch.float32 else 0.0)
+        return x.abs().mean(), x.sum() + (1e-3 * x.abs().sum().detach() if x.dtype == torch.float32 else 0.0)
 
     assert judge_step(step_of(exact), [signed], BY_NAME["usual"], 0).mark != "fail"
     assert judge_step(step_of(wrong), [signed], BY_NAME["usual"], 0).mark == "fail"
 
 
-@pytest.mark.parametrize(("off", "mark"), [(0.0, "pass"), (1e-2, "fail")])
-def test_a_picture_that_is_white_in_place_of_black_has_a_psnr_of_zero_decibels(off, mark, monkeypatch):
-    """4e-7 dB beside 1e-16 dB are a rounding; a hundredth of a dB is a fault."""
+@pytest.mark.parametrize(("white", "off", "mark"), [
+    (1.0, 0.0, "pass"), (1.0, 1e-2, "fail"), (1e8, 0.0, "pass"), (1e8, 3e-7, "fail"),
+])  # fmt: skip
+def test_a_picture_that_is_white_in_place_of_black_has_a_psnr_of_zero_decibels(white, off, mark, monkeypatch):
+    """The rounding of a pixel counts in the PSNR; a pixel that is cut off at white has none."""
     quality = find_node("metrics.quality")
     fn, params = quality.fn, quality.params().model_dump()
 
@@ -261,7 +264,7 @@ def test_a_picture_that_is_white_in_place_of_black_has_a_psnr_of_zero_decibels(o
 
     monkeypatch.setattr(quality, "fn", changed)
     step = Step("quality", quality, params, {}, Location("test"), {})
-    cell = judge_step(step, [torch.ones(3, 12, 12), torch.zeros(3, 12, 12)], extreme_cases.USUAL, 0)
+    cell = judge_step(step, [torch.full((3, 12, 12), white), torch.zeros(3, 12, 12)], extreme_cases.USUAL, 0)
     assert cell.mark == mark, cell
 
 
