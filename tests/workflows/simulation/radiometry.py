@@ -62,16 +62,36 @@ def irradiance(wavelength, laser, radii, exposure, points=600):
     return LENS["transmittance"] * np.abs(2 * math.pi * bessel @ field / (wavelength * LENS["focal"])) ** 2
 
 
+def sampled_irradiance(wavelength, laser, y, x, exposure, samples=540):
+    """Irradiance on the sensor in W/m2 at the places (y, x) by a sum over the samples of the pupil inside its rim.
+
+    The rim is a staircase, whose samples stand for the area of the disc.
+    """
+    w, curvature = beam_at_lens(wavelength, laser)
+    axis = 2 * mean_power(laser, exposure) * haze(laser["wavelength"], laser) / (math.pi * w**2)
+    at = (np.arange(samples) - (samples - 1) / 2) * LENS["diameter"] / samples
+    square = at[:, None] ** 2 + at**2
+    inside = square <= LENS["diameter"] ** 2 / 4
+    field = inside * np.exp(-square / w**2 + 1j * math.pi / wavelength * square / curvature)
+    rows, columns = (np.exp(-2j * math.pi / (wavelength * LENS["focal"]) * np.outer(to, at)) for to in (y, x))
+    step = math.pi * LENS["diameter"] ** 2 / 4 / inside.sum() * (LENS["diameter"] / samples) ** 2
+    return LENS["transmittance"] * axis * step * np.abs(rows @ field @ columns.T / (wavelength * LENS["focal"])) ** 2
+
+
 def electrons(laser, radii, exposure, efficiency):
-    """Electrons of a pixel at its centre: the Gaussian line times photons per joule times quantum efficiency."""
+    """Electrons of a pixel at its centre, at distances from the middle of the spot."""
+    return line_electrons(laser, exposure, efficiency, lambda nm: irradiance(nm, laser, radii, exposure))
+
+
+def line_electrons(laser, exposure, efficiency, light, nodes=9):
+    """Electrons of pixels: the Gaussian line times photons per joule times quantum efficiency."""
     sigma = laser["fwhm"] / (2 * math.sqrt(2 * math.log(2)))
-    x, weight = special.roots_hermitenorm(9)
-    total = np.zeros(len(radii))
-    for offset, share in zip(x * sigma, weight / weight.sum(), strict=True):
-        nm = laser["wavelength"] + offset
-        photons = nm / (PLANCK * LIGHT) * irradiance(nm, laser, radii, exposure) * exposure * PIXEL**2
-        total += share * efficiency(nm) * photons
-    return total
+    x, weight = special.roots_hermitenorm(nodes)
+    wavelengths = laser["wavelength"] + x * sigma
+    return sum(
+        share * efficiency(nm) * nm / (PLANCK * LIGHT) * light(nm) * exposure * PIXEL**2
+        for nm, share in zip(wavelengths, weight / weight.sum(), strict=True)
+    )
 
 
 def white_electrons(lux, spectrum, luminous, efficiency, band, exposure):
