@@ -2,6 +2,7 @@
 
 from neusee.nodes.doe import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.doe._analytic_masks import axicon, cubic, flat, half_rings, spiral_axicon, vortex, zernike
+from neusee.nodes.doe._equal_filter import equal_filter
 from neusee.nodes.doe._fabrication_limits import fabricate
 from neusee.nodes.doe._glass_table import index_rows
 from neusee.nodes.doe._height_map_files import read_height_map
@@ -27,6 +28,7 @@ __all__ = [
     "Written",
     "axicon",
     "cubic",
+    "equal_filter",
     "fabricate",
     "flat",
     "half_rings",

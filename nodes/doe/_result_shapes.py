@@ -5,6 +5,7 @@ from typing import Any
 from torch import Tensor
 
 from neusee.nodes.doe._analytic_masks import axicon, cubic, flat, half_rings, spiral_axicon, vortex, zernike
+from neusee.nodes.doe._equal_filter import equal_filter
 from neusee.nodes.doe._fabrication_limits import fabricate
 from neusee.nodes.doe._minimum_feature import smooth
 from neusee.nodes.doe._refractive_index import material
@@ -14,6 +15,7 @@ from neusee.nodes.doe._unet_height_map import unet
 from neusee.nodes.shape_rules import blank, double, like_first
 from neusee.nodes.values import Bands, Shade, Stop
 
+equal_filter.shape(like_first)
 fabricate.shape(like_first)
 smooth.shape(like_first)
 

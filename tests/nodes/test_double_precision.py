@@ -255,6 +255,13 @@ def filtered(psf, illuminant, responses, bands, *, electrons, read_noise, glare,
     return np.array(columns, L).T
 
 
+def weakest(light, lsr, bands, lines):
+    """The light times the largest of the ratios at the band that is nearest to the mean of each line."""
+    centres = [float((x.centres * x.weights).sum() / x.weights.sum()) for x in lines]
+    found = [exact(lsr)[np.abs(np.asarray(bands.centres) - c).argmin()] for c in centres]
+    return exact(light) * min(max(found), L(1))
+
+
 def warmed(psf, plain, *, pixel_pitch, dwell):
     """Heat of the hottest pixel over that of the clear lens: every pixel warms every pixel of silicon."""
     import mpmath
@@ -373,6 +380,7 @@ def rng():
 PROTECTED = {"light": 70.0, "read_noise": 3.7, "veil": 11.0, "limit": 0.03, "transmittance": 0.9, "contrast": 0.2,
              "up_to": 0.41}  # fmt: skip
 CASES = [
+    case(doe.equal_filter, (IMAGE, ILLUMINANT, BANDS, [BANDS]), weakest),
     case(doe.fabricate, (HEIGHT,), wrapped, {"wrap_at": 550e-9}),
     case(doe.fabricate, (HEIGHT,), stepped, {"max_height": 9.1e-5, "levels": 5}),
     case(doe.material, (BANDS,), lambda b: fused_silica(b.centres)),

@@ -139,6 +139,7 @@ CASES = {
     "calibrate.sufficient": Case("0.mean", (LEVELS,)),
     "doe.axicon": Case("waves", (STOP,), {"waves": number(2.0)}),
     "doe.cubic": Case("waves", (STOP,), {"waves": number(2.0)}),
+    "doe.equal_filter": Case("1", (RAW, rand(4), BANDS, [LINE])),
     "doe.fabricate": Case("0", (HEIGHT,), {"wrap_at": 550e-9, "levels": 4}),
     "doe.half_rings": Case("waves.0", (STOP,), {"waves": [number(2.0), number(1.0)]}),
     "doe.material": Case("0.centres", (BANDS,)),

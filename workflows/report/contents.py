@@ -17,7 +17,7 @@ A leading ``?`` marks an optional argument: if the recipe lacks the step, the fi
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import resources
 
@@ -53,7 +53,9 @@ TABLE: Mapping[str, Mapping[str, str]] = {
     "plain lens": _row("plain"),
     "with mask": _row("mask"),
     "restored": {"quality": "restored_quality"},
+    "grey filter, restored": {"quality": "rival_quality", "saturated": "rival_saturated"},
 }
+RIVAL = "grey filter, restored"
 
 #: Steps that give the error by the number of bands, by what they are the error of.
 SPECTRAL: Mapping[str, str] = {"spectral": "of the PSF of a white point", "laser_spectral": "of a laser spot"}
@@ -68,13 +70,29 @@ FILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
 
 
 def wanted(recipe: Recipe) -> tuple[str, ...]:
-    """Return the steps that a run must give: the outputs, the steps of the expected numbers, and the spectral errors.
+    """Return the steps that a run must give: outputs, steps of expected numbers, spectral errors, and a mask's rival.
 
-    An expected number counts if an output needs its step, and a spectral error if the outputs need all its inputs.
+    An expected number counts if an output needs its step, and a spectral error if the outputs need all its inputs. The
+    rival of a mask counts if the outputs tell how the mask protects and how the restored picture looks.
     """
     asked = _asked(recipe)
     errors = (name for name in spectral_steps(recipe) if asked.issuperset(recipe.steps[name].sources))
-    return tuple(dict.fromkeys([*recipe.outputs, *(e.step for e in compared(recipe)[0]), *errors]))
+    numbers = (e.step for e in compared(recipe)[0])
+    return tuple(dict.fromkeys([*recipe.outputs, *numbers, *errors, *_rival(recipe, asked)]))
+
+
+def _rival(recipe: Recipe, asked: set[str]) -> Iterable[str]:
+    """Return the steps of the grey filter that is the rival of a mask; none if the recipe has a filter of its own."""
+    steps = TABLE[RIVAL].values()
+    told = asked.issuperset((TABLE["with mask"]["LSR"], *TABLE["restored"].values()))
+    return steps if told and not shade_of(recipe) and recipe.steps.keys() >= set(steps) else ()
+
+
+def shade_of(recipe: Recipe) -> str | None:
+    """Return the step of the grey filter, stop or notch in the arm of the mask, or None."""
+    pupil = recipe.steps.get("pupil[mask]")
+    shade = pupil.wires.get("shade") if pupil else None
+    return shade if isinstance(shade, str) else None
 
 
 def compared(recipe: Recipe) -> tuple[list[Expectation], list[Expectation]]:

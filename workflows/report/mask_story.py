@@ -1,4 +1,4 @@
-"""What a mask buys and what it costs in a run, in sentences with the numbers of the run, and what could replace it."""
+"""What a mask, filter or stop buys and costs in a run, in sentences with the numbers of the run, and its rival."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.report.contents import RIVAL, shade_of
 from neusee.workflows.report.result_numbers import Value, arms, lines_of, suppressed
 
 SENTENCES = ("buys", "costs", "rival")
@@ -23,46 +24,66 @@ def story(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, An
     """Return the sentences on what the mask of a run buys and costs, and their numbers; nothing without a pair."""
     numbers = {name: _known(cells) for name, cells in arms(recipe, keys, value).items()}
     lsr = suppressed(recipe, keys, value)
-    said = sentences(numbers, lsr, bool(lines_of(recipe, keys)))
-    shaded = "pupil[mask]" in recipe.steps and recipe.steps["pupil[mask]"].wires.get("shade")
-    said |= {} if shaded or not said else rival(lsr)
+    said = sentences(numbers, lsr, bool(lines_of(recipe, keys)), element(recipe))
+    said |= {} if shade_of(recipe) or not said else rival(lsr, numbers)
     return {**said, "numbers": {name: numbers[name] for name in numbers if said}, "lsr": lsr if said else {}}
 
 
-def sentences(numbers: Mapping[str, Arm], lsr: Mapping[str, float], laser: bool) -> dict[str, str]:
+def element(recipe: Recipe) -> str:
+    """Return what stands in the arm of the mask: a mask, a stop, a filter, several of these, or a flat plate."""
+    height, shade = recipe.steps.get("height"), recipe.steps.get(shade_of(recipe) or "")
+    parts = [] if height and height.node.path == "doe.flat" else ["mask"]
+    if shade:
+        kinds = {"smaller stop": "diameter", "grey filter": "transmittance"}
+        parts += [kind for kind, name in kinds.items() if shade.params.get(name, 1.0) < 1]
+        parts += ["notch filter"] * bool(shade.params.get("notches"))
+    return " and ".join(parts) or "flat plate"
+
+
+def sentences(
+    numbers: Mapping[str, Arm], lsr: Mapping[str, float], laser: bool, element: str = "mask"
+) -> dict[str, str]:
     """Return the sentences ``buys`` and ``costs`` from the numbers of plain lens, mask and restored picture.
 
     ``lsr`` has the laser suppression ratio of the mask by wavelength of each laser. ``laser`` is False if no laser
-    shines. A sentence whose numbers a run does not have for both the plain lens and the mask is left out.
+    shines. ``element`` is what stands in place of the mask, such as ``grey filter``. A sentence whose numbers a run
+    does not have for both the plain lens and the mask is left out.
     """
     plain, mask = numbers.get(PLAIN, {}), numbers.get(MASK, {})
     if not plain or not mask:
         return {}
-    texts = _buys(plain, mask, lsr, laser), _costs(plain, mask, numbers.get(RESTORED, {}), laser)
+    restored = numbers.get(RESTORED, {})
+    texts = _buys(plain, mask, lsr, laser, element), _costs(plain, mask, restored, laser, element)
     return {name: text for name, text in zip(SENTENCES[:2], texts, strict=True) if text}
 
 
-def rival(lsr: Mapping[str, float]) -> dict[str, str]:
+def rival(lsr: Mapping[str, float], numbers: Mapping[str, Arm]) -> dict[str, str]:
     """Return the sentence ``rival``: the grey filter that weakens each laser at least as much, if the mask does at all.
 
-    Its picture is that of another run, which takes as long as this one: no step of this run computes it.
+    The picture behind this filter has its numbers if the run computed them, and else the command that computes them.
     """
     share = max(lsr.values(), default=1.0)
     if share >= _LEAST:
         return {}
-    grey = f"{share:.3g}"
-    text = f"A grey filter that passes {grey} of the light weakens the laser as much: for its picture, restored alike, "
-    return {"rival": f"{text}run this recipe with doe=grey_filter doe.transmittance={grey}."}
+    text = f"A grey filter that passes {share:.3g} of the light weakens the laser as much: "
+    command = f"doe=grey_filter doe.transmittance={share:.3g}"
+    found, restored = numbers.get(RIVAL, {}), numbers.get(RESTORED, {})
+    if _QUALITY not in found:
+        return {"rival": f"{text}for its picture, restored alike, run this recipe with {command}."}
+    against = f" against {restored[_QUALITY]:.1f} dB behind the mask" if _QUALITY in restored else ""
+    picture = f"its picture, restored by a Wiener filter, has a PSNR of {found[_QUALITY]:.1f} dB{against}"
+    count = "no pixel saturates" if not found.get(_LOST) else f"{found[_LOST]:,.0f} pixels saturate"
+    return {"rival": f"{text}{picture}{f'; {count}' if _LOST in found else ''} ({command})."}
 
 
 def _known(cells: Arm) -> dict[str, float]:
     return {name: number for name, number in cells.items() if not math.isnan(number)}
 
 
-def _buys(plain: Arm, mask: Arm, lsr: Mapping[str, float], laser: bool) -> str:
+def _buys(plain: Arm, mask: Arm, lsr: Mapping[str, float], laser: bool, element: str) -> str:
     """Return a sentence with the irradiance of the brightest pixel without and with the mask, and the LSR."""
     if not (plain.get(_PEAK, 0.0) > 0 and mask.get(_PEAK, 0.0) > 0):
-        return _suppression(lsr)
+        return _suppression(lsr, element)
     less = plain[_PEAK] / mask[_PEAK]
     ends = f"{_number(mask[_PEAK])} in place of {_number(plain[_PEAK])} times saturation"
     if abs(less - 1) < _EQUAL:
@@ -72,19 +93,21 @@ def _buys(plain: Arm, mask: Arm, lsr: Mapping[str, float], laser: bool) -> str:
         much = f"{_number(ratio)} times" if ratio >= _TIMES else f"{100 * abs(1 / less - 1):.0f} %"
         change = f"the brightest pixel receives {much} {word} light than behind the plain lens ({ends}"
     if not laser:
-        return f"No laser shines here, from which the mask could protect the sensor: {change})."
+        return f"No laser shines here, from which the {element} could protect the sensor: {change})."
     bought = (
         "protection for" if less >= _TIMES else "little protection for" if less >= 1 + _EQUAL else "no protection of"
     )
-    return f"The mask buys {bought} the sensor: {change}{'; ' * bool(lsr)}{_ratios(lsr)})."
+    verb = "buy" if _several(element) else "buys"
+    return f"The {element} {verb} {bought} the sensor: {change}{'; ' * bool(lsr)}{_ratios(lsr)})."
 
 
-def _suppression(lsr: Mapping[str, float]) -> str:
+def _suppression(lsr: Mapping[str, float], element: str) -> str:
     """Return a sentence with the LSR of the mask alone, for a run that does not compute the irradiance."""
     if not lsr:
         return ""
     bought = "a weaker laser" if max(lsr.values()) < 1 - _EQUAL else "no weaker laser here"
-    return f"The mask buys {bought}: {_ratios(lsr)} of the peak behind the clear lens."
+    verb = "buy" if _several(element) else "buys"
+    return f"The {element} {verb} {bought}: {_ratios(lsr)} of the peak behind the clear lens."
 
 
 def _ratios(lsr: Mapping[str, float]) -> str:
@@ -96,34 +119,42 @@ def _ratios(lsr: Mapping[str, float]) -> str:
     return f"LSR {first}" if len(lsr) == 1 else f"LSR from {first} to {last}"
 
 
-def _costs(plain: Arm, mask: Arm, restored: Arm, laser: bool) -> str:
+def _costs(plain: Arm, mask: Arm, restored: Arm, laser: bool, element: str) -> str:
     """Return a sentence with the picture quality and the saturated pixels without and with the mask."""
-    parts = [part for part in (_picture(plain, mask, restored), _saturation(plain, mask, laser)) if part]
+    texts = _picture(plain, mask, restored, element), _saturation(plain, mask, laser, element)
+    parts = [part for part in texts if part]
     return f"{'; '.join(parts)}." if parts else ""
 
 
-def _picture(plain: Arm, mask: Arm, restored: Arm) -> str:
+def _picture(plain: Arm, mask: Arm, restored: Arm, element: str) -> str:
     if _QUALITY not in plain or _QUALITY not in mask:
         return ""
     before, behind, after = (arm.get(_QUALITY, -math.inf) for arm in (plain, mask, restored))
     end = f", and {after:.1f} dB after restoration" if _QUALITY in restored else ""
-    text = f"PSNR {before:.1f} dB with the plain lens{',' if end else ' and'} {behind:.1f} dB with the mask{end}"
+    text = f"PSNR {before:.1f} dB with the plain lens{',' if end else ' and'} {behind:.1f} dB with the {element}{end}"
+    verb = "cost" if _several(element) else "costs"
     if behind >= before:
-        return f"The mask costs no picture quality here: {text}"
-    return f"The mask costs picture quality{', which restoration wins back' if after >= before else ''}: {text}"
+        return f"The {element} {verb} no picture quality here: {text}"
+    return f"The {element} {verb} picture quality{', which restoration wins back' if after >= before else ''}: {text}"
 
 
-def _saturation(plain: Arm, mask: Arm, laser: bool) -> str:
+def _saturation(plain: Arm, mask: Arm, laser: bool, element: str) -> str:
     """Return how many pixels saturate with the mask and with the plain lens, and that a laser dazzles more of them."""
     if _LOST not in plain or _LOST not in mask:
         return ""
     with_mask, without = (f"{arm[_LOST]:,.0f}" for arm in (mask, plain))
     if with_mask == without == "0":
         return "no pixel saturates"
-    same = f"{with_mask} pixels saturate with and without the mask"
-    text = same if with_mask == without else f"{with_mask} pixels saturate with the mask, {without} without"
+    same = f"{with_mask} pixels saturate with and without the {element}"
+    text = same if with_mask == without else f"{with_mask} pixels saturate with the {element}, {without} without"
     wider = mask[_LOST] / plain[_LOST] if laser and plain[_LOST] > 0 else 0.0
-    return f"{text}: the mask enlarges the dazzled area {_number(wider)} times" if wider > 1 + _EQUAL else text
+    verb = "enlarge" if _several(element) else "enlarges"
+    return f"{text}: the {element} {verb} the dazzled area {_number(wider)} times" if wider > 1 + _EQUAL else text
+
+
+def _several(element: str) -> bool:
+    """Return True for a mask with a filter or stop, which takes a verb in the plural."""
+    return " and " in element
 
 
 def _number(value: float) -> str:

@@ -27,16 +27,24 @@ MOST = 100
 ENOUGH = 1e-5  #: squared distance for each seen pixel, in units of the posterior, at which the iteration ends. The
 #: residual underestimates this distance by a factor of 10 to 30, because it underestimates the slowest modes
 _ONCE = "the deconvolution has no second derivative: differentiate without create_graph=True"
+ALONE = 0.1  #: factor of ENOUGH for the finest grid alone, which has no coarser grid to start from
 CAREFUL = 8.0  #: factor by which the tolerance falls with each coarser grid, whose steps are cheap
 
 
-def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH) -> Tensor:
-    """Return half the spectrum of the most likely picture before the blur, given the seen pixels and the prior."""
+def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH, coarser: bool = True) -> Tensor:
+    """Return half the spectrum of the most likely picture before the blur, given the seen pixels and the prior.
+
+    Without ``coarser`` grids the steps start from a picture without contrast, which suits a narrow PSF alone.
+    """
     tensors = (seen.picture, seen.weight, seen.transfer, *seen.glare)
     with torch.no_grad():
         alone = _fixed(seen)
         lower = seen.picture.new_empty(0) if halvings(_size(seen)) else _factor(alone)
-        x = _solved(alone, lower, steps, enough * float((seen.weight > 0).sum()))
+        enough = enough * float((seen.weight > 0).sum())
+        if coarser or lower.numel():
+            x = _solved(alone, lower, steps, enough)
+        else:
+            x = descend(alone, torch.zeros_like(alone.transfer), MOST, ALONE * enough)
     followed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     if not (followed or transformed()):
         return x

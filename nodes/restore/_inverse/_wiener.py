@@ -44,6 +44,7 @@ def wiener(
     *,
     balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     doubt: Doubt = 0.0,
+    coarser_grids: bool = True,
     read_noise: Electrons,
 ) -> Tensor:
     """Deconvolve a picture with a known PSF: compute the most likely scene, given the pixels that are not clipped.
@@ -56,7 +57,8 @@ def wiener(
     `doubt` is the standard deviation of a pattern in each pixel over its value there: the variance of the noise grows
     by (doubt x glare)^2. `nearby` has other possible patterns of each glare, as `restore.nearby_glare` computes them:
     their differences from the glare, averaged over the patterns, are its covariance. The glare in a variance is a
-    least-squares estimate, in which uncertain pixels count less.
+    least-squares estimate, in which uncertain pixels count less. The iteration starts from the answer on
+    `coarser_grids`; without these it starts from a picture without contrast: faster, and right for a plain lens alone.
 
     Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses (channel, band),
             each glare and ghost (channel, at least y, at least x), cropped to the centre, each nearby
@@ -67,9 +69,10 @@ def wiener(
             laser that does not clip is taken for scene. The result may be negative: beside lamps hundreds of
             times as bright as the scene it rings. The iteration ends by its residual, or after 20 steps on the finest
             grid: behind five half-rings rms 0.005 to 0.02 of the contrast from the converged answer (512 to 2048 pixels
-            a side), behind a plain lens 1e-3. Gradients: of the exact answer, first order only. Up to 256 pixels a
-            side all is float64, and rounding adds 1e-6 to both (`rtol` holds there); in wider pictures float32 adds
-            3e-4 to the result and up to 2e-3 to the gradients; in pictures of 1e7 e-, 2e-2 and 8e-2.
+            a side), behind a plain lens 1e-3, and 3e-3 without coarser grids. Gradients: of the exact answer, first
+            order only. Up to 256 pixels a side all is float64, and rounding adds 1e-6 to both (`rtol` holds there); in
+            wider pictures float32 adds 3e-4 to the result and up to 2e-3 to the gradients; in pictures of 1e7 e-, 2e-2
+            and 8e-2.
     Raises: ValueError where shapes or bands differ, and for pictures and PSFs that are not finite.
     Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; as least squares with a
             prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.
@@ -83,7 +86,7 @@ def wiener(
     patterns, others, ghostly = ([crop(x.to(fine), shape=size) for x in g or ()] for g in (glare, nearby, ghosts))
     known = (~clipped).to(fine)
     light = visible([*patterns, *ghostly], [*others, *[None] * (len(patterns) + len(ghostly) - len(others))], known)
-    return _restored(fine, known, kernels, light, (balance, read_noise, doubt)).to(electrons)
+    return _restored(fine, known, kernels, light, (balance, read_noise, doubt), coarser_grids).to(electrons)
 
 
 @wiener.check
@@ -150,7 +153,12 @@ def grey_shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
 
 
 def _restored(
-    electrons: Tensor, known: Tensor, kernels: Tensor, glare: Glare, settings: tuple[float, float, float]
+    electrons: Tensor,
+    known: Tensor,
+    kernels: Tensor,
+    glare: Glare,
+    settings: tuple[float, float, float],
+    coarser: bool,
 ) -> Tensor:
     """Deconvolve a picture: scale the scene to mean 0 and variance 1, solve this problem, and scale the result back."""
     y, x = electrons.shape[-2:]
@@ -168,7 +176,8 @@ def _restored(
     weight = known * (scale / noise.sqrt()).square()
     scaled = tuple(pattern / scale for pattern in (*glare.patterns, *light.modes))
     centred = (picture - mean) / scale
-    spectrum = most_likely(Blurred(centred, weight, transfer, power, size, _GREY, scaled, bounded=len(light.modes)))
+    problem = Blurred(centred, weight, transfer, power, size, _GREY, scaled, bounded=len(light.modes))
+    spectrum = most_likely(problem, coarser=coarser)
     sharp = torch.stack([torch.fft.irfft2(s, s=size)[:y, :x] for s in spectrum])  # one batch takes twice as long
     return sharp * scale + mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None]
 

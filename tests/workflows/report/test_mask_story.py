@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from neusee.nodes.values import Bands
+from neusee.workflows.recipe.loading import load
 from neusee.workflows.report import console, mask_story, run_page
+from neusee.workflows.report.contents import wanted
 from neusee.workflows.report.mask_story import sentences
 
 PLAIN = {"peak/I_sat": 912.3, "LSR": 1.0, "PSNR (dB)": 27.07, "saturated px": 244.0}
@@ -244,9 +246,53 @@ def test_the_page_leads_with_the_pictures_and_the_story(document):
 
 
 def test_the_rival_of_a_mask_is_the_grey_filter_of_its_least_suppressed_laser():
-    (text,) = mask_story.rival({"410 nm": 0.0012, "690 nm": 0.0022}).values()
+    (text,) = mask_story.rival({"410 nm": 0.0012, "690 nm": 0.0022}, {}).values()
     assert text == (
         "A grey filter that passes 0.0022 of the light weakens the laser as much: for its picture, restored alike, run "
         "this recipe with doe=grey_filter doe.transmittance=0.0022."
     )
-    assert mask_story.rival({}) == mask_story.rival({"530 nm": 0.95}) == {}
+    assert mask_story.rival({}, {}) == mask_story.rival({"530 nm": 0.95}, {}) == {}
+
+
+def test_the_rival_has_the_quality_of_its_own_picture_if_the_run_computed_it():
+    filtered = {"PSNR (dB)": 20.14, "saturated px": 0.0}
+    numbers = {"grey filter, restored": filtered, "restored": {"PSNR (dB)": 17.67}}
+    opening = "A grey filter that passes 0.00149 of the light weakens the laser as much: its picture, restored by a "
+    end = "(doe=grey_filter doe.transmittance=0.00149)."
+    assert mask_story.rival(GREEN, numbers) == {
+        "rival": f"{opening}Wiener filter, has a PSNR of 20.1 dB against 17.7 dB behind the mask; "
+        f"no pixel saturates {end}"
+    }
+    alone = {"grey filter, restored": {"PSNR (dB)": 12.0, "saturated px": 1234.0}}
+    assert mask_story.rival(GREEN, alone)["rival"].endswith(f"a PSNR of 12.0 dB; 1,234 pixels saturate {end}")
+
+
+@pytest.mark.parametrize(
+    ("doe", "name", "plural"),
+    [
+        ("grey_filter", "grey filter", False),
+        ("small_stop", "smaller stop", False),
+        ("notch", "notch filter", False),
+        ("stop_and_filter", "smaller stop and grey filter", True),
+        ("axicon_and_notch", "mask and notch filter", True),
+        ("flat", "flat plate", False),
+        ("axicon", "mask", False),
+    ],
+)
+def test_the_story_names_what_stands_in_place_of_a_mask(doe, name, plural):
+    assert mask_story.element(load("first_light", [f"doe={doe}"])) == name
+    numbers = {"plain lens": PLAIN, "with mask": MASK, "restored": {}}
+    found = sentences(numbers, GREEN, True, name)
+    assert found["buys"].startswith(f"The {name} {'buy' if plural else 'buys'} protection for the sensor")
+    assert found["costs"].startswith(f"The {name} {'cost' if plural else 'costs'} picture quality: PSNR 27.1 dB with")
+    assert (
+        f"14.6 dB with the {name}; 418 pixels saturate with the {name}, 244 without: the {name} enl" in found["costs"]
+    )
+
+
+def test_the_rival_is_computed_where_a_run_tells_of_a_mask_and_a_restored_picture():
+    rival = {"rival_quality", "rival_saturated"}
+    assert rival <= set(wanted(load("first_light")))
+    assert not rival & set(wanted(load("first_light", ["doe=grey_filter"])))  # that is the rival
+    assert not rival & set(wanted(load("first_light", ["outputs=[restored_quality]"])))
+    assert not rival & set(wanted(load("six_lasers")))

@@ -26,6 +26,22 @@ def test_the_story_has_the_numbers_of_the_readme(tmp_path):
     told = re.findall(r"\d[\d.,]*\d", story["buys"] + story["costs"])
     assert told == ["236", "3.87", "912", "0.00149", "530", "27.1", "14.6", "17.7", "418", "244", "1.71"]
     text = README.read_text(encoding="utf-8")
+    row = next(line for line in text.splitlines() if line.startswith("| plain lens, same filter")).split("|")
+    rival = story["numbers"]["grey filter, restored"]
+    assert f"passes {float(row[1].split('transmittance=')[1].rstrip('`) '))} of the light" in story["rival"]
+    assert float(row[2].removesuffix("dB ")) == pytest.approx(rival["PSNR (dB)"], abs=0.06)  # of one decimal
+    sentence = " ".join(text.partition("The run computes the first rival itself: ")[2].split("\n\n")[0].split())
+    assert (
+        sentence
+        == f"a grey filter that passes 0.00149 of the light gives a PSNR of {row[2].strip()}, and no pixel saturates."
+    )
+    assert int(row[4]) == rival["saturated px"] == 0
+    assert "no pixel saturates" in story["rival"]
     assert not [number for number in told if not re.search(rf"\b{re.escape(number)}\b", text)]
     page = done.page.read_text(encoding="utf-8")
-    assert page.index(story["buys"]) < page.index('alt="What the camera sees') < page.index('id="results"')
+    assert (
+        page.index(story["buys"])
+        < page.index(story["rival"])
+        < page.index('alt="What the camera sees')
+        < page.index('id="results"')
+    )

@@ -249,3 +249,16 @@ def test_the_first_guess_of_the_glare_is_least_squares_beside_a_constant():
     design = torch.stack([(seen * c).flatten() for c in centred], 1)
     fit = torch.linalg.solve(design.T @ design, design.T @ electrons.double().flatten())
     torch.testing.assert_close(found, (fit[0] * one + fit[1] * two).float(), rtol=1e-5, atol=1e-6)
+
+
+def test_a_narrow_psf_needs_no_coarser_grids():
+    """Dim light behind a grey filter: read noise of 10.5 e- and a fall of the PSF as wide as the window."""
+    at = torch.arange(-32, 33).double()
+    kernel = (1 + (at[:, None].square() + at.square()) / 1.5**2).pow(-1.5)
+    psf = Psf((kernel / kernel.sum()).float()[None], ONE)
+    electrons = seen(scene() / 400, psf)
+    nested, alone = (run(electrons, psf, coarser_grids=coarser) for coarser in (True, False))
+    exact = run(electrons[..., :40, :40], psf)
+    assert error(alone, nested) < 0.01 * float(nested.std())
+    assert error(alone, nested) > 0  # another start of the iteration
+    assert run(electrons[..., :40, :40], psf, coarser_grids=False).equal(exact)  # solved without an iteration
