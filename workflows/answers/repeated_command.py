@@ -151,7 +151,7 @@ class Command:
             raise Unsettled("a recipe is in the folder of the cache or of results")
         folders = [path for path in self._opened.folders if path not in ignored and not _PART.search(path)]
         listed = {path: self._opened.folders[path] for path in folders if path != written}
-        return witnesses_of([*files, *inputs], recipes, listed, self._started - _TICK)
+        return witnesses_of([*files, *inputs], recipes, listed, self._started - _TICK, written)
 
 
 def _parts(folder: str) -> tuple[str, str]:

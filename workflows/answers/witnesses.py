@@ -38,13 +38,18 @@ def listing(folder: str) -> Listing:
     return Listing(all_names(folder), max(about.st_mtime_ns, about.st_ctime_ns))
 
 
-def witnesses_of(files: Iterable[str], recipes: Iterable[str], listed: Mapping[str, Listing], before: int) -> Witnesses:
+def witnesses_of(
+    files: Iterable[str], recipes: Iterable[str], listed: Mapping[str, Listing], before: int, made: str | None = None
+) -> Witnesses:
     """Return witnesses for these paths as they are now; a path without a file is a witness of its absence.
 
+    ``made`` is a folder that the command itself may have made: as a new name in a listed folder it is no change.
     Raises `Unsettled` for what changed after the time ``before`` (ns), and for a folder in place of a file.
     """
     for folder, then in listed.items():
-        if then.changed > before or all_names(folder) != then.names:
+        own = os.path.relpath(made, folder).partition(os.sep)[0] if made else ""
+        now = [name for name in all_names(folder) if name != own or name in then.names]
+        if then.changed > before or now != then.names:
             raise Unsettled(f"{folder} changed while the command ran")
     found: dict[str, str] = {}
     absent = []

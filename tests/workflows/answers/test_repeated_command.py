@@ -301,6 +301,25 @@ def test_a_folder_that_was_listed_is_a_witness(place):
     assert place.again(lambda: os.listdir("frames"))
 
 
+@pytest.mark.parametrize("out", ["fresh", "results/of/today"])
+def test_the_first_command_in_a_folder_is_kept_although_it_makes_the_folder_of_results(place, out):
+    place.out = Path(out)
+    place.words += ["--out", out]
+    assert place.again(lambda: os.listdir("."))  # as Python does where it looks for modules
+    assert (place.work / out).is_dir()
+    assert not place.again()
+    (place.work / "new.txt").write_text("")
+    assert place.again(lambda: os.listdir("."))
+
+
+def test_another_name_beside_the_folder_of_results_is_a_change(place):
+    def meanwhile():
+        os.listdir(".")
+        (place.work / "runs2").mkdir()
+
+    assert doubtful(place, None, meanwhile)
+
+
 def test_results_in_the_folder_of_the_recipe_are_not_kept(place):
     place.words += ["--out", "."]
     place.out = Path(".")
