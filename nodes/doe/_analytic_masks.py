@@ -91,10 +91,11 @@ def _half_rings(grid: PupilGrid, waves: tuple[float, ...], alternate: bool, orie
     """Return the phase of the half-ring mask, in rad."""
     v, u = axes(grid)
     square = v.square() + u.square()
-    annulus = (square * len(waves)).floor().long().clamp(max=len(waves) - 1)
+    annulus = (square * len(waves)).floor_().to(torch.int32).clamp_(max=len(waves) - 1)
     signed = [-slope if alternate and index % 2 else slope for index, slope in enumerate(waves)]
-    side = torch.sign(u * math.cos(orientation) + v * math.sin(orientation))
-    return 2 * math.pi * torch.tensor(signed, dtype=torch.float64, device=v.device)[annulus] * square.sqrt() * side
+    slopes = 2 * math.pi * torch.tensor(signed, dtype=torch.float64, device=v.device)
+    side = (u * math.cos(orientation) + v * math.sin(orientation)).sign_()
+    return slopes.index_select(0, annulus.flatten()).view_as(square).mul_(square.sqrt_()).mul_(side)
 
 
 @node()

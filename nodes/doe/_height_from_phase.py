@@ -17,7 +17,7 @@ def height_from_phase(phase: Tensor, grid: PupilGrid, wavelength: float, materia
     The height outside the stop is 0 too.
     """
     open_ = inside(grid, phase.device)
-    raised = phase - phase[open_].min()
+    raised = phase - torch.where(open_, phase, math.inf).min()
     return torch.where(open_, raised * (wave_height(material, wavelength) / (2 * math.pi)), 0.0).to(torch.float32)
 
 
