@@ -14,6 +14,7 @@ from neusee.workflows.safety.distance_zones import QUANTILES
 from neusee.workflows.safety.safety_estimate import Estimate, Finding
 
 _COLOURS = (VERMILION, ORANGE, "#CC79A7", "#56B4E9", "#8c510a", "#7f7f7f")
+_BELOW = 1.5  #: decades below the peak of a spot that a picture of the spot shows at least
 _DASHES = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 1)))
 _NAMES = {"irradiance": "irradiance at the lens (W/m2)", "fluence": "fluence of a pulse at the lens (J/m2)"}
 
@@ -58,7 +59,8 @@ def spots(patterns: Sequence[DamagePattern]) -> Any:
     """Draw the exposure on the sensor over the limit of damage: red above the limit, blue below."""
     figure, axes = canvas(4.6 * len(patterns), 4.0, 1, len(patterns))
     for axis, each in zip(axes[0], patterns, strict=True):
-        half, decades = each.width / 2 * 1e6, max(1.0, abs(float(np.log10(each.peak))))
+        half, brightest = each.width / 2 * 1e6, float(np.log10(each.peak))
+        decades = max(1.0, brightest, _BELOW - brightest)  # a spot far below the limit is seen too
         light = np.log10(np.maximum(each.ratio, 10.0**-decades))
         limits = {"vmin": -decades, "vmax": decades}
         shown = axis.imshow(light, cmap="RdBu_r", extent=(-half, half, -half, half), **limits)
