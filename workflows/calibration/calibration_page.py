@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -26,6 +26,14 @@ if TYPE_CHECKING:
 
 _PREDICTED = 400  #: draws for the band of the predicted variance
 _CORNER = 20_000  #: draws for the picture of pairs
+#: by kind of a result: the numbers that the frames do not give
+NOT_TOLD = {
+    "estimate": (),
+    "between": ("mean", "sd"),
+    "upper": ("mean", "sd", "low"),
+    "lower": ("mean", "sd", "high"),
+    "none": ("mean", "sd", "low", "high"),
+}
 _PURE = (
     "quantum_efficiency",
     "spread",
@@ -61,8 +69,14 @@ class ParameterEstimate:
             return f"{with_uncertainty(self.mean, self.sd)} {self.unit}".rstrip()
         if self.kind == "none":
             return KINDS["none"]
+        if self.kind == "between":
+            return f"{self.low:.3g} to {self.high:.3g} {self.unit}".rstrip() + " (90 %, depends on the prior)"
         limit = f"below {self.high:.3g}" if self.kind == "upper" else f"above {self.low:.3g}"
         return f"{limit} {self.unit}".rstrip() + " (95 %, depends on the prior)"
+
+    def end(self, which: Literal["low", "high"]) -> str:
+        """Return the 5 % or the 95 % end of the interval as text, or a dash where only the prior gives it."""
+        return "–" if which in NOT_TOLD[self.kind] else f"{getattr(self, which):.6g}"
 
 
 @dataclass(frozen=True)
@@ -144,18 +158,21 @@ def sections(result: CalibrationResult) -> list[Section]:
 
 def _parameters(result: CalibrationResult) -> Section:
     text = """A value is given only if the posterior is less than a third as wide as the prior. Otherwise there is a
-        limit, which depends on the prior. The last columns show the share of the draws below the recipe's own value,
+        limit, which depends on the prior, and a dash stands for an end that only the prior gives. The last columns
+        show the share of the draws below the recipe's own value,
         and the width of the posterior divided by the width of the prior."""
     columns = ("parameter", "posterior", "5 %", "95 %", "unit", "recipe", "draws below it", "width / prior")
     estimates = result.rows()
     rows = [
-        (_words(r.name), r.text, f"{r.low:.6g}", f"{r.high:.6g}", r.unit, f"{r.nominal:.6g}", r.share, r.narrower)
+        (_words(r.name), r.text, r.end("low"), r.end("high"), r.unit, f"{r.nominal:.6g}", r.share, r.narrower)
         for r in estimates
     ]
     marks: dict[tuple[int, int], Mark] = {
         (i, 6): "pass" if 0.005 <= r.share <= 0.995 else "warn" for i, r in enumerate(estimates) if r.kind == "estimate"
     }
-    return Section("The sensor", text, columns, rows, marks=marks)
+    return Section(
+        "The lens" if isinstance(result.problem.levels, Rings) else "The sensor", text, columns, rows, marks=marks
+    )
 
 
 def _models(result: CalibrationResult) -> Section:

@@ -18,12 +18,14 @@ import emcee
 import numpy as np
 
 from neusee.workflows.calibration.ensembles import Walk, walk_until
+from neusee.workflows.calibration.guided_move import GuidedMove
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
 from neusee.workflows.keys.seal import seal_file, unseal_file
 from neusee.workflows.report.study_folder import Progress, silent
 
 if TYPE_CHECKING:
+    from neusee.workflows.calibration.importance_sampling import Guide
     from neusee.workflows.calibration.log_posterior import FloatArray
 
 ENSEMBLES = 4
@@ -76,13 +78,15 @@ def sample(
     how: str = "de",
     wanted: int = 1000,
     progress: Progress = silent,
+    guide: Guide | None = None,
 ) -> Chains:
     """Sample until each chain is 50 autocorrelation times long and the effective sample size is at least ``wanted``.
 
-    ``file`` keeps the draws; if the file exists, the chains continue from its last step.
+    ``file`` keeps the draws; if the file exists, the chains continue from its last step. With a ``guide`` the walkers
+    start at its samples, and half of their proposals are from its mixture.
     """
-    moves = move(how)
-    runs = [start_ensemble(problem, mode, file, index, seed, walkers, moves) for index in range(ENSEMBLES)]
+    moves = GuidedMove(move(how), guide.mixture) if guide else move(how)
+    runs = [start_ensemble(problem, mode, file, index, seed, walkers, moves, guide) for index in range(ENSEMBLES)]
     before, steps = _round(min(run.iteration for run in runs))
     tau_before, kept = _longest_time(runs, before) if before else np.inf, True
     while True:
@@ -120,9 +124,16 @@ def _round(iteration: int) -> tuple[int, int]:
 
 
 def start_ensemble(
-    problem: SensorPosterior, mode: LaplaceFit, file: Path, index: int, seed: int, walkers: int, moves: Any
+    problem: SensorPosterior,
+    mode: LaplaceFit,
+    file: Path,
+    index: int,
+    seed: int,
+    walkers: int,
+    moves: Any,
+    guide: Guide | None = None,
 ) -> Walk:
-    """Return an ensemble of walkers that continues the draws in ``file``, or that starts near the mode."""
+    """Return an ensemble that continues the draws in ``file``, or starts near the mode or at samples of the guide."""
     dimensions = len(problem.names)
     backend = _read(file, index)
     if backend is not None and backend.shape == (walkers, dimensions):
@@ -133,7 +144,8 @@ def start_ensemble(
     random = np.random.RandomState(rng.integers(1 << 32, size=8, dtype=np.uint32))
     backend = emcee.backends.Backend()
     backend.reset(walkers, dimensions)
-    return Walk(backend, moves, random, _alive(problem, mode, walkers, rng))
+    start = guide.starts(walkers, rng) if guide else _alive(problem, mode, walkers, rng)
+    return Walk(backend, moves, random, start)
 
 
 def _alive(problem: SensorPosterior, mode: LaplaceFit, walkers: int, rng: np.random.Generator) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,9 +21,13 @@ _PART = 0.1  #: least component with which a parameter counts as part of a direc
 _ALONE = 0.97  #: least component with which a direction counts as that of one parameter alone
 _WIDER = 1.25  #: largest factor by which doubled priors may widen the posterior of a determined parameter
 _FAR = 3.0  #: distance from the prior's middle, in standard deviations, at which the likelihood is compared
+_TELLS = 0.5  #: standard deviations of the prior by which a limit must lie inside that of the prior alone
+_ENDS = (0.05, 0.95)
+_ALONE_DRAWS = 20_000  #: draws of the prior
 _FALLS = 4.0  #: nats by which the likelihood must fall at this distance to set a limit
 
-KINDS = {"estimate": "", "upper": "only an upper limit", "lower": "only a lower limit", "none": "not from these frames"}
+KINDS = {"estimate": "", "upper": "only an upper limit", "lower": "only a lower limit",
+         "between": "only limits on both sides", "none": "not from these frames"}  # fmt: skip
 #: by parameter and kind: the reason why the frames set only a limit, or none
 _REASONS = {
     ("full_well", "lower"): ": no frame is saturated by the well",
@@ -71,6 +75,52 @@ def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
     count = f"{len(weak)} of {len(problem.names)} parameters cannot be determined from these frames"
     refused = f"{count}: {'; '.join(sentences)}" if 2 * len(weak) > len(problem.names) else ""
     return Identifiability(kinds, sentences, s.tolist(), refused)
+
+
+def identify_from_draws(
+    problem: SensorPosterior, mode: LaplaceFit, known: Identifiability, samples: FloatArray, weight: FloatArray
+) -> Identifiability:
+    """Find what the data determine from weighted draws, for a posterior that is not like that about its mode.
+
+    A parameter whose posterior is less than a third as wide as its prior has a value. Any other has a limit on each
+    side on which the posterior ends clearly inside the prior, counting only the draws of the prior that are possible;
+    where parameters far along a ridge fit as well, the limits are those of the ridge.
+    """
+    z, alone = problem.whitened(samples), _possible(problem)
+    kinds = {}
+    for at, name in enumerate(problem.names):
+        low, high = weighted_quantiles(z[:, at], weight, _ENDS)
+        low_alone, high_alone = np.quantile(alone[:, at], _ENDS)
+        tells = bool(low > low_alone + _TELLS), bool(high < high_alone - _TELLS)
+        limit = {(True, False): "lower", (False, True): "upper", (True, True): "between"}.get(tells, "none")
+        width = float(np.sqrt(weight @ (z[:, at] - weight @ z[:, at]) ** 2))
+        kinds[name] = "estimate" if width < 1 / WEAK else limit
+    sentences, named = [], set()
+    for ridge in problem.coordinates.ridges(torch.from_numpy(mode.theta)):
+        if ridge.text in known.directions and "estimate" not in {kinds[name] for name in ridge.kinds}:
+            kinds |= ridge.kinds  # the data alone give no limit along the ridge, whatever the priors say
+            sentences.append(ridge.text)
+            named |= set(ridge.kinds)
+    rest = [name for name, kind in kinds.items() if kind != "estimate" and name not in named]
+    sentences += [f"{_plain(name)}: {KINDS[kinds[name]]}" for name in rest]
+    return replace(known, kinds=kinds, directions=sentences)
+
+
+def weighted_quantiles(values: FloatArray, weight: FloatArray, shares: Sequence[float]) -> FloatArray:
+    """Return the values below which the ``shares`` of the weights lie."""
+    order = np.argsort(values)
+    at = np.searchsorted(np.cumsum(weight[order]), shares).clip(0, len(values) - 1)
+    quantiles: FloatArray = values[order][at]
+    return quantiles
+
+
+def _possible(problem: SensorPosterior) -> FloatArray:
+    """Return draws of the prior (draw, free) at which the posterior is not zero, in its standard deviations."""
+    z = np.random.default_rng(0).standard_normal((_ALONE_DRAWS, len(problem.names)))
+    places = problem.theta(problem.coordinates.from_whitened(torch.from_numpy(z)))
+    inside = np.flatnonzero(np.isfinite(places).all(1))
+    possible: FloatArray = z[inside[np.isfinite(problem.log_posterior(places[inside]))]]
+    return possible
 
 
 def _as_good(problem: SensorPosterior, mode: LaplaceFit, ridge: Ridge) -> bool:

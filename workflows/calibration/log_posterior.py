@@ -54,6 +54,8 @@ class SensorPosterior:
         source = str(density.wires[density.node.inputs[0]])
         done = run(recipe, store, (density.name, prior.name, source))
         coordinates = kind.of(done[prior.name], density.params)
+        if isinstance(coordinates, ScatterCoordinates):
+            coordinates = coordinates.seen_by(done[source], density.params)
         free = [f"{density.name}.{name}" for name in coordinates.names]
         quick = replace(density, params={**density.params, "told": False})
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from neusee.nodes.calibrate import Likelihood
+from neusee.nodes.calibrate import Likelihood, Rings
 from neusee.workflows.calibration.identifiability import Identifiability
-from neusee.workflows.calibration.importance_sampling import draw_samples, weights
+from neusee.workflows.calibration.importance_sampling import Guide, draw_guide, draw_samples, weights
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
@@ -24,6 +24,9 @@ MISFIT = 1e-3  #: probability below which chance does not explain a deviance
 _NEVER = -1e6  #: log weight of an impossible sample
 _RHAT, _INDEPENDENT, _ACCEPTED = 1.01, 1000.0, (0.1, 0.7)
 _TAIL, _SD, _MEAN, _BELOW = 0.5, 0.05, 0.1, 2.0
+_WEIGHTED = 0.1  #: least effective share of weighted draws
+_SLOW, _SMOOTH = 8, 5e-3  #: slowest waves over the rings, and probability below which chance does not explain them
+_SURPRISE = 3.5  #: standard deviations of its prior by which a mean may lie from the middle of the prior
 _LUCK = 4.0  #: standard errors by which the widths of two samples may differ
 
 
@@ -58,6 +61,7 @@ class ImportanceSamples:
     samples: FloatArray  #: (draw, free)
     weights: FloatArray  #: (draw,) sum 1
     tail: float  #: k-hat; above 0.7 the weights are unreliable
+    guide: Guide | None = None  #: the mixture of a posterior that may be long and bent
 
     def mean(self) -> FloatArray:
         """Return the weighted mean (free,) of the samples."""
@@ -89,18 +93,21 @@ def arviz() -> Any:
 
 def importance_samples(problem: SensorPosterior, mode: LaplaceFit, seed: int) -> ImportanceSamples:
     """Draw importance samples from the posterior, and return them with Pareto-smoothed weights."""
-    samples, log = draw_samples(problem, mode, np.random.default_rng(seed))
+    rng, guide = np.random.default_rng(seed), None
+    if problem.coordinates.bent:
+        guide = draw_guide(problem, mode, rng)
+    samples, log = (guide.samples, guide.log) if guide else draw_samples(problem, mode, rng)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         smooth, tail = arviz().psislw(np.where(np.isfinite(log), log - log.max(), _NEVER))
-    return ImportanceSamples(samples, weights(smooth), float(tail))
+    return ImportanceSamples(samples, weights(smooth), float(tail), guide)
 
 
 def checks(
     problem: SensorPosterior, mode: LaplaceFit, identifiability: Identifiability, chains: Chains, law: ImportanceSamples
 ) -> list[Check]:
     """Run all checks of a posterior and return the results; if a check fails, the posterior is not fit for use."""
-    peak, data = _of_peak(problem, mode, identifiability, chains, law), _of_data(problem, mode, identifiability)
+    peak, data = _of_peak(problem, mode, identifiability, chains, law), _of_data(problem, mode, identifiability, law)
     return [*_of_chains(chains), *peak, *data]
 
 
@@ -138,9 +145,13 @@ def _of_peak(
     below = mode.log - float(chains.log.max())
     distance = f"{abs(below):.2g} nats {'below' if below > 0 else 'above'} the mode"
     yield Check("the best draw is near the mode", distance, f"within {_BELOW:.0f} nats", _mark(abs(below) <= _BELOW))
-    at = [i for i, name in enumerate(problem.names) if identifiability.kinds[name] == "estimate"]
+    at = [i for i, name in enumerate(problem.names) if law.guide or identifiability.kinds[name] == "estimate"]
     if not at:
         return
+    if law.guide:
+        size = 1 / float((law.weights**2).sum())
+        text, least = f"effective sample size {size:.0f} of {len(law.weights)}", _WEIGHTED * len(law.weights)
+        yield Check("weighted draws are numerous enough", text, f"at least {least:.0f}", _mark(size >= least, "warn"))
     sd, mean = law.sd()[at], law.mean()[at]
     flat = chains.flat[:, at]
     apart, off = np.abs(flat.std(0) / sd - 1), np.max(np.abs(flat.mean(0) - mean) / sd)
@@ -154,12 +165,16 @@ def _of_peak(
     )
 
 
-def _of_data(problem: SensorPosterior, mode: LaplaceFit, identifiability: Identifiability) -> Iterator[Check]:
+def _of_data(
+    problem: SensorPosterior, mode: LaplaceFit, identifiability: Identifiability, law: ImportanceSamples
+) -> Iterator[Check]:
     look = problem.likelihood(mode.theta[None])
     if float(look.degrees_of_freedom.sum()) > len(identifiability.estimated):
         fit = goodness_of_fit(look, len(identifiability.estimated))
         text = f"deviance {fit.deviance:.1f} of {fit.freedom:.0f} degrees of freedom, p = {fit.p:.2g}"
         yield Check("the model of the sensor fits the levels", text, f"a p-value above {MISFIT}", _mark(fit.good))
+    if law.guide and isinstance(problem.levels, Rings):
+        yield from _of_rings(problem, law, law.guide)
     count = len(identifiability.directions)
     weak = f"{count} of {len(identifiability.strengths)} directions are not determined"
     text = weak if count else "all parameters are determined"
@@ -169,6 +184,39 @@ def _of_data(problem: SensorPosterior, mode: LaplaceFit, identifiability: Identi
         "all combinations of parameters determined",
         _mark(not count, "warn"),
     )
+
+
+def _of_rings(problem: SensorPosterior, law: ImportanceSamples, guide: Guide) -> Iterator[Check]:
+    best = guide.samples[[int(problem.log_posterior(guide.samples).argmax())]]
+    look = problem.likelihood(best)
+    away = problem.levels.mean.numpy() - look.mean.numpy().reshape(-1)
+    strength, p = slow_waves(away / np.sqrt(look.variance.numpy().reshape(-1)))
+    yield Check(
+        "the rings deviate from the model without a trend",
+        f"slow waves of the deviations over the radius: {strength:.1f}, p = {p:.2g}",
+        f"a p-value above {_SMOOTH}; else one surface does not describe this lens",
+        _mark(p >= _SMOOTH, "warn"),
+    )
+    middle = law.weights @ problem.whitened(guide.samples)
+    worst = int(np.abs(middle).argmax())
+    text = f"{problem.names[worst].replace('_', ' ')} {middle[worst]:+.1f} sd of its prior from the middle"
+    surprised = abs(float(middle[worst])) > _SURPRISE
+    bar = f"each mean within {_SURPRISE} sd; else prior and picture contradict each other"
+    yield Check("the priors agree with the picture", text, bar, _mark(not surprised, "warn"))
+
+
+def slow_waves(deviation: FloatArray) -> tuple[float, float]:
+    """Return the strength of slow waves in the deviations of rings, and the probability that chance alone gives it.
+
+    ``deviation`` (ring,) is in standard deviations. A wrong model deviates over many rings in one direction, even
+    where the relative scatter of the rings is free and takes up all that the model lacks. The strength is the sum of
+    squares of the slowest components of a cosine transform.
+    """
+    from scipy.fft import dct
+    from scipy.special import chdtrc
+
+    strength = float((dct(deviation, norm="ortho")[:_SLOW] ** 2).sum())
+    return strength, float(chdtrc(_SLOW, strength))
 
 
 def goodness_of_fit(likelihood: Likelihood, free: int = 0) -> GoodnessOfFit:

@@ -20,6 +20,7 @@ _ROUNDS = 60
 _CLOSE = 1e-6  #: twice the nats that one more step may gain at the end of the search
 _NEXT = 1e-3  #: twice the nats that one more step may gain at a settled mode beside an edge
 _STEP = 1e-3  #: step of a difference, in standard deviations of the coordinate
+_WIDEST = 1e3  #: standard deviation of a coordinate that nothing determines, so that a step stays a number
 _EDGE = 1e3  #: nats: a step of a difference that costs more crosses an edge
 _NARROWER = 0.5 ** np.arange(1, 12)  #: shares of the way from the middle of the prior to the guess
 _SHORT = 1e-7  #: step before any standard deviation is known: levels may determine a well to a part in a million
@@ -88,7 +89,7 @@ def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit
     for _ in range(_ROUNDS):
         rows, prior = _slopes(problem, theta, step_of)
         covariance = _covariance(rows, prior)
-        step_of = np.sqrt(covariance.diagonal()) * _STEP
+        step_of = np.sqrt(covariance.diagonal()).clip(max=_WIDEST) * _STEP
         gradient = _gradient(problem, theta, step_of)
         step = covariance @ gradient
         if gradient @ step < _CLOSE:

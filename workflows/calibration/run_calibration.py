@@ -14,8 +14,8 @@ import numpy as np
 
 from neusee.nodes.calibrate import Rings
 from neusee.nodes.values import Levels
-from neusee.workflows.calibration.calibration_page import CalibrationResult, banner, lead, sections
-from neusee.workflows.calibration.identifiability import identify
+from neusee.workflows.calibration.calibration_page import NOT_TOLD, CalibrationResult, banner, lead, sections
+from neusee.workflows.calibration.identifiability import identify, identify_from_draws
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import compare_models
 from neusee.workflows.calibration.posterior_checks import arviz, checks, count_failures, importance_samples
@@ -68,14 +68,24 @@ def find_posterior(
     identifiability = identify(problem, mode)
     if identifiability.refused:
         raise CalibrationRefused(identifiability.refused)
-    for line in identifiability.directions:
-        progress(f"not identifiable: {line}")
     key = digest("posterior", engine("calibration.emcee_sampler"), problem.key, walkers, move, recipe.seed)
     file = store.root / "posterior" / f"{key}.h5"
-    chains = emcee_sampler.sample(
-        problem, mode, file, seed=recipe.seed, walkers=walkers, how=move, wanted=draws, progress=progress
-    )
     law = importance_samples(problem, mode, recipe.seed)
+    if law.guide:
+        identifiability = identify_from_draws(problem, mode, identifiability, law.samples, law.weights)
+    for line in identifiability.directions:
+        progress(f"not identifiable: {line}")
+    chains = emcee_sampler.sample(
+        problem,
+        mode,
+        file,
+        seed=recipe.seed,
+        walkers=walkers,
+        how=move,
+        wanted=draws,
+        progress=progress,
+        guide=law.guide,
+    )
     models = compare_models(recipe, store, recipe.seed) if isinstance(problem.levels, Levels) else []
     tested = checks(problem, mode, identifiability, chains, law)
     return CalibrationResult(problem, mode, identifiability, chains, tested, models)
@@ -99,8 +109,9 @@ def _document(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the results of a parameter, without mean and standard deviation if the frames give no estimate."""
-    kept = {name: value for name, value in row.items() if row["kind"] == "estimate" or name not in ("mean", "sd")}
+    """Return the results of a parameter, without the numbers that the frames do not give."""
+    not_told = NOT_TOLD[row["kind"]]
+    kept = {name: value for name, value in row.items() if name not in not_told}
     return {name: None if isinstance(x, float) and not math.isfinite(x) else x for name, x in kept.items()}
 
 

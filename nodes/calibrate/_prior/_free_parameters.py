@@ -66,6 +66,8 @@ class Free:
     edged: ClassVar[frozenset[str]] = frozenset()  #: the parameters that rounded numbers
     #: constrain by edges and not by a slope: the last row of `Likelihood.scaled` describes the free one of these
 
+    bent: ClassVar[bool] = False  #: True if data may leave a posterior that is long, bent, or in several parts
+
     names: tuple[str, ...]  #: names of the free parameters
     prior: Prior
     held: Mapping[str, float]  #: values of the held parameters

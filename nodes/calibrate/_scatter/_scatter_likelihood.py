@@ -87,17 +87,24 @@ def _ripple() -> Tensor:
     return torch.tensor(_FRINGES, dtype=torch.float64)
 
 
-def _total(numbers: dict[str, Tensor]) -> Tensor:
+def _total(numbers: Mapping[str, Tensor]) -> Tensor:
     return scattered_share(numbers["b0"], numbers["l"], numbers["s"])
 
 
 def _light(numbers: dict[str, Tensor], square: Tensor, fringe: float, scale: float) -> Tensor:
     """Return the electrons of the source in pixels at squared distances; ``fringe`` is wavelength N in pixels."""
+    light: Tensor = numbers["electrons"] * share_of_light(numbers, square, fringe, scale)
+    return light
+
+
+def share_of_light(numbers: Mapping[str, Tensor], square: Tensor, fringe: float, scale: float) -> Tensor:
+    """Return the share of the light that core and scatter send into pixels at squared distances from the source.
+
+    ``fringe`` is wavelength N in pixels, and ``scale`` the direction cosine of a pixel.
+    """
     b0, l, s = (numbers[name] for name in ("b0", "l", "s"))  # noqa: E741
     veil = on_far_pixels(lobe(b0, l, s, torch.tensor(scale, dtype=torch.float64)), square)
-    core = (1 - _total(numbers).clamp_max(1)) * numbers["core"] * diffraction_wing(square, fringe)
-    light: Tensor = numbers["electrons"] * (core + veil)
-    return light
+    return (1 - _total(numbers).clamp_max(1)) * numbers["core"] * diffraction_wing(square, fringe) + veil
 
 
 def diffraction_wing(square: Tensor, fringe: float) -> Tensor:
@@ -113,6 +120,8 @@ def _averaged(parts: Tensor, rings: Rings) -> Tensor:
 
 def guess_scatter(rings: Rings, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
     """Return a first guess of the scatter: over a grid of l and s, the b0 and background that fit the rings best.
+
+    Guesses that scatter more than all light are left out.
 
     Shapes: rings; numbers by name, with the names of ``believed``; ``params`` are those of `stray_light`.
     Units:  those of `stray_light`.
@@ -131,6 +140,7 @@ def guess_scatter(rings: Rings, believed: Mapping[str, float], params: Mapping[s
             rest = rings.mean - believed["electrons"] * believed["core"] * _averaged(wing, rings)
             fit = torch.linalg.lstsq(rows * weight[:, None], (rest * weight)[:, None]).solution[:, 0]
             off = float(((rows @ fit - rest) * weight).square().sum())
-            if off < least and float(fit[0]) > 0:
+            share = float(fit[0]) * float(scattered_share(*(torch.tensor(x, dtype=torch.float64) for x in (1.0, l, s))))
+            if off < least and 0 < share < 1:
                 least, best = off, best | {"b0": float(fit[0]), "l": l, "s": s}
     return best

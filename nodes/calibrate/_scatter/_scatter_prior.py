@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.calibrate._prior._free_parameters import Factor, Free, Positive, Prior, Ridge, believed, freed
+from neusee.nodes.calibrate._scatter._point_source import Rings
+from neusee.nodes.calibrate._scatter._scatter_likelihood import share_of_light
 from neusee.nodes.flare._harvey_shack import scattered_share
 from neusee.nodes.units import Electrons, Real
 
@@ -54,23 +57,48 @@ def _(result: Prior, **params: object) -> list[Check]:
     return [Check(f"{len(free)} free: {', '.join(free)}")]
 
 
+class Sight(NamedTuple):
+    """What a frame shows of a lens: the radii of the first and the last ring, and the scales of a pixel."""
+
+    inner: float  #: pixels from the source
+    outer: float  #: pixels from the source
+    fringe: float  #: wavelength N in pixels
+    scale: float  #: direction cosine of a pixel
+
+    @classmethod
+    def of(cls, rings: Rings, lens: Mapping[str, Any]) -> Sight:
+        """Return what the rings of a frame show; ``lens`` are parameters of `stray_light`."""
+        fringe = lens["wavelength"] * lens["focal_length"] / (lens["diameter"] * lens["pixel_pitch"])
+        inner, outer = (float(rings.square[rings.ring == at].mean()) ** 0.5 for at in (0, len(rings.mean) - 1))
+        return cls(inner, outer, fringe, lens["pixel_pitch"] / lens["focal_length"])
+
+
 @dataclass(frozen=True)
 class ScatterCoordinates(Free):
-    """Coordinates of the scatter of a lens, in which frames determine few combinations of b0, l and s.
+    """Coordinates of the scatter of a lens in which what a frame determines does not depend on what it leaves open.
 
-    Where all three are free, the coordinates are ln l, the logarithm of the BSDF at the middle of the prior of l, and
-    the logarithm of the negative slope of the BSDF there in double logarithms. Frames of rings determine the last two,
-    whatever l is. Other parameters are logarithms, and the background is itself.
+    Where b0, l and s are free, their coordinates are ln l, the logarithm of the BSDF at a distance between those of
+    the first and the last ring, and the logarithm of the negative slope of the BSDF there in double logarithms. Rings
+    determine the last two, whatever l is. The coordinate of the electrons is the logarithm of the signal of the source
+    in the first ring, and that of the background the whole signal in the last ring; without a ``sight`` they are the
+    logarithm of the electrons, and the background. Other parameters are logarithms.
     """
 
     every: ClassVar[tuple[str, ...]] = SCATTER_NAMES
     linear: ClassVar[frozenset[str]] = _LINEAR
+    bent: ClassVar[bool] = True
+    sight: Sight | None = None
+
+    def seen_by(self, rings: Rings, lens: Mapping[str, Any]) -> ScatterCoordinates:
+        """Return the coordinates for the rings of a frame; ``lens`` are parameters of `stray_light`."""
+        return replace(self, sight=Sight.of(rings, lens))
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Return a readable name of each sampler coordinate."""
-        joint = {"b0": "ln BSDF", "s": "ln slope"} if self._joint else {}
-        return tuple(joint.get(name, ("" if name in self.linear else "ln ") + name) for name in self.names)
+        new = {"b0": "ln BSDF", "s": "ln slope"} if self._joint else {}
+        new |= {"electrons": "ln first ring", "background": "last ring"} if self.sight else {}
+        return tuple(new.get(name, ("" if name in self.linear else "ln ") + name) for name in self.names)
 
     def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
         """Convert parameters of the scatter to sampler coordinates (..., free parameter)."""
@@ -80,20 +108,36 @@ class ScatterCoordinates(Free):
             q = self._square(columns["l"])
             columns["b0"] = columns["b0"] + values["s"] / 2 * torch.log1p(q)
             columns["s"] = (-values["s"]).log() + torch.log(q / (1 + q))
-        return torch.stack([columns[name] for name in self.names], -1)
+        if self.sight:
+            first, last = self._shares(self.sight, values)
+            if "background" in columns:
+                columns["background"] = columns["background"] + self._of("electrons", values) * last
+            if "electrons" in columns:
+                columns["electrons"] = columns["electrons"] + first.log()
+        return torch.stack(torch.broadcast_tensors(*(columns[name] for name in self.names)), -1)  # type: ignore[no-untyped-call]
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
         """Convert sampler coordinates (..., free parameter) to parameters of the scatter."""
-        if not self._joint:
-            return self.unscaled(place)
         columns = dict(zip(self.names, place.unbind(-1), strict=True))
-        q = self._square(columns["l"])
-        columns["s"] = -columns["s"].exp() * (1 + q) / q
-        columns["b0"] = columns["b0"] - columns["s"] / 2 * torch.log1p(q)
-        return self.unscaled(torch.stack([columns[name] for name in self.names], -1))
+        if self._joint:
+            q = self._square(columns["l"])
+            columns["s"] = -columns["s"].exp() * (1 + q) / q
+            columns["b0"] = columns["b0"] - columns["s"] / 2 * torch.log1p(q)
+        values = {name: x if name in self.linear else x.exp() for name, x in columns.items()}
+        if self.sight:
+            first, last = self._shares(self.sight, values)
+            if "electrons" in values:
+                values["electrons"] = values["electrons"] / first
+            if "background" in values:
+                values["background"] = values["background"] - self._of("electrons", values) * last
+        return values
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Return the log prior density per unit of the sampler coordinates, up to a constant."""
+        """Return the log prior density per unit of the sampler coordinates, up to a constant.
+
+        The coordinates of electrons and background are shifted by what the other parameters say, which leaves volumes
+        as they are; that of s contributes the factor -s.
+        """
         log = -0.5 * self.whitened(parameters).square().sum(-1)
         return log + (-parameters["s"]).log() if self._joint else log
 
@@ -101,8 +145,21 @@ class ScatterCoordinates(Free):
     def _joint(self) -> bool:
         return {"b0", "l", "s"} <= set(self.names)
 
+    def _of(self, name: str, values: Mapping[str, Tensor]) -> Tensor:
+        return values[name] if name in values else torch.tensor(self.held[name], dtype=torch.float64)
+
+    def _shares(self, sight: Sight, values: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the shares of the light in a pixel of the first and of the last ring."""
+        numbers = {name: self._of(name, values)[..., None] for name in ("b0", "l", "s", "core")}
+        square = torch.tensor([sight.inner**2, sight.outer**2], dtype=torch.float64)
+        first, last = share_of_light(numbers, square, sight.fringe, sight.scale).unbind(-1)
+        return first, last
+
     def _square(self, log_l: Tensor) -> Tensor:
-        """Return (beta / l)**2 at the direction cosine beta in the middle of the prior of l."""
+        """Return (beta / l)**2 at the direction cosine beta between the rings, or in the middle of the prior of l."""
+        if self.sight:
+            middle = math.log(self.sight.scale) + 0.5 * math.log(self.sight.inner * self.sight.outer)
+            return (2 * (middle - log_l)).exp()
         return (2 * (self.prior.centre[SCATTER_NAMES.index("l")] - log_l)).exp()
 
     def ridges(self, place: Tensor) -> list[Ridge]:

@@ -71,11 +71,12 @@ def recipe():
     return load("calibrate_stray_light")
 
 
-def problem_of(rings, prior=PRIOR, lens=LENS):
+def problem_of(rings, prior=PRIOR, lens=LENS, scatter=0.005):
     """Return the posterior of rings as `neusee calibrate` has it, with the node called directly."""
-    held = {"core": 1.0, "scatter": 0.005}
+    held = {"core": 1.0, "scatter": scatter}
     believed = calibrate.stray_prior(**prior)
     coordinates = calibrate.ScatterCoordinates.of(believed, {**TRUTH, **held})
+    coordinates = coordinates.seen_by(rings, lens)
     fixed = {**lens, "gain": CAMERA["gain"], "read_noise": CAMERA["read_noise"], **coordinates.held}
 
     def weigh(parameters, told):
@@ -87,11 +88,35 @@ def problem_of(rings, prior=PRIOR, lens=LENS):
     )
 
 
-def drawn_truth(draw, wider=1.0, shift=0.0):
+def recipe_prior():
+    """Return the prior of the recipe `calibrate_stray_light`, which is wide."""
+    given = recipe().steps["prior"].params
+    return {name: tuple(pair) for name, pair in given.items() if pair is not None}
+
+
+def drawn_truth(draw, wider=1.0, shift=0.0, prior=PRIOR):
     """Draw a lens from the prior, or from one that is ``wider`` or moved by ``shift`` standard deviations."""
     truth = dict(TRUTH)
     for name in TRUTH:
-        centre, width = PRIOR[name]
+        centre, width = prior[name]
         away = wider * draw.normal() + (shift if name in ("b0", "l", "s") else 0.0)
         truth[name] = centre + away * width if name in ("s", "background") else centre * width**away
     return truth
+
+
+def drawn_camera(seed, prior, size=128):
+    """Return a lens drawn from the prior, its place and pixels, and the rings of its picture.
+
+    Lenses that scatter all light, and pictures without saturated pixels, are drawn again.
+    """
+    draw = np.random.default_rng([16, seed])
+    while True:
+        truth, lens = drawn_truth(draw, prior=prior), {**LENS, "pixel_pitch": draw.uniform(4e-6, 6.5e-6)}
+        centre = tuple((size - 1) / 2 + draw.uniform(-0.5, 0.5, 2))
+        band = draw.uniform(10e-9, 40e-9)
+        if truth["s"] >= 0 or scattered(truth["b0"], truth["l"], truth["s"], 2, (0, 0), 1.0)[1] >= 1:
+            continue
+        try:
+            return truth, lens, rings_of(picture(truth, draw, size, centre, lens, band=band))
+        except ValueError:
+            continue

@@ -6,10 +6,11 @@ import torch
 from scipy.integrate import quad
 
 from neusee.nodes import calibrate
-from neusee.workflows.calibration import calibration_figures, emcee_sampler, importance_sampling
+from neusee.workflows.calibration import calibration_figures, emcee_sampler, importance_sampling, posterior_checks
 from neusee.workflows.calibration.calibration_page import ring_radii, unit_of
-from neusee.workflows.calibration.identifiability import identify
-from neusee.workflows.calibration.importance_sampling import draw_samples, weights
+from neusee.workflows.calibration.identifiability import identify, identify_from_draws
+from neusee.workflows.calibration.importance_sampling import draw_guide, draw_samples, weights
+from neusee.workflows.calibration.posterior_checks import importance_samples
 from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
 from tests.workflows.calibration.simulated_lenses import (
     CAMERA,
@@ -19,6 +20,7 @@ from tests.workflows.calibration.simulated_lenses import (
     drawn_truth,
     picture,
     problem_of,
+    recipe_prior,
     rings_of,
 )
 
@@ -40,6 +42,12 @@ def shape_of(problem, samples):
 def weighted(problem, mode, seed):
     samples, log = draw_samples(problem, mode, np.random.default_rng(seed))
     return shape_of(problem, samples), weights(log)
+
+
+def told(problem, mode):
+    """Return what `neusee calibrate` says that the picture tells."""
+    samples, log = draw_samples(problem, mode, np.random.default_rng(1))
+    return identify_from_draws(problem, mode, identify(problem, mode), samples, weights(log))
 
 
 def test_the_mean_of_a_ring_is_wing_and_scatter():
@@ -77,7 +85,7 @@ def test_coordinates_are_one_to_one_and_their_density_is_that_of_the_prior():
 def test_a_lobe_within_the_saturated_pixels_gives_limits_and_no_value():
     narrow = {**TRUTH, "b0": 15.0 * 20**2.2, "l": 0.004 / 20, "s": -2.2}
     problem, mode = fitted(narrow, prior=WIDE | {"b0": (15.0 * 20**2.2, 30.0), "l": (2e-4, 10.0)}, size=256)
-    found = identify(problem, mode)
+    found = told(problem, mode)
     assert (found.kinds["l"], found.kinds["b0"]) == ("upper", "lower")
     assert "b0 and l only as b0 l^(-s): l lies within the saturated pixels" in found.directions
     assert found.kinds["s"] == "estimate"
@@ -85,7 +93,7 @@ def test_a_lobe_within_the_saturated_pixels_gives_limits_and_no_value():
 
 def test_a_lobe_that_the_frame_shows_gives_values():
     problem, mode = fitted({**TRUTH, "b0": 60.0}, prior=WIDE, size=192)
-    found = identify(problem, mode)
+    found = told(problem, mode)
     assert mode.settled
     assert [found.kinds[name] for name in SHAPE] == ["estimate"] * 3
 
@@ -116,10 +124,31 @@ def test_intervals_cover_the_truth(monkeypatch):
     assert (held <= 192).all(), held
 
 
+#: by planted fault: the lens, further surfaces, and a prior that is wrong
+FAULTS = {
+    "none": ({"b0": 60.0}, (), {}),
+    "two surfaces": ({"b0": 6000.0, "l": 0.001, "s": -3.0}, [(120.0, 0.006, -6.0, 1.0)], {}),
+    "a wrong prior": ({"b0": 60.0}, (), {"s": (-1.0, 0.2)}),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_one_surface_or_the_prior_cannot_explain_is_told(fault):
+    lens, more, prior = FAULTS[fault]
+    rings = rings_of(picture({**TRUTH, **lens}, np.random.default_rng(1), more=more))
+    problem = problem_of(rings, {**recipe_prior(), **prior})
+    law = importance_samples(problem, find_mode(problem, initial_theta(problem)), 1)
+    trend, surprise = posterior_checks._of_rings(problem, law, law.guide)
+    marks = {"none": ("pass", "pass"), "two surfaces": ("warn", "warn"), "a wrong prior": ("pass", "warn")}
+    assert (trend.mark, surprise.mark) == marks[fault], (trend, surprise)
+
+
 @pytest.mark.slow
 def test_chains_agree_with_weighted_draws(tmp_path):
     problem, mode = fitted({**TRUTH, "b0": 40.0}, seed=3)
-    chains = emcee_sampler.sample(problem, mode, tmp_path / "draws.h5", seed=1, walkers=32, wanted=300)
+    guide = draw_guide(problem, mode, np.random.default_rng(2))
+    chains = emcee_sampler.sample(problem, mode, tmp_path / "draws.h5", seed=1, walkers=32, wanted=300, guide=guide)
     draws, weight = weighted(problem, mode, 1)
     mean = weight @ draws
     sd = np.sqrt(weight @ (draws - mean) ** 2)

@@ -1,0 +1,189 @@
+"""A mixture of densities like a posterior that may be long, bent, or in several parts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from neusee.workflows.calibration.tempered_particles import follow_posterior
+
+if TYPE_CHECKING:
+    from neusee.workflows.calibration.log_posterior import FloatArray, SensorPosterior
+    from neusee.workflows.calibration.posterior_mode import LaplaceFit
+
+_PARTICLES, _BESIDE = 1000, 200  #: particles, and draws about the mode
+_FAR = 40.0  #: nats below the best point at which a particle is lost in a mode that does not count
+_PARTS = 14  #: components that are fitted
+_TAIL = 6.0  #: degrees of freedom of each component
+_ROUNDS, _STEPS, _TRIED = 16, 8, 2000  #: most fits, steps of each fit, samples on which a fit is tried
+_SOFT, _ENOUGH = 0.3, 0.4  #: effective sample fractions: to fit the next mixture, to stop
+_BROAD, _WIDER = 0.05, 2.0  #: share and width of one broad component, which bounds the weights
+_BORROWED = 0.03  #: share of samples whose covariance in all is added to that of the components
+_NEVER = -1e300  #: log density of an impossible sample
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """A mixture of Student's t distributions of several coordinates."""
+
+    shares: FloatArray  #: (component,) sum 1
+    centres: FloatArray  #: (component, free)
+    roots: FloatArray  #: (component, free, free) lower triangular roots of the scale matrices
+
+    def draw(self, count: int, rng: np.random.Generator | np.random.RandomState) -> FloatArray:
+        """Draw samples (count, free)."""
+        part = rng.choice(len(self.shares), size=count, p=self.shares)
+        normal = rng.standard_normal((count, self.centres.shape[1]))
+        off = normal / np.sqrt(rng.chisquare(_TAIL, (count, 1)) / _TAIL)
+        samples: FloatArray = self.centres[part] + np.einsum("nij,nj->ni", self.roots[part], off)
+        return samples
+
+    def log_density(self, samples: FloatArray) -> FloatArray:
+        """Return the logarithm of the density at samples (draw, free), up to a constant."""
+        power = -0.5 * (_TAIL + self.centres.shape[1])
+        return _log_sum(self._levels() + power * np.log1p(self._squares(samples) / _TAIL))
+
+    def normal_shares(self, samples: FloatArray) -> FloatArray:
+        """Return the share (draw, component) of each component in the density of normal components at samples."""
+        logs = self._levels() - 0.5 * self._squares(samples)
+        shares: FloatArray = np.exp(logs - _log_sum(logs)[:, None])
+        return shares
+
+    def _levels(self) -> FloatArray:
+        widths = np.diagonal(self.roots, axis1=1, axis2=2)
+        levels: FloatArray = np.log(self.shares.clip(1e-300)) - np.log(widths).sum(1)
+        return levels
+
+    def _squares(self, samples: FloatArray) -> FloatArray:
+        """Return the squared distance (draw, component) from each centre, in widths of the component."""
+        away = np.linalg.inv(self.roots) @ (samples.T[None] - self.centres[:, :, None])
+        squares: FloatArray = (away**2).sum(1).T
+        return squares
+
+
+def fit_mixture(
+    problem: SensorPosterior, mode: LaplaceFit, count: int, rng: np.random.Generator
+) -> tuple[Mixture, FloatArray, FloatArray]:
+    """Return a mixture like the posterior, samples of it (count, free), and the log of posterior over mixture of each.
+
+    The mixture is fitted to particles and to draws about the mode, and then to its own weighted samples. The mixture
+    with the largest effective sample size is kept, and new samples are drawn from it, whose own effective sample size
+    the caller must check.
+    """
+    samples = _start(problem, mode, rng)
+    weight, best, kept = np.full(len(samples), 1 / len(samples)), -1.0, None
+    for _ in range(_ROUNDS):
+        mixture = _fitted(samples, weight, rng)
+        samples, log = _weighed(problem, mixture, _TRIED, rng)
+        fraction = _effective(log)
+        if fraction > best:
+            best, kept = fraction, mixture
+        if fraction >= _ENOUGH:
+            break
+        weight = _normalised(_softened(log))
+    assert kept is not None  # the first fit is kept
+    return kept, *_weighed(problem, kept, count, rng)
+
+
+def _weighed(
+    problem: SensorPosterior, mixture: Mixture, count: int, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return samples of a mixture, and the logarithm of posterior over mixture of each."""
+    samples = mixture.draw(count, rng)
+    return samples, _finite(problem.log_posterior(samples)) - mixture.log_density(samples)
+
+
+def _start(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator) -> FloatArray:
+    """Return particles and draws about the mode (point, free), without those that are lost far below the best."""
+    places, logs = follow_posterior(problem, _PARTICLES, rng)
+    beside = mode.draw(_BESIDE, rng)
+    places, logs = np.concatenate([places, beside]), np.concatenate([logs, problem.log_posterior(beside)])
+    return places[logs > max(float(logs.max()), mode.log) - _FAR]
+
+
+def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -> Mixture:
+    """Return the mixture that expectation and maximisation find for weighted samples, and a broad component."""
+    centre, whole = _moments(samples, weight)
+    root = np.linalg.cholesky(_firm(whole))
+    at = _apart(np.linalg.solve(root, (samples - centre).T).T, weight, rng)
+    found = Mixture(np.full(_PARTS, 1 / _PARTS), samples[at], np.repeat(0.5 * root[None], _PARTS, 0))
+    for _ in range(_STEPS):
+        parts = weight[:, None] * found.normal_shares(samples)
+        found = _maximised(samples, parts, whole)
+    return Mixture(
+        np.append((1 - _BROAD) * found.shares, _BROAD),
+        np.concatenate([found.centres, centre[None]]),
+        np.concatenate([found.roots, _WIDER * root[None]]),
+    )
+
+
+def _apart(places: FloatArray, weight: FloatArray, rng: np.random.Generator) -> list[int]:
+    """Return the numbers of samples to start the components from: every second one is far from those before."""
+    pool = rng.choice(len(places), size=4 * _PARTICLES // 10, p=weight)
+    chosen, away = [int(pool[0])], ((places[pool] - places[pool[0]]) ** 2).sum(1)
+    for number in range(1, _PARTS):
+        far = number % 2 and away.sum() > 0
+        chosen.append(int(rng.choice(pool, p=away / away.sum()) if far else rng.choice(pool)))
+        away = np.minimum(away, ((places[pool] - places[chosen[-1]]) ** 2).sum(1))
+    return chosen
+
+
+def _maximised(samples: FloatArray, parts: FloatArray, whole: FloatArray) -> Mixture:
+    """Return the mixture of normal components with the moments of samples, by their shares ``parts``."""
+    shares = parts.sum(0)
+    centres = parts.T @ samples / shares.clip(1e-300)[:, None]
+    away = samples[None] - centres[:, None]
+    sums = np.swapaxes(away * parts.T[:, :, None], 1, 2) @ away
+    borrowed = _BORROWED / len(shares)
+    covariance = (sums + borrowed * whole) / (shares + borrowed)[:, None, None]
+    roots = np.linalg.cholesky(_firm(covariance)).astype(np.float64)
+    return Mixture(shares / shares.sum(), centres, roots)
+
+
+def _moments(samples: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    centre = weight @ samples
+    away = samples - centre
+    return centre, away.T @ (weight[:, None] * away)
+
+
+def _firm(covariance: FloatArray) -> FloatArray:
+    """Return covariances (..., free, free) whose rounding cannot make a variance negative."""
+    firm = covariance.copy()
+    at = np.arange(covariance.shape[-1])
+    firm[..., at, at] *= 1 + 1e-9
+    return firm
+
+
+def _softened(log: FloatArray) -> FloatArray:
+    """Return ``log`` times the largest factor, up to 1, whose weights leave enough effective samples for a fit."""
+    if _effective(log) >= _SOFT:
+        return log
+    low, high = 1e-12, 1.0
+    for _ in range(40):
+        middle = (low * high) ** 0.5
+        low, high = (middle, high) if _effective(middle * log) >= _SOFT else (low, middle)
+    return low * log
+
+
+def _effective(log: FloatArray) -> float:
+    """Return the effective sample size of weights with the logarithms ``log``, divided by their number."""
+    return float(1 / (_normalised(log) ** 2).sum() / len(log))
+
+
+def _normalised(log: FloatArray) -> FloatArray:
+    weight = np.exp(log - log.max())
+    normalised: FloatArray = weight / weight.sum()
+    return normalised
+
+
+def _finite(log: FloatArray) -> FloatArray:
+    return np.nan_to_num(log, nan=_NEVER, neginf=_NEVER)
+
+
+def _log_sum(logs: FloatArray) -> FloatArray:
+    """Return the logarithm of the sum of exponentials along the last axis."""
+    top = logs.max(-1)
+    total: FloatArray = top + np.log(np.exp(logs - top[..., None]).sum(-1))
+    return total
