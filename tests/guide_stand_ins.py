@@ -10,9 +10,13 @@ import re
 import shlex
 from collections.abc import Mapping
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from neusee.workflows.evaluation.pipelines import CASES as LASERS
+from neusee.workflows.evaluation.pipelines import NONE
+from neusee.workflows.studies.leave_out.possible_omissions import omissions
 from neusee.workflows.studies.stability import stability_study
 from neusee.workflows.studies.stability.extreme_cases import CASES
 from tests.guide_commands import ROOT
@@ -26,6 +30,8 @@ SMALL_OPTIONS = {
     **{f"scene/{name}": "scene: {shape: [28, 28]}" for name in ("china", "siemens", "night")},
 }
 LARGEST = {"optics.samples": 128, "optics.bands": 31, "scene.shape": 96, "sensor.shape": 64}  #: of a small camera
+
+OF_PACKAGE = re.compile(r"\boptics: [a-z]")  #: in a recipe that takes its optics from an option of the package
 
 #: commands that compute little or nothing, and run as they are written
 LIGHT = (
@@ -47,13 +53,13 @@ class StandIn(NamedTuple):
     more: tuple[str, ...] = ()  #: words after those of the page
     instead: Mapping[str, str] = {}  #: words in the place of words of the page
     constants: Mapping[str, Any] = {}  #: ``module:name`` of a number of the program that is made small
-    processes: int = 1  #: of torchrun
+    processes: int = 1  #: of a mesh
     code: int = 0  #: the exit code
 
 
 PITCH = "doe.pitch=14.96 um"
 FULL_MASK = StandIn("the height map has the 540 samples of the full pupil", more=(PITCH,))
-FIELD = {"sensor.shape=[512,512]": "sensor.shape=[32,32]", "scene.shape=[576,576]": "scene.shape=[36,36]"}
+FIELD = {"sensor.shape=[512,512]": "sensor.shape=[24,24]", "scene.shape=[576,576]": "scene.shape=[28,28]"}
 PIPELINES = "flat+none, half_ring+wiener, pixelwise@mask.npy+wiener"
 EVALUATE = 'evaluate first_light "sensor.shape=[512,512]" "scene.shape=[576,576]"'
 SIX = "train train_small train.stages.1.iterations=6 train.stages.2.iterations=6"
@@ -70,6 +76,11 @@ DEMONSTRATION = (
     "train.size=null",
 )  # fmt: skip
 SMALLNET = (*TRAINING[:-2], "train.stages.2.iterations=2", "train.critics.width=4")
+
+
+def three_omissions(*found: Any) -> Any:
+    """Return the first three steps that a study may leave out."""
+    return islice(omissions(*found), 3)
 
 
 def without_walk(problem: Any, mode: Any, seed: int, *_: Any, **how: Any) -> Any:
@@ -91,7 +102,20 @@ TWO = (*PROTECTION, "--draws", "2")
 CLUSTER = "tcp://scheduler:8786"
 TWO_LASERS = ("~lasers.blue", "~lasers.cyan", "~lasers.yellow", "~lasers.red")
 FEW_DRAWS = ("--draws", "100", "--walkers", "16")
-CUT = {"calibration.emcee_sampler:_LONGEST": 250}  #: steps; the command says that its chains are cut, by exit code 3
+#: steps; the command says that its chains are cut, by exit code 3
+CUT = {"calibration.emcee_sampler:_FIRST": 80, "calibration.emcee_sampler:_LONGEST": 80}
+#: two lasers of an evaluation's page, as weak as its points: each saturated pixel adds an unknown to the filter
+WEAK = {
+    "evaluation.comparison_pictures:_WEAKEST": 30.0,
+    "evaluation.comparison_pictures:CASES": {name: LASERS[name] for name in ("green", "red", NONE)},
+}
+#: settings of an accuracy study, each measured once
+FEW_POINTS = {
+    "studies.accuracy.accuracy_study:_FEWER": (1e-1,), "studies.accuracy.accuracy_study:TIMES": 1,
+    "studies.accuracy.recipe_knobs:_FEWER": (1 / 3,), "studies.accuracy.recipe_knobs:_FEWER_SCALES": (0.75,),
+    "studies.accuracy.single_steps:_TIMES": 1,
+}  # fmt: skip
+FEW_STOPS = {"protection.protection_result:_RATIO": 0.5, "protection.protection_result:_MASK_STOPS": (1.0, 0.7)}
 
 STAND_INS = {
     "run demonstration": StandIn(
@@ -110,7 +134,8 @@ STAND_INS = {
         "a field of 768 x 768", instead={"scene.shape=[768,768]": "scene.shape=[36,36]"}
     ),
     "run six_lasers": StandIn("two of the six lasers", more=TWO_LASERS),
-    "run six_lasers --executor dask:2": StandIn("two of the six lasers, and other noise", more=(*TWO_LASERS, "seed=8")),
+    "run six_lasers --executor dask:2": StandIn(
+        "two lasers, other noise, and one process", more=(*TWO_LASERS, "seed=8"), instead={"dask:2": "dask:1"}),
     f"run six_lasers --executor {CLUSTER}": StandIn(
         "a scheduler and a worker on this machine", more=(*TWO_LASERS, "seed=9"), instead={CLUSTER: "LOCAL"}
     ),
@@ -132,7 +157,7 @@ STAND_INS = {
         "patch.shape=[8, 8]", "patch.leaves=8", "train_lift.iterations=4", "train_lift.batch=1", "train_lift.keep=2",
         "train_lift.warmup=2", "train_lift.validation_batches=2")),
     "study accuracy first_light --quick": StandIn("minutes", more=(
-        "laser=none", "outputs=[raw,lsr]", "--seeds", "1")),
+        "laser=none", "outputs=[raw,lsr]", "--seeds", "1"), constants=FEW_POINTS),
     "study stability first_light": StandIn("minutes: the first two of the extreme cases", constants={
         "studies.stability.stability_study:study": partial(stability_study.study, cases=CASES[:2])}),
     "study uncertainty my/uncertain.yaml --error 0.1 --points sobol": StandIn(
@@ -140,8 +165,9 @@ STAND_INS = {
     'study uncertainty first_light sensor.read_noise="normal(10.5 e-, 0.5 e-)"': StandIn(
         "minutes: hundreds of draws of every output", more=("--most", "64", "outputs=[saturated]")),
     "study leave-out first_light": StandIn(
-        "minutes: what simpler scenes cost is not measured", more=("outputs=[raw,lsr]",), constants={
-            "studies.leave_out.leave_out_study:measure_scenes": lambda *_: []}),
+        "minutes: three omissions, and what simpler scenes cost is not measured", more=("outputs=[raw,lsr]",),
+        constants={"studies.leave_out.leave_out_study:measure_scenes": lambda *_: [],
+            "studies.leave_out.omission_rows:omissions": three_omissions}),
     "study calibration calibrate --simulations 100": StandIn(
         "minutes: 20 sensors of 32 x 32 pixels, and draws without a walk", more=("flats.shape=[32,32]",
             "sensor.gain=0.37 DN/e-"), instead={"100": "20"},
@@ -159,30 +185,32 @@ STAND_INS = {
     "safety first_light laser=pointer +safety=camera": StandIn("a thousand draws", more=SAFETY[:1]),
     'safety first_light laser=pointer +safety=camera doe=vortex "lasers.pointer.power=uniform(1 mW, 5 mW)"': StandIn(
         "a thousand draws", more=SAFETY[:1]),
-    "study protection five_half_rings": StandIn("ten minutes: two draws", more=TWO),
-    "study protection five_half_rings sensor=night": StandIn("ten minutes: two draws", more=TWO),
-    "study protection five_half_rings --draws 6": StandIn("minutes", more=PROTECTION, instead={"6": "2"}),
-    "study protection five_half_rings --draws 3 --bands 2": StandIn("minutes", more=PROTECTION, instead={"3": "2"}),
+    "study protection five_half_rings": StandIn("ten minutes: two draws", more=TWO, constants=FEW_STOPS),
+    "study protection five_half_rings sensor=night": StandIn("ten minutes: two draws", more=TWO, constants=FEW_STOPS),
+    "study protection five_half_rings --draws 6": StandIn(
+        "minutes", more=PROTECTION, instead={"6": "2"}, constants=FEW_STOPS),
+    "study protection five_half_rings --draws 3 --bands 2": StandIn(
+        "minutes", more=PROTECTION, instead={"3": "2"}, constants=FEW_STOPS),
     "study protection axicon doe.waves=5 --light continuous --draws 6": StandIn(
-        "minutes", more=PROTECTION, instead={"6": "2"}),
+        "minutes", more=PROTECTION, instead={"6": "2"}, constants=FEW_STOPS),
     f"{EVALUATE} --scenes 3 --strengths 0,1e3,1e6": StandIn(
-        "a minute", instead={**FIELD, "3": "1", "0,1e3,1e6": "0,1e3"}),
+        "a minute", instead={**FIELD, "3": "1", "0,1e3,1e6": "0,30"}, constants=WEAK),
     f"{EVALUATE} --scenes 3 --strengths 1e4,1e6 "
     '--pipelines "flat+wiener, half_ring+wiener, five_half_rings+wiener" --equal-protection 0.002': StandIn(
-        "minutes", more=("--by", "filter"),
-        instead={**FIELD, "3": "1", "1e4,1e6": "1e4", "0.002": "1e-5",
+        "minutes", more=("--by", "filter"), constants=WEAK,
+        instead={**FIELD, "3": "1", "1e4,1e6": "100", "0.002": "1e-5",
                  "flat+wiener, half_ring+wiener, five_half_rings+wiener": "flat+none, five_half_rings+none"}),
     f"{EVALUATE} --scenes 3 --strengths 1e2,1e4,1e6 "
     '--pipelines "flat+none, half_ring+none, five_half_rings+none"': StandIn(
-        "a minute", instead={**FIELD, "3": "1", "1e2,1e4,1e6": "1e2,1e4"}),
+        "a minute", instead={**FIELD, "3": "1", "1e2,1e4,1e6": "10,100"}, constants=WEAK),
     f'{EVALUATE} --data photographs --pipelines "flat+none, half_ring+wiener, pixelwise@mask.npy+wiener"': StandIn(
         "20 scenes, a mask of 540 samples", instead={**FIELD, PIPELINES: PIPELINES.replace("mask", "mask_128")},
-        more=("--scenes", "1", "--strengths", "1e3", "+evaluate={mismatch: null}")),
+        more=("--scenes", "1", "--strengths", "30", "+evaluate={mismatch: null}"), constants=WEAK),
     f'{EVALUATE} --pipelines "flat+none, five_half_rings+nafnet@net.safetensors" --reference flat+none': StandIn(
-        "20 scenes", instead=FIELD, more=("--scenes", "1", "--strengths", "1e3")),
+        "20 scenes", instead=FIELD, more=("--scenes", "1", "--strengths", "30"), constants=WEAK),
     "evaluate my/train_smallnet.yaml --scenes 3 --strengths 0,1e3 --pipelines "
     "flat+none,five_half_rings+smallnet@smallnet.safetensors": StandIn(
-        "three scenes", instead={"3": "1", "0,1e3": "1e3"}),
+        "three scenes", instead={"3": "1", "0,1e3": "30"}, constants=WEAK),
 }  # fmt: skip
 
 
@@ -194,10 +222,10 @@ def stand_in(words: str, folder: Path) -> StandIn | None:
     if declared is None and kind not in SIZED and not words.startswith("study uncertainty"):
         raise NotDeclared(f"neusee {words}: say in STAND_INS how a test runs this command")
     text = _recipe_text(words, folder)
-    if declared is None and not re.search(r"^ *- optics: ", text, re.MULTILINE):
+    if declared is None and not OF_PACKAGE.search(text):
         return None
     found = declared or StandIn("the camera is small; expected numbers are those of the full camera")
-    numbers = re.search(r"^expect:", text, re.MULTILINE) and re.search(r"^ *- optics: ", text, re.MULTILINE)
+    numbers = re.search(r"^expect:", text, re.MULTILINE) and OF_PACKAGE.search(text)
     return found._replace(more=(*found.more, *(["~expect"] if numbers else [])))
 
 

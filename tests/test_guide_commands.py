@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
-import os
 import re
 import shlex
 import shutil
 import subprocess
-import sys
 import tomllib
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -40,6 +36,7 @@ from tests.guide_commands import (
     named_files,
     write_reader_files,
 )
+from tests.guide_machines import scheduler, together
 from tests.guide_stand_ins import LIGHT, SMALL_OPTIONS, STAND_INS, NotDeclared, StandIn, stand_in, typed
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:typer")
@@ -85,16 +82,18 @@ def reader(place, monkeypatch, tmp_path):
         yield place
 
 
-def carry_out(words: str, place: Path, monkeypatch, *more: str) -> None:
-    """Run a command of a page, or its stand-in, and ask for exit code 0."""
-    found = stand_in(words, place)
+def carry_out(words: str, place: Path, monkeypatch) -> None:
+    """Run a command of a page, or its stand-in, and ask for exit code 0; draw no figures that no page shows."""
+    found, own = stand_in(words, place), tuple(typed(words, None))
+    asked = SHOWN.get(own, set())
     with monkeypatch.context() as patch, scheduler(found) as address:
+        if not asked:
+            patch.setattr(style, "png_of", lambda _: (place / "no_graph.png").read_bytes())
         if found:
             patch.setenv("NEUSEE_RECIPES", str(place / "options"))
         for name, value in (found.constants if found else {}).items():
             module, _, attribute = name.partition(":")
             patch.setattr(importlib.import_module(f"neusee.workflows.{module}"), attribute, value)
-        asked = SHOWN.get(tuple(typed(words, None)), set())
         patch.setattr(simulate_recipe, "timeline", lambda result: None)  # no page shows it
         patch.setattr(run_pictures, "FIGURES", [f for f in run_pictures.FIGURES if f.name in asked])
         if "graph" not in asked:
@@ -103,33 +102,13 @@ def carry_out(words: str, place: Path, monkeypatch, *more: str) -> None:
         if found and found.processes > 1:
             return together(arguments, found.processes)
         with pytest.raises(SystemExit) as end:
-            app.main([*arguments, *more])
+            app.main([*arguments, *(["--out", str(shown_by(own, place))] if asked else [])])
         assert end.value.code == (found.code if found else 0)
 
 
-@contextlib.contextmanager
-def scheduler(found: StandIn | None) -> Iterator[str]:
-    """Start a scheduler of dask with one worker on this machine if a stand-in asks for one; yield its address."""
-    if not found or "LOCAL" not in found.instead.values():
-        yield ""
-        return
-    from distributed import LocalCluster
-
-    with LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
-    ) as cluster:
-        yield cluster.scheduler_address
-
-
-def together(arguments: list[str], count: int) -> None:
-    """Run a command in several processes of torchrun."""
-    start = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count), "-m"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / ".src")}
-    done = subprocess.run(
-        [*start, "neusee.workflows.cli", *arguments], env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr[-6000:]
-    print(done.stdout)
+def shown_by(words: tuple[str, ...], place: Path) -> Path:
+    """Return the folder for the results of a command whose pictures a page shows."""
+    return place / "shown" / f"{zlib.crc32(repr(words).encode()):x}"
 
 
 ALONE = {"handbook"}  #: its test is that of the whole site
@@ -160,7 +139,7 @@ def test_every_command_runs(words, place, reader, tmp_path, monkeypatch, capfd):
             carry_out("new node bloom", place, monkeypatch)
             shutil.copy("bloom.py", tmp_path / "mylab" / "optics.py")
     if words.startswith("compare"):
-        carry_out("run first_light", place, monkeypatch)
+        carry_out("run first_light seed=7", place, monkeypatch)  # as it stands, in the folder `runs`
         for name in set(re.findall(r"runs/\w+|\d{4}-\w+-\w+", words)):
             shutil.copytree((place / "runs" / "latest").resolve(), place / "runs" / Path(name).name)
     if words == "train train_demonstration --stage 2":
@@ -266,14 +245,15 @@ def test_a_shell_takes_the_variable_and_the_program_knows_it(line):
 
 @pytest.fixture
 def small_pictures(reader, monkeypatch):
-    """Let the build of the handbook draw its pictures by the stand-ins of the commands, in this process."""
+    """Let the build of the handbook take its pictures from the stand-ins of the commands, which run if none did."""
     written = {tuple(shlex.split(words)): words for words in SPOKEN}
 
-    def run(words, work, results):
-        monkeypatch.chdir(reader)
-        carry_out(written[words], reader, monkeypatch, "--out", str(results))
-        (folder,) = [path for path in results.iterdir() if path.is_dir() and not path.is_symlink()]
-        return folder
+    def run(words, *_):
+        results = shown_by(words, reader)
+        if not results.is_dir():
+            monkeypatch.chdir(reader)
+            carry_out(written[words], reader, monkeypatch)
+        return max(path for path in results.iterdir() if path.is_dir() and not path.is_symlink())
 
     monkeypatch.setattr(command_pictures, "_run", run)
     return reader
