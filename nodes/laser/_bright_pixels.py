@@ -57,13 +57,15 @@ def bright_pixels(
             pupil of M samples across repeats light of its stepped edges: 1 to 2 % too bright at n = M / 8, 5 % at
             n = M / 6 and 9 to 14 % at n = M / 4. An average of samples up to lambda N / 2 apart is that of the pixel to
             1 %.
-    Raises: ParameterError before the run for a sample pitch that is no whole fraction of the pixel.
+    Raises: ParameterError before the run for a sample pitch that is no whole fraction of the pixel; ValueError for a
+            PSF that is narrower than a pixel.
     Source: by definition.
     """
     weights = (bands.weights * bands.centres).double()  # photons of each wavelength, which fill wells
     weights = weights / weights.sum()
-    light = sum(w * band.detach() for w, band in zip(weights.tolist(), psf.intensity, strict=True))
-    image = _pixels(torch.as_tensor(light), _samples(pixel_pitch, sample_pitch))
+    samples = _samples(pixel_pitch, sample_pitch)
+    bands_of_pixels = (_pixels(band.detach().double(), samples) for band in psf.intensity)
+    image = torch.as_tensor(sum(w * band for w, band in zip(weights.tolist(), bands_of_pixels, strict=True)))
     narrow = [m < n for m, n in zip(image.shape, shape, strict=True)]
     image = crop(image, shape=(min(shape[0], image.shape[0]), min(shape[1], image.shape[1])))
     count = ranks(image.numel())
@@ -86,6 +88,9 @@ def _samples(pixel_pitch: float, sample_pitch: float | None) -> int:
 
 def _pixels(light: Tensor, samples: int) -> Tensor:
     """Return the light (y, x) of each pixel from that of its samples; a part of a pixel at the end is left out."""
+    if min(light.shape) < samples:
+        size = f"{light.shape[0]} x {light.shape[1]}"
+        raise ValueError(f"a PSF of {size} samples holds no pixel, which is {samples} samples wide: enlarge its window")
     return light if samples == 1 else avg_pool2d(light[None], samples)[0] * samples**2
 
 

@@ -65,6 +65,9 @@ def _(psf: Psf, bands: Bands, **params: Any) -> BrightPixels:
 
 
 @bright_pixels.work
-def _(result: BrightPixels, psf: Psf, *inputs: Any, **params: Any) -> tuple[float, float]:
+def _(
+    result: BrightPixels, psf: Psf, *inputs: Any, pixel_pitch: float, sample_pitch: float | None = None, **params: Any
+) -> tuple[float, float]:
     samples = float(psf.intensity[0].numel())
-    return 24.0 * samples, 2.0 * psf.intensity.numel() + 30 * samples
+    pixels = samples * min(1.0, (sample_pitch or pixel_pitch) / pixel_pitch) ** 2
+    return 8.0 * samples + 48 * pixels, 2.0 * psf.intensity.numel() + 30 * samples

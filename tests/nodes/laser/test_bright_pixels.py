@@ -114,6 +114,29 @@ def test_the_rim_says_whether_the_window_holds_the_pixels():
     assert part.rim[-1] == 1
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
+def test_the_light_of_bands_and_samples_is_summed_in_double_precision(dtype):
+    """In single precision the roundings of the sum split pixels that are alike, so that their rank is by chance."""
+    at = torch.arange(-20.0, 22.0)
+    light = (1 + at[:, None].square() + at.square()).pow(-1).to(dtype)
+    three = Bands(*(torch.tensor(x, dtype=torch.float64) for x in ([5e-7, 5.3e-7, 6e-7], [1e-9] * 3, [0.2, 0.5, 0.3])))
+    fine = {"shape": (50, 14), "pixel_pitch": PITCH, "sample_pitch": PITCH / 3}
+    single, double = (
+        bright_pixels(Psf(torch.stack([x, x / 3, x * 0.7]), torch.ones(3)), three, **fine)
+        for x in (light, light.double())
+    )
+    near = bright_pixels(Psf(torch.stack([light, light / 3, light * 0.7]).double(), torch.ones(3)), three, **fine)
+    assert all(one.equal(other) for one, other in zip(single, near, strict=True))
+    torch.testing.assert_close(single.level, double.level, rtol=2 * float(torch.finfo(dtype).eps), atol=0.0)
+
+
+def test_a_psf_that_is_narrower_than_a_pixel_is_refused():
+    with pytest.raises(ValueError, match="a PSF of 2 x 9 samples holds no pixel, which is 3 samples wide"):
+        bright_pixels(
+            Psf(torch.ones(1, 2, 9), torch.ones(1)), LINE, shape=(3, 3), pixel_pitch=PITCH, sample_pitch=PITCH / 3
+        )
+
+
 def test_a_sample_pitch_that_is_no_fraction_of_the_pixel_is_refused_with_one_that_is():
     with pytest.raises(ParameterError, match=r"give a whole fraction of the pixel, such as 1\.45 um"):
         bright_pixels.hooks.preflight(pixel_pitch=2.9e-6, sample_pitch=1.3e-6)
