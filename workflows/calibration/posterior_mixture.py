@@ -68,23 +68,30 @@ def fit_mixture(
 ) -> tuple[Mixture, FloatArray, FloatArray]:
     """Return a mixture like the posterior, samples of it (count, free), and the log of posterior over mixture of each.
 
-    The mixture is fitted to particles and to draws about the mode, and then to its own weighted samples. The mixture
-    with the largest effective sample size is kept, and new samples are drawn from it, whose own effective sample size
-    the caller must check.
+    A first mixture is fitted to particles and to draws about the mode, and stays a half of every further one, because
+    a part of the posterior that has no samples is missed without a sign in the weights. The other half is fitted to
+    weighted samples, again and again. The mixture with the largest effective sample size is kept, and new samples are
+    drawn from it, whose own effective sample size the caller must check.
     """
-    samples = _start(problem, mode, rng)
-    weight, best, kept = np.full(len(samples), 1 / len(samples)), -1.0, None
+    points = _start(problem, mode, rng)
+    first = mixture = kept = _fitted(points, np.full(len(points), 1 / len(points)), rng)
+    best = -1.0
     for _ in range(_ROUNDS):
-        mixture = _fitted(samples, weight, rng)
         samples, log = _weighed(problem, mixture, _TRIED, rng)
         fraction = _effective(log)
         if fraction > best:
             best, kept = fraction, mixture
         if fraction >= _ENOUGH:
             break
-        weight = _normalised(_softened(log))
-    assert kept is not None  # the first fit is kept
+        mixture = _joined(first, _fitted(samples, _normalised(_softened(log)), rng))
     return kept, *_weighed(problem, kept, count, rng)
+
+
+def _joined(one: Mixture, other: Mixture) -> Mixture:
+    """Return the mixture of two mixtures in equal parts."""
+    shares = 0.5 * np.concatenate([one.shares, other.shares])
+    centres, roots = (np.concatenate([a, b]) for a, b in ((one.centres, other.centres), (one.roots, other.roots)))
+    return Mixture(shares, centres, roots)
 
 
 def _weighed(

@@ -91,6 +91,7 @@ def test_a_lobe_within_the_saturated_pixels_gives_limits_and_no_value():
     assert found.kinds["s"] == "estimate"
 
 
+@pytest.mark.slow
 def test_a_lobe_that_the_frame_shows_gives_values():
     problem, mode = fitted({**TRUTH, "b0": 60.0}, prior=WIDE, size=192)
     found = told(problem, mode)
