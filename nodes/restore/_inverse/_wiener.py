@@ -164,6 +164,8 @@ def _restored(
     y, x = electrons.shape[-2:]
     balance, read, doubt = settings
     known = torch.where(known.amax((-2, -1), keepdim=True) > 0, known, 1.0)
+    share = _power_of_two(kernels.sum((-2, -1), keepdim=True).detach())
+    kernels = kernels / share  # the same bits, and the floors below concern the shape of the PSF, not a grey filter
     trusted, light, wrong = doubted(electrons, known, glare, doubt, lambda mean: _noise(electrons, mean, read))
     picture = electrons - light.sum
     mean = average(picture, trusted)
@@ -179,7 +181,12 @@ def _restored(
     problem = Blurred(centred, weight, transfer, power, size, _GREY, scaled, bounded=len(light.modes))
     spectrum = most_likely(problem, coarser=coarser)
     sharp = torch.stack([torch.fft.irfft2(s, s=size)[:y, :x] for s in spectrum])  # one batch takes twice as long
-    return sharp * scale + mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None]
+    return (sharp * scale + mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None]) / share
+
+
+def _power_of_two(x: Tensor) -> Tensor:
+    """Return the powers of two nearest to ``x`` by ratio, and 1 where ``x`` is not positive."""
+    return torch.where(x > 0, x, 1.0).log2().round().exp2()
 
 
 def _passed(transfer: Tensor, power: Tensor, size: tuple[int, int]) -> Tensor:

@@ -83,6 +83,15 @@ def test_lost_light_is_put_back():
     torch.testing.assert_close(run(0.5 * flat, dim), flat, rtol=1e-4, atol=0.0)
 
 
+@pytest.mark.parametrize("power", [-30, -17, -10, 4])
+def test_a_grey_filter_scales_the_scene_of_the_same_electrons(power):
+    """A power of two divides and multiplies without rounding; floors of the program made strong filters too dark."""
+    psf = disc(2.0)
+    electrons = seen(scene(48), psf)
+    plain, dimmed = run(electrons, psf), run(electrons, Psf(psf.intensity * 2.0**power, ONE))
+    assert torch.equal(dimmed, plain * 2.0**-power)
+
+
 def test_balance_trades_sharpness_for_noise():
     blurred, psf = seen(scene(), disc(5)), disc(5)
     rough = [float(run(blurred, psf, balance=b).diff().square().mean()) for b in (0.01, 1.0, 100.0)]
