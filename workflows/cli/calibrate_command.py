@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -60,5 +61,6 @@ def calibrate(
 def _lines(parameters: dict[str, dict[str, object]]) -> list[str]:
     from neusee.workflows.calibration.calibration_page import ParameterEstimate
 
-    rows = [ParameterEstimate(**{"mean": 0.0, "sd": 0.0, **row}) for row in parameters.values()]  # type: ignore[arg-type]
+    unknown = dict.fromkeys(("mean", "sd", "low", "high"), math.nan)  # what the frames do not tell is not in the file
+    rows = [ParameterEstimate(**{**unknown, **row}) for row in parameters.values()]  # type: ignore[arg-type]
     return [f"{row.name.replace('_', ' '):20s} {row.text}" for row in rows]
