@@ -20,6 +20,7 @@ from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf
 
 _FALL = 3.0  #: the power spectrum of pictures falls with frequency to this power, like that of edges
+_NO_LIGHT = 1e-12  #: share of the light below which a PSF counts as one without light
 _GREY = 0.95  #: correlation between the channels of pictures
 _PRECISE = (
     256  #: pixels a side, up to which all is computed in float64: the dense float64 algebra takes most time there
@@ -185,8 +186,8 @@ def _restored(
 
 
 def _power_of_two(x: Tensor) -> Tensor:
-    """Return the powers of two nearest to ``x`` by ratio, and 1 where ``x`` is not positive."""
-    return torch.where(x > 0, x, 1.0).log2().round().exp2()
+    """Return the powers of two nearest to ``x`` by ratio; 1 for a PSF without light, whose slopes overflow."""
+    return torch.where(x > _NO_LIGHT, x, 1.0).log2().round().exp2()
 
 
 def _passed(transfer: Tensor, power: Tensor, size: tuple[int, int]) -> Tensor:
