@@ -132,6 +132,22 @@ class Levels(NamedTuple):
     cell_count: Tensor  #: (cell,) float64
 
 
+class FoundLasers(NamedTuple):
+    """Lasers that were found in a frame, the most certain first; a row beyond ``number`` is 0 and no laser."""
+
+    number: Tensor  #: () int64, of lasers
+    direction: Tensor  #: (laser, 2) float64, rad, (n_y, n_x)
+    wavelength: Tensor  #: (laser,) float64, m
+    fwhm: Tensor  #: (laser,) float64, m, width of the line, the best of those that were tried
+    strength: Tensor  #: (laser, channel) float64, electrons over all of the pattern behind a clear pupil
+    direction_interval: Tensor  #: (laser, 2, 2) float64, rad: lower and upper end (90 %) along each axis
+    wavelength_interval: Tensor  #: (laser, 2) float64, m: lower and upper end (90 %)
+    strength_interval: Tensor  #: (laser, channel, 2) float64, electrons: lower and upper end (90 %)
+    identifiable: Tensor  #: (laser, 2) bool: True where the frame tells direction, and wavelength
+    gain: Tensor  #: (laser, 2) float64: log likelihood gained by the laser, and beyond what a lamp there gains
+    correlation: Tensor  #: (laser, value, value) float64, of n_y, n_x, wavelength and the strength of each channel
+
+
 #: for each class, the fields with one entry per band
 BAND_FIELDS: dict[type, tuple[str, ...]] = {
     Bands: Bands._fields,

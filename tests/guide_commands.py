@@ -6,6 +6,7 @@ import contextlib
 import re
 import shutil
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -14,12 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import save_file
 
 from neusee.nodes import own_modules
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
 from neusee.workflows.recipe import node_families
+from tests.deepinv_without_torchvision import deepinv_or_skip
 
 ROOT = Path(__file__).parents[1]
 GUIDE = ROOT / "recipes" / "guide"
@@ -79,6 +82,18 @@ def forgotten_modules(*folders: Path) -> Iterator[None]:
     node_families._installed.cache_clear()
 
 
+#: packages of extras that `test` does not bring, and how a test imports one or is skipped with the reason
+NEEDS = {"deepinv": deepinv_or_skip}
+
+
+def import_or_skip(code: str) -> None:
+    """Import the packages of `NEEDS` that a block of Python imports, or skip the test with the reason."""
+    for package, imported in NEEDS.items():
+        if re.search(rf"^(?:from|import) {package}\b", code, re.MULTILINE):
+            imported()
+            warnings.simplefilter("ignore")  # of the next versions of this package, until the end of the test
+
+
 # --- the files of the reader ------------------------------------------------------------------------------------------
 
 
@@ -100,7 +115,8 @@ def write_reader_files(folder: Path) -> None:
     shutil.copy(ROOT / "recipes" / "samples" / "camera_levels.csv", folder / "my.csv")
     (folder / "camera.csv").write_text("wavelength,red,green,blue\n400,0,0,1\n550,0,1,0\n700,1,0,0\n")
     network = start_network(partial(NAFNet, width=16), torch.Generator().manual_seed(0))
-    save_file(network.state_dict(), folder / "net.safetensors")
+    for name in ("net", "best"):
+        save_file(network.state_dict(), folder / f"{name}.safetensors")
     names: dict[str, Any] = {}
     exec((folder / "my" / "smallnet.py").read_text(encoding="utf-8"), names)
     save_file(names["SmallUNet"](16).state_dict(), folder / "smallnet.safetensors")
@@ -109,6 +125,8 @@ def write_reader_files(folder: Path) -> None:
     (folder / "my_photographs").mkdir()
     for name in ("holiday.jpg", "my_photographs/one.jpg"):
         shutil.copy(ROOT / "recipes" / "samples" / "china.jpg", folder / name)
+    with Image.open(folder / "holiday.jpg") as image:
+        image.rotate(180).save(folder / "my_photographs" / "two.jpg")
     shutil.copytree(folder / "my_photographs", folder / "photographs")
     shutil.copy(ROOT / "recipes" / "samples" / "night.exr", folder / "street.exr")
     (folder / "mylab").mkdir()

@@ -39,7 +39,7 @@ LIGHT = (
     "handbook",
 )  # fmt: skip
 #: commands that run as they are written, but for the small options that hide those of the packaged camera
-SIZED = ("run", "sweep")
+SIZED = ("run", "sweep", "restore")
 
 
 class NotDeclared(LookupError):
@@ -149,6 +149,19 @@ STAND_INS = {
         processes=2),
     f'train train_small doe=shaded "{LIMITED}" --stage mask': StandIn(
         "an hour", more=TRAINING, instead={LIMITED: LIMITED.replace("{kind", "{iterations: 2, kind")}),
+    "train train_small train.photographs=my_photographs": StandIn("ten minutes", more=(*TRAINING, *ONE)),
+    "train train_small train.photographs=my_photographs train.validate_every=100 train.patience=5": StandIn(
+        "ten minutes", more=(*TRAINING, *ONE)),
+    "train train_small train.photographs=my_photographs train.augment.symmetries=all train.augment.exposure=2 "
+    "train.augment.colour=0.3": StandIn("ten minutes", more=(*TRAINING, *ONE)),
+    'train my/train_smallnet.yaml "train.export=[pt2]"': StandIn("minutes", more=SMALLNET),
+    "train train_hour train.photographs=my_photographs": StandIn("a quarter of an hour", more=(
+        *TRAINING[:-2], "train.network.width=4", "train.stages.2.iterations=1", "train.stages.2.batch=2")),
+    "evaluate train_hour --data photographs --scenes 20 "
+    '--pipelines "flat+none, five_half_rings+wiener, five_half_rings+nafnet@best.safetensors"': StandIn(
+        "20 scenes", instead={"20": "1"}, more=("--strengths", "30", "+evaluate={mismatch: null}"), constants=WEAK),
+    "train my/train_smallnet.yaml train.start=smallnet.safetensors train.rates.weights=5e-5": StandIn(
+        "minutes", more=SMALLNET),
     "train train_demonstration --stage mask": StandIn("half an hour", more=DEMONSTRATION),
     "train train_demonstration --stage 2": StandIn("half an hour", more=DEMONSTRATION),
     "train my/train_smallnet.yaml": StandIn("minutes", more=SMALLNET),

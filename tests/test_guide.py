@@ -26,6 +26,7 @@ from tests.guide_commands import (
     blocks,
     cases,
     forgotten_modules,
+    import_or_skip,
     lines,
     write_reader_files,
 )
@@ -161,6 +162,7 @@ def test_the_readme_says_the_two_commands_that_are_tested():
 @pytest.mark.parametrize("code", cases(lambda page: blocks(page, "python")))
 def test_every_python_block_compiles_and_its_names_exist(code):
     tree = ast.parse(code)
+    import_or_skip(code)
     modules = {}
     for item in (item for item in tree.body if isinstance(item, ast.ImportFrom | ast.Import)):
         for alias in item.names:

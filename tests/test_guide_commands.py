@@ -31,6 +31,7 @@ from tests.guide_commands import (
     blocks,
     cases,
     forgotten_modules,
+    import_or_skip,
     indented,
     lines,
     named_files,
@@ -144,6 +145,9 @@ def test_every_command_runs(words, place, reader, tmp_path, monkeypatch, capfd):
             shutil.copytree((place / "runs" / "latest").resolve(), place / "runs" / Path(name).name)
     if words == "train train_demonstration --stage 2":
         carry_out("train train_demonstration --stage mask", place, monkeypatch)
+    if words.startswith("restore"):
+        carry_out('run half_ring "outputs=[raw]"', place, monkeypatch)
+        shutil.copy(place / "runs" / "latest" / "data" / "raw_mask.png", place / "shot.png")
     carry_out(words, place, monkeypatch)
     assert capfd.readouterr().out
 
@@ -200,6 +204,7 @@ def test_every_file_of_the_reader_is_used_by_a_command_or_by_another_file():
 @pytest.mark.slow
 @pytest.mark.parametrize("code", cases(lambda page: blocks(page, "python")))
 def test_every_python_block_runs(code, place, reader, tmp_path, monkeypatch):
+    import_or_skip(code)
     monkeypatch.setenv("NEUSEE_RECIPES", str(place / "all_bands"))  # expected numbers name bands
     monkeypatch.chdir(tmp_path)
     path = tmp_path / f"block_{zlib.crc32(code.encode()):x}.py"
@@ -253,7 +258,9 @@ def small_pictures(reader, monkeypatch):
         if not results.is_dir():
             monkeypatch.chdir(reader)
             carry_out(written[words], reader, monkeypatch)
-        return max(path for path in results.iterdir() if path.is_dir() and not path.is_symlink())
+        folder = max(path for path in results.iterdir() if path.is_dir() and not path.is_symlink())
+        command_pictures._name_latest(folder, reader)
+        return folder
 
     monkeypatch.setattr(command_pictures, "_run", run)
     return reader
@@ -269,7 +276,7 @@ def test_the_handbook_is_built_strictly_with_every_picture(small_pictures, tmp_p
     assert len(files) == len(wanted) > 40
     for path in files:
         with Image.open(path) as picture:
-            assert min(picture.size) > 30
+            assert min(picture.size) > 30 or picture.size == (24, 24), path  # the latter a frame of SMALL_SENSOR
             assert len(picture.convert("L").getcolors()) > 10, path
     shown = {
         name for html in page.parent.rglob("*.html") for name in re.findall(r"pictures/(\w+\.png)", html.read_text())

@@ -27,7 +27,7 @@ FORBIDDEN_IN_NODES = {"yaml", "ruamel", "emcee", "typer", "rich", "jinja2", "log
 ROOMS = (
     "graph", "keys", "recipe.text", "recipe.blocks", "recipe.distributions", "recipe", "store", "placement",
     "tolerance", "engine", "report.figures", "report", "contract", "explain", "simulation", "comparison", "safety",
-    "protection", "sweeps", "training.loop",
+    "restoration", "protection", "priors", "sweeps", "training.loop",
     "training.parallel", "training.mask_design", "training", "training.lift", "evaluation", "calibration", "studies",
     "studies.accuracy", "studies.stability", "studies.leave_out", "studies.uncertainty", "studies.calibration",
     "studies.protection", "api",
@@ -48,8 +48,8 @@ UPWARD = {
 
 #: Rooms that answer a command each, and do not import one another.
 COMMANDS = (
-    "contract", "explain", "simulation", "comparison", "safety", "sweeps", "training", "calibration", "evaluation",
-    "studies",
+    "contract", "explain", "simulation", "comparison", "safety", "restoration", "sweeps", "training", "calibration",
+    "evaluation", "studies",
 )  # fmt: skip
 ACROSS = {
     ("simulation", "explain"): "a run says why each of its steps ran",

@@ -20,11 +20,13 @@ if TYPE_CHECKING:
     from neusee.workflows.graph.run_error import RunError
     from neusee.workflows.graph.step_record import Event, StepRecord
     from neusee.workflows.placement.tasks_and_devices import Schedule
+    from neusee.workflows.priors.recipe_physics import as_physics
     from neusee.workflows.recipe.loading import load, recipes
     from neusee.workflows.store.result_store import Store
 
 _HOME = {
     "as_function": "engine.differentiable_function",
+    "as_physics": "priors.recipe_physics",
     "Recipe": "graph.recipe_graph",
     "Step": "graph.recipe_graph",
     "Diagnostic": "graph.diagnostics",
@@ -54,6 +56,7 @@ __all__ = [
     "StepRecord",
     "Store",
     "as_function",
+    "as_physics",
     "load",
     "recipes",
     "run",

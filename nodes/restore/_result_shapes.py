@@ -14,15 +14,19 @@ from neusee.nodes.restore._inverse._fft_grid import halvings, torus
 from neusee.nodes.restore._inverse._hidden_pixels import MOST, STEPS
 from neusee.nodes.restore._inverse._lowest_frequencies import MODES, SHARE
 from neusee.nodes.restore._inverse._nearby_glare import nearby_glare
+from neusee.nodes.restore._inverse._posterior_spread import wiener_spread
 from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
 from neusee.nodes.restore._inverse._wiener import wiener
+from neusee.nodes.restore._lasers._find_lasers import find_lasers
+from neusee.nodes.restore._lasers._found_glare import found_glare, found_nearby
 from neusee.nodes.restore._networks._fft_mamba import fft_mamba
 from neusee.nodes.restore._networks._nafnet import nafnet
 from neusee.nodes.restore._networks._network_node import network
 from neusee.nodes.restore._networks._own_network import tried
 from neusee.nodes.restore._networks._unet import unet
+from neusee.nodes.restore._white_level import white_level
 from neusee.nodes.shape_rules import at_least_single, blank, double, like_first, transform_operations
-from neusee.nodes.values import Psf, Pupil
+from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
 
 _SYSTEM = 35.0  #: bytes for each element of a dense system: the matrix, its factors and copies
 _INVERTED = 0.30  #: operations of a transform that take as long as one of the cube of the side of an inverted matrix
@@ -30,6 +34,8 @@ _WHITENED = 0.94  #: side of a dense system that needs as much memory as an inve
 _FILLED = 790.0  #: operations of a transform that take as long as an element of a matrix of covariances
 _FOCUS = 2.0  #: transforms, of the size of pupil and window together, that take as long as a band of a PSF
 _MODE = 24.0  #: bytes for each pixel of a pattern that the glare may have: its copies, scaled and weighted
+_SEARCHED = 150.0  #: bytes for each pixel of a frame in which lasers are searched: patterns, and slopes of a fit
+_LINES = 61  #: spectral lines that a search tries, each with five transforms
 _KEPT = 1 / 8  #: bytes of inner results of a network that need as much memory as a byte of the usual work of a node
 _LAYER = 1e-3  #: operations of a transform that take as long as one of a layer
 
@@ -64,6 +70,45 @@ def _(result: Tensor, glare: Tensor, pupil: Pupil, *others: Any, **params: Any) 
     return 16.0 * (pupil.height.numel() + y * x), _FOCUS * times * transform_operations(y, x)
 
 
+@find_lasers.shape
+def _(electrons: Tensor, *inputs: Any, most: int = 3, **params: Any) -> FoundLasers:
+    channels = len(electrons)
+    shapes = ((2,), (), (), (channels,), (2, 2), (2,), (channels, 2))
+    values = [double(most, *shape) for shape in shapes]
+    certain, spread = blank(most, 2, dtype=torch.bool), double(most, 3 + channels, 3 + channels)
+    places, wave, width, size, ends, wave_ends, size_ends = values
+    number, gain = blank(dtype=torch.int64), double(most, 2)
+    return FoundLasers(number, places, wave, width, size, ends, wave_ends, size_ends, certain, gain, spread)
+
+
+@find_lasers.work
+def _(result: FoundLasers, electrons: Tensor, *others: Any, **params: Any) -> tuple[float, float]:
+    y, x = electrons.shape[-2:]
+    rounds = 1 + len(result.direction)
+    return _SEARCHED * y * x, 5.0 * _LINES * rounds * transform_operations(2 * y, 2 * x)
+
+
+@found_glare.shape
+def _(found: Any, pupil: Any, electrons: Tensor, **params: Any) -> Tensor:
+    return blank(*electrons.shape, dtype=at_least_single(electrons))
+
+
+@found_nearby.shape
+def _(found: Any, pupil: Any, electrons: Tensor, *, patterns: int = 12, **params: Any) -> Tensor:
+    return blank(patterns, *electrons.shape, dtype=at_least_single(electrons))
+
+
+def _summed(result: Tensor, found: Any, pupil: Pupil, electrons: Tensor, **params: Any) -> tuple[float, float]:
+    """Return the work of sums over all samples of the pupil, for each row and column of pixels."""
+    side, (y, x) = max(pupil.height.shape), electrons.shape[-2:]
+    count = len(result) if result.ndim > electrons.ndim else 1
+    return 64.0 * (side**2 + side * (y + x)), count * float(side * side * y + side * y * x)
+
+
+for node in (found_glare, found_nearby):
+    node.work(_summed)
+
+
 @wiener.work
 def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any) -> tuple[float, float]:
     y, x = _torus(electrons, psf)
@@ -74,6 +119,25 @@ def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any) 
     largest = max(unknowns, _WHITENED * side)
     nearby = _MODE * sum(len(each) for each in (others[5] if len(others) > 5 else None) or ()) * electrons.numel()
     return max(31.0 * len(electrons) * y * x, _SYSTEM * largest**2) + nearby, operations
+
+
+@wiener_spread.shape
+def _(
+    electrons: Tensor, psf: Any, illuminant: Any, responses: Any, bands: Any, clipped: Any, matrix: Tensor,
+    *glare: Any, **params: Any,
+) -> Tensor:  # fmt: skip
+    return blank(len(matrix), *electrons.shape[-2:], dtype=at_least_single(electrons))
+
+
+@wiener_spread.work
+def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, draws: int = 8, **params: Any) -> tuple[float, float]:
+    memory, operations = wiener.hooks.work(result, electrons, psf, *others[:4], *others[5:])  # type: ignore[misc]
+    return 1.5 * memory, draws * operations
+
+
+@white_level.shape
+def _(signal: Any, clipped: Any, psf: Any, bands: Bands, *others: Any, **params: Any) -> Tensor:
+    return double(len(bands.centres))
 
 
 def _descent(electrons: Tensor, psf: Psf) -> tuple[float, float]:

@@ -4,12 +4,14 @@ from neusee.nodes.sensor import _result_shapes  # noqa: F401  attaches the shape
 from neusee.nodes.sensor._channel_sums import channel_sums
 from neusee.nodes.sensor._digitization import crop, digitize, full_well
 from neusee.nodes.sensor._exposure import add_photons, expose, level
+from neusee.nodes.sensor._frame_file import FRAME_SUFFIXES, frame
 from neusee.nodes.sensor._noise import dark_current, photon_noise, read_noise
 from neusee.nodes.sensor._photon_transfer import photon_transfer
 from neusee.nodes.sensor._saturation import photons_that_fill, saturation
 from neusee.nodes.sensor._sensor_limits import Limits, limits
 
 __all__ = [
+    "FRAME_SUFFIXES",
     "Limits",
     "add_photons",
     "channel_sums",
@@ -17,6 +19,7 @@ __all__ = [
     "dark_current",
     "digitize",
     "expose",
+    "frame",
     "full_well",
     "level",
     "limits",

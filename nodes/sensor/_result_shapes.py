@@ -6,6 +6,7 @@ from torch import Tensor
 
 from neusee.nodes.sensor._digitization import crop, digitize, full_well
 from neusee.nodes.sensor._exposure import add_photons, expose, level
+from neusee.nodes.sensor._frame_file import frame
 from neusee.nodes.sensor._noise import dark_current, photon_noise, read_noise
 from neusee.nodes.sensor._photon_transfer import photon_transfer
 from neusee.nodes.sensor._saturation import saturation
@@ -47,3 +48,8 @@ def _(*, levels: int = 24, **params: Any) -> Tensor:
 @photon_transfer.work
 def _(result: Tensor, *, pixels: int = 16384, **params: Any) -> tuple[float, float]:
     return 16.0 * pixels, float(len(result) * pixels)
+
+
+@frame.shape
+def _(responses: Tensor, *, shape: tuple[int, int], **params: Any) -> Tensor:
+    return blank(len(responses), *shape)

@@ -1,9 +1,10 @@
-"""Coverage of a lens's stray light under a wide prior: `python tests/benchmarks/bench_stray_light.py [CAMERAS] [FILE]`.
+"""Coverage of a lens's stray light: `python tests/benchmarks/bench_stray_light.py [CAMERAS] [FILE] [PRIOR] [FIRST]`.
 
-A table in Markdown of CAMERAS (200) whose lens is drawn from the prior of the recipe `calibrate_stray_light`: how many
-90 % intervals of b0, l and s hold the truth, the effective sample size, and how often a misfit is told. Pictures are
-those of tests/workflows/calibration/simulated_lenses.py, by NumPy and SciPy alone, of 128 x 128 pixels of 4 to 6.5 um
-in light of 10 to 40 nm. FILE keeps a line for each camera that is done; a second call goes on from there.
+A table in Markdown of CAMERAS (200), from number FIRST (0) on, whose lens is drawn from PRIOR: `wide` (that of the
+recipe `calibrate_stray_light`) or `narrow` (that of the tests). How many 90 % intervals of b0, l and s hold the truth,
+the effective sample size, and how often a misfit is told. Pictures are those of
+tests/workflows/calibration/simulated_lenses.py, by NumPy and SciPy alone, of 128 x 128 pixels of 4 to 6.5 um in light
+of 10 to 40 nm. FILE keeps a line for each camera that is done; a second call goes on from there.
 """
 
 import json
@@ -18,7 +19,7 @@ from neusee.workflows.calibration.identifiability import identify
 from neusee.workflows.calibration.importance_sampling import draw_samples, weights
 from neusee.workflows.calibration.posterior_checks import _SMOOTH, _SURPRISE, slow_waves
 from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
-from tests.workflows.calibration.simulated_lenses import drawn_camera, problem_of, recipe_prior
+from tests.workflows.calibration.simulated_lenses import PRIOR, drawn_camera, problem_of, recipe_prior
 
 SHAPE = ("b0", "l", "s")
 
@@ -60,12 +61,12 @@ def _quantile(values, weight, share):
     return float(values[order][np.searchsorted(np.cumsum(weight[order]), share)])
 
 
-def main(count=200, file="stray_light_coverage.jsonl"):
+def main(count=200, file="stray_light_coverage.jsonl", prior="wide", first=0):
     torch.set_num_threads(1)
-    path, prior = Path(file), recipe_prior()
+    path, prior = Path(file), {"wide": recipe_prior, "narrow": lambda: PRIOR}[prior]()
     rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
     done = {row["seed"] for row in rows}
-    for seed in sorted(set(range(int(count))) - done):
+    for seed in sorted(set(range(int(first), int(first) + int(count))) - done):
         rows.append(fitted(seed, prior))
         with path.open("a") as kept:
             kept.write(json.dumps(rows[-1]) + "\n")

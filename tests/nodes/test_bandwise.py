@@ -88,7 +88,8 @@ def tensors(value):
     return [value] if isinstance(value, Tensor) else list(value)
 
 
-@pytest.fixture(params=[1, 2])
+# Two threads wait for each other on a core that they share with other tests: seconds of a few milliseconds' work.
+@pytest.fixture(params=[1, pytest.param(2, marks=pytest.mark.slow)])
 def threads(request):
     before = torch.get_num_threads()
     torch.set_num_threads(request.param)

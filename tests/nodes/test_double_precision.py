@@ -339,6 +339,16 @@ def level(image, bands, responses, *, strength, **_):
     return np.full(4, L(strength) * FILLS / np.tensordot(weights, exact(image), 1).max())
 
 
+def white_light(signal, clipped, psf, bands, illuminant, responses, *, white=None, **_):
+    weights = exact(responses) * photons_per_joule(bands.centres) * AREA * exact(illuminant)
+    if white is not None:
+        return np.full(4, L(white) * FILLS / weights.sum(1).max())
+    passed = (weights / weights.sum(1, keepdims=True)) @ exact(psf.intensity).sum((1, 2))
+    whole = weights.sum(1) * L(0.56) * passed
+    shown = (exact(signal) / whole[:, None, None]).max(0)[~clipped.any(0).numpy()]
+    return np.full(4, np.quantile(shown, L("0.995")))
+
+
 def gaussian_line(*, wavelength, fwhm, count, floor, **_):
     import mpmath
 
@@ -429,6 +439,9 @@ CASES = [
     case(restore.colour, (PICTURE, draw(3, 3)), lambda c, m: np.tensordot(exact(m), exact(c), 1)),
     case(restore.electrons, (1e4 * PICTURE,), lambda r, gain, offset: exact(r) / L(gain) - L(offset),
          {"gain": 2.7, "offset": 390.1}),
+    case(restore.white_level, (1e4 * PICTURE, PICTURE > 1.0, PSF, BANDS, ILLUMINANT, RESPONSES), white_light, WELL),
+    case(restore.white_level, (1e4 * PICTURE, PICTURE > 1.0, PSF, BANDS, ILLUMINANT, RESPONSES), white_light,
+         {"white": 0.7, **WELL}),
     case(sensor.add_photons, (PICTURE, [TRUTH], [PICTURE]), lambda p, a, b: exact(p) + exact(a[0]) + exact(b[0])),
     case(sensor.expose, (IMAGE, BANDS, RESPONSES, LEVEL), photons, SHUTTER),
     case(scene.grey, (PICTURE,),
@@ -462,17 +475,19 @@ _ELSEWHERE = {
         "doe.shade", "doe.spiral_axicon", "doe.unet", "doe.vortex", "doe.zernike", "flare.dirt", "scene.exr",
         "scene.hyperspectral", "scene.photograph", "scene.targets", "spectra.lift_mst_plus_plus", "restore.fft_mamba",
         "restore.nafnet", "restore.network", "restore.unet"),
-    "draws": ("calibrate.expose", "optics.direction", "sensor.dark_current", "sensor.digitize", "sensor.photon_noise",
-        "sensor.photon_transfer", "sensor.read_noise", "spectra.grain", "spectra.leaves", "spectra.metamers"),
+    "draws": ("calibrate.expose", "optics.direction", "restore.wiener_spread", "sensor.dark_current",
+        "sensor.digitize", "sensor.photon_noise", "sensor.photon_transfer", "sensor.read_noise", "spectra.grain",
+        "spectra.leaves", "spectra.metamers"),
     "reads tables or files": ("calibrate.descriptor", "calibrate.frames", "calibrate.point_source", "calibrate.table",
-        "restore.colour_matrix",
+        "restore.colour_matrix", "sensor.frame",
         "spectra.illuminant", "spectra.lift_lmmse", "spectra.lift_lmmse_mixture", "spectra.lift_mallett",
         "spectra.lift_mallett_mixture", "spectra.line_table", "spectra.reflectances", "spectra.render",
         "optics.white_irradiance", "spectra.responses"),
     "computes float64 numbers from parameters": ("laser.light", "laser.wavefront"),
     "is a fit or a likelihood, with tests of its own": ("calibrate.camera", "calibrate.camera_prior",
         "calibrate.density", "calibrate.least_squares", "calibrate.levels", "calibrate.prior", "calibrate.reduce",
-        "calibrate.stray_light", "calibrate.stray_prior", "calibrate.sufficient", "restore.nearby_glare",
+        "calibrate.stray_light", "calibrate.stray_prior", "calibrate.sufficient", "restore.find_lasers",
+        "restore.found_glare", "restore.found_nearby", "restore.nearby_glare",
         "restore.richardson_lucy", "restore.wiener", "spectra.compress"),
     "copies, counts or states": ("laser.bright_pixels", "laser.damaged_pixels", "laser.dazzle", "laser.dazzle_curve",
         "metrics.saturated", "optics.stop", "restore.clipped", "sensor.crop", "sensor.limits", "spectra.filters"),

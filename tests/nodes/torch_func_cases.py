@@ -13,7 +13,7 @@ from neusee.nodes.restore._networks._fft_mamba import FFTMamba
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
 from neusee.nodes.restore._networks._unet import UNet
-from neusee.nodes.values import Channels, Dirt, LowRankCube, Psf, Pupil
+from neusee.nodes.values import Channels, Dirt, FoundLasers, LowRankCube, Psf, Pupil
 
 HERE = Path(__file__).parent
 
@@ -57,6 +57,15 @@ CHANNELS = Channels(rand(3, 12, 12), rand(3, 4), torch.tensor(0.0, dtype=torch.f
 LEVEL = 1e3 * rand(4)
 LASER_PUPIL = PUPIL._replace(index=INDEX[:3], wavelengths=LINE.centres)
 DIRECTION = torch.tensor([1e-4, -2e-4], dtype=torch.float64)
+BENT = PUPIL._replace(path=1e-7 * rand(16, 16, dtype=torch.float32, seed=2))  # a path of 0 has no scale but a metre
+_PLACE, _NM = DIRECTION[None], torch.tensor([533e-9], dtype=torch.float64)
+_AMOUNT = torch.tensor([[4e4, 9e4, 1e4]], dtype=torch.float64)
+FOUND = FoundLasers(
+    torch.tensor(1), _PLACE, _NM, torch.full_like(_NM, 5e-9), _AMOUNT, torch.stack([_PLACE - 1e-6, _PLACE + 1e-6], -1),
+    torch.stack([_NM - 2e-9, _NM + 2e-9], -1), torch.stack([0.9 * _AMOUNT, 1.1 * _AMOUNT], -1),
+    torch.ones(1, 2, dtype=torch.bool), torch.tensor([[200.0, 100.0]], dtype=torch.float64),
+    (0.9 * torch.eye(6, dtype=torch.float64) + 0.1)[None],
+)  # fmt: skip
 
 STOP = optics.stop(samples=16, pitch=5e-4, diameter=8e-3)
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
@@ -199,6 +208,13 @@ CASES = {
     "restore.colour": Case("0", (PICTURE, rand(3, 3))),
     "restore.colour_matrix": Case("1", (BANDS, LIGHT, RESPONSES, LEVEL), {**SHUTTER, "quantum_efficiency": 0.56}),
     "restore.electrons": Case("0", (RAW,), {"gain": 1 / 0.37, "offset": 50.0}),
+    "restore.find_lasers": Case(
+        "0",
+        (2000 * rand(3, 32, 32), torch.zeros(3, 32, 32, dtype=torch.bool), PSF, PUPIL, LIGHT, RESPONSES, BANDS),
+        {**LENS, "read_noise": 5.0, "most": 1, "lamps": 0},
+    ),
+    "restore.found_glare": Case("1.height", (FOUND, BENT, PICTURE), LENS),
+    "restore.found_nearby": Case("1.height", (FOUND, BENT, PICTURE), {**LENS, "patterns": 2}),
     "restore.nearby_glare": Case(
         "1.height",
         (rand(3, 9, 9), LASER_PUPIL, DIRECTION, LINE, spectra.responses(LINE)),
@@ -208,6 +224,14 @@ CASES = {
         "0",
         (WIDE_RAW, PSF, LIGHT, RESPONSES, BANDS, torch.zeros(3, 48, 48, dtype=torch.bool)),
         {"read_noise": 5.0, "iterations": 3},
+    ),
+    "restore.white_level": Case(
+        "0", (RAW, torch.zeros(RAW.shape, dtype=torch.bool), PSF, BANDS, LIGHT, RESPONSES), WELL
+    ),
+    "restore.wiener_spread": Case(
+        "6",
+        (WIDE_RAW, PSF, LIGHT, RESPONSES, BANDS, torch.zeros(3, 48, 48, dtype=torch.bool), rand(3, 3)),
+        {"read_noise": 5.0, "draws": 2},
     ),
     "restore.wiener": Case(
         "0",
@@ -278,6 +302,7 @@ NOTHING_TO_FOLLOW = {
     "doe.vortex": "has a whole charge alone",
     "optics.stop": "states the pupil grid, which other nodes read as plain numbers",
     "scene.exr": "reads a file",
+    "sensor.frame": "reads a file",
     "scene.hyperspectral": "reads a file",
     "scene.photograph": "reads a file",
     "spectra.line_table": "reads a file",

@@ -94,7 +94,6 @@ def rings(
 @drawn
 def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -> Any:
     """Draw a corner plot of all pairs of parameters, with the recipe's own values in orange."""
-    import corner
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -105,7 +104,9 @@ def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -
     style = {"label_kwargs": {"fontsize": text}, "color": BLUE, "plot_datapoints": False, "labelpad": _LABEL_PAD}
     style["max_n_ticks"] = 3 if size < _PAGE else 2
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # corner warns of contours that few draws reach
+        warnings.simplefilter("ignore")  # ArviZ, which corner imports, warns once a day; corner, of sparse contours
+        import corner
+
         corner.corner(
             draws,
             labels=[_wrapped(name) for name in names],

@@ -37,6 +37,23 @@ def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int
     return name, words, 1 + named + before
 
 
+def split_frames(words: list[str]) -> tuple[list[str], list[str], int]:
+    """Return the files and the changes in the arguments of a command, and the number of the first change.
+
+    A file may have the sign = in its name if it exists.
+    """
+    from pathlib import Path
+
+    count = next((n for n, word in enumerate(words) if _is_change(word) and not Path(word).exists()), len(words))
+    frames, changes = words[:count], words[count:]
+    for number, word in enumerate(changes):
+        if not _is_change(word):
+            fail(f"{word}: not a change of a value: {_fix(changes, number)}")
+    if not frames:
+        fail("no frame is named: neusee restore FRAME --camera RECIPE, then changes of values")
+    return frames, changes, 1 + count
+
+
 def _fix(words: list[str], number: int) -> str:
     """Return how to write the word at ``number``, which is not a change and often the rest of a value with a space."""
     if number == 0:

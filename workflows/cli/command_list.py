@@ -28,6 +28,7 @@ COMMANDS = {
     "report": ("recipe_commands", "Write the page of a run again from stored results."),
     "compare": ("compare_command", "Compare two runs: numbers, pictures, recipe and code."),
     "safety": ("safety_command", "Estimate damage and dazzle by a laser, and the distances."),
+    "restore": ("restore_command", "Restore the scene from frames that a camera took."),
     "sweep": ("sweep_command", "Run a recipe at several values of its parameters."),
     "train": ("train_command", "Train the mask of a recipe and its restoring network."),
     "calibrate": ("calibrate_command", "Find the posterior of a sensor from calibration frames."),

@@ -119,7 +119,9 @@ def _next(folder: Path, stage: Stages) -> list[str]:
         return [f"mask:    {folder / 'mask.safetensors'}", f"report:  {folder / 'report.html'}"]
     mask, network = folder / "mask.safetensors", folder / "network.safetensors"
     lines = [f"mask:    {mask}"] if mask.is_file() else []
-    return [*lines, f"network: {network}", f"curves:  {folder / 'curves.png'}"]
+    best = folder / "best.safetensors"
+    lines += [f"best:    {best}"] if best.is_file() else []
+    return [*lines, f"network: {network}", f"report:  {folder / 'training.html'}"]
 
 
 @contextmanager

@@ -25,6 +25,7 @@ def draw_pictures(
 ) -> dict[Picture, str]:
     """Run each command once in the folder ``work``, copy the pictures to ``target`` and return their file names.
 
+    Commands run in their order, and `runs/latest` is what the one before wrote.
     If a command fails, a ``strict`` build raises `NoPicture`; any other build says so and goes on without the picture.
     """
     by_words: dict[tuple[str, ...], list[Picture]] = {}
@@ -36,6 +37,7 @@ def draw_pictures(
     for number, (words, wanted) in enumerate(by_words.items(), 1):
         try:
             results = _run(words, work, work / f"results_{number}")
+            _name_latest(results, work)
             names |= {picture: _take(picture, results, target) for picture in wanted}
         except NoPicture as error:
             if strict:
@@ -62,6 +64,14 @@ def _run(words: tuple[str, ...], work: Path, results: Path) -> Path:
             f"neusee {' '.join(words)} ended with exit code {done.returncode}: {done.stderr.strip()[-500:]}"
         )
     return folders[0]
+
+
+def _name_latest(results: Path, work: Path) -> None:
+    """Make a folder of results the `runs/latest` of the commands that follow, as it is for a reader who types them."""
+    latest = work / "runs" / "latest"
+    latest.parent.mkdir(exist_ok=True)
+    latest.unlink(missing_ok=True)
+    latest.symlink_to(results.resolve(), target_is_directory=True)
 
 
 def _take(picture: Picture, results: Path, target: Path) -> str:

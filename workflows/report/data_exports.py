@@ -1,4 +1,4 @@
-"""Data files of a run: spectral OpenEXR, RGB OpenEXR, 16-bit PNG and safetensors."""
+"""Data files of a run: spectral OpenEXR, RGB OpenEXR, PNG of 16 bits and safetensors."""
 
 from __future__ import annotations
 
@@ -78,6 +78,27 @@ def png16(image: Tensor) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(*c) for c in chunks)
 
 
+def srgb(image: Tensor, source: Path, draws: int) -> bytes:
+    """Encode a restored picture in linear sRGB, white 1, as an sRGB PNG of 16 bits that names the frame."""
+    from neusee.workflows.report.figures.style import encoded
+
+    codes = torch.from_numpy(encoded(image)).permute(2, 0, 1) * 65535.0
+    return _named(png16(codes), source, draws)
+
+
+def marked(marked: Tensor, source: Path, draws: int) -> bytes:
+    """Encode the pixels with a marked channel as white on black, as a PNG that names the frame."""
+    return _named(png16(marked.any(0, keepdim=True) * 65535.0), source, draws)
+
+
+def _named(png: bytes, source: Path, draws: int) -> bytes:
+    """Return a PNG with text chunks that name the frame, and the number of draws of the interval beside it."""
+    header = 8 + 12 + 13
+    texts = {b"Source": source.name, b"Comment": f"restored by neusee; interval of each pixel from {draws} draws"}
+    chunks = (_chunk(b"tEXt", name + b"\0" + text.encode("latin-1", "replace")) for name, text in texts.items())
+    return png[:header] + b"".join(chunks) + png[header:]
+
+
 def _chunk(name: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
 
@@ -94,5 +115,7 @@ _WRITERS: dict[str, Callable[..., bytes]] = {
     "spectral": spectral,
     "exr": exr,
     "png16": png16,
+    "srgb": srgb,
+    "marked": marked,
     "safetensors": safetensors,
 }

@@ -10,7 +10,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report.contents import RIVAL, shade_of
 from neusee.workflows.report.result_numbers import Value, arms, lines_of, suppressed
 
-SENTENCES = ("buys", "costs", "rival")
+SENTENCES = ("buys", "costs", "rival", "frame")
 PLAIN, MASK, RESTORED = "plain lens", "with mask", "restored"
 _PEAK, _QUALITY, _LOST = "peak/I_sat", "PSNR (dB)", "saturated px"
 _EQUAL = 0.01  #: relative difference of two peaks below which the mask changes nothing

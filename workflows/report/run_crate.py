@@ -40,7 +40,8 @@ _FILES = {
     "sweep.csv": "The results of each point of the sweep.",
     "sweep.yaml": "The axes of the sweep, the state of its points, and the command.",
     "training.json": "The settings and the results of the training.",
-    "losses.csv": "The losses of each iteration.",
+    "training.html": "The page of the training; it loads no other file.",
+    "losses.csv": "The losses of each iteration, and the numbers of held-out pictures.",
     "mask.json": "The figures of merit of the designed mask.",
 }
 

@@ -29,6 +29,7 @@ from neusee.workflows.graph.step_record import StepRecord
 from neusee.workflows.recipe.distributions.nominal_values import told
 from neusee.workflows.recipe.paper_readings import consequences, in_force
 from neusee.workflows.report.contents import FIGURES, compared
+from neusee.workflows.report.frame_story import said_of_frame
 from neusee.workflows.report.mask_story import story
 from neusee.workflows.report.result_numbers import expected, metrics, table
 from neusee.workflows.report.run_crate import remove_crate, restore_crate
@@ -77,7 +78,7 @@ def document(
         "seed": recipe.seed,
         "counts": state_counts(done),
         **_judgement(found, failed, unchecked),
-        "story": story(recipe, result.keys, result.value),
+        "story": {**story(recipe, result.keys, result.value), **said_of_frame(recipe, result.keys, result.value)},
         "table": table(recipe, result.keys, result.value),
         "metrics": metrics(recipe, result.keys, result.value),
         "notes": [*_sampling(recipe), *recipe.notes, *unchecked_lines(unchecked), *warned],

@@ -14,12 +14,12 @@ from neusee.nodes import doe
 from neusee.nodes.network_weights import file_metadata
 from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings
-from neusee.workflows.recipe.blocks.train_block import KEY, Network, Stage, Training
-from neusee.workflows.recipe.own_families import KEY as OWN_NODES
+from neusee.workflows.recipe.blocks.train_block import KEY, Stage, Training
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.training import held_out
+from neusee.workflows.training.exported_files import require_exports, write_exports
+from neusee.workflows.training.held_out import Best, Split, Validation
 from neusee.workflows.training.loop.checkpoint import export
 from neusee.workflows.training.loop.resumable_loop import Losses, Progress, ResumableLoop, Watch
 from neusee.workflows.training.mask_design.design_run import MASK, design_in, designed
@@ -27,10 +27,13 @@ from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh, MeshErr
 from neusee.workflows.training.tensorboard_log import open_board
 from neusee.workflows.training.training_figures import curves, png, strip
 from neusee.workflows.training.training_iteration import Learner
+from neusee.workflows.training.training_key import key_of_training
+from neusee.workflows.training.training_page import write_page
 from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.warm_start import WarmStart
 
 _COLUMNS = ("stage", "iteration", "LSR", "BSR", "L1", "reconstruction", "adversarial", "critics", "penalty", "slope",
-            "rate", "seconds")  # fmt: skip
+            "rate", *held_out.COLUMNS, "seconds")  # fmt: skip
 
 
 def train(
@@ -63,14 +66,17 @@ def train(
         raise MeshError("--stage mask runs in a single process: start the training without torchrun")
     _require_equal_shares(recipe, settings, mesh)
     photographs = _photographs(recipe, settings, bool(with_pictures))
-    folder = runs / f"{recipe.name}_train_{_key(recipe, settings, photographs, Code(store.code_memo))}"
+    parts = held_out.split(recipe, settings, photographs)
+    start = WarmStart.of(recipe, settings)
+    key = key_of_training(recipe, settings, photographs, parts, start, Code(store.code_memo))
+    folder = runs / f"{recipe.name}_train_{key}"
     folder.mkdir(parents=True, exist_ok=True)
     if not mesh.first:
         progress, watch = (lambda line: None), None
     if MASK in stages:
         design_in(folder, recipe, settings, store, command, progress, device)
     if with_pictures:
-        loop = _TrainingLoop(recipe, settings, photographs, store, folder, progress, device, watch, mesh)
+        loop = _TrainingLoop(recipe, settings, parts, start, store, folder, progress, device, watch, mesh)
         with loop.board or nullcontext():
             loop.run_stages(with_pictures, command)
     return folder
@@ -96,36 +102,24 @@ def _photographs(recipe: Recipe, settings: Training, needed: bool) -> Photograph
     return Photographs((file,) if isinstance(file, Path) else ())
 
 
-def _key(recipe: Recipe, settings: Training, photographs: Photographs, code: Code) -> str:
-    """Return a digest of all settings that can change a trained network or mask, as a part of the folder name."""
-    items = recipe.config.settings.items()
-    left_out = (f"{KEY}.", OWN_NODES)
-    values = {name: str(setting.value) for name, setting in items if not name.startswith(left_out)}
-    defaults = {"mask": MaskSettings(), "clip": 10.0, "reduction": "mean"}
-    usual = {name for name, x in defaults.items() if getattr(settings, name) == x}  # so that older trainings continue
-    block = settings.model_copy(update={"keep": 1, "show": 1}).model_dump(mode="json", exclude={"tensorboard", *usual})
-    block["network"] = _identity(settings.network, code)
-    return digest("training", values, block, [path.name for path in photographs.paths])[:8]
-
-
-def _identity(network: Network, code: Code) -> dict[str, Any]:
-    """Return what identifies the network of a training; a class of the user counts with its code."""
-    if network.architecture is None:
-        return {"kind": network.kind, "width": network.width, **network.options}
-    made = code.digest(network.architecture.network.__module__)
-    return {"class": str(network.architecture), "code": made, **network.model_dump(include={"parameters", "multiple"})}
-
-
 class _TrainingLoop(ResumableLoop[Learner]):
     def __init__(
-        self, recipe: Recipe, settings: Training, photographs: Photographs, store: Store, folder: Path,
-        progress: Progress, device: str, watch: Watch | None, mesh: Mesh,
+        self, recipe: Recipe, settings: Training, parts: Split, start: WarmStart | None, store: Store,
+        folder: Path, progress: Progress, device: str, watch: Watch | None, mesh: Mesh,
     ) -> None:  # fmt: skip
         self.designed = designed(folder)
-        learner = Learner(recipe, settings, device, self.designed, mesh)
+        learner = Learner(recipe, settings, device, self.designed, mesh, start)
+        require_exports(learner.net, settings)
         super().__init__(folder, settings, learner, _COLUMNS, progress, device, watch, mesh.first)
-        self.recipe, self.settings, self.photographs, self.store = recipe, settings, photographs, store
-        self.mesh, self.stage = mesh, 2 if self.designed else min(settings.learnt)
+        self.recipe, self.settings, self.split, self.store = recipe, settings, parts, store
+        self.photographs, self.validation = parts.trained, Validation(parts, mesh, device)
+        self.mesh, self.stage, self.best = mesh, 2 if self.designed else min(settings.learnt), Best()
+        self.start = start
+        progress(str(parts))
+        if settings.augment.pooled != "none":
+            progress("pooled pictures are turned with their true pictures, as behind a mask and a sensor that turn")
+        if start is not None and not self.state.path.exists():
+            progress(f"begins with the weights of {start.file}")
         self.resume()
         mesh.agree(f"{folder.name} in stage {self.stage} after {self.iteration} iterations")
         self.board = open_board(folder, self._iterations_of_all_stages) if settings.tensorboard and mesh.first else None
@@ -162,8 +156,12 @@ class _TrainingLoop(ResumableLoop[Learner]):
         """Train to the end of the present stage, and write the checkpoint with which the next stage begins."""
         fixed = None if self.stage == 1 else frozen(self.recipe, self.settings, self.folder)
         parts = self.recipe, self.settings, self.photographs, self.store, self.device
-        self.samples = TrainingStream(*parts, fixed, self.mesh)
+        self.samples = TrainingStream(*parts, fixed, self.mesh, self.split.judged)
+        self.best = Best.of(self.rows.rows, self.stage)
         self.run(self._length, self.settings.stages[self.stage].batch)
+        if counts := self.samples.pool_counts:
+            read, made = counts["from_store"], counts["simulated"]
+            self.progress(f"pictures of the pool: {read} came from the cache, {made} were simulated")
         if self.writes:
             self._export()
         self.stage, self.iteration = self.stage + 1, 0
@@ -176,6 +174,29 @@ class _TrainingLoop(ResumableLoop[Learner]):
         rate = self.learner.set_rates(self.iteration)
         losses, self.seen = self.learner.iterate(self.samples, self.stage, self.iteration)
         return losses | {"rate": rate}
+
+    def validate(self, iterations: int) -> Losses:
+        """Restore the held-out pictures at intervals and at the end of a stage, and write the network if it is best.
+
+        In stage 1 no state is the best, because the PSNR does not measure the suppression of the laser: a flat mask has
+        the best pictures.
+        """
+        if not self.split.judged or (iterations % self.settings.validate_every and iterations != self._length):
+            return {}
+        net: Any = self.learner.average.module if self.learner.average else self.learner.net
+        found = self.validation(net, self.samples, self.learner.shared(self.samples), self.stage == 2)
+        self.best = self.best.after(held_out.score_of(found), iterations)
+        better = self.stage == 2 and self.best.iterations == iterations
+        if better and self.writes:
+            export(self.folder, "best", net.stored.state_dict(), file_metadata(self.learner.net))
+        self.progress(f"stage {self.stage}, iteration {iterations}: {held_out.said(found, better)}")
+        return found
+
+    @property
+    def stops_early(self) -> bool:
+        """Return True if stage 2 has had ``train.patience`` validations without a better state."""
+        patience = self.settings.patience
+        return self.stage == 2 and patience is not None and self.best.since >= patience
 
     def note(self, losses: Losses) -> None:
         """Write the losses of the last training iteration to TensorBoard, and pass them to the callback ``watch``."""
@@ -216,19 +237,21 @@ class _TrainingLoop(ResumableLoop[Learner]):
         return "designed without images" if self.designed else "learnt in stage 1"
 
     def _close(self, command: Sequence[str]) -> None:
-        rows = self.rows.rows
-        self.close(
-            curves(rows),
-            self.recipe.name,
-            command,
-            mask=self._mask_source,
-            train=self.settings.model_dump(mode="json"),
-            photographs=len(self.photographs.paths),
-            mesh=str(self.mesh),
-            broken={str(path): reason for path, reason in self.photographs.broken.items()},
-            iterations={str(stage): sum(int(r["stage"]) == stage for r in rows) for stage in self.settings.stages},
-            last=rows[-1],
-        )
+        rows, drawn = self.rows.rows, curves(self.rows.rows)
+        facts: dict[str, Any] = {
+            "mask": self._mask_source,
+            "train": self.settings.model_dump(mode="json"),
+            "photographs": len(self.photographs.paths),
+            **held_out.facts(self.split, rows, self.settings.patience),
+            "mesh": str(self.mesh),
+            **({"start": self.start.facts} if self.start else {}),
+            "broken": {str(path): reason for path, reason in self.photographs.broken.items()},
+            "iterations": {str(stage): sum(int(r["stage"]) == stage for r in rows) for stage in self.settings.stages},
+            "last": rows[-1],
+        }
+        write_exports(self.folder, self.learner.net, self.settings)
+        write_page(self.folder, self.recipe.name, rows, drawn, facts)
+        self.close(drawn, self.recipe.name, command, **facts)
 
 
 def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neusee.workflows.report.figures.style import BLUE, VERMILION, canvas, drawn, encoded
+from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, VERMILION, canvas, drawn, encoded
 
 _SHOWN = ("LSR", "BSR", "L1", "reconstruction", "adversarial", "critics", "penalty", "rate")
 _GAP = 4  #: pixels between pictures
@@ -37,6 +37,51 @@ def curves(rows: Sequence[Mapping[str, str]]) -> Any:
     axes.flat[0].legend()
     figure.supxlabel("iteration")
     return figure
+
+
+@drawn
+def held_out_curves(rows: Sequence[Mapping[str, str]], best: int) -> Any:
+    """Draw training loss and held-out PSNR over the iterations of both stages, with the level of the network's input.
+
+    ``best`` is the number of iterations of stage 2 before the best state, or 0 if no state is the best.
+    """
+    figure, axes = canvas(9.0, 6.4, 2, 1, sharex=True)
+    first = sum(row["stage"] == "1" for row in rows)
+    name = "reconstruction" if any(row["reconstruction"] for row in rows) else "L1"
+    loss = [(float(_at(row, first)), float(row[name])) for row in rows if row[name]]
+    at, values = zip(*loss, strict=True)
+    axes[0, 0].plot(at, values, color=BLUE, alpha=0.25, linewidth=0.7)
+    axes[0, 0].plot(at, running_median(values), color=BLUE, linewidth=1.5)
+    axes[0, 0].set_yscale("log", nonpositive="mask")
+    axes[0, 0].set_ylabel(f"training: {name} loss")
+    judged = [row for row in rows if row.get("held_out_PSNR")]
+    _draw_held_out(axes[1, 0], judged, first)
+    for ax in axes[:, 0]:
+        if 0 < first < len(rows):
+            ax.axvline(first, color=BLACK, linewidth=0.8, linestyle=":")
+            ax.annotate("stage 2", (first, 1), (3, -12), ("data", "axes fraction"), "offset points", fontsize=9)
+        if best:
+            ax.axvline(first + best, color=GREEN, linewidth=1.0, label=f"best: after {best} iterations of stage 2")
+    axes[1, 0].set(xlabel="iteration", ylabel="held-out pictures: PSNR (dB)")
+    figure.legend(*axes[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
+def _draw_held_out(ax: Any, judged: Sequence[Mapping[str, str]], first: int) -> None:
+    at = [_at(row, first) for row in judged]
+    for who, colour, text in (("held_out", VERMILION, "network"), ("input", BLACK, "input of the network")):
+        values = [float(row[f"{who}_PSNR"]) for row in judged]
+        style = "--" if who == "input" else "-"
+        ax.plot(at, values, color=colour, linestyle=style, marker=".", linewidth=1.5, label=text)
+    with_ends = [row for row in judged if row["held_out_PSNR_low"]]
+    low, high = ([float(row[f"held_out_PSNR_{end}"]) for row in with_ends] for end in ("low", "high"))
+    label = "90 % interval of the mean over photographs"
+    ax.fill_between([_at(row, first) for row in with_ends], low, high, color=VERMILION, alpha=0.15, label=label)
+
+
+def _at(row: Mapping[str, str], first: int) -> int:
+    """Return the number of iterations of both stages after the iteration of a row."""
+    return int(row["iteration"]) + 1 + first * (row["stage"] == "2")
 
 
 def running_median(values: Sequence[float]) -> list[float]:

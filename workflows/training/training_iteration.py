@@ -38,6 +38,7 @@ from neusee.workflows.training.loop.resumable_loop import Losses, averaged, requ
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.training_pictures import Sample, TrainingStream
+from neusee.workflows.training.warm_start import WarmStart
 
 
 class Scales(NamedTuple):
@@ -51,13 +52,16 @@ class Learner:
     """The mask, the networks and the optimisers of a training, with equal values in all processes."""
 
     def __init__(
-        self, recipe: Recipe, settings: Training, device: str, designed: bool = False, mesh: Mesh = ALONE
-    ) -> None:
+        self, recipe: Recipe, settings: Training, device: str, designed: bool = False, mesh: Mesh = ALONE,
+        start: WarmStart | None = None,
+    ) -> None:  # fmt: skip
         self.settings, self.seed, self.device, self.mesh = settings, recipe.seed, device, mesh
         self._stop: Stop | None = None
         self._moment = 0, 0  # stage and iteration
         self.mask = nn.Module() if designed or not settings.learn else self._start(recipe, settings.learn)
         self.net: Restorer = self._network(settings.network)
+        if start is not None:
+            start.load_into(self.net)
         self.critics = nn.ModuleList(critics(self._rng("critics"), settings.critics.width)).to(settings.dtype)
         self.average = averaged(self.net, settings.average)
         self.begin(Stage(iterations=0), learns=True)
@@ -153,6 +157,11 @@ class Learner:
         if self.stage.adversarial:
             found |= self._train_critics(pairs, self._rng("between", stage, iteration))
         return found, seen
+
+    @torch.no_grad()
+    def shared(self, samples: TrainingStream) -> Shared:
+        """Return the results that depend on the present mask but on no picture, without gradients."""
+        return samples.begin(self.height()) if samples.shared else Shared.of({})
 
     def _names(self) -> list[str]:
         """Return the names of the losses in the present training stage, in the same order in every process."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.bicubic_resize import resize
-from neusee.nodes.scene import Photographs
+from neusee.nodes.scene import Change, Photographs, symmetry
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step, dependents, needed
@@ -28,9 +29,11 @@ from neusee.workflows.training.parallel.band_shards import Shards
 from neusee.workflows.training.parallel.picture_rounds import Pictures
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
+from neusee.workflows.training.stored_pool import StoredPool
 
 _LASER = ("optics.laser_irradiance", "strength")  #: the node of a laser, and the parameter that is 0 without a laser
 _SEEDS = 2**31
+HELD_OUT = 3  #: in place of the number of a stage: the pictures of held-out photographs, the same in both stages
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,11 @@ class Sample:
     truth: Tensor  #: (n, 3, y, x), the true picture
     light: Tensor  #: (band,), the fraction of the light of the scene that the mask keeps
     drawn: Mapping[str, Any]  #: the values that were sampled for the picture
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """Return picture, true picture and light by name."""
+        return {"picture": self.picture, "truth": self.truth, "light": self.light}
 
 
 class TrainingStream:
@@ -55,10 +63,11 @@ class TrainingStream:
         device: str,
         frozen: Recipe | None = None,
         mesh: Mesh = ALONE,
+        held_out: Sequence[Path] = (),
     ) -> None:
         learn = None if frozen else settings.learn
         self.settings, self.photographs, self.device = settings, photographs, device
-        self.seed, self.mesh = recipe.seed, mesh
+        self.seed, self.mesh, self.held_out = recipe.seed, mesh, held_out
         self._pool = settings.pool if frozen else None
         self._kept: dict[tuple[int, int], Sample] = {}
         outputs = (settings.picture, settings.truth, settings.light, settings.psf)
@@ -68,6 +77,7 @@ class TrainingStream:
         recipe = in_precision(frozen or recipe, settings.dtype)
         recipe = with_substitutions(recipe, outputs, {learn} if learn else ())
         order = needed(recipe, outputs)
+        self._stored = StoredPool(recipe, settings, store, device) if self._pool and settings.keep_pool else None
         self._lasers = [f"{n}.{_LASER[1]}" for n in order if recipe.steps[n].node.path == _LASER[0]]
         readers = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
         self._readers = {name: _given(recipe, name) for name in readers}
@@ -95,6 +105,11 @@ class TrainingStream:
         outputs = [settings.picture, settings.truth, settings.light]
         self._each = Pictures(recipe, [*border, settings.scene, *self._readers], outputs, noise, self.shards, ways)
 
+    @property
+    def pool_counts(self) -> dict[str, int]:
+        """Return how many pictures of the pool this process read from the store, and how many it simulated."""
+        return {"from_store": self._stored.read, "simulated": self._stored.computed} if self._stored else {}
+
     def begin(self, height: Tensor) -> Shared:
         """Compute the steps that depend on the mask alone, once for all pictures of a training iteration."""
         results = self.shared({str(self.settings.learn): height}) if self.shared else {}
@@ -118,26 +133,53 @@ class TrainingStream:
             mine = together[self.mesh.column] if self.mesh.column < len(together) else None
             if not self._each.by_band:
                 if mine is not None:
-                    yield mine, self(shared.seen, stage, first + mine)
+                    yield mine, self._turned(self(shared.seen, stage, first + mine), stage, first + mine)
                 continue
-            begun = {i: self._drawn(stage, (first + i) % (self._pool or _SEEDS)) for i in together}
+            begun = {i: self._drawn(stage, self._number(stage, first + i)) for i in together}
             parts = {i: (theta, noise) for i, (theta, noise, _) in begun.items()}
             with self._each.together(shared, parts, mine) as values:
                 if mine is not None:
-                    yield mine, self._sample(values, begun[mine][2])
+                    yield mine, self._turned(self._sample(values, begun[mine][2]), stage, first + mine)
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
         """Return the training picture with the given number, which does not depend on order or process."""
-        if self._pool is None:
-            return self._alone(shared, stage, number % _SEEDS)
-        number %= self._pool
+        number = self._number(stage, number)
+        if self._pool is None or stage == HELD_OUT:
+            return self._alone(shared, stage, number)
         if (stage, number) not in self._kept:
             self._kept[stage, number] = self._alone(shared, stage, number)
         return self._kept[stage, number]
 
+    def _number(self, stage: int, number: int) -> int:
+        """Return the number of a picture within its pool; held-out pictures have no pool."""
+        return number % (self._pool or _SEEDS) if stage != HELD_OUT else number
+
+    def _turned(self, sample: Sample, stage: int, number: int) -> Sample:
+        """Turn a pooled picture and the true picture together, each time otherwise: as behind a mask that is turned."""
+        if self._pool is None or stage == HELD_OUT or self.settings.augment.pooled == "none":
+            return sample
+        seed = (self.seed, stage, number, 4)
+        return replace(sample, picture=symmetry(sample.picture, seed), truth=symmetry(sample.truth, seed))
+
+    def _scene(self, stage: int, number: int) -> Tensor:
+        """Return the scene of a picture (3, y, x), with the changes of ``train.augment``."""
+        if stage == HELD_OUT:
+            return Photographs((self.held_out[number],)).crop(self.shape, self.seed, (stage, number))
+        how = self.settings.augment
+        change = Change.drawn((self.seed, stage, number, 3), how.symmetries == "all", how.exposure, how.colour)
+        return change.of(self.photographs.crop(change.frame(self.shape), self.seed, (stage, number)))
+
     def _alone(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
         theta, noise, drawn = self._drawn(stage, number)
-        return self._sample(self._each.alone({**shared, **theta}, noise), drawn)
+
+        def simulated() -> Sample:
+            return self._sample(self._each.alone({**shared, **theta}, noise), drawn)
+
+        if self._stored is None or stage == HELD_OUT:
+            return simulated()
+        given = {name: theta[name] for name in self._readers}
+        return Sample(**self._stored.picture(theta[self.settings.scene], given, noise, lambda: simulated().tensors),
+                      drawn=drawn)  # fmt: skip
 
     def _drawn(self, stage: int, number: int) -> tuple[dict[str, Any], int, dict[str, Any]]:
         """Sample the random inputs of a training picture; return the inputs, the noise seed, and all values by name."""
@@ -150,8 +192,7 @@ class TrainingStream:
         if rng.random() < self.settings.laser_free:
             theta |= dict.fromkeys(self._lasers, 0.0)
             drawn["laser"] = "none"
-        scene = self.photographs.crop(self.shape, self.seed, (stage, number))
-        theta |= {self.settings.scene: scene.to(self.device, self.settings.dtype)}
+        theta |= {self.settings.scene: self._scene(stage, number).to(self.device, self.settings.dtype)}
         noise = int(rng.integers(_SEEDS))
         return theta, noise, {**drawn, "noise": noise, "number": number}
 

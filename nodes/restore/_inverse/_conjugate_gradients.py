@@ -10,7 +10,7 @@ from torch import Tensor
 from neusee.nodes.restore._inverse._lowest_frequencies import Lowest
 from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, inverse_colour, mixed, weighing
 
-LOWEST = 256  #: pixels a side, up to which each step solves the lowest frequencies exactly
+LOWEST = 512  #: pixels a side, up to which each step solves the lowest frequencies exactly
 _PIECE = 2**18  #: numbers of a spectrum worked on at a time, which fit in the cache
 
 

@@ -4,7 +4,7 @@ import math
 
 from neusee.nodes.restore._inverse._masked_blur import Size
 
-DENSE = 40  #: pixels a side, up to which a picture is solved exactly
+DENSE = 20  #: pixels a side, up to which a picture is solved exactly
 
 
 def torus(picture: Size, edge: Size) -> Size:

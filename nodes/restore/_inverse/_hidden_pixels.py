@@ -24,10 +24,9 @@ from neusee.nodes.torch_func import transformed
 
 STEPS = 20  #: the most steps on the finest grid; each coarser grid may take four times as many, up to MOST
 MOST = 100
-ENOUGH = 1e-5  #: squared distance for each seen pixel, in units of the posterior, at which the iteration ends. The
+ENOUGH = 1e-6  #: squared distance for each seen pixel, in units of the posterior, at which the iteration ends. The
 #: residual underestimates this distance by a factor of 10 to 30, because it underestimates the slowest modes
 _ONCE = "the deconvolution has no second derivative: differentiate without create_graph=True"
-ALONE = 0.1  #: factor of ENOUGH for the finest grid alone, which has no coarser grid to start from
 CAREFUL = 8.0  #: factor by which the tolerance falls with each coarser grid, whose steps are cheap
 
 
@@ -44,7 +43,7 @@ def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH, coars
         if coarser or lower.numel():
             x = _solved(alone, lower, steps, enough)
         else:
-            x = descend(alone, torch.zeros_like(alone.transfer), MOST, ALONE * enough)
+            x = descend(alone, torch.zeros_like(alone.transfer), MOST, enough)
     followed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     if not (followed or transformed()):
         return x

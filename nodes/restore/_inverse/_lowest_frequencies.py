@@ -15,7 +15,8 @@ from torch.nn.functional import pad
 from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, inverse_colour, with_bounds
 
 _LEAST = 1e-11  #: times the largest diagonal number of the matrix: its round-off in float64
-MODES = 1000  #: real unknowns of each channel for up to three channels; more channels share the total of three
+MODES = 500  #: real unknowns of each channel for up to three channels; more channels share the total of three.
+#: The time of the matrix grows with its cube: 1000 took three quarters of the filter and left nearly the same error
 _ROWS = 256  #: rows of the inverse that are read at a time
 SHARE = 24  #: grid points for each unknown, at least, on a small torus
 

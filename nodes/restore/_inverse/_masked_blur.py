@@ -35,13 +35,11 @@ class Blurred:
     def blur(self, spectrum: Tensor) -> Tensor:
         """Return the blurred picture, given half the spectrum of x."""
         y, x = self.picture.shape[-2:]
-        pairs = zip(self.transfer, spectrum.expand_as(self.transfer), strict=True)  # one batch takes twice as long
-        return torch.stack([torch.fft.irfft2(t * s, s=self.torus)[:y, :x] for t, s in pairs])
+        return blurred(self.transfer, spectrum, self.torus, (y, x))
 
     def gathered(self, pixels: Tensor) -> Tensor:
         """Return half the spectrum that results from the adjoint of `blur`, applied to a picture."""
-        spectrum: Tensor = self.transfer.conj() * torch.fft.rfft2(pixels, s=self.torus)
-        return spectrum
+        return gathered(self.transfer, pixels, self.torus)
 
     def slope(self, x: Tensor) -> Tensor:
         """Return the gradient of the log posterior at the picture of spectrum x; the most likely picture has 0."""
@@ -49,6 +47,19 @@ class Blurred:
         prior = mixed(x, own, -shared) / self.power.clamp_min(1e-30)
         rise = self.gathered(weighing(self)(self.picture - self.blur(x))) - prior
         return rise if self.pull is None else rise + self.pull
+
+
+def blurred(transfer: Tensor, spectrum: Tensor, torus: Size, size: Size) -> Tensor:
+    """Return the first corner (..., channel, *size) of blurred pictures, given half their spectra (..., fy, fx)."""
+    whole = spectrum.expand(*spectrum.shape[:-3], *transfer.shape)
+    pairs = zip(transfer, whole.unbind(-3), strict=True)  # one batch of all channels takes twice as long
+    return torch.stack([torch.fft.irfft2(t * s, s=torus)[..., : size[0], : size[1]] for t, s in pairs], -3)
+
+
+def gathered(transfer: Tensor, pixels: Tensor, torus: Size) -> Tensor:
+    """Return half the spectra that result from the adjoint of `blurred`, applied to pictures (..., channel, y, x)."""
+    spectrum: Tensor = transfer.conj() * torch.fft.rfft2(pixels, s=torus)
+    return spectrum
 
 
 def weighing(seen: Blurred) -> Map:

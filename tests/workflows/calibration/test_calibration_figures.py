@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -56,3 +60,13 @@ def test_a_single_draw_does_not_squeeze_a_panel_of_pairs():
         assert low < 0.8
         assert 1.2 < high < 2.0
     assert figure.axes[3].get_xlim()[1] >= 1.45
+
+
+def test_pairs_are_drawn_on_a_machine_that_has_not_seen_the_daily_warning_of_arviz(tmp_path):
+    program = (
+        "import numpy as np; from neusee.workflows.calibration import calibration_figures as c; "
+        "c.corners.__wrapped__(np.random.default_rng(0).normal(size=(400, 2)), ['a', 'b'], [0, 0])"
+    )
+    command = [sys.executable, "-W", "error::FutureWarning", "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"XDG_CACHE_HOME": str(tmp_path)})
+    assert done.returncode == 0, done.stderr

@@ -10,6 +10,7 @@ from typer.main import get_command
 import neusee
 from neusee.workflows.cli import app
 from neusee.workflows.cli.handbook_reference import reference_pages
+from neusee.workflows.handbook import command_pictures
 from neusee.workflows.handbook import site_build as build
 from neusee.workflows.handbook.command_pictures import NoPicture, draw_pictures
 from neusee.workflows.handbook.guide_pages import GUIDE, Picture, pictures_of, read_pages, with_pictures, write_files
@@ -75,6 +76,21 @@ def test_a_command_that_fails_is_named_with_its_message(tmp_path):
     assert draw_pictures([picture], tmp_path, tmp_path / "pictures", said.append, strict=False) == {}
     assert said[0].startswith("commands that draw pictures: 1;")
     assert said[1].startswith("no picture: neusee cache no_such ended with exit code 2")
+
+
+def test_a_command_finds_the_results_of_the_one_before(tmp_path, monkeypatch):
+    seen = []
+
+    def run(words, work, results):
+        seen.append(sorted(path.read_text() for path in (work / "runs" / "latest").glob("*.png")))
+        results.mkdir()
+        (results / "a.png").write_text(words[0])
+        return results
+
+    monkeypatch.setattr(command_pictures, "_run", run)
+    pictures = [Picture((name,), "a.png", "Nothing.") for name in ("first", "second", "third")]
+    draw_pictures(pictures, tmp_path, tmp_path / "pictures", print)
+    assert seen == [[], ["first"], ["second"]]
 
 
 def test_every_picture_of_the_guide_has_a_command_and_a_sentence():

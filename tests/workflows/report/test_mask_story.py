@@ -237,7 +237,7 @@ def test_the_page_leads_with_the_pictures_and_the_story(document):
     document["figures"] = [{"name": "overview", "title": "What the camera sees", "caption": "Pictures."}]
     page = run_page.page(document, {"overview": b"png"})
     places = [
-        page.index(text) for text in (*document["story"].values(), 'alt="What the camera', "Right.", 'id="results"')
+        page.index(text) for text in (*document["story"].values(), 'alt="What the camera', "Right.", 'id="notes"')
     ]
     assert places == sorted(places)
     wrong = run_page.page(document | {"failed": ["a check"]}, {"overview": b"png"})

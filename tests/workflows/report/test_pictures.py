@@ -19,6 +19,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.report import contents, run_pictures
 from neusee.workflows.report.figures import (
     camera_overview,
+    frame_and_interval,
     numerics,
     optics,
     own_tables,
@@ -117,6 +118,16 @@ def drawings(light: SimpleNamespace, table_arguments: dict) -> dict[str, tuple]:
         "overview": (
             camera_overview.overview,
             dict(truth=scene(), plain=scene() + 0.3, mask=scene(), restored=scene(), spots={"green": spot()}),
+        ),
+        "frame": (
+            frame_and_interval.restored_frame,
+            dict(
+                frame=scene(),
+                restored=scene() - 0.2 * (spot() > 0),
+                spread=0.02 + 0.03 * scene(),
+                clipped=spot() > 0,
+                draws=8,
+            ),
         ),
         "height": (optics.height, dict(pupil=pupil(4.0))),
         "psf": (optics.psf, dict(plain=light.plain, mask=light.mask, bands=bands(), pixel_pitch=PIXEL)),

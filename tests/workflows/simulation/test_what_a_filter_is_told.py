@@ -28,3 +28,19 @@ def test_the_laws_of_a_laser_reach_its_patterns():
         step = recipe.steps[name]
         assert step.wires["glare"] == glare
         assert {law: step.params[law] for law in laws} == pytest.approx(laws)
+
+
+def test_a_search_is_told_nothing_of_the_laser_but_the_frame():
+    recipe = load("first_light", ["restore=search"])
+    before, told = ["deconvolved"], set()
+    while before:
+        name = before.pop()
+        told.add(name)
+        if name != "raw[mask]":  # the frame
+            wires = recipe.steps[name].wires.values()
+            before += [each for wire in wires for each in ([wire] if isinstance(wire, str) else wire or ())]
+    assert {"search", "found_glare[first]", "found_nearby[third]", "raw[mask]"} <= told
+    assert not [name for name in told if "green" in name or name.startswith(("line", "laser", "direction", "light"))]
+    assert recipe.steps["deconvolved"].wires["glare"] == tuple(
+        f"found_glare[{n}]" for n in ("first", "second", "third")
+    )

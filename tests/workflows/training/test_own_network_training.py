@@ -15,7 +15,8 @@ from neusee.workflows.evaluation.evaluation_scenes import scenes
 from neusee.workflows.evaluation.pipelines import EvaluationRefused, compose_pipelines, read_pipelines
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
-from neusee.workflows.training.run_training import _identity, train
+from neusee.workflows.training.run_training import train
+from neusee.workflows.training.training_key import _identity
 
 TINY = [
     "optics.samples=64", "optics.pitch=126.2 um", "optics.bands=3", "optics.window=[48, 48]", "scene.shape=[48, 48]",

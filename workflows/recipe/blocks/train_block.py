@@ -80,6 +80,15 @@ class Rates(SettingsBlock):
         return float(0.5 * self.factor ** ((iteration - self.halve) // self.every))
 
 
+class Augment(SettingsBlock):
+    """Changes of the photographs of a training, which make more scenes of them; held-out pictures are not changed."""
+
+    symmetries: Literal["mirror", "all"] = "mirror"  #: mirror: half of the scenes left to right; all: quarter turns too
+    exposure: Annotated[float, Field(ge=0, le=10)] = 0.0  #: stops by which a scene is darker, at most
+    colour: Share = 0.0  #: largest change of the saturation of colours
+    pooled: Literal["none", "turned_mask"] = "none"  #: turned_mask: turn pooled pictures, as behind a turned mask
+
+
 class Stage(SettingsBlock):
     """Settings of a training stage: duration, batch size and weights of the loss terms; a weight of 0 omits a term."""
 
@@ -103,10 +112,13 @@ class Training(SettingsBlock):
     psf: str = "psf[mask]"
     light: str = "bsr[mask]"  #: step that returns the background suppression ratio (BSR) by band
     network: Network = Network()
+    start: Path | None = None  #: weights, or the folder of a training, with which the network begins; None: drawn
     size: tuple[Number, Number] | None = None
     patch: tuple[Number, Number] | None = None  #: pixels (y, x) of a training patch of an image
     patches: Number = 1  #: number of patches of each image
     pool: Number | None = None  #: images that are reused while the mask is fixed; None: always new images
+    keep_pool: bool = True  #: keep the pictures of the pool in the cache, for later trainings
+    augment: Augment = Augment()
     critics: Critics = Critics()
     betas: tuple[Beta, Beta] = (0.9, 0.999)
     rates: Rates = Rates()
@@ -118,14 +130,38 @@ class Training(SettingsBlock):
     clip: GradientNorm = 10.0  #: largest gradient norm of a module
     mask: MaskSettings = MaskSettings()  #: settings of the mask design without images, which replaces stage 1
     stages: dict[Annotated[int, Field(ge=1, le=2)], Stage]
+    held_out: Annotated[float, Field(gt=0, le=0.5)] | None = 0.1  #: share of the photographs; None: none
+    held_out_pictures: Number = 16  #: held-out photographs that a validation restores, at most
+    validate_every: Number = 500  #: iterations
+    patience: Number | None = None  #: validations without a better state after which stage 2 ends; None: no limit
     keep: Number = 100
     show: Number = 500
     tensorboard: bool = False
+    export: tuple[Literal["pt2", "onnx"], ...] = ()  #: files of the trained network for other programs
 
     @property
     def learnt(self) -> tuple[int, ...]:
         """Return the numbers (1, 2) of the training stages that run."""
         return tuple(sorted(n for n in self.stages if self.learn or n != 1))
+
+    @model_validator(mode="after")
+    def _exports(self) -> Training:
+        if self.export and self.network.architecture is None and self.network.kind == "fft_mamba":
+            text = "export: the scan of fft_mamba is in no graph of torch.export or ONNX"
+            raise ValueError(f"{text}: train network.kind: nafnet or unet, or a class of your own")
+        return self
+
+    @model_validator(mode="after")
+    def _validates(self) -> Training:
+        if self.patience is not None and self.held_out is None:
+            raise ValueError("patience: nothing is held out that could stay without a better state: set held_out")
+        return self
+
+    @model_validator(mode="after")
+    def _turns_a_pool(self) -> Training:
+        if self.augment.pooled != "none" and self.pool is None:
+            raise ValueError("augment.pooled: there is no pool to turn: set pool, or write pooled: none")
+        return self
 
     @property
     def design(self) -> MaskTraining:
@@ -149,11 +185,18 @@ def read_training(composed: Composed, context: dict[str, Any] | None = None) -> 
     composed, training = read_block(composed, KEY, Training, _plain(block), context)
     if training and "network" in block.items and (wrong := list(_wrong_network(block.items["network"], training))):
         return composed.with_problems(wrong), None
-    if training is None or training.photographs is None or training.photographs.is_dir():
-        return composed, training
-    value = block.items["photographs"]
-    problem = Diagnostic(value.mark, value.name, f"the path {training.photographs} is not a folder of photographs")
-    return composed.with_problems([problem]), None
+    missing = list(_missing(block, training)) if training else []
+    return (composed.with_problems(missing), None) if missing else (composed, training)
+
+
+def _missing(block: Value, training: Training) -> Iterator[Diagnostic]:
+    """Yield a diagnostic for each path of a training that does not exist."""
+    if training.photographs is not None and not training.photographs.is_dir():
+        value = block.items["photographs"]
+        yield Diagnostic(value.mark, value.name, f"the path {training.photographs} is not a folder of photographs")
+    if training.start is not None and not training.start.exists():
+        value = block.items["start"]
+        yield Diagnostic(value.mark, value.name, f"there is neither a file nor a folder {training.start}")
 
 
 def _wrong_network(given: Value, training: Training) -> Iterator[Diagnostic]:
@@ -184,7 +227,7 @@ def _wrong_network(given: Value, training: Training) -> Iterator[Diagnostic]:
 def _plain(block: Value) -> Any:
     """Return the block ``train`` as plain data, with file paths relative to the folder of their YAML file."""
     plain = block.plain
-    for outer, key in ((block, "photographs"), (block.items.get("mask"), "start")):
+    for outer, key in ((block, "photographs"), (block, "start"), (block.items.get("mask"), "start")):
         value = outer.items.get(key) if outer else None
         if value is not None and isinstance(value.data, str):
             (plain if outer is block else plain["mask"])[key] = Path(value.mark.folder) / Path(value.data).expanduser()

@@ -64,6 +64,15 @@ class ResumableLoop(ABC, Generic[L]):
     def show(self) -> None:
         """Write a picture that shows the output of the networks at the present iteration of the training."""
 
+    def validate(self, iterations: int) -> Losses:
+        """Return further numbers for the loss table after a number of iterations of the stage; most have none."""
+        return {}
+
+    @property
+    def stops_early(self) -> bool:
+        """Return True if the present stage ends before its last iteration."""
+        return False
+
     def begin_stage(self) -> None:
         """Prepare networks and optimisers for the present stage of the training."""
 
@@ -85,16 +94,17 @@ class ResumableLoop(ABC, Generic[L]):
         self.batch = batch
         if self.writes and self.iteration < iterations:
             remove_crate(self.folder)
-        while self.iteration < iterations:
+        while self.iteration < iterations and not self.stops_early:
             began = time.perf_counter()
             try:
                 losses = self.iterate()
             except NotFinite as error:
                 raise self._dumped(error) from error
+            losses |= self.validate(self.iteration + 1)
             losses["seconds"] = time.perf_counter() - began
             self.rows.add(self.stage, self.iteration, losses)
             self.iteration += 1
-            ended = self.iteration == iterations
+            ended = self.iteration == iterations or self.stops_early
             if self.writes and (ended or self.iteration % self.show_every == 0):
                 self.show()
             self.note(losses)

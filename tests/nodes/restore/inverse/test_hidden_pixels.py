@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from neusee.nodes.restore._inverse import _conjugate_gradients, _fft_grid, _hidden_pixels, _lowest_frequencies
 from neusee.nodes.restore._inverse._conjugate_gradients import descend
@@ -191,6 +192,50 @@ def test_gradients_through_the_iteration_are_those_of_the_exact_answer(monkeypat
     for mine, dense, right in zip(found, slopes(leaves, probe, most_likely), exact, strict=True):
         assert float((mine - right).norm()) < 1e-3 * float(right.norm())
         assert float((dense - right).norm()) < 1e-6 * float(right.norm())
+
+
+class Work(TorchDispatchMode):
+    """Counts decompositions of matrices, and the results with at least `side` squared numbers."""
+
+    def __init__(self, side):
+        super().__init__()
+        self.side, self.decompositions, self.matrices = side, 0, 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        self.decompositions += any(name in str(func) for name in ("cholesky_ex", "linalg_solve", "lu_factor", "eigh"))
+        first = result[0] if isinstance(result, tuple | list) and result else result
+        new = isinstance(first, torch.Tensor) and "view" not in str(func) and first.numel() >= self.side**2
+        self.matrices += new
+        return result
+
+
+def test_the_gradient_of_a_picture_that_is_solved_exactly_needs_no_matrix_but_the_factor():
+    """Work is counted, not timed: one decomposition forward; one solve by its factor, and no matrix, backward."""
+    picture, size = (20, 16), torus((20, 16), (6, 6))
+    seen = problem(picture, size, 2, 0.5, hidden=0.2)
+    leaf = seen.picture.clone().requires_grad_()
+    model = replace(seen, picture=leaf, transfer=seen.transfer.clone().requires_grad_())
+    side = 2 * 20 * 16
+    with Work(side) as forward:
+        found = space(model, most_likely(model)).square().sum()
+    with Work(side) as backward:
+        found.backward()
+    assert (forward.decompositions, backward.decompositions) == (1, 0)
+    assert forward.matrices > 0
+    assert backward.matrices == 0
+    assert bool(leaf.grad.any())
+
+
+def test_gradcheck_of_a_picture_that_is_solved_exactly():
+    seen = problem((5, 4), (8, 7), 2, 0.5, hidden=0.2)
+
+    def restored(picture, through):
+        model = replace(seen, picture=picture, transfer=torch.view_as_complex(through))
+        return space(seen, most_likely(model))
+
+    leaves = [leaf.clone().requires_grad_() for leaf in (seen.picture, torch.view_as_real(seen.transfer))]
+    assert torch.autograd.gradcheck(restored, leaves)
 
 
 @pytest.mark.parametrize("picture", [(41, 80), (81, 7), (200, 123)])

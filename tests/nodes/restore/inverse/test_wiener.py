@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from neusee.nodes.optics import image
 from neusee.nodes.restore import wiener
 from neusee.nodes.restore._inverse import _wiener
+from neusee.nodes.restore._inverse._fft_grid import DENSE
 from neusee.nodes.restore._inverse._glare import strengths
 from neusee.nodes.restore._inverse._wiener import effective_psf
 from neusee.nodes.sensor import crop
@@ -267,7 +268,7 @@ def test_a_narrow_psf_needs_no_coarser_grids():
     psf = Psf((kernel / kernel.sum()).float()[None], ONE)
     electrons = seen(scene() / 400, psf)
     nested, alone = (run(electrons, psf, coarser_grids=coarser) for coarser in (True, False))
-    exact = run(electrons[..., :40, :40], psf)
+    exact = run(electrons[..., :DENSE, :DENSE], psf)
     assert error(alone, nested) < 0.01 * float(nested.std())
     assert error(alone, nested) > 0  # another start of the iteration
-    assert run(electrons[..., :40, :40], psf, coarser_grids=False).equal(exact)  # solved without an iteration
+    assert run(electrons[..., :DENSE, :DENSE], psf, coarser_grids=False).equal(exact)  # solved without an iteration

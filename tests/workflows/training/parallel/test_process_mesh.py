@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import load_file
 
 from neusee.nodes import doe
@@ -243,3 +244,27 @@ def test_a_psf_that_couples_its_bands_is_named(tmp_path):
 def samples(recipe, folder, mesh):
     how = recipe.training
     return TrainingStream(recipe, how, _photographs(recipe, how, True), Store(folder), "cpu", None, mesh)
+
+
+@pytest.mark.slow
+def test_all_processes_hold_out_the_same_photographs(tmp_path):
+    (tmp_path / "photographs").mkdir()
+    for i in range(4):
+        Image.effect_noise((60, 50), 40 + 20 * i).convert("RGB").save(tmp_path / "photographs" / f"{i}.png")
+    words = [*SHORT, "train.stages.2.iterations=2", "train.held_out=0.5", "train.validate_every=2",
+             f"train.photographs={tmp_path / 'photographs'}"]  # fmt: skip
+    found = processes(tmp_path, [(mesh, mesh, "train", words) for mesh in ("1x1", "2x1", "1x2")])
+    rows = {}
+    for name, mesh in found:
+        assert not any(codes(found[name, mesh])), errors(found[name, mesh])
+        (folder,) = (tmp_path / name).iterdir()
+        table = [line.split(",")[:-1] for line in (folder / "losses.csv").read_text().splitlines()]
+        rows[name] = table
+        about = json.loads((folder / "training.json").read_text())
+        assert (about["photographs"], len(about["held_out"]), about["best"]["iterations"]) == (2, 2, 2)
+    assert rows["2x1"] == rows["1x2"] == rows["1x1"]
+    one = [*words, "train.held_out_pictures=1", "train.validate_every=1"]  # one process has no picture to restore
+    again = processes(tmp_path, [("alone", "1x2", "train", one)])["alone", "1x2"]
+    assert not any(codes(again)), errors(again)
+    place = rows["1x1"][0].index("held_out_PSNR")
+    assert [bool(row[place]) for row in rows["1x1"][1:]] == [False, True, True, False, True]

@@ -1,0 +1,165 @@
+"""The node that finds lasers in one frame of a known camera, without any knowledge of the lasers."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes._half_precision import refuse_not_finite
+from neusee.nodes.restore._inverse._wiener import refuse_other_pictures
+from neusee.nodes.restore._lasers._candidates import line_templates
+from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Laser, lamp_light
+from neusee.nodes.restore._lasers._greedy_search import Found, Known, search
+from neusee.nodes.restore._lasers._intervals import NORMAL, covariances
+from neusee.nodes.restore._lasers._line_pattern import Lens, Sensor
+from neusee.nodes.units import Electrons, PositiveLength
+from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
+
+_WIDEST = (0.5, 10.0)  #: pixels and nm; half of a wider interval does not identify
+_RIVAL = 5.0  #: log likelihood by which the fit exceeds one at another place or wavelength, to identify
+_CHANNELS, _SMALLEST = 3, 20
+_PRECISE = 256  #: pixels a side, up to which all is computed in float64
+
+
+Widths = Annotated[tuple[PositiveLength, ...], Field(min_length=1, max_length=8)]
+
+
+@node()
+def find_lasers(
+    electrons: Tensor,
+    clipped: Tensor,
+    psf: Psf,
+    pupil: Pupil,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    *,
+    focal_length: PositiveLength,
+    pixel_pitch: PositiveLength,
+    sensor: Sensor = "point",
+    read_noise: Electrons,
+    most: Annotated[int, Field(ge=1, le=8)] = 3,
+    lamps: Annotated[int, Field(ge=0, le=16)] = 4,
+    widths: Widths = (1e-9, 5e-9, 10e-9),
+    least: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 40.0,
+    margin: Annotated[float, Field(ge=0, lt=1)] = 0.02,
+) -> FoundLasers:
+    """Find the lasers in one frame: their number, and direction, wavelength and strength of each, with intervals.
+
+    The camera is known and the lasers are not. The pattern of a spectral line at every place and wavelength is compared
+    with the frame, which a short filter has made nearly white: the scene counts as a random picture whose details
+    are as strong as those around each pixel. The values of clipped pixels are not used; their number and places say
+    where a fit begins. The best candidates are fitted with a free response of each channel (3 %), and with each of the
+    ``widths`` (full width at half maximum) of a line. A laser must gain ``least`` of log likelihood, and at least
+    ``margin`` of its gain beyond that of a lamp, a point source whose spectrum is smooth. All lasers and lamps are
+    fitted at once, and the search goes on in the rest. Intervals (90 %) come from the second derivatives and the
+    scatter of the residual.
+
+    Shapes: electrons and clipped (3, y, x), psf.intensity (band, any, any), pupil, illuminant (band,),
+            responses (3, band), bands -> FoundLasers of ``most`` rows.
+    Units:  electrons e-; direction rad; wavelength and widths m; strength e-; gain none.
+    Error:  in frames of more than 256 pixels a side float32 rounds the fit. A light that is narrow but no laser, such
+            as a light-emitting diode, may be taken for one. A laser that changes no pixel that is seen is not found.
+            Two lasers within 2 pixels and 25 nm count as one. The responses are linear between the bands.
+            `recipes/guide/found_lasers.md` has measured rates and coverage.
+    Raises: ValueError for a number of channels other than 3, frames of fewer than 20 pixels a side, inputs of different
+            channels, bands or pixels, and values that are not finite.
+    Gradient: none, because a search chooses between candidates.
+    Source: matched filter as in Kay, Fundamentals of Statistical Signal Processing II, 1998, ch. 4; covariance of a
+            model that may be wrong as in White, Econometrica 50, 1 (1982).
+    """
+    _refuse(electrons, clipped, psf, pupil, responses, bands)
+    lens = Lens(focal_length, pixel_pitch, (electrons.shape[-2], electrons.shape[-1]), sensor)
+    with torch.no_grad():
+        precise = max(electrons.shape[-2:]) <= _PRECISE
+        frame = electrons.detach().to(torch.float64 if precise else torch.float32)
+        plain = Pupil(*(x.detach() for x in pupil))
+        known = Known(
+            frame,
+            (~clipped).to(frame),
+            Camera(plain, responses.detach().to(frame), bands, lens, torch.tensor(widths[0], dtype=torch.float64)),
+            lamp_light(psf, illuminant, responses, bands, lens.shape, frame.dtype),
+            line_templates(plain, responses, bands, lens),
+            read_noise,
+            widths,
+        )
+        found = search(known, most, lamps, least, margin)
+        return _table(found, known, most)
+
+
+@find_lasers.check
+def _(
+    result: FoundLasers, electrons: Tensor, *inputs: Any, focal_length: float, pixel_pitch: float, **_: Any
+) -> list[Check]:
+    count = int(result.number)
+    if not count:
+        return [Check("no laser found")]
+    texts = []
+    for n in range(count):
+        y, x = (result.direction[n] * (focal_length / pixel_pitch)).tolist()
+        low, high = (result.wavelength_interval[n] / NANOMETRE).tolist()
+        known = "" if bool(result.identifiable[n].all()) else ", not identifiable"
+        texts.append(
+            f"{y:+.2f}, {x:+.2f} px, {float(result.wavelength[n]) / NANOMETRE:.1f} nm ({low:.1f} to {high:.1f}){known}"
+        )
+    return [Check(f"{count} laser{'s' * (count > 1)} found: {'; '.join(texts)}")]
+
+
+def _refuse(electrons: Tensor, clipped: Tensor, psf: Psf, pupil: Pupil, responses: Tensor, bands: Bands) -> None:
+    if electrons.ndim != 3 or len(electrons) != _CHANNELS:
+        raise ValueError(
+            f"electrons {tuple(electrons.shape)}: lasers are found in a frame of 3 colour channels (3, y, x) alone, "
+            "because the ratio of the channels tells a laser from a lamp: give such a frame"
+        )
+    refuse_other_pictures(electrons, psf, responses, clipped, None)
+    if min(electrons.shape[-2:]) < _SMALLEST:
+        raise ValueError(
+            f"a frame of {tuple(electrons.shape[-2:])} pixels is too small: give at least {_SMALLEST} a side"
+        )
+    if len(pupil.wavelengths) != len(bands.centres):
+        raise ValueError(
+            f"pupil of {len(pupil.wavelengths)} bands and {len(bands.centres)} bands differ: "
+            "compute both from one `bands` step"
+        )
+    refuse_not_finite("no laser can be found", pupil=pupil.path.sum() + pupil.height.sum() + pupil.amplitude.sum())
+
+
+def _table(found: Found, known: Known, most: int) -> FoundLasers:
+    """Return what was found in SI units, the laser of the largest gain first."""
+    at = [n for n, part in enumerate(found.fit.parts) if isinstance(part, Laser)]
+    spread = covariances(found.fit, tuple(known.electrons.shape)) if at else []
+    order = sorted(range(len(at)), key=lambda n: -found.choices[at[n]].gain)
+    result = _empty(most, len(known.electrons))
+    pixel = known.camera.lens.pixel_pitch / known.camera.lens.focal_length
+    for row, n in enumerate(order):
+        part = found.fit.parts[at[n]]
+        assert isinstance(part, Laser)
+        values = torch.cat([part.values[:3], part.channels()]).cpu().double()
+        covariance = spread[n].cpu().double()
+        half = NORMAL * covariance.diagonal().sqrt()
+        ends = torch.stack([values - half, values + half], -1)
+        result.direction[row], result.direction_interval[row] = pixel * values[:2], pixel * ends[:2]
+        result.wavelength[row], result.wavelength_interval[row] = NANOMETRE * values[2], NANOMETRE * ends[2]
+        result.fwhm[row] = part.camera.fwhm
+        result.strength[row], result.strength_interval[row] = values[3:], ends[3:]
+        choice = found.choices[at[n]]
+        alone = choice.rival > _RIVAL
+        result.identifiable[row, 0] = alone and float(half[:2].max()) < _WIDEST[0]
+        result.identifiable[row, 1] = alone and float(half[2]) < _WIDEST[1]
+        result.gain[row] = torch.tensor([choice.gain, choice.margin])
+        result.correlation[row] = covariance / torch.outer(half / NORMAL, half / NORMAL)
+    return result._replace(number=torch.tensor(len(at)))
+
+
+def _empty(most: int, channels: int) -> FoundLasers:
+    shapes = ((2,), (), (), (channels,), (2, 2), (2,), (channels, 2))
+    blank = [torch.zeros(most, *shape, dtype=torch.float64) for shape in shapes]
+    certain = torch.zeros(most, 2, dtype=torch.bool)
+    gain, spread = (torch.zeros(most, *shape, dtype=torch.float64) for shape in ((2,), (3 + channels, 3 + channels)))
+    places, wave, width, size, ends, wave_ends, size_ends = blank
+    none = torch.tensor(0)
+    return FoundLasers(none, places, wave, width, size, ends, wave_ends, size_ends, certain, gain, spread)

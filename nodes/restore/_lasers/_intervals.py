@@ -1,0 +1,53 @@
+"""How well a frame tells the values of each laser: from the curvature of the fit and the scatter of its residual."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from neusee.nodes.restore._lasers._components import NANOMETRE, Laser
+from neusee.nodes.restore._lasers._joint_fit import Fit, solved
+
+NORMAL = 1.6448536269514722  #: standard deviations on each side of a 90 % interval
+_BLOCK = 8  #: pixels a side of blocks whose residuals count as independent of one another
+_MODEL = (0.002, 0.002, 0.02)  #: pixels, pixels and nm, standard deviations of what the model neglects
+_SHAPE = 0.03  #: standard deviation of the wavelength from the unknown shape of a line, over the width of the line
+_AMOUNT = 0.003  #: the same of the electrons of each channel, relative
+
+
+def covariances(fit: Fit, shape: tuple[int, ...]) -> list[Tensor]:
+    """Return for each laser the covariance of y, x (pixels), nm, and the electrons of each channel.
+
+    ``shape`` is that of the frame. The inverse of the second derivatives is enlarged where the slopes of blocks of the
+    frame scatter more than the model says.
+    """
+    count = len(fit.normal)
+    inverse = solved(fit.normal, torch.eye(count).to(fit.normal))
+    scores = (fit.columns * fit.rest).double().view(count, *shape).sum(1)
+    y, x = (-n % _BLOCK for n in shape[-2:])
+    blocks = pad(scores, (0, x, 0, y)).unfold(1, _BLOCK, _BLOCK).unfold(2, _BLOCK, _BLOCK).sum((-2, -1)).flatten(1)
+    prior = fit.normal - (fit.columns @ fit.columns.T).double()
+    scattered = inverse @ (blocks @ blocks.T + prior) @ inverse
+    growth = (scattered.diagonal() / inverse.diagonal().clamp_min(1e-300)).clamp_min(1.0).sqrt()
+    whole = growth[:, None] * inverse * growth
+    found, first = [], 0
+    for part in fit.parts:
+        own = whole[first : first + len(part.values), first : first + len(part.values)]
+        first += len(part.values)
+        if isinstance(part, Laser):
+            found.append(_of_channels(part, own))
+    return found
+
+
+def _of_channels(laser: Laser, own: Tensor) -> Tensor:
+    """Return the covariance of place, wavelength and electrons of each channel, with what the model neglects."""
+    slopes = laser.channel_slopes().to(own)
+    to = torch.zeros(3 + len(slopes), len(own)).to(own)
+    to[:3, :3] = torch.eye(3).to(own)
+    to[3:] = slopes
+    neglected = torch.zeros(len(to)).to(own)
+    neglected[:3] = torch.tensor(_MODEL).to(own).square()
+    neglected[2] += (_SHAPE * laser.camera.fwhm.to(own) / NANOMETRE).square()
+    neglected[3:] = (_AMOUNT * laser.channels()).square().to(own)
+    return to @ own @ to.T + neglected.diag()

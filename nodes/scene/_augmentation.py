@@ -1,0 +1,62 @@
+"""Changes of photographs that give a training more scenes: symmetries of the square, exposure and colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Change:
+    """One drawn change of a photograph; the default changes nothing."""
+
+    quarters: int = 0  #: quarter turns, counter-clockwise
+    stops: float = 0.0  #: a scene of 2**stops times the light
+    saturation: float = 1.0  #: of the colours; 0 is grey
+
+    @classmethod
+    def drawn(cls, seed: tuple[int, ...], turned: bool, darker: float, colour: float) -> Change:
+        """Return the change that a seed draws, at most ``darker`` stops darker and with a saturation of 1 ± ``colour``.
+
+        If ``turned``, the number of quarter turns is drawn from 0 to 3; with a mirror these are the eight symmetries.
+        """
+        rng = np.random.default_rng(seed)
+        quarters, stops, saturation = int(rng.integers(4)), -float(rng.random()), 2.0 * float(rng.random()) - 1.0
+        return cls(quarters if turned else 0, darker * stops, 1.0 + colour * saturation)
+
+    def frame(self, shape: tuple[int, int]) -> tuple[int, int]:
+        """Return the rows and columns of a photograph that this change turns into a picture of ``shape``."""
+        return (shape[1], shape[0]) if self.quarters % 2 else shape
+
+    def of(self, picture: Tensor) -> Tensor:
+        """Change a picture (3, y, x) in linear sRGB from 0 to 1: its colours, its light and its position.
+
+        The saturation is that of kornia: each encoded colour moves along the line to the grey of its luma (ITU-R
+        BT.601), and is clipped to the range from 0 to 1. The random augmentations of kornia draw from the
+        one random stream of torch, whereas these values are given.
+        """
+        if self.saturation != 1.0:
+            picture = _saturated(picture, self.saturation)
+        if self.stops:
+            picture = picture * 2.0**self.stops
+        return picture.rot90(self.quarters, (-2, -1)).contiguous() if self.quarters else picture
+
+
+def _saturated(picture: Tensor, factor: float) -> Tensor:
+    from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+    from kornia.enhance import adjust_saturation_with_gray_subtraction
+
+    changed: Tensor = rgb_to_linear_rgb(adjust_saturation_with_gray_subtraction(linear_rgb_to_rgb(picture), factor))
+    return changed
+
+
+def symmetry(pictures: Tensor, seed: tuple[int, ...]) -> Tensor:
+    """Turn and mirror pictures (..., y, x) by a symmetry that a seed draws: one of eight, or of four if y is not x."""
+    rng = np.random.default_rng(seed)
+    quarters, mirrored = int(rng.integers(4)), bool(rng.integers(2))
+    if pictures.shape[-1] != pictures.shape[-2]:
+        quarters -= quarters % 2
+    turned = pictures.rot90(quarters, (-2, -1))
+    return (turned.flip(-1) if mirrored else turned).contiguous()

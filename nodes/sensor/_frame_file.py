@@ -1,0 +1,208 @@
+"""A frame that somebody took, read from a file as the digital numbers of the camera."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.input_files import once_per_version, refuse_large_array, refuse_large_picture
+from neusee.nodes.sensor._digitization import Bits
+from neusee.nodes.units import DataFile, Shape
+
+_DAMAGED = "{name} is damaged or no picture ({error}): copy the file again"
+_COLOURS = {0: 1, 2: 3}  #: channels of a PNG by its colour type
+_ARRAY = "(y, x), (y, x, 3) or (3, y, x)"
+
+
+@node(rtol=0.0)
+def frame(responses: Tensor, *, file: DataFile, shape: Shape, bits: Bits = 16) -> Tensor:
+    """Read a frame that a camera took: the digital numbers of each channel, unchanged.
+
+    The file is a PNG or TIFF of 8 or 16 bits, an OpenEXR picture, or a NumPy array. No tone curve is undone: the
+    numbers must be those of the converter, from 0 to 2**bits - 1, so that `restore.electrons` can divide them by the
+    gain and subtract the offset of the sensor.
+
+    Shapes: responses (channel, band), of which only the number of channels counts -> (channel, y, x) float32.
+    Units:  DN.
+    Error:  none: whole numbers are exact. An orientation in EXIF is ignored, as the sensor does not turn.
+    Raises: ParameterError before the run for a file that is damaged or of another format, and for a size, channels,
+            depth or numbers that do not fit the sensor.
+    Source: EMVA Standard 1288, release 4.0 (digital numbers of a camera).
+    """
+    if problem := _problem(file, len(responses), tuple(shape), bits):
+        raise ParameterError("file", problem)
+    return torch.from_numpy(np.ascontiguousarray(_read(file).values, dtype=np.float32))
+
+
+@frame.preflight
+def _(*, responses: Tensor | None = None, file: Path, shape: Shape, bits: int = 16) -> list[str]:
+    channels = None if responses is None else len(responses)
+    if problem := _problem(file, channels, tuple(shape), bits):
+        raise ParameterError("file", problem)
+    return []
+
+
+@frame.check
+def _(result: Tensor, *inputs: Any, bits: int = 16, **params: Any) -> list[Check]:
+    low, high, top = float(result.min()), float(result.max()), 2**bits - 1
+    return [Check(f"numbers from {low:.0f} to {high:.0f} of {top} DN, mean {float(result.mean()):.4g}", high > low)]
+
+
+class _Frame(NamedTuple):
+    values: NDArray[Any]  #: (channel, y, x)
+    depth: int | None  #: bits of the numbers in the file; None for a file of floating-point numbers
+
+
+@once_per_version
+def _problem(file: Path, channels: int | None, shape: tuple[int, int], bits: int) -> str:
+    """Return why a file is no frame of this sensor, in one sentence, or an empty text."""
+    try:
+        values, depth = _read(file)
+    except ParameterError as error:
+        return str(error)
+    name, found = file.name, values.shape[1:]
+    if channels is not None and len(values) != channels:
+        return _other_channels(name, len(values), channels)
+    if found != shape:
+        size = f"[{found[0]}, {found[1]}]"
+        return (
+            f"{name} has {found[0]} x {found[1]} pixels (y, x), but sensor.shape is {list(shape)}: give the whole "
+            f'frame of this sensor, or "sensor.shape={size}" if this window around its centre was read out'
+        )
+    return _other_depth(name, depth, bits) or _other_numbers(name, values, bits)
+
+
+def _other_channels(name: str, found: int, channels: int) -> str:
+    if found == 1:
+        return (
+            f"{name} has one channel, but the camera has {channels}: it may be a raw colour filter array, which is not "
+            "handled yet; develop it to three channels without a tone curve, or name a sensor.camera of one channel"
+        )
+    return f"{name} has {found} channels, but the camera has {channels}: give a frame of the channels of sensor.camera"
+
+
+def _other_depth(name: str, depth: int | None, bits: int) -> str:
+    if depth is not None and depth < bits and depth == 8:
+        return (
+            f"{name} has 8 bits, but sensor.bits is {bits}: save the numbers of the camera in 16 bits, or give "
+            "sensor.bits=8 with the gain of these numbers"
+        )
+    return ""
+
+
+def _other_numbers(name: str, values: NDArray[Any], bits: int) -> str:
+    top = 2**bits - 1
+    if values.dtype.kind == "f":
+        if count := int((~np.isfinite(values)).sum()):
+            return f"{name} holds {count} values that are not finite (NaN or infinity): give the numbers of the camera"
+        broken = values != np.round(values)
+        if broken.any():
+            return (
+                f"{name} holds {values[broken][0]:g}, no whole number: give the digital numbers of the camera, from 0 "
+                f"to {top}, without a tone curve and without scaling"
+            )
+    least, most = int(values.min()), int(values.max())
+    if least < 0:
+        return f"{name} holds {least}, below 0: give the numbers of the camera with its offset, not subtracted"
+    if most > top:
+        return (
+            f"{name} holds {most} DN, but {bits} bits end at {top}: set sensor.bits to the depth of the converter, or "
+            "shift the numbers down if the camera moved them to the upper bits"
+        )
+    if most == least:
+        return f"{name} has the same number, {most}, in every pixel: there is no picture in it"
+    return ""
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def _read(file: Path) -> _Frame:
+    """Read a frame; raise ParameterError for a file that cannot be read or has another form than a frame."""
+    reader = _READERS.get(file.suffix.lower())
+    if reader is None:
+        known = ", ".join(_READERS)
+        raise ParameterError("file", f"{file.name} is no frame that can be read: give {known}")
+    try:
+        return reader(file)
+    except ParameterError:
+        raise
+    except Exception as error:  # the readers of kornia-rs raise no class of their own
+        text = str(error).partition("\n")[0] or type(error).__name__
+        raise ParameterError("file", _DAMAGED.format(name=file.name, error=text)) from None
+
+
+def _png(file: Path) -> _Frame:
+    from kornia_rs import io
+    from PIL import Image
+
+    head = file.read_bytes()[:26]
+    if not head.startswith(b"\x89PNG") or len(head) < 26:
+        raise ParameterError("file", f"{file.name} is no PNG file, whatever its name says: save the frame as PNG")
+    depth, channels = head[24], _COLOURS.get(head[25], 0)
+    if not channels or depth not in (8, 16):
+        text = f"{file.name} has a palette, transparency or {depth} bits: save raw numbers of 8 or 16 bits"
+        raise ParameterError("file", text)
+    refuse_large_picture(file, int.from_bytes(head[20:24]), int.from_bytes(head[16:20]))
+    with Image.open(file) as image:
+        image.verify()
+    read = io.read_image_png_u16 if depth == 16 else io.read_image_png_u8
+    return _Frame(_first(np.asarray(read(str(file), "rgb" if channels == 3 else "mono"))), depth)
+
+
+def _tiff(file: Path) -> _Frame:
+    from kornia_rs import io
+
+    kinds = ((io.read_image_tiff_u16, 16), (io.read_image_tiff_u8, 8), (io.read_image_tiff_f32, None))
+    said = ""
+    for read, depth in kinds:
+        for mode in ("rgb", "mono"):
+            try:
+                return _Frame(_first(np.asarray(read(str(file), mode))), depth)
+            except Exception as error:  # another kind of pixels, or a damaged file
+                said = str(error).partition("\n")[0]
+    text = f"{file.name} cannot be read as grey or RGB of 8 or 16 bits ({said}): save it so, without compression"
+    raise ParameterError("file", text)
+
+
+def _exr(file: Path) -> _Frame:
+    import OpenEXR
+
+    with OpenEXR.File(str(file), separate_channels=True) as opened:
+        channels = {name: np.array(channel.pixels) for name, channel in opened.channels().items()}
+    names = ["R", "G", "B"] if {"R", "G", "B"} <= channels.keys() else list(channels)
+    if len(names) not in (1, 3):
+        text = f"{file.name} has the channels {', '.join(channels)}: save R, G and B, or one channel alone"
+        raise ParameterError("file", text)
+    return _Frame(np.stack([channels[name].astype(np.float64) for name in names]), None)
+
+
+def _npy(file: Path) -> _Frame:
+    array = np.load(file, mmap_mode="r", allow_pickle=False)
+    refuse_large_array(file, array.shape)
+    if array.dtype.kind not in "uif" or array.ndim not in (2, 3) or not array.size:
+        text = f"{file.name} is {array.dtype} of shape {array.shape}: give numbers of shape {_ARRAY}"
+        raise ParameterError("file", text)
+    if array.ndim == 3 and array.shape[0] in (1, 3):
+        return _Frame(np.array(array), None)
+    return _Frame(_first(np.array(array)), None)
+
+
+def _first(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Return pixels (y, x) or (y, x, channel) with the channel first."""
+    return pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1)
+
+
+_READERS: dict[str, Callable[[Path], _Frame]] = {
+    ".png": _png,
+    ".tif": _tiff,
+    ".tiff": _tiff,
+    ".exr": _exr,
+    ".npy": _npy,
+}
+FRAME_SUFFIXES = tuple(_READERS)  #: of files that `frame` reads

@@ -1,0 +1,131 @@
+"""How often lasers are found in one frame, how exactly, and how often no laser is taken for one.
+
+    python tests/benchmarks/bench_laser_search.py results.jsonl --seeds 1000 40
+    python tests/benchmarks/bench_laser_search.py results.jsonl --report
+
+The frames come from `tests/nodes/restore/lasers/own_camera.py`, a camera in NumPy alone. Each seed makes, for each
+mask, two frames without a laser, one of them with lamps, one with a laser of 1000 or more, and one with a weaker laser.
+A frame that stands in the file is not computed again, so that a run that was stopped continues. The patterns on the
+axis, which depend on the mask alone, are computed once.
+"""
+
+import argparse
+import functools
+import json
+import sys
+import time
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import torch
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT))
+
+from neusee.nodes.restore._lasers import _find_lasers  # noqa: E402
+from tests.nodes.restore.lasers import own_camera as own  # noqa: E402
+from tests.nodes.restore.lasers.as_inputs import found_in, kept_templates  # noqa: E402
+
+SIDE = 128
+MASKS = ("plain", "half_ring", "cubic")
+STRONG, WEAK = (1e3, 1e4, 1e5, 1e6), (1.0, 10.0, 100.0)
+KINDS = ("sample", "leaves", "noise")
+
+
+def cases(seed):
+    """Name, mask, strength and number of lamps of each frame of a seed."""
+    for mask in MASKS:
+        yield f"{mask}-none", mask, 0.0, 0
+        yield f"{mask}-lamps", mask, 0.0, 1 + seed % 3
+        yield f"{mask}-strong", mask, STRONG[seed % len(STRONG)], 0
+        yield f"{mask}-weak", mask, WEAK[seed % len(WEAK)], 0
+
+
+def row(seed, name, mask, strength, lamps):
+    """What is true of one frame, and what was found."""
+    rng = np.random.default_rng([seed, *name.encode()])
+    kind = KINDS[int(rng.integers(len(KINDS)))]
+    spot, wavelength = tuple(rng.uniform(-0.35, 0.35, 2) * SIDE), rng.uniform(420e-9, 670e-9)
+    lasers = [own.Laser(spot, wavelength, strength)] if strength else []
+    frame = own.frame(mask, kind, SIDE, lasers, rng, lamps)
+    start = time.process_time()
+    found = found_in(frame, mask)
+    pixel = own.PITCH / own.FOCAL
+    return {
+        "seed": seed, "name": name, "mask": mask, "strength": strength, "lamps": lamps, "kind": kind,
+        "clipped": float(frame.clipped.any(0).mean()), "seconds": round(time.process_time() - start, 2),
+        "spot": list(spot), "nm": wavelength * 1e9, "channels": lasers[0].channels.tolist() if lasers else None,
+        "number": int(found.number), "found_spot": (found.direction[0] / pixel).tolist(),
+        "spot_ends": (found.direction_interval[0] / pixel).tolist(), "found_nm": float(found.wavelength[0]) * 1e9,
+        "nm_ends": (found.wavelength_interval[0] * 1e9).tolist(), "found_channels": found.strength[0].tolist(),
+        "channel_ends": found.strength_interval[0].tolist(), "identifiable": found.identifiable[0].tolist(),
+        "gain": found.gain.tolist(),
+    }  # fmt: skip
+
+
+def run(path, first, count):
+    """Append the frames that the file lacks."""
+    done = {(r["seed"], r["name"]) for r in rows(path)}
+    keep = functools.cache(kept_templates)
+    for seed in range(first, first + count):
+        for name, mask, strength, lamps in cases(seed):
+            if (seed, name) not in done:
+                with patch.object(_find_lasers, "line_templates", lambda *_, mask=mask: keep(mask, SIDE)):
+                    each = row(seed, name, mask, strength, lamps)
+                with path.open("a") as file:
+                    file.write(json.dumps(each) + "\n")
+
+
+def rows(path):
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def inside(value, ends):
+    return ends[0] <= value <= ends[1]
+
+
+def report(all_rows):
+    """Print the rates of each mask and strength."""
+    free = [r for r in all_rows if not r["strength"]]
+    print(f"without a laser: {sum(r['number'] > 0 for r in free)} of {len(free)} frames with a false alarm")
+    for lamps in (False, True):
+        some = [r for r in free if bool(r["lamps"]) == lamps]
+        print(f"  {'with' if lamps else 'no'} lamps: {sum(r['number'] > 0 for r in some)} of {len(some)}")
+    print(
+        "mask, strength: frames, found, identifiable, place within 0.2 px, within 5 nm, coverage of place, nm, channels"
+    )
+    groups = {(r["mask"], r["strength"]) for r in all_rows if r["strength"]}
+    for mask, strength in [*sorted(groups), ("all", 1e3), ("all", 0.0)]:
+        some = [r for r in all_rows if (r["mask"], r["strength"]) == (mask, strength)]
+        if mask == "all":
+            some = [r for r in all_rows if (r["strength"] >= 1e3 if strength else 0 < r["strength"] < 1e3)]
+        print(f"{mask:9} {strength:7g}: {line(some)}")
+    extra = [r for r in all_rows if r["strength"] and r["number"] > 1]
+    print(f"more than one laser found where there is one: {len(extra)} of {sum(r['strength'] > 0 for r in all_rows)}")
+
+
+def line(some):
+    """The rates of some frames with a laser."""
+    seen = [r for r in some if r["number"]]
+    near = [r for r in seen if max(abs(np.subtract(r["spot"], r["found_spot"]))) < 0.2]
+    hue = [r for r in seen if abs(r["nm"] - r["found_nm"]) < 5]
+    sure = [r for r in seen if all(r["identifiable"])]
+    place = [inside(a, e) for r in sure for a, e in zip(r["spot"], r["spot_ends"], strict=True)]
+    colour = [inside(r["nm"], r["nm_ends"]) for r in sure]
+    amounts = [inside(a, e) for r in sure for a, e in zip(r["channels"], r["channel_ends"], strict=True)]
+    shares = [f"{np.mean(x):.2f} of {len(x)}" if x else "-" for x in (place, colour, amounts)]
+    return f"{len(some):3} {len(seen):3} {len(sure):3} {len(near):3} {len(hue):3}  {'  '.join(shares)}"
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "COUNT"))
+    parser.add_argument("--report", action="store_true")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    if given.seeds:
+        run(given.file, *given.seeds)
+    if given.report:
+        report(rows(given.file))

@@ -1,0 +1,140 @@
+"""Lasers found in frames of a camera in NumPy that shares no line with the nodes, and frames without any."""
+
+import numpy as np
+import pytest
+import torch
+
+from neusee.nodes import restore
+from neusee.nodes.restore._lasers._line_pattern import Lens, index_at, line_pattern
+from neusee.nodes.restore._lasers._whitening import filled, filter_of
+from tests.nodes.restore.lasers import own_camera as own
+from tests.nodes.restore.lasers.as_inputs import BANDS, LENS, found_in, inputs, pupil_of, tensor
+
+PIXEL = own.PITCH / own.FOCAL
+SIDE = 64
+
+
+def frame_of(lasers, mask="half_ring", kind="noise", seed=3, lamps=0, side=SIDE):
+    return own.frame(mask, kind, side, lasers, np.random.default_rng(seed), lamps)
+
+
+def number(x):
+    return torch.tensor(x, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("mask", ["plain", "half_ring", "cubic"])
+def test_the_pattern_of_a_line_is_that_of_direct_sums(mask):
+    expected = own.pattern(mask, 533e-9, (3.3, -8.2), (48, 40))
+    lens = Lens(own.FOCAL, own.PITCH, (48, 40))
+    found = line_pattern(pupil_of(mask, torch.float64), number([3.3, -8.2]) * PIXEL, number(533e-9), lens, number(0.0))
+    assert np.abs(found.numpy() - expected).max() < 1e-6 * expected.max()
+
+
+def test_the_index_between_bands_is_that_of_the_glass_and_other_numbers_of_bands_have_one():
+    pupil = pupil_of("plain")
+    for nm in (401.0, 533.0, 699.0):
+        assert float(index_at(number(nm * 1e-9), pupil)) == pytest.approx(own.silica(nm * 1e-9), abs=3e-8)
+    for count in (1, 2, 3):
+        few = pupil._replace(index=pupil.index[:count], wavelengths=pupil.wavelengths[:count])
+        for n in range(count):
+            assert float(index_at(few.wavelengths[n], few)) == pytest.approx(float(few.index[n]), abs=1e-12)
+
+
+def test_a_pixel_between_two_points_of_it_sees_their_mean():
+    """The mean over a pixel by SciPy's direct sums at 9 x 9 places in that pixel."""
+    lens = Lens(own.FOCAL, own.PITCH, (9, 9), "integrated")
+    found = line_pattern(
+        pupil_of("plain", torch.float64), number([0.0, 0.0]), number(550e-9), lens, number(0.0)
+    ).numpy()
+    at = (np.arange(9) + 0.5) / 9 - 0.5
+    expected = np.mean([own.pattern("plain", 550e-9, (-y, -x), (9, 9)) for y in at for x in at], 0)
+    assert np.abs(found - expected).max() < 6e-3 * expected.max()
+
+
+def test_a_strong_laser_is_found_where_it_is():
+    laser = own.Laser((4.3, -7.8), 533e-9, 1e3)
+    found = found_in(frame_of([laser]), "half_ring", lamps=1)
+    assert int(found.number) == 1
+    assert (found.direction[0] / PIXEL).tolist() == pytest.approx(laser.spot, abs=0.2)
+    assert float(found.wavelength[0]) == pytest.approx(laser.wavelength, abs=5e-9)
+    assert found.strength[0].tolist() == pytest.approx(laser.channels.tolist(), rel=0.1)
+    assert found.identifiable[0].all()
+    low, high = found.wavelength_interval[0].tolist()
+    assert low < float(found.wavelength[0]) < high
+    assert not found.identifiable[1:].any()
+    assert not found.strength[1:].any()
+
+
+def test_no_laser_is_found_where_there_is_none():
+    found = found_in(frame_of([], seed=5), "half_ring", lamps=1)
+    assert int(found.number) == 0
+    assert not any(bool(x.any()) for x in found)
+
+
+def test_the_glare_found_is_the_light_of_the_laser():
+    laser = own.Laser((4.3, -7.8), 533e-9, 1e3)
+    frame = frame_of([laser])
+    found = found_in(frame, "half_ring", lamps=1, widths=(1e-9,))
+    picture = tensor(frame.electrons).float()
+    glare = restore.found_glare(found, pupil_of("half_ring"), picture, rank=1, **LENS).numpy()
+    expected = laser.electrons("half_ring", (SIDE, SIDE))
+    assert np.abs(glare - expected).max() < 0.03 * expected.max()
+    none = restore.found_glare(found, pupil_of("half_ring"), picture, rank=2, **LENS)
+    assert not none.any()
+    rng = torch.Generator().manual_seed(1)
+    nearby = restore.found_nearby(found, pupil_of("half_ring"), picture, rank=1, patterns=8, rng=rng, **LENS)
+    spread = (nearby - torch.tensor(glare)).square().mean().sqrt()
+    assert 0 < float(spread) < 0.2 * float(np.sqrt((glare**2).mean()))
+    assert not restore.found_nearby(found, pupil_of("half_ring"), picture, rank=3, rng=rng, **LENS).any()
+
+
+def test_what_is_filled_comes_from_what_is_seen_and_a_smooth_picture_is_removed():
+    y, x = torch.meshgrid(torch.arange(40.0), torch.arange(40.0), indexing="ij")
+    slope = (3 * y + x)[None].double().repeat(3, 1, 1) + 100
+    seen = torch.ones_like(slope)
+    seen[:, 10:18, 12:19] = 0
+    again = filled(torch.where(seen > 0, slope, torch.nan).nan_to_num(1e9), seen)
+    assert float((again - slope).abs().max()) < 12
+    use = filter_of(slope + torch.randn(slope.shape, generator=torch.Generator().manual_seed(0)), 0 * slope + 1, seen)
+    assert float(use(torch.ones_like(slope)).abs().max()) < 1e-9
+
+
+def test_other_frames_are_refused():
+    given = inputs(frame_of([]), "half_ring")
+    with pytest.raises(ValueError, match="3 colour channels"):
+        restore.find_lasers(given[0][:1], given[1][:1], *given[2:], read_noise=own.READ, **LENS)
+    with pytest.raises(ValueError, match="at least 20 a side"):
+        restore.find_lasers(given[0][:, :19], given[1][:, :19], *given[2:], read_noise=own.READ, **LENS)
+    other = given[3]._replace(wavelengths=BANDS.centres[:5], index=given[3].index[:5])
+    with pytest.raises(ValueError, match="compute both from one `bands` step"):
+        restore.find_lasers(*given[:3], other, *given[4:], read_noise=own.READ, **LENS)
+    empty = found_in(frame_of([], side=32), "half_ring", lamps=0)
+    with pytest.raises(ValueError, match="do not fit"):
+        restore.found_glare(empty, given[3], given[0][:1], **LENS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mask", "strength"), [("plain", 1e3), ("plain", 1e5), ("half_ring", 1e5), ("cubic", 1e3), ("half_ring", 1e2)]
+)
+def test_lasers_of_any_strength_are_found(mask, strength):
+    laser = own.Laser((-11.6, 8.4), 588e-9, strength)
+    found = found_in(frame_of([laser], mask, "leaves", seed=11, side=96), mask)
+    assert int(found.number) == 1
+    assert (found.direction[0] / PIXEL).tolist() == pytest.approx(laser.spot, abs=0.2)
+    assert float(found.wavelength[0]) == pytest.approx(laser.wavelength, abs=5e-9)
+
+
+@pytest.mark.slow
+def test_two_lasers_are_two():
+    lasers = [own.Laser((-20.6, 8.4), 588e-9, 1e3), own.Laser((15.2, -12.1), 470e-9, 2e3)]
+    found = found_in(frame_of(lasers, seed=12, side=96), "half_ring")
+    assert int(found.number) == 2
+    assert sorted((found.wavelength[:2] * 1e9).tolist()) == pytest.approx([470, 588], abs=5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mask", ["plain", "half_ring"])
+def test_lamps_are_no_lasers(mask):
+    for seed in (21, 22):
+        assert int(found_in(frame_of([], mask, "leaves", seed=seed, lamps=2, side=96), mask).number) == 0

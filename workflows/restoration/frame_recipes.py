@@ -1,0 +1,122 @@
+"""The recipe that restores a frame: the camera of another recipe or of a sensor file, and the frame as its picture."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.recipe.text.composition import compose, locate
+from neusee.workflows.recipe.text.option_groups import choices_of, shown
+from neusee.workflows.recipe.text.overrides import Override, read_override
+from neusee.workflows.recipe.text.yaml_values import read
+
+OUTPUTS = ("raw[mask]", "developed[mask]", "clipped[mask]", "restored", "restored_spread")
+PLAIN_CAMERA = "first_light"  #: recipe around a sensor file, with a plain lens
+_SCENE = ("scene", "cube")  #: steps of the groups `scene` and `lift`, which a frame does not need
+_DROPPED = ("rival", "damage", "safety")  #: groups that compare or judge a simulated laser
+_STEM = re.compile(r"[^\w-]+")
+
+
+def recipes_of(
+    frames: Iterable[Path], camera: str, mask: str, changes: Sequence[str], folder: Path, first: int
+) -> list[Recipe]:
+    """Return a checked recipe for each frame.
+
+    ``camera`` is a recipe or the file of a sensor group, ``mask`` an option of the group `doe`, a file of a height map,
+    or empty; ``changes`` are the overrides of the user, numbered from ``first``.
+    Raises `RecipeError` with the mistakes of all frames, each mistake once.
+    """
+    name, base, words = _camera(camera, folder)
+    words += _mask(mask, folder)
+    found, problems = list[Recipe](), dict[Diagnostic, None]()
+    for frame in frames:
+        try:
+            found.append(_one(frame, (name, base, words), changes, folder, first))
+        except RecipeError as error:
+            problems |= dict.fromkeys(error.diagnostics)
+    if problems:
+        raise RecipeError(problems)
+    return found
+
+
+def _one(
+    frame: Path, camera: tuple[str, Path, Sequence[Override]], changes: Sequence[str], folder: Path, first: int
+) -> Recipe:
+    name, base, words = camera
+    own = [read_override(text, Location(f"argument {n}", folder=str(folder))) for n, text in enumerate(changes, first)]
+    file = _said("frame", f"frame.file={_quoted(frame)}", folder, shown_as=str(_near(frame, folder)))
+    recipe = load(name, [*_prepared(name, base, own), *words, file, *own], base)
+    title = f"The frame {frame.name}, restored with the camera {name}"
+    return replace(recipe, name=f"restore_{_STEM.sub('_', frame.stem)}", title=title)
+
+
+def _camera(camera: str, folder: Path) -> tuple[str, Path, list[Override]]:
+    """Return the recipe of a camera, the folder to which its paths are relative, and the words that choose a sensor."""
+    path = folder / Path(camera).expanduser()
+    if not camera.endswith((".yaml", ".yml")) or not path.is_file() or "steps" in (items := _items(path)):
+        return camera, folder, []
+    if "sensor" not in items or ("defaults" in items and path.parent.name != "sensor"):
+        return camera, folder, []
+    if path.parent.name != "sensor" or path.suffix != ".yaml":
+        message = "the file has only a sensor: put it into a folder called sensor, as neusee new sensor does"
+        raise RecipeError([Diagnostic(Location("--camera"), camera, message)])
+    words = [f"sensor={path.stem}", "doe=flat"]
+    return PLAIN_CAMERA, path.absolute().parent.parent, [_said("--camera", word, folder) for word in words]
+
+
+def _items(path: Path) -> set[str]:
+    return set(map(str, read(path, path.name).root.items))
+
+
+def _mask(mask: str, folder: Path) -> list[Override]:
+    """Return the words that put a mask, an option of the group `doe` or the file of a height map, into the pupil."""
+    if not mask:
+        return []
+    path = folder / Path(mask).expanduser()
+    if path.is_file():
+        return [_said("--mask", word, folder) for word in ("doe=pixelwise", f"doe.file={_quoted(path)}")]
+    if path.suffix or "/" in mask:
+        message = "no such file: give a height map, or the name of an option of the group doe"
+        raise RecipeError([Diagnostic(Location("--mask"), mask, message)])
+    return [_said("--mask", f"doe={mask}", folder)]
+
+
+def _prepared(name: str, base: Path, own: Sequence[Override]) -> list[Override]:
+    """Return the words that turn a recipe of a camera into one that restores: no scene, no laser, other outputs."""
+    path = locate(name, base)
+    document = read(path, shown(path, base)).root
+    groups = {choice.group for choice in choices_of(document, [])}
+    root = compose(name, (), base).root
+    steps = root.items["steps"].items if "steps" in root.items else {}
+    chosen = {override.path[0] for override in own}
+    words = ["camera=frame"] if "camera" in groups else []
+    words += [f"~{group}" for group in _DROPPED if group in groups]
+    if not chosen & {"laser", "lasers"}:
+        words += ["laser=none"] if "laser" in groups else []
+        words += ["lasers={}"] if "lasers" in document.items else []
+    if "restore" not in chosen:
+        words += ["restore=wiener_blind"] if "restore" in groups else ["+restore=wiener_blind"]
+    words += [f"+steps.{step}.each=simulated" for step in _SCENE if step in steps]
+    words += ["~expect"] if "expect" in root.items.keys() - chosen else []
+    words += ["outputs=" + json.dumps(OUTPUTS)] if "outputs" not in chosen else []
+    return [_said("neusee restore", word, base) for word in words]
+
+
+def _said(where: str, text: str, folder: Path, shown_as: str = "") -> Override:
+    override = read_override(text, Location(where, folder=str(folder)))
+    return replace(override, text=shown_as) if shown_as else override
+
+
+def _quoted(path: Path) -> str:
+    """Return a path as a YAML text, so that no character of it has a meaning."""
+    return "'" + str(path.absolute()).replace("'", "''") + "'"
+
+
+def _near(path: Path, folder: Path) -> Path:
+    return path.relative_to(folder) if path.is_relative_to(folder) else path

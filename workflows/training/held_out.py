@@ -1,0 +1,242 @@
+"""Photographs that a training never sees, and how well the network restores them while it is trained."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from neusee.nodes import metrics
+from neusee.nodes.scene import Photographs
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.recipe.blocks.train_block import KEY, Training
+from neusee.workflows.training.loop.resumable_loop import Losses
+from neusee.workflows.training.parallel.process_mesh import Mesh
+from neusee.workflows.training.parallel.shared_graph import Shared
+from neusee.workflows.training.training_pictures import HELD_OUT, Sample, TrainingStream
+
+CONFIDENCE = 0.9  #: of the interval of a mean over photographs
+_ENDS = 1 << 16  #: bytes at each end of a file that identify a photograph
+_METRICS = ("PSNR", "L1", "SSIM")
+_SCORE = "held_out_PSNR"  #: the number by which the best state is chosen
+#: columns of the loss table: network, input of the network, and the PSNR that the network adds to its input
+COLUMNS = tuple(
+    f"{who}_{metric}{end}"
+    for who, names in (("held_out", _METRICS), ("input", _METRICS), ("gain", _METRICS[:1]))
+    for metric in names
+    for end in (("", "_low", "_high") if who != "input" else ("",))
+)
+
+
+@dataclass(frozen=True)
+class Split:
+    """The photographs of a training, and the photographs that are held out."""
+
+    trained: Photographs
+    held_out: tuple[Path, ...] = ()  #: all of them, in the order of their digests
+    judged: tuple[Path, ...] = ()  #: the first of them, which the validation restores
+
+    def __str__(self) -> str:
+        if not self.held_out:
+            return f"trains on {len(self.trained.paths)} photographs; none is held out, so that no state is the best"
+        text = f"trains on {len(self.trained.paths)} photographs; {len(self.held_out)} are held out"
+        return text if len(self.judged) == len(self.held_out) else f"{text}, of which {len(self.judged)} are restored"
+
+
+def split(recipe: Recipe, settings: Training, photographs: Photographs) -> Split:
+    """Set photographs aside by their content, so that every process, stage and later start has the same split.
+
+    Equal files stay together, whatever their names. Without a folder of photographs nothing is held out.
+
+    Raises ValueError for a folder with fewer than two different photographs, unless ``train.held_out`` is null.
+    """
+    if not holds_out(settings):
+        return Split(photographs)
+    alike: dict[str, list[Path]] = {}
+    for path in photographs.paths:
+        alike.setdefault(_digest(path), []).append(path)
+    if len(alike) < 2:
+        raise ValueError(_too_few(recipe, settings, len(photographs.paths)))
+    assert settings.held_out is not None
+    count = min(max(1, round(settings.held_out * len(alike))), len(alike) - 1)
+    chosen = [alike[digest] for digest in sorted(alike)[:count]]
+    away = {path for paths in chosen for path in paths}
+    trained = replace(photographs, paths=tuple(path for path in photographs.paths if path not in away))
+    one_each = [paths[0] for paths in chosen][: settings.held_out_pictures]
+    judged = tuple(path for path in one_each if _readable(path, trained))
+    return Split(trained, tuple(path for paths in chosen for path in paths), judged)
+
+
+def holds_out(settings: Training) -> bool:
+    """Return True if a training has a folder of photographs and holds some of them out."""
+    return settings.photographs is not None and bool(settings.held_out)
+
+
+def _readable(path: Path, photographs: Photographs) -> bool:
+    """Return True if a photograph can be decoded; note the reason in ``photographs`` if it cannot."""
+    try:
+        Photographs((path,)).crop((1, 1), 0, 0)
+    except ValueError as error:
+        photographs.broken[path] = str(error)
+        return False
+    return True
+
+
+def _digest(path: Path) -> str:
+    """Return a digest of the size of a file and of its first and last 64 KiB.
+
+    A folder may hold many gigabytes, which a training need not read before it begins.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(_ENDS)
+        file.seek(max(0, size - _ENDS))
+        return hashlib.sha256(b"%d " % size + head + file.read()).hexdigest()
+
+
+def _too_few(recipe: Recipe, settings: Training, count: int) -> str:
+    given = recipe.config.settings.get(f"{KEY}.photographs")
+    found = "1 photograph" if count == 1 else f"{count} photographs, all equal"
+    return (
+        f"{given.source if given else recipe.name}   {KEY}.photographs   the folder {settings.photographs} holds "
+        f"{found}, and {KEY}.held_out: {settings.held_out} sets photographs aside for the validation: add photographs, "
+        f"or write {KEY}.held_out=null"
+    )
+
+
+# --- validation -------------------------------------------------------------------------------------------------------
+
+
+class Validation:
+    """The validation of a training: held-out pictures with fixed scenes, lasers and noise."""
+
+    def __init__(self, split: Split, mesh: Mesh, device: str) -> None:
+        self.photographs, self.mesh, self.device = split.judged, mesh, device
+        self._kept: dict[int, Sample] | None = None
+
+    @torch.no_grad()
+    def __call__(self, net: nn.Module, samples: TrainingStream, shared: Shared, fixed: bool) -> Losses:
+        """Return means over the held-out photographs with their intervals, by column of the loss table.
+
+        Pictures behind a ``fixed`` mask are computed once and kept in the memory of the processor.
+        """
+        trains = net.training
+        net.eval()
+        found: dict[str, float] = {}
+        for i, sample in self._pictures(samples, shared, fixed):
+            picture = sample.picture.to(self.device)
+            truth = sample.truth.to(self.device)
+            for who, estimate in (("held_out", net(picture)), ("input", picture)):
+                found |= {f"{i} {who}_{name}": x for name, x in _quality(estimate, truth).items()}
+        net.train(trains)
+        names = [f"{i} {who}_{n}" for i in range(len(self.photographs)) for who in ("held_out", "input")
+                 for n in _METRICS]  # fmt: skip
+        return summary(self.mesh.numbers(found, names, self.device), len(self.photographs))
+
+    def _pictures(self, samples: TrainingStream, shared: Shared, fixed: bool) -> Iterator[tuple[int, Sample]]:
+        if fixed and self._kept is not None:  # empty in a process without a picture, which must not wait for others
+            yield from self._kept.items()
+            return
+        kept: dict[int, Sample] = {}
+        for i, sample in samples.batch(shared, HELD_OUT, 0, len(self.photographs)):
+            if fixed:
+                kept[i] = replace(sample, picture=sample.picture.cpu(), truth=sample.truth.cpu())
+            yield i, sample
+        self._kept = kept if fixed else None
+
+
+def _quality(estimate: Tensor, truth: Tensor) -> dict[str, float]:
+    """Return PSNR, L1 and SSIM of the pictures (n, 3, y, x) of one photograph, each a mean over the pictures."""
+    each = [metrics.quality(e.float(), t.float()) for e, t in zip(estimate, truth, strict=True)]
+    return {name: sum(float(getattr(q, name.lower())) for q in each) / len(each) for name in _METRICS}
+
+
+def summary(found: Mapping[str, float], count: int) -> Losses:
+    """Return means and intervals over ``count`` photographs from numbers named such as ``0 held_out_PSNR``."""
+    columns = {
+        f"{who}_{name}": [found[f"{i} {who}_{name}"] for i in range(count)]
+        for who in ("held_out", "input")
+        for name in _METRICS
+    }
+    pairs = zip(columns["held_out_PSNR"], columns["input_PSNR"], strict=True)
+    columns["gain_PSNR"] = [own - other for own, other in pairs]
+    result: Losses = {}
+    for name, values in columns.items():
+        mean, low, high = interval(values)
+        result[name] = mean
+        if f"{name}_low" in COLUMNS and count > 1:
+            result |= {f"{name}_low": low, f"{name}_high": high}
+    return result
+
+
+def interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Return the mean of independent numbers, and its 90 % interval from Student's t distribution (NaN for one)."""
+    x = np.asarray(values, dtype=np.float64)
+    if len(x) < 2:
+        return float(x.mean()), math.nan, math.nan
+    from scipy.stats import t
+
+    half = float(t.ppf((1 + CONFIDENCE) / 2, len(x) - 1)) * float(x.std(ddof=1)) / math.sqrt(len(x))
+    return float(x.mean()), float(x.mean()) - half, float(x.mean()) + half
+
+
+# --- the best state ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best state of a stage so far, by the mean PSNR of the held-out pictures."""
+
+    score: float = -math.inf
+    iterations: int = 0  #: iterations of the stage before this state
+    since: int = 0  #: validations after this state
+
+    @classmethod
+    def of(cls, rows: Sequence[Mapping[str, str]], stage: int) -> Best:
+        """Return the best state of a stage that a table of losses knows."""
+        best = cls()
+        for row in rows:
+            if row["stage"] == str(stage) and row.get(_SCORE):
+                best = best.after(float(row[_SCORE]), int(row["iteration"]) + 1)
+        return best
+
+    def after(self, score: float, iterations: int) -> Best:
+        """Return the best state after one more validation."""
+        if score > self.score:
+            return Best(score, iterations)
+        return replace(self, since=self.since + 1)
+
+
+def facts(parts: Split, rows: Sequence[Mapping[str, str]], patience: int | None) -> dict[str, Any]:
+    """Return what `training.json` says of the held-out photographs, the best state and the end of stage 2."""
+    names = {"held_out": [str(path) for path in parts.held_out], "judged": len(parts.judged)}
+    best = Best.of(rows, 2)
+    if not best.iterations:
+        return names
+    row = next(r for r in rows if r["stage"] == "2" and int(r["iteration"]) + 1 == best.iterations)
+    numbers = {name: float(row[name]) for name in COLUMNS if row.get(name)}
+    early = patience is not None and best.since >= patience
+    return {**names, "best": {"iterations": best.iterations, **numbers}, "stopped_early": early}
+
+
+def score_of(found: Losses) -> float:
+    """Return the number by which the best state is chosen, with the digits that the loss table keeps."""
+    return float(f"{found[_SCORE]:.6g}")
+
+
+def said(found: Losses, better: bool) -> str:
+    """Return one line of text about a validation."""
+
+    def shown(name: str) -> str:
+        both = f" ({found[f'{name}_low']:.2f} to {found[f'{name}_high']:.2f})" if f"{name}_low" in found else ""
+        return f"{found[name]:.2f} dB{both}"
+
+    text = f"held-out PSNR {shown('held_out_PSNR')}, input {found['input_PSNR']:.2f} dB, gain {shown('gain_PSNR')}"
+    return f"{text}, the best so far" if better else text
