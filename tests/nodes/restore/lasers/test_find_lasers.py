@@ -51,9 +51,16 @@ def test_a_pixel_between_two_points_of_it_sees_their_mean():
     assert np.abs(found - expected).max() < 6e-3 * expected.max()
 
 
-def test_a_strong_laser_is_found_where_it_is():
+@pytest.fixture(scope="module")
+def strong():
+    """A strong laser, a frame with it, and what is found there."""
     laser = own.Laser((4.3, -7.8), 533e-9, 1e3)
-    found = found_in(frame_of([laser]), "half_ring", lamps=1)
+    frame = frame_of([laser])
+    return laser, frame, found_in(frame, "half_ring", lamps=1)
+
+
+def test_a_strong_laser_is_found_where_it_is(strong):
+    laser, _, found = strong
     assert int(found.number) == 1
     assert (found.direction[0] / PIXEL).tolist() == pytest.approx(laser.spot, abs=0.2)
     assert float(found.wavelength[0]) == pytest.approx(laser.wavelength, abs=5e-9)
@@ -71,10 +78,8 @@ def test_no_laser_is_found_where_there_is_none():
     assert not any(bool(x.any()) for x in found)
 
 
-def test_the_glare_found_is_the_light_of_the_laser():
-    laser = own.Laser((4.3, -7.8), 533e-9, 1e3)
-    frame = frame_of([laser])
-    found = found_in(frame, "half_ring", lamps=1, widths=(1e-9,))
+def test_the_glare_found_is_the_light_of_the_laser(strong):
+    laser, frame, found = strong
     picture = tensor(frame.electrons).float()
     glare = restore.found_glare(found, pupil_of("half_ring"), picture, rank=1, **LENS).numpy()
     expected = laser.electrons("half_ring", (SIDE, SIDE))
