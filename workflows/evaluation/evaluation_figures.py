@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from neusee.nodes.metrics import most_contrast
-from neusee.workflows.evaluation.confidence_intervals import MetricTable, mean
+from neusee.workflows.evaluation.confidence_intervals import MetricTable
 from neusee.workflows.report.figures.camera_overview import high
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, encoded, picture
 
@@ -85,7 +85,7 @@ def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
 
 
 def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], name: str) -> None:
-    intervals = [mean(table.at(metric, i)) for i in range(len(table.strengths))]
+    intervals = [table.at(metric, i) for i in range(len(table.strengths))]
     at = _places(table.strengths)
     ax.plot(at, [x.mean for x in intervals], marker="o", markersize=4, linewidth=1.4, label=name, **look)
     low, up = [x.low for x in intervals], [x.high for x in intervals]
@@ -94,7 +94,7 @@ def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], nam
 
 def _top(tables: Iterable[MetricTable], metric: str) -> float:
     """Return the end of an axis that shows every mean, and intervals up to three times the largest mean."""
-    found = [mean(table.at(metric, i)) for table in tables for i in range(len(table.strengths))]
+    found = [table.at(metric, i) for table in tables for i in range(len(table.strengths))]
     largest = max((x.mean for x in found if x.mean > 0), default=0.0)
     return 1.05 * max(largest, min(3 * largest, max([x.high for x in found if x.high > 0], default=0.0))) or 1.0
 

@@ -40,7 +40,7 @@ def summary(result: EvaluationResult) -> dict[str, Any]:
         p.name: {
             "mask": p.front,
             "restorer": p.back,
-            **{metric: asdict(mean(result.tables[p.name].scenes(metric))) for metric in METRICS},
+            **{metric: asdict(result.tables[p.name].mean(metric)) for metric in METRICS},
             "against": {name: asdict(x) for name, x in result.against[p.name].items()},
         }
         for p in result.pipelines
@@ -51,9 +51,7 @@ def rows(result: EvaluationResult) -> list[Sequence[Any]]:
     """Return the rows of ``table.csv``, one for each mask and restorer, with the numbers from `summary`."""
     listed: list[Sequence[Any]] = []
     for p in result.pipelines:
-        each = [mean(result.tables[p.name].scenes(metric)) for metric in METRICS] + list(
-            result.against[p.name].values()
-        )
+        each = [result.tables[p.name].mean(metric) for metric in METRICS] + list(result.against[p.name].values())
         numbers = [x for interval in each for x in astuple(interval)]
         listed.append((p.name, p.front, p.back, len(result.scenes), *("" if math.isnan(x) else x for x in numbers)))
     return listed
@@ -62,7 +60,7 @@ def rows(result: EvaluationResult) -> list[Sequence[Any]]:
 def lead(result: EvaluationResult) -> str:
     """Return a few sentences with the main result of the evaluation."""
     best = min(result.pipelines, key=lambda p: float(result.tables[p.name].scenes("l1").mean()))
-    least = _with_interval(mean(result.tables[best.name].scenes("l1")), "l1")
+    least = _with_interval(result.tables[best.name].mean("l1"), "l1")
     strengths = ", ".join("none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in result.strengths)
     enough = len(result.scenes) >= len(CASES)
     few = "" if enough else f" These are too few scenes for all {len(CASES)} lasers of the protocol."
@@ -92,10 +90,10 @@ def sections(result: EvaluationResult, shown: Mapping[str, bytes]) -> list[Secti
 def _crossed(result: EvaluationResult) -> Section:
     masks = list(dict.fromkeys(p.front for p in result.pipelines))
     restorers = list(dict.fromkeys(p.back for p in result.pipelines))
-    l1 = {(p.front, p.back): _with_interval(mean(result.tables[p.name].scenes("l1")), "l1") for p in result.pipelines}
+    l1 = {(p.front, p.back): _with_interval(result.tables[p.name].mean("l1"), "l1") for p in result.pipelines}
     listed = [(mask, *(l1.get((mask, back)) for back in restorers)) for mask in masks]
     text = """L1 at full size (sRGB from 0 to 1, as a display shows it): the mean over the strengths of each scene, then
-        mean and 95 % confidence interval over scenes (Student's t)."""
+        mean and 95 % confidence interval (Student's t). Scenes of one photograph count as one draw."""
     return Section("Mask by restorer", text, ("mask", *restorers), listed)
 
 
@@ -113,7 +111,7 @@ def _numbers(result: EvaluationResult) -> Section:
     metrics = [metric for metric in METRICS if metric != "peak"]
     columns = ("pipeline", *(_column(metric) for metric in metrics))
     listed = [
-        (p.name, *(_with_interval(mean(result.tables[p.name].scenes(metric)), metric) for metric in metrics))
+        (p.name, *(_with_interval(result.tables[p.name].mean(metric), metric) for metric in metrics))
         for p in result.pipelines
     ]
     return Section("All numbers", text, columns, listed)
@@ -146,10 +144,10 @@ def _column(metric: str) -> str:
 
 
 def _compared(result: EvaluationResult) -> Section:
-    text = f"""Differences from {result.reference} in the same scenes. L1 less: by how much L1 is lower, with interval
-        of Student's t. Gain: the same as a fraction of the mean L1 of the reference, with an interval from 10 000 draws
-        of the scenes (bootstrap); fewer than five scenes have no interval. A colour marks an interval without zero. If
-        many pipelines are compared with one reference, about one in twenty is marked by chance."""
+    text = f"""Differences from {result.reference} in the same scenes. L1 less: by how much L1 is lower. Gain: the same
+        as a fraction of the mean L1 of the reference. Intervals of 95 % come from 10 000 draws of the photographs
+        (bootstrap-t); fewer than five photographs have no interval. A colour marks an interval without zero. If many
+        pipelines are compared with one reference, about one in twenty is marked by chance."""
     listed: list[Sequence[Any]] = []
     marks: dict[tuple[int, int], Mark] = {}
     for p in result.pipelines:

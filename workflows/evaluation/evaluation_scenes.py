@@ -99,6 +99,15 @@ def scenes(recipe: Recipe, store: Store, root: Path | None, count: int) -> tuple
     return shown, broken
 
 
+def photographs(shown: Sequence[Scene]) -> list[int]:
+    """Return the number of the photograph of each scene, over which intervals are drawn.
+
+    Scenes that are all of one photograph differ in laser and noise only; each then counts as one draw.
+    """
+    names = list(dict.fromkeys(scene.name for scene in shown))
+    return [names.index(scene.name) for scene in shown] if len(names) > 1 else list(range(len(shown)))
+
+
 def refuse_directions(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> None:
     """Raise `EvaluationRefused` if the laser of a scene comes from where the pupil of the recipe does not reach.
 

@@ -18,13 +18,14 @@ import numpy as np
 
 from neusee.workflows.evaluation import equal_protection
 from neusee.workflows.evaluation.comparison_pictures import panels
-from neusee.workflows.evaluation.confidence_intervals import METRICS, compare_with, metric_table
+from neusee.workflows.evaluation.confidence_intervals import METRICS, metric_table
 from neusee.workflows.evaluation.equal_protection import protect
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointNumbers, PointRequest
 from neusee.workflows.evaluation.evaluation_result import EvaluationResult
-from neusee.workflows.evaluation.evaluation_scenes import Scene, refuse_directions, scenes
+from neusee.workflows.evaluation.evaluation_scenes import Scene, photographs, refuse_directions, scenes
 from neusee.workflows.evaluation.mask_optics import masks
 from neusee.workflows.evaluation.mistold_points import mistold_rows, told_with_errors
+from neusee.workflows.evaluation.paired_intervals import compare_with
 from neusee.workflows.evaluation.pipelines import (
     NONE,
     EvaluationRefused,
@@ -88,7 +89,7 @@ def evaluate(
     mistold = told_with_errors(bench, each, shown, strengths, progress)
     optics = masks(each, store, device, points)
     drawn = panels(bench, each, shown[0], strengths)
-    tables = {name: metric_table(own, strengths) for name, own in points.items()}
+    tables = {name: metric_table(own, strengths, photographs(shown)) for name, own in points.items()}
     least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
     more = {name: compare_with(own, tables[reference], base.seed) for name, own in tables.items()}
     rest = (reference, points, tables, more, optics, drawn, [p.pipeline for p in each], mistold, equal)
