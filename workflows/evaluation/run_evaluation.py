@@ -12,37 +12,42 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from neusee.workflows.evaluation import equal_protection
-from neusee.workflows.evaluation.comparison_pictures import panels
+from neusee.workflows.evaluation.comparison_pictures import Panel, panels
 from neusee.workflows.evaluation.confidence_intervals import METRICS, metric_table
 from neusee.workflows.evaluation.equal_protection import protect
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointNumbers, PointRequest
-from neusee.workflows.evaluation.evaluation_result import EvaluationResult
-from neusee.workflows.evaluation.evaluation_scenes import Scene, photographs, refuse_directions, scenes
-from neusee.workflows.evaluation.mask_optics import masks
+from neusee.workflows.evaluation.evaluation_result import EvaluationResult, MistoldPoint
+from neusee.workflows.evaluation.evaluation_scenes import Scene, photographs, refuse_directions, scenes, wavelengths
+from neusee.workflows.evaluation.mask_optics import MaskOptics, masks
 from neusee.workflows.evaluation.mistold_points import mistold_rows, told_with_errors
 from neusee.workflows.evaluation.paired_intervals import compare_with
 from neusee.workflows.evaluation.pipelines import (
+    CASES,
+    DRAWN,
     NONE,
+    SIX,
     EvaluationRefused,
     Pipeline,
     PipelineRecipes,
+    base_recipe,
     compose_pipelines,
     read_pipelines,
+    refuse_fixed_laser,
 )
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.protection.equal_shade import EqualProtection
-from neusee.workflows.recipe.loading import load
+from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport, StudyRun, silent
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 
-__all__ = ["STRENGTHS", "EvaluationRefused", "EvaluationResult", "evaluate", "read_pipelines"]
+__all__ = ["STRENGTHS", "EvaluationRefused", "EvaluationResult", "evaluate", "read_pipelines", "read_settings"]
 
 STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  #: strengths of the paper, in multiples of saturation
 SMALL = 256  #: pixels of the shorter side of the pictures that the paper restores
@@ -54,7 +59,7 @@ def evaluate(
     changes: Sequence[str | Override] = (),
     *,
     data: Path | None = None,
-    count: int = 20,
+    count: int | None = 20,
     strengths: Sequence[float] = STRENGTHS,
     small: int = SMALL,
     reference: str = "",
@@ -68,34 +73,85 @@ def evaluate(
 ) -> Path:
     """Evaluate every pipeline on ``count`` scenes at all laser ``strengths``, and return the folder of the results.
 
-    Args: recipe, changes: the camera, as for `load`. data: a folder of photographs, by default the scene of the recipe.
+    Args: recipe, changes: the camera, as for `load`; its block ``evaluate`` says which lasers the scenes have. data: a
+    folder of photographs, by default the scene of the recipe. count: by default 20, None means every photograph once.
     small: shorter side of the reduced pictures, which are compared too. reference: the pipeline with which all other
     pipelines are compared, by default the first pipeline. equal: the peak to which filters and stops bring every
     pipeline. progress: receives a line for each scene.
     Raises: `EvaluationRefused` with every mistake before anything runs.
     """
-    store, place = store or open_store(), folder or Path.cwd()
-    each = compose_pipelines(recipe, changes, pipelines, place)
+    place = folder or Path.cwd()
+    base, settings = base_recipe(recipe, changes, place), read_settings(recipe, changes, place)
+    asked = _Asked(recipe, changes, place, store or open_store(), settings, progress)
+    bare = compose_pipelines(recipe, changes, pipelines, place)
     strengths, reference = _strengths(strengths), _reference(reference, pipelines)
-    each = protect(recipe, changes, each, equal, store, place, progress) if equal else each
-    reference = {old.name: new.name for old, new in zip(pipelines, each, strict=True)}[reference]
-    base = load(recipe, changes, place)
     study_run = StudyRun("evaluate", base, command)
-    shown, broken = scenes(base, store, data, count)
-    refuse_directions(each[0], shown)
+    if settings.lasers == "drawn":
+        refuse_fixed_laser(base)
+    shown, broken = scenes(base, asked.store, data, count, [DRAWN] if settings.lasers == "drawn" else list(CASES))
+    refuse_directions(bare[0], shown)
+    each, references = _equalled(asked, bare, reference, equal)
     _report_scenes(shown, broken, strengths, each, progress)
-    bench = EvaluationPoints(store, small, device)
-    points = _points(bench, each, shown, strengths, progress)
-    mistold = told_with_errors(bench, each, shown, strengths, progress)
-    optics = masks(each, store, device, points)
-    drawn = panels(bench, each, shown[0], strengths)
-    tables = {name: metric_table(own, strengths, photographs(shown)) for name, own in points.items()}
+    bench = EvaluationPoints(asked.store, small, device)
+    measured = _measured(asked, bench, each, shown, strengths)
+    tables = {name: metric_table(own, strengths, photographs(shown)) for name, own in measured[0].items()}
     least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
-    more = {name: compare_with(own, tables[reference], base.seed) for name, own in tables.items()}
-    rest = (reference, points, tables, more, optics, drawn, [p.pipeline for p in each], mistold, equal)
-    result = EvaluationResult(base, shown, broken, strengths, least, *rest)
+    more = {name: compare_with(own, tables[references[name]], base.seed) for name, own in tables.items()}
+    points, mistold, optics, pictures = measured
+    rest = (references, points, tables, more, optics, pictures, [p.pipeline for p in each], mistold, equal)
+    found = tuple(wavelengths(bare[0], shown))
+    result = EvaluationResult(base, shown, broken, strengths, least, *rest, wavelengths=found)
     document = study_run.document(_document(result, bench))
     return study_run.write(runs, digest(document["summary"]), document, _report(result))
+
+
+class _Asked(NamedTuple):
+    """The camera of an evaluation, and where its results are kept."""
+
+    recipe: str
+    changes: Sequence[str | Override]
+    folder: Path
+    store: Store
+    settings: EvaluateSettings
+    progress: Progress
+
+
+def _measured(
+    asked: _Asked,
+    bench: EvaluationPoints,
+    each: list[PipelineRecipes],
+    shown: Sequence[Scene],
+    strengths: tuple[float, ...],
+) -> tuple[dict[str, list[dict[float, PointNumbers]]], list[MistoldPoint], dict[str, MaskOptics], list[Panel]]:
+    """Return the numbers of all points, those of restorers told with errors, the masks, and the pictures to show."""
+    points = _points(bench, each, shown, strengths, asked.progress)
+    mistold = told_with_errors(bench, each, shown, strengths, asked.progress)
+    optics = masks(each, asked.store, bench.device, points)
+    if more := asked.settings.figure:
+        bench.release()
+        lines = [p.pipeline for p in each]
+        each = compose_pipelines(asked.recipe, [*asked.changes, *more], lines, asked.folder)
+    figure = SIX if asked.settings.lasers == "drawn" else None
+    return points, mistold, optics, panels(bench, each, shown[0], strengths, figure)
+
+
+def read_settings(recipe: str, changes: Sequence[str | Override], folder: Path) -> EvaluateSettings:
+    """Return the block ``evaluate`` of a recipe; raise `EvaluationRefused` with all mistakes in the recipe."""
+    return base_recipe(recipe, changes, folder).evaluation or EvaluateSettings()
+
+
+def _equalled(
+    asked: _Asked, bare: list[PipelineRecipes], reference: str, equal: EqualProtection | None
+) -> tuple[list[PipelineRecipes], dict[str, str]]:
+    """Return the pipelines, at equal protection if that was asked for, and the name of the reference of each."""
+    if equal is None:
+        return bare, dict.fromkeys((p.name for p in bare), reference)
+    shaded = protect(asked.recipe, asked.changes, bare, equal, asked.store, asked.folder, asked.progress)
+    rival = {old.name: new.name for old, new in zip(bare, shaded, strict=True)}[reference]
+    references = dict.fromkeys((p.name for p in shaded), rival)
+    if not asked.settings.beside:
+        return shaded, references
+    return [*bare, *shaded], {**dict.fromkeys((p.name for p in bare), reference), **references}
 
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
@@ -162,6 +218,7 @@ def _document(result: EvaluationResult, bench: EvaluationPoints) -> dict[str, An
         "strengths": list(result.strengths),
         "small": result.small,
         "reference": result.reference,
+        "lasers": [None if metres is None else metres * 1e9 for metres in result.wavelengths],
         **equal_protection.as_document(result),
         "computed": bench.computed,
         "seconds a point": bench.seconds / bench.computed if bench.computed else None,
@@ -176,7 +233,7 @@ def _report(result: EvaluationResult) -> StudyReport:
     tables: dict[str, CsvTable] = {
         "points.csv": ((*_POINT, *METRICS), _point_rows(result)),
         "table.csv": (COLUMNS, rows(result)),
-        "mistold.csv": ((*_POINT[:1], "told", *_POINT[3:], *METRICS), mistold_rows(result.mistold)),
+        "mistold.csv": ((*_POINT[:1], "told", *_POINT[3:6], *_POINT[7:], *METRICS), mistold_rows(result.mistold)),
         "suppression.csv": (("mask", "wavelength (nm)", "lsr", "bsr", "floor"), _curve_rows(result)),
     }
     if result.protection is not None:
@@ -186,14 +243,15 @@ def _report(result: EvaluationResult) -> StudyReport:
     return StudyReport(title, lead(result), sections(result, pictures), pictures, tables, shown=shown)
 
 
-_POINT = ("pipeline", "mask", "restorer", "scene", "photograph", "laser", "strength")
+_POINT = ("pipeline", "mask", "restorer", "scene", "photograph", "laser", "wavelength (nm)", "strength")
 
 
 def _point_rows(result: EvaluationResult) -> list[Sequence[Any]]:
+    waves = ["" if metres is None else f"{metres * 1e9:.6g}" for metres in result.wavelengths]
     return [
-        (p.name, p.front, p.back, s.number, s.name, s.case, f"{k:g}", *(point[metric] for metric in METRICS))
+        (p.name, p.front, p.back, s.number, s.name, s.case, nm, f"{k:g}", *(point[metric] for metric in METRICS))
         for p in result.pipelines
-        for s, at in zip(result.scenes, result.points[p.name], strict=True)
+        for s, at, nm in zip(result.scenes, result.points[p.name], waves, strict=True)
         for k, point in at.items()
     ]
 
