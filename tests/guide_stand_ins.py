@@ -114,9 +114,9 @@ PROTOCOL = (
     "flat+none, half_ring+none", "--equal-protection", "1e-5",
 )  # fmt: skip
 #: two of the six lasers of the protocol's page, and weak ones
-TWO_COLUMNS = {
+TWO_OF_SIX = {
     "evaluation.comparison_pictures:_WEAKEST": 30.0,
-    "evaluation.run_evaluation:SIX": {name: LASERS[name] for name in ("green", NONE)},
+    "evaluation.run_evaluation:SIX": {name: LASERS[name] for name in ("green", "red", NONE)},
 }
 #: settings of an accuracy study, each measured once
 FEW_POINTS = {
@@ -216,7 +216,7 @@ STAND_INS = {
     "study protection axicon doe.waves=5 --light continuous --draws 6": StandIn(
         "minutes", more=PROTECTION, instead={"6": "2"}, constants=FEW_STOPS),
     "evaluate paper_protocol --data photographs": StandIn(
-        "days: the camera of the paper has 2160 x 2160 samples", more=PROTOCOL, constants=TWO_COLUMNS),
+        "days: the camera of the paper has 2160 x 2160 samples", more=PROTOCOL, constants=TWO_OF_SIX),
     f"{EVALUATE} --scenes 3 --strengths 0,1e3,1e6": StandIn(
         "a minute", instead={**FIELD, "3": "1", "0,1e3,1e6": "0,30"}, constants=WEAK),
     f"{EVALUATE} --scenes 3 --strengths 1e4,1e6 "
