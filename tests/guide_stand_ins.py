@@ -116,7 +116,7 @@ PROTOCOL = (
 #: two of the six lasers of the protocol's page, and weak ones
 TWO_OF_SIX = {
     "evaluation.comparison_pictures:_WEAKEST": 30.0,
-    "evaluation.run_evaluation:SIX": {name: LASERS[name] for name in ("green", "red", NONE)},
+    "evaluation.measured_points:SIX": {name: LASERS[name] for name in ("green", "red", NONE)},
 }
 #: settings of an accuracy study, each measured once
 FEW_POINTS = {

@@ -143,22 +143,16 @@ def evaluate(
     Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` if a step fails.
     """
     from neusee.workflows.evaluation import run_evaluation
-    from neusee.workflows.evaluation.equal_protection import read_protection
 
     here, name, words = Path.cwd(), _name(recipe, "evaluate"), _arguments(changes)
     own = run_evaluation.read_settings(name, words, here)
-    lines = own.pipelines if pipelines is None else pipelines
-    level = own.equal_protection if equal_protection is None else equal_protection
     return run_evaluation.evaluate(
         name,
-        run_evaluation.read_pipelines(lines, here) if isinstance(lines, str) else lines,
-        words,
+        changes=words,
+        **run_evaluation.options_of(own, pipelines, scenes, reference, equal_protection, by, here),
         data=None if data is None else Path(data).expanduser(),
-        count=scenes or (None if own.scenes == "all" else own.scenes),
         strengths=run_evaluation.STRENGTHS if strengths is None else strengths,
         small=small,
-        reference=reference or (own.reference if pipelines is None else ""),
-        equal=read_protection(level, by or own.by),
         store=store,
         runs=writable_folder(out),
         command=command,

@@ -62,14 +62,8 @@ def evaluate(
     """
     name, changes, _ = split(words)
     check_device(device)
-    options: dict[str, Any] = {
-        "data": data,
-        "scenes": scenes,
-        "strengths": strengths,
-        "small": small,
-        "reference": reference,
-    }
-    options |= {"equal-protection": equal_protection, "by": by, "pipelines": pipelines}
+    options = {"data": data, "scenes": scenes, "strengths": strengths, "small": small, "reference": reference}
+    shared = {"pipelines": pipelines, "equal-protection": equal_protection, "by": by}
     folder = _evaluate(
         name,
         changes=changes,
@@ -84,7 +78,7 @@ def evaluate(
         device=device,
         out=out,
         progress=progress_lines(quiet or as_json),
-        command=["neusee", "evaluate", name, *changes, *option_words(options)],
+        command=["neusee", "evaluate", name, *changes, *option_words(options | shared)],
     )
     say_folder(folder, as_json)
 

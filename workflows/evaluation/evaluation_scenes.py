@@ -26,6 +26,10 @@ from neusee.workflows.store.result_store import Store
 _PHOTOGRAPH = "scene.photograph"
 
 
+class UnreadablePhotograph(EvaluationRefused):
+    """Error for a photograph that has the header and the end of a picture, but cannot be decoded."""
+
+
 @dataclass(frozen=True)
 class Scene:
     """One scene of an evaluation, whose photograph is read at the first use."""
@@ -55,8 +59,9 @@ class Scene:
         try:
             return crop_photograph(self.path, self.shape, self.recipe.seed, self.number)
         except (ParameterError, OSError, ValueError, SyntaxError) as error:
-            text = "remove this file and run the same command again; all other points are kept"
-            raise EvaluationRefused(f"{self.path}: {error}: {text}") from error
+            raise UnreadablePhotograph(
+                f"{self.path}: {error}: remove this file, and run the same command again"
+            ) from error
 
     def key(self, code: Code) -> str:
         """Return the cache key of the picture of the scene."""

@@ -10,27 +10,29 @@ all points, so that an interrupted evaluation continues.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from neusee.workflows.evaluation import equal_protection
-from neusee.workflows.evaluation.comparison_pictures import Panel, panels
 from neusee.workflows.evaluation.confidence_intervals import METRICS, metric_table
-from neusee.workflows.evaluation.equal_protection import protect
-from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointNumbers, PointRequest
-from neusee.workflows.evaluation.evaluation_result import EvaluationResult, MistoldPoint
-from neusee.workflows.evaluation.evaluation_scenes import Scene, photographs, refuse_directions, scenes, wavelengths
-from neusee.workflows.evaluation.mask_optics import MaskOptics, masks
-from neusee.workflows.evaluation.mistold_points import mistold_rows, told_with_errors
+from neusee.workflows.evaluation.equal_protection import protect, read_protection
+from neusee.workflows.evaluation.evaluation_points import EvaluationPoints
+from neusee.workflows.evaluation.evaluation_result import EvaluationResult
+from neusee.workflows.evaluation.evaluation_scenes import (
+    Scene,
+    photographs,
+    refuse_directions,
+    scenes,
+    wavelengths,
+)
+from neusee.workflows.evaluation.measured_points import AskedCamera, Measured, measure
+from neusee.workflows.evaluation.mistold_points import mistold_rows
 from neusee.workflows.evaluation.paired_intervals import compare_with
 from neusee.workflows.evaluation.pipelines import (
     CASES,
     DRAWN,
-    NONE,
-    SIX,
     EvaluationRefused,
     Pipeline,
     PipelineRecipes,
@@ -39,6 +41,7 @@ from neusee.workflows.evaluation.pipelines import (
     read_pipelines,
     refuse_fixed_laser,
 )
+from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.protection.equal_shade import EqualProtection
 from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
@@ -47,7 +50,15 @@ from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 
-__all__ = ["STRENGTHS", "EvaluationRefused", "EvaluationResult", "evaluate", "read_pipelines", "read_settings"]
+__all__ = [
+    "STRENGTHS",
+    "EvaluationRefused",
+    "EvaluationResult",
+    "evaluate",
+    "options_of",
+    "read_pipelines",
+    "read_settings",
+]
 
 STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  #: strengths of the paper, in multiples of saturation
 SMALL = 256  #: pixels of the shorter side of the pictures that the paper restores
@@ -82,7 +93,7 @@ def evaluate(
     """
     place = folder or Path.cwd()
     base, settings = base_recipe(recipe, changes, place), read_settings(recipe, changes, place)
-    asked = _Asked(recipe, changes, place, store or open_store(), settings, progress)
+    asked = AskedCamera(recipe, changes, place, store or open_store(), settings, progress)
     bare = compose_pipelines(recipe, changes, pipelines, place)
     strengths, reference = _strengths(strengths), _reference(reference, pipelines)
     study_run = StudyRun("evaluate", base, command)
@@ -93,46 +104,11 @@ def evaluate(
     each, references = _equalled(asked, bare, reference, equal)
     _report_scenes(shown, broken, strengths, each, progress)
     bench = EvaluationPoints(asked.store, small, device)
-    measured = _measured(asked, bench, each, shown, strengths)
-    tables = {name: metric_table(own, strengths, photographs(shown)) for name, own in measured[0].items()}
-    least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
-    more = {name: compare_with(own, tables[references[name]], base.seed) for name, own in tables.items()}
-    points, mistold, optics, pictures = measured
-    rest = (references, points, tables, more, optics, pictures, [p.pipeline for p in each], mistold, equal)
-    found = tuple(wavelengths(bare[0], shown))
-    result = EvaluationResult(base, shown, broken, strengths, least, *rest, wavelengths=found)
+    found = measure(asked, bench, each, shown, strengths)
+    waves = tuple(wavelengths(bare[0], found.scenes))
+    result = _result(base, strengths, small, references, found, [p.pipeline for p in each], equal, broken, waves)
     document = study_run.document(_document(result, bench))
     return study_run.write(runs, digest(document["summary"]), document, _report(result))
-
-
-class _Asked(NamedTuple):
-    """The camera of an evaluation, and where its results are kept."""
-
-    recipe: str
-    changes: Sequence[str | Override]
-    folder: Path
-    store: Store
-    settings: EvaluateSettings
-    progress: Progress
-
-
-def _measured(
-    asked: _Asked,
-    bench: EvaluationPoints,
-    each: list[PipelineRecipes],
-    shown: Sequence[Scene],
-    strengths: tuple[float, ...],
-) -> tuple[dict[str, list[dict[float, PointNumbers]]], list[MistoldPoint], dict[str, MaskOptics], list[Panel]]:
-    """Return the numbers of all points, those of restorers told with errors, the masks, and the pictures to show."""
-    points = _points(bench, each, shown, strengths, asked.progress)
-    mistold = told_with_errors(bench, each, shown, strengths, asked.progress)
-    optics = masks(each, asked.store, bench.device, points)
-    if more := asked.settings.figure:
-        bench.release()
-        lines = [p.pipeline for p in each]
-        each = compose_pipelines(asked.recipe, [*asked.changes, *more], lines, asked.folder)
-    figure = SIX if asked.settings.lasers == "drawn" else None
-    return points, mistold, optics, panels(bench, each, shown[0], strengths, figure)
 
 
 def read_settings(recipe: str, changes: Sequence[str | Override], folder: Path) -> EvaluateSettings:
@@ -140,8 +116,28 @@ def read_settings(recipe: str, changes: Sequence[str | Override], folder: Path) 
     return base_recipe(recipe, changes, folder).evaluation or EvaluateSettings()
 
 
+def options_of(
+    settings: EvaluateSettings,
+    pipelines: str | Sequence[Pipeline] | None,
+    scenes: int | None,
+    reference: str,
+    equal_protection: float | None,
+    by: str | None,
+    folder: Path,
+) -> dict[str, Any]:
+    """Return arguments of `evaluate`: those that are given, and else those of the settings of the recipe."""
+    lines = settings.pipelines if pipelines is None else pipelines
+    level = settings.equal_protection if equal_protection is None else equal_protection
+    return {
+        "pipelines": read_pipelines(lines, folder) if isinstance(lines, str) else lines,
+        "count": scenes or (None if settings.scenes == "all" else settings.scenes),
+        "reference": reference or (settings.reference if pipelines is None else ""),
+        "equal": read_protection(level, by or settings.by),
+    }
+
+
 def _equalled(
-    asked: _Asked, bare: list[PipelineRecipes], reference: str, equal: EqualProtection | None
+    asked: AskedCamera, bare: list[PipelineRecipes], reference: str, equal: EqualProtection | None
 ) -> tuple[list[PipelineRecipes], dict[str, str]]:
     """Return the pipelines, at equal protection if that was asked for, and the name of the reference of each."""
     if equal is None:
@@ -152,6 +148,26 @@ def _equalled(
     if not asked.settings.beside:
         return shaded, references
     return [*bare, *shaded], {**dict.fromkeys((p.name for p in bare), reference), **references}
+
+
+def _result(
+    base: Recipe,
+    strengths: tuple[float, ...],
+    small: int,
+    references: dict[str, str],
+    found: Measured,
+    pipelines: Sequence[Pipeline],
+    equal: EqualProtection | None,
+    broken: Sequence[tuple[Path, str]],
+    waves: Sequence[float | None],
+) -> EvaluationResult:
+    """Return the result of an evaluation with its statistics over scenes."""
+    owners, lost = photographs(found.scenes), [*broken, *found.broken]
+    tables = {name: metric_table(own, strengths, owners) for name, own in found.points.items()}
+    least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
+    more = {name: compare_with(own, tables[references[name]], base.seed) for name, own in tables.items()}
+    rest = (found.masks, found.panels, pipelines, found.mistold, equal, waves)
+    return EvaluationResult(base, found.scenes, lost, strengths, least, references, found.points, tables, more, *rest)
 
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
@@ -182,28 +198,6 @@ def _report_scenes(
         progress(f"not read: {path.name}: {reason}")
     if len(broken) > 5:
         progress(f"not read: {len(broken) - 5} more")
-
-
-def _points(
-    bench: EvaluationPoints,
-    each: Sequence[PipelineRecipes],
-    shown: Sequence[Scene],
-    strengths: Sequence[float],
-    progress: Progress,
-) -> dict[str, list[dict[float, PointNumbers]]]:
-    """Compute all evaluation points laser by laser, because scenes with the same laser have common optical results."""
-    points: dict[str, list[dict[float, PointNumbers]]] = {p.name: [{} for _ in shown] for p in each}
-    before, order = "", [scene.case for scene in shown]
-    for done, scene in enumerate(sorted(shown, key=lambda scene: order.index(scene.case)), 1):
-        if before not in ("", scene.case):
-            bench.forget()
-        before, alone = scene.case, replace(scene)  # a copy, which releases the picture when it is deleted
-        for strength in strengths if scene.case != NONE else (0.0,):
-            for pipeline in each:
-                point = bench.point(pipeline, PointRequest(alone, strength))
-                points[pipeline.name][scene.number][strength] = point
-        progress(f"scene {done} of {len(shown)} ({scene.case}, {scene.name}): {bench.computed} points computed")
-    return points
 
 
 # --- the folder -------------------------------------------------------------------------------------------------------

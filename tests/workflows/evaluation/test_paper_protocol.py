@@ -18,8 +18,10 @@ from scipy.stats import kstest
 
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
+from neusee.workflows.evaluation import evaluation_scenes
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
 from neusee.workflows.evaluation.evaluation_scenes import photographs, scenes, wavelengths
+from neusee.workflows.evaluation.measured_points import _points
 from neusee.workflows.evaluation.mistold_points import _variant
 from neusee.workflows.evaluation.pipelines import (
     DRAWN,
@@ -112,6 +114,24 @@ def test_a_restorer_that_is_told_an_error_of_zero_sees_the_drawn_values(store, f
     assert bench.point(same, PointRequest(scene, 1e3)) == bench.point(true, PointRequest(scene, 1e3))
 
 
+def test_a_photograph_that_cannot_be_decoded_costs_its_scene_and_no_other(store, folder, monkeypatch):
+    usual = evaluation_scenes.crop_photograph
+
+    def damaged(path, *rest):
+        if path.name == "b.png":
+            raise OSError("broken data stream")
+        return usual(path, *rest)
+
+    monkeypatch.setattr(evaluation_scenes, "crop_photograph", damaged)
+    shown, said = drawn(store, folder), list[str]()
+    points, kept, broken = _points(EvaluationPoints(store, 16), [pipeline("flat+none")], shown, (0.0,), said.append)
+    assert sorted(scene.name for scene in kept) == ["a.png", "c.png"]
+    assert len(points["flat+none"]) == 2
+    assert [path.name for path, _ in broken] == ["b.png"]
+    assert "broken data stream" in broken[0][1]
+    assert "not read, and left out: b.png" in said
+
+
 def test_a_laser_without_a_law_is_refused():
     with pytest.raises(EvaluationRefused, match=r"evaluate\.lasers is drawn, but no law says which wavelength"):
         refuse_fixed_laser(load("paper_protocol", [*SMALL, "laser=green"]))
@@ -125,6 +145,7 @@ _PROGRAM = """
 import os, signal, sys
 from pathlib import Path
 import neusee
+from neusee.workflows.evaluation import evaluation_scenes
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
