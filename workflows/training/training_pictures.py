@@ -21,10 +21,12 @@ from neusee.nodes.scene import Change, Photographs, symmetry
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step, dependents, needed
+from neusee.workflows.graph.told_copies import TOLD
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+from neusee.workflows.training.camera_mismatch import CameraMismatch
 from neusee.workflows.training.parallel.band_shards import Shards
 from neusee.workflows.training.parallel.picture_rounds import Pictures
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
@@ -73,24 +75,37 @@ class TrainingStream:
         outputs = (settings.picture, settings.truth, settings.light, settings.psf)
         require_steps(recipe, "train", (*outputs, settings.scene, *([learn] if learn else [])))
         self._inputs = Inputs.of(recipe, outputs) if recipe.uncertain and recipe.uncertain.names else None
+        self._mismatch = CameraMismatch.of(recipe, settings)
         self.shape = _frame(recipe, settings.scene)
-        recipe = in_precision(frozen or recipe, settings.dtype)
+        believed = in_precision(frozen or recipe, settings.dtype)
+        recipe, self.psf = self._mismatch.camera(believed, settings)
+        outputs = (*outputs[:-1], self.psf)
         recipe = with_substitutions(recipe, outputs, {learn} if learn else ())
         order = needed(recipe, outputs)
         self._stored = StoredPool(recipe, settings, store, device) if self._pool and settings.keep_pool else None
         self._lasers = [f"{n}.{_LASER[1]}" for n in order if recipe.steps[n].node.path == _LASER[0]]
-        readers = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
-        self._readers = {name: _given(recipe, name) for name in readers}
-        fixed = set(needed(recipe, [settings.psf]))  # random effects in the PSF, such as dirt, are constant
+        self._readers = self._read(believed, order)
+        readers = self._readers
+        fixed = set(needed(recipe, [self.psf]))  # random effects in the PSF, such as dirt, are constant
         noise = {name for name in order if recipe.steps[name].node.random and name not in fixed}
         drawn = dependents(recipe, noise | {settings.scene, *(name.rpartition(".")[0] for name in readers)}, order)
         learnt = dependents(recipe, {learn} if learn else (), order)
-        if settings.psf in drawn:
+        if self.psf in drawn:
             raise ValueError(f"train.psf: {settings.psf} changes with each picture: name a step with a constant PSF")
-        self.shards = Shards.of(recipe, settings.psf, outputs, drawn | learnt, store, mesh)
+        self.shards = Shards.of(recipe, self.psf, outputs, drawn | learnt, store, mesh)
         drawn |= self.shards.behind
-        read = _sources(recipe, drawn) | {settings.psf}
+        read = _sources(recipe, drawn) | {self.psf}
         self._divide(recipe, learn, [n for n in order if n in (learnt - drawn) & read], drawn, noise, store)
+
+    def _read(self, believed: Recipe, order: Sequence[str]) -> dict[str, Any]:
+        """Return the parameters that change with each picture, with the values that the recipe states.
+
+        What is drawn for the camera is told to the restorer too, but for the differences of ``train.mismatch``.
+        """
+        drawn = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
+        told, steps = [TOLD + name for name in drawn], set(order)
+        each = [name for name in (*drawn, *told, *self._mismatch.moved) if name.rpartition(".")[0] in steps]
+        return {name: _given(believed, name.removeprefix(TOLD)) for name in each}
 
     def _divide(
         self, recipe: Recipe, learn: str | None, border: list[str], drawn: set[str], noise: set[str], store: Store
@@ -189,6 +204,10 @@ class TrainingStream:
             values = self._inputs.at(rng.standard_normal((1, len(self._inputs.names))))[0]
             drawn = dict(zip(self._inputs.names, map(float, values), strict=True))
             theta |= self._inputs.theta(drawn)
+        theta |= {name: theta[name.removeprefix(TOLD)] for name in theta if name.startswith(TOLD)}
+        differences = self._mismatch.drawn((self.seed, stage, number))
+        theta |= self._mismatch.truth(theta, differences)
+        drawn |= {f"mismatch {path}": value for path, value in differences.items()}
         if rng.random() < self.settings.laser_free:
             theta |= dict.fromkeys(self._lasers, 0.0)
             drawn["laser"] = "none"
