@@ -12,6 +12,7 @@ from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.told_copies import TOLD
 from neusee.workflows.training.held_out import HELD_OUT
+from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.run_training import train
 from neusee.workflows.training.training_pictures import TrainingStream
 from tests.workflows.training.test_warm_start import TINY
@@ -163,7 +164,8 @@ def test_a_pool_of_another_law_is_another_pool(tmp_path, photograph):
 def test_a_mask_is_trained_for_what_is_told_of_it(tmp_path, photograph):
     words = [*TINY, "doe=unet", "doe.grid=32", "train.learn=height", "train.stages.1.iterations=1",
              "train.stages.1.batch=1", "train.stages.1.adversarial=0", "train.picture=restored"]  # fmt: skip
-    recipe = load("train_small", [*words, *differing(*DRAWN)])
+    made = ["+height_error=smooth", *differing("height_error.rms=uniform(0 nm, 20 nm)")]
+    recipe = load("train_small", [*words, *differing(*DRAWN), *made])
     found = train(recipe, Store(tmp_path), tmp_path / "runs", [], lambda line: None, (1, 2))
     assert (found / "mask.safetensors").is_file()
     other = train(load("train_small", words), Store(tmp_path), tmp_path / "runs", [], lambda line: None, (1,))
@@ -207,3 +209,19 @@ def test_what_no_camera_can_have_is_a_mistake_before_any_work(tmp_path, laws, sa
     with pytest.raises(RecipeError, match=said):
         train(recipe, Store(tmp_path), tmp_path / "runs", [], lambda line: None, (2,))
     assert not (tmp_path / "runs").exists()
+
+
+def test_the_packaged_laws_are_those_of_the_guide():
+    recipe = load("train_small", [*CAMERA, "+mismatch=usual"])
+    assert recipe.training.mismatch == dict(law.split("=") for law in DRAWN)
+    assert list(recipe.uncertain.mismatch) == [law.partition("=")[0] for law in DRAWN]
+
+
+def test_a_design_that_is_told_unchanged_shares_one_gradient_with_the_camera():
+    """The told mask without an error is the same tensor as the mask; the gradient of both is the sum."""
+    height = torch.tensor([1.0, 2.0], requires_grad=True)
+    design = 3 * height
+    shared = Shared.of({"fabricated": design, f"{TOLD}made": design})
+    (shared.seen["fabricated"].sum() + 10 * shared.seen[f"{TOLD}made"].sum()).backward()
+    shared.back()
+    assert height.grad.tolist() == [33.0, 33.0]
