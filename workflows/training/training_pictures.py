@@ -53,6 +53,9 @@ class Sample:
         return {"picture": self.picture, "truth": self.truth, "light": self.light}
 
 
+_NOTHING = Sample(torch.zeros(0), torch.zeros(0), torch.zeros(0), {})  #: of a process without a picture in a round
+
+
 class TrainingStream:
     """The training pictures of a recipe, behind a mask that is trained or behind the fixed mask of ``frozen``."""
 
@@ -72,6 +75,7 @@ class TrainingStream:
         self.seed, self.mesh, self.held_out = recipe.seed, mesh, held_out
         self._pool = settings.pool if frozen else None
         self._kept: dict[tuple[int, int], Sample] = {}
+        self._rounds: dict[tuple[int, ...], Sample] = {}  #: by stage and numbers, of processes that divide the bands
         outputs = (settings.picture, settings.truth, settings.light, settings.psf)
         require_steps(recipe, "train", (*outputs, settings.scene, *([learn] if learn else [])))
         self._inputs = Inputs.of(recipe, outputs) if recipe.uncertain and recipe.uncertain.names else None
@@ -119,6 +123,8 @@ class TrainingStream:
         self.shared = as_function(recipe, learn, outputs=border, caller=caller, **ways) if learn else None
         outputs = [settings.picture, settings.truth, settings.light]
         self._each = Pictures(recipe, [*border, settings.scene, *self._readers], outputs, noise, self.shards, ways)
+        if self._each.by_band:
+            self._stored = None  # a picture that several processes compute stays in memory
 
     @property
     def pool_counts(self) -> dict[str, int]:
@@ -150,11 +156,19 @@ class TrainingStream:
                 if mine is not None:
                     yield mine, self._turned(self(shared.seen, stage, first + mine), stage, first + mine)
                 continue
-            begun = {i: self._drawn(stage, self._number(stage, first + i)) for i in together}
+            key = (stage, *(self._number(stage, first + i) for i in together))
+            if key in self._rounds:  # in the memory of all processes, or of none
+                if mine is not None:
+                    yield mine, self._turned(self._rounds[key], stage, first + mine)
+                continue
+            begun = {i: self._drawn(stage, number) for i, number in zip(together, key[1:], strict=True)}
             parts = {i: (theta, noise) for i, (theta, noise, _) in begun.items()}
             with self._each.together(shared, parts, mine) as values:
+                sample = _NOTHING if mine is None else self._sample(values, begun[mine][2])
                 if mine is not None:
-                    yield mine, self._turned(self._sample(values, begun[mine][2]), stage, first + mine)
+                    yield mine, self._turned(sample, stage, first + mine)
+            if self._pool is not None and stage != HELD_OUT:
+                self._rounds[key] = sample
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
         """Return the training picture with the given number, which does not depend on order or process."""
