@@ -59,25 +59,24 @@ class CameraMismatch:
             raise _mistake(given, path, f"{settings.learn} is trained, so that its parameters have no effect")
         return cls(differences, moved, probes)
 
-    def camera(self, recipe: Recipe, settings: Training) -> tuple[Recipe, str]:
-        """Return the recipe with copies of what the restorer is told, and the step of the PSF that is told.
+    def camera(self, recipe: Recipe, outputs: Sequence[str], psf: str) -> tuple[Recipe, str]:
+        """Return the recipe with copies of what the makers of the ``outputs`` are told, and the copy of the PSF step.
 
         Until they are drawn, the true values are the probes, so that no step counts as one without effect.
         """
         moved = {name for name in self.moved if _has(recipe, name)}
         if not moved:
-            return recipe, settings.psf
+            return recipe, psf
         camera = set(needed(recipe, [FRAME]))
-        outputs = (settings.picture, settings.truth, settings.light, settings.psf)
         readers = knowers(recipe, [name for name in needed(recipe, outputs) if name not in camera])
-        told = needed(recipe, [*known(recipe, readers), settings.psf])
+        told = needed(recipe, [*known(recipe, readers), psf])
         copied = dependents(recipe, {name.rpartition(".")[0] for name in moved}) & set(told)
         changed = with_copies(recipe, readers, copied, lambda step: step)
         steps = dict(changed.steps)
         for name in moved:
             step, _, param = name.rpartition(".")
             steps[step] = _with(steps[step], param, self.probes[name])
-        return replace(changed, steps=steps), (TOLD if settings.psf in copied else "") + settings.psf
+        return replace(changed, steps=steps), (TOLD if psf in copied else "") + psf
 
     def drawn(self, seed: Sequence[int]) -> dict[str, float]:
         """Draw the differences of one picture, in SI, by path."""

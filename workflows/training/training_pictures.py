@@ -19,8 +19,7 @@ from torch import Tensor
 from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.scene import Change, Photographs, symmetry
 from neusee.workflows.engine.differentiable_function import as_function
-from neusee.workflows.graph.diagnostics import nearest
-from neusee.workflows.graph.recipe_graph import Recipe, Step, dependents, needed
+from neusee.workflows.graph.recipe_graph import Recipe, dependents, needed
 from neusee.workflows.graph.told_copies import TOLD
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
@@ -32,6 +31,7 @@ from neusee.workflows.training.parallel.picture_rounds import Pictures
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.stored_pool import StoredPool
+from neusee.workflows.training.training_recipe import frame_of, in_precision, require_steps
 
 _LASER = ("optics.laser_irradiance", "strength")  #: the node of a laser, and the parameter that is 0 without a laser
 _SEEDS = 2**31
@@ -44,7 +44,7 @@ class Sample:
 
     picture: Tensor  #: (n, 3, y, x), the developed picture of the camera
     truth: Tensor  #: (n, 3, y, x), the true picture
-    light: Tensor  #: (band,), the fraction of the light of the scene that the mask keeps
+    light: Tensor  #: (band,), the fraction of the light of the scene that the mask keeps; empty where no loss reads it
     drawn: Mapping[str, Any]  #: the values that were sampled for the picture
 
     @property
@@ -80,13 +80,18 @@ class TrainingStream:
         require_steps(recipe, "train", (*outputs, settings.scene, *([learn] if learn else [])))
         self._inputs = Inputs.of(recipe, outputs) if recipe.uncertain and recipe.uncertain.names else None
         self._mismatch = CameraMismatch.of(recipe, settings)
-        self.shape = _frame(recipe, settings.scene)
+        self.shape = frame_of(recipe, settings.scene)
         believed = in_precision(frozen or recipe, settings.dtype)
-        recipe, self.psf = self._mismatch.camera(believed, settings)
-        outputs = (*outputs[:-1], self.psf)
+        stage = settings.stages.get(2 if frozen else 1)
+        light = (settings.light,) if stage is not None and stage.bsr else ()  # else no loss reads it
+        recipe, self.psf = self._mismatch.camera(believed, (settings.picture, settings.truth, *light), settings.psf)
+        self._made = (settings.picture, settings.truth, *light)
+        outputs = (*self._made, self.psf)
         recipe = with_substitutions(recipe, outputs, {learn} if learn else ())
         order = needed(recipe, outputs)
-        self._stored = StoredPool(recipe, settings, store, device) if self._pool and settings.keep_pool else None
+        self._stored = (
+            StoredPool(recipe, settings, self._made, store, device) if self._pool and settings.keep_pool else None
+        )
         self._lasers = [f"{n}.{_LASER[1]}" for n in order if recipe.steps[n].node.path == _LASER[0]]
         self._readers = self._read(believed, order)
         readers = self._readers
@@ -121,8 +126,8 @@ class TrainingStream:
         self._whole = [name for name in border if name in read]
         caller = self.shards.call
         self.shared = as_function(recipe, learn, outputs=border, caller=caller, **ways) if learn else None
-        outputs = [settings.picture, settings.truth, settings.light]
-        self._each = Pictures(recipe, [*border, settings.scene, *self._readers], outputs, noise, self.shards, ways)
+        free = [*border, settings.scene, *self._readers]
+        self._each = Pictures(recipe, free, self._made, noise, self.shards, ways)
         if self._each.by_band:
             self._stored = None  # a picture that several processes compute stays in memory
 
@@ -239,7 +244,7 @@ class TrainingStream:
         if self.settings.size is not None:
             both = [resize(picture, *self.settings.size) for picture in both]
         picture, truth = self._patches(torch.stack(both), drawn["noise"])
-        return Sample(picture, truth, values[self.settings.light], drawn)
+        return Sample(picture, truth, values.get(self.settings.light, torch.zeros(0)), drawn)
 
     def _patches(self, both: Tensor, seed: int) -> Tensor:
         """Cut patches from a training picture and the true picture at the same positions, as a tensor (2, n, 3, y, x).
@@ -255,32 +260,6 @@ class TrainingStream:
         count = self.settings.patches
         places = [[int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)] for _ in range(count)]
         return torch.stack([both[..., y : y + patch[0], x : x + patch[1]] for y, x in places], 1)
-
-
-def in_precision(recipe: Recipe, dtype: torch.dtype) -> Recipe:
-    """Return the recipe with steps in float64 if ``dtype`` is float64: steps with a choice of precision are double."""
-    if dtype != torch.float64:
-        return recipe
-    steps = {name: _precise(step) if "precision" in step.params else step for name, step in recipe.steps.items()}
-    return replace(recipe, steps=steps)
-
-
-def _precise(step: Step) -> Step:
-    return replace(step, params={**step.params, "precision": "double"})
-
-
-def require_steps(recipe: Recipe, block: str, names: Sequence[str]) -> None:
-    """Raise ValueError unless the recipe has all steps ``names``, which the settings block ``block`` names."""
-    for name in names:
-        if name not in recipe.steps:
-            raise ValueError(f"{block}: the recipe has no step {name}; {nearest(name, recipe.steps)}")
-
-
-def _frame(recipe: Recipe, scene: str) -> tuple[int, int]:
-    shape = recipe.steps[scene].params.get("shape")
-    if shape is None:
-        raise ValueError(f"train: the step {scene} has no shape: set {scene}.shape in pixels, such as [96, 96]")
-    return shape[0], shape[1]
 
 
 def _given(recipe: Recipe, name: str) -> Any:
