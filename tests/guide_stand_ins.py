@@ -163,6 +163,11 @@ STAND_INS = {
         "ten minutes", more=(*TRAINING, *ONE)),
     "train train_small train.photographs=my_photographs train.augment.symmetries=all train.augment.exposure=2 "
     "train.augment.colour=0.3": StandIn("ten minutes", more=(*TRAINING, *ONE)),
+    "train train_small train.photographs=my_photographs train.picture=restored +mismatch=usual": StandIn(
+        "ten minutes", more=(*TRAINING, *ONE)),
+    "train train_small train.photographs=my_photographs train.picture=restored +height_error=smooth "
+    "\"train.mismatch={height_error.rms: 'uniform(0 nm, 20 nm)', height_error.depth: 'normal(0, 0.01)'}\"": StandIn(
+        "ten minutes", more=(*TRAINING, *ONE)),
     'train my/train_smallnet.yaml "train.export=[pt2]"': StandIn("minutes", more=SMALLNET),
     "train train_hour train.photographs=my_photographs": StandIn("a quarter of an hour", more=(
         *TRAINING[:-2], "train.network.width=4", "train.stages.2.iterations=1", "train.stages.2.batch=2")),

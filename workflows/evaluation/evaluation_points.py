@@ -17,9 +17,10 @@ from neusee.nodes.metrics import quality
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import call, place
 from neusee.workflows.evaluation.evaluation_scenes import Scene
-from neusee.workflows.evaluation.mistold_filter import TOLD, shifted
+from neusee.workflows.evaluation.mistold_filter import shifted
 from neusee.workflows.evaluation.pipelines import BEAM, NONE, PipelineRecipes
 from neusee.workflows.graph.recipe_graph import Recipe, Step, dependents, needed
+from neusee.workflows.graph.told_copies import TOLD
 from neusee.workflows.keys.cache_key import device_kind, digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
