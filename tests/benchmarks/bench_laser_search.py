@@ -99,9 +99,8 @@ def report(all_rows):
     free = [r for r in all_rows if not r["strength"]]
     for lamps in (False, True):
         some = [r for r in free if bool(r["lamps"]) == lamps]
-        print(
-            f"false alarms {'with' if lamps else 'without'} lamps: {rate(sum(r['number'] > 0 for r in some), len(some))}"
-        )
+        alarms = rate(sum(r["number"] > 0 for r in some), len(some))
+        print(f"false alarms {'with' if lamps else 'without'} lamps: {alarms}")
     print(f"false alarms: {rate(sum(r['number'] > 0 for r in free), len(free))}")
     seconds = np.array([r["seconds"] for r in all_rows])
     print(f"seconds of a processor a frame: {np.median(seconds):.1f} in the median, {seconds.max():.1f} at most")
