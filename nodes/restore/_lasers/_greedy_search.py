@@ -22,6 +22,8 @@ _AROUND = 256  #: pixels a side of the window in which these are compared
 _FEW = 4  #: clipped pixels, fewer of which need no explanation
 _TRIED = 2  #: candidates that are fitted before one of them is chosen
 _CLIPPED = 4  #: candidates for clipped pixels, whose surroundings are searched before any is fitted
+_BEHIND = 0.25  #: share of a gain, candidates below which are not fitted
+_WIDER = 1.5  #: times the first width, up to which a fitted width is not compared with others
 _FIRST, _LAST = 5, 12  #: steps of a fit of one part, and of all parts
 
 
@@ -137,9 +139,11 @@ def _best(known: Known, fit: Fit, data: Data, least: float, margin: float) -> Ch
     choose = (residual, left.data.use, left.data.weights)
     lamp = Templates(torch.zeros(1).double(), left.known.lamp.patterns[None], left.known.lamp.colour[None])
     starts = [*candidates(*choose, known.lines, _TRIED), *candidates(*choose, lamp, 1)]
-    near = [_nearest(left, residual, one) for one in _clipped_starts(known, fit.parts, data.use)]
+    clipped = _clipped_starts(known, fit.parts, data.use)
+    near = [_nearest(left, residual, one) for one in clipped if one.gain >= _BEHIND * clipped[0].gain]
     starts += sorted(near, reverse=True)[:_TRIED]
-    found = [each for each in _all_grown(left, starts) if not _known_already(each.part, fit.parts)]
+    grown = _all_grown(left, sorted(starts, reverse=True))
+    found = [each for each in grown if not _known_already(each.part, fit.parts)]
     lasers = [each for each in found if isinstance(each.part, Laser)]
     best = _ahead(left, found, lasers, least, margin) if lasers else (found[0] if found else None)
     return best and best._replace(part=_precise(best.part, known))
@@ -170,15 +174,21 @@ def _precise(part: Laser | Lamp, known: Known) -> Laser | Lamp:
 
 
 def _all_grown(left: _Left, starts: list[Candidate]) -> list[Choice]:
-    """Return what grows from candidates, the largest gain first."""
-    found = [_grown(left, start) for start in starts]
-    return sorted((each for each in found if each is not None), key=lambda each: -each.gain)
+    """Return what grows from candidates that are not far behind what others have grown to, the largest gain first."""
+    found: list[Choice] = []
+    for start in starts:
+        if start.gain >= _BEHIND * max((each.gain for each in found), default=0.0):
+            found += filter(None, [_grown(left, start)])
+    return sorted(found, key=lambda each: -each.gain)
 
 
 def _widened(left: _Left, one: Choice) -> Choice:
-    """Return a laser with the width of its line that explains most."""
-    best = one
-    for width in left.known.widths[1:]:
+    """Return a laser with the width of its line that explains most; one of a narrow line stays as it is."""
+    best, widths = one, left.known.widths
+    assert isinstance(one.part, Laser)
+    if float(one.part.fwhm) < _WIDER * widths[0]:
+        return one
+    for width in widths[1:]:
         camera = left.known.camera._replace(fwhm=left.known.camera.fwhm.new_tensor(width))
         assert isinstance(best.part, Laser)
         parts, misfit = misfit_of(left.data, (replace(best.part, camera=camera),), _FIRST)
@@ -228,7 +238,7 @@ def _nearest(left: _Left, residual: Tensor, start: Candidate) -> Candidate:
         patterns = grid_patterns(camera.pupil, down, right, wavelength, lens).to(white)
         light = within(heard[:, None, None] * seen(patterns.flatten(0, 1)[:, None]))
         product, norm = (light * white).sum((1, 2, 3)), light.square().sum((1, 2, 3)).clamp_min(1e-30)
-        gain = product.clamp_min(0.0).square() / norm
+        gain = 0.5 * product.clamp_min(0.0).square() / norm
         n = int(gain.argmax())
         if float(gain[n]) > best.gain:
             y, x = divmod(n, len(_HALVES))
