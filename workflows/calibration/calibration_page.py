@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from neusee.nodes.calibrate import Rings, Sufficient
+from neusee.nodes.calibrate import FrameTest, Rings, Sufficient
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration import calibration_figures as figures
+from neusee.workflows.calibration.frame_validity import frame_section
 from neusee.workflows.calibration.identifiability import KINDS, Identifiability
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import IntervalEstimate, ModelSpread
@@ -89,6 +90,7 @@ class CalibrationResult:
     chains: Chains
     checks: Sequence[Check]
     models: Sequence[ModelSpread] = ()  #: of a camera of unknown response
+    frames: Sequence[FrameTest] = ()  #: the tests of the frames
 
     @property
     def params(self) -> Mapping[str, Any]:
@@ -153,7 +155,13 @@ def _words(name: str) -> str:
 def sections(result: CalibrationResult) -> list[Section]:
     """Return the sections of a calibration's page: parameters, checks, identifiability and pictures."""
     models = (_models,) if result.models else ()
-    return [part(result) for part in (_parameters, *models, _checks, _not_determined, _curve, _corner, _chains)]
+    frames = (_frames,) if result.frames else ()
+    parts = (_parameters, *models, _checks, *frames, _not_determined, _curve, _corner, _chains)
+    return [part(result) for part in parts]
+
+
+def _frames(result: CalibrationResult) -> Section:
+    return frame_section(result.frames)
 
 
 def _parameters(result: CalibrationResult) -> Section:
