@@ -135,8 +135,7 @@ def banner(result: CalibrationResult) -> str:
 def lead(result: CalibrationResult) -> str:
     """Return the opening of a calibration's page: estimates, values to report, and undetermined parameters."""
     values = [f"{_words(row.name)} {row.text}" for row in result.rows()]
-    estimated = [m for m in result.models if result.identifiability.kinds[m.name] == "estimate"]
-    stated = [f"{_words(m.name)} {_between(m.stated)}" for m in estimated]
+    stated = [f"{_words(m.name)} {_between(m.stated)}" for m in estimated_models(result)]
     return "\n\n".join(
         f"{opening}{'; '.join(parts)}."
         for opening, parts in (
@@ -146,6 +145,11 @@ def lead(result: CalibrationResult) -> str:
         )
         if parts
     )
+
+
+def estimated_models(result: CalibrationResult) -> list[ModelSpread]:
+    """Return the models of the response for each parameter that the frames determine; others have no value."""
+    return [model for model in result.models if result.identifiability.kinds[model.name] == "estimate"]
 
 
 def _words(name: str) -> str:
@@ -190,7 +194,8 @@ def _models(result: CalibrationResult) -> Section:
         single model is too narrow."""
     columns = ("parameter", *(f"{n} terms" for n in range(len(result.models[0].models))), "stated", "unit")
     rows = [
-        (_words(m.name), *map(_between, (*m.models, m.stated)), unit_of(m.name, result.params)) for m in result.models
+        (_words(m.name), *map(_between, (*m.models, m.stated)), unit_of(m.name, result.params))
+        for m in estimated_models(result)
     ]
     return Section("How models of the response differ", text, columns, rows)
 

@@ -14,7 +14,14 @@ import numpy as np
 
 from neusee.nodes.calibrate import FrameTest, Rings
 from neusee.nodes.values import Levels
-from neusee.workflows.calibration.calibration_page import NOT_TOLD, CalibrationResult, banner, lead, sections
+from neusee.workflows.calibration.calibration_page import (
+    NOT_TOLD,
+    CalibrationResult,
+    banner,
+    estimated_models,
+    lead,
+    sections,
+)
 from neusee.workflows.calibration.frame_validity import (
     as_rows,
     frame_checks,
@@ -155,7 +162,7 @@ def _document(result: CalibrationResult) -> dict[str, Any]:
             "mean": flat.mean(0).tolist(),
             "covariance": np.cov(flat.T).reshape(len(problem.names), -1).tolist(),
         },
-        "stated": {model.name: asdict(model.stated) for model in result.models},
+        "stated": {model.name: asdict(model.stated) for model in estimated_models(result)},
         "frames": as_rows(result.frames),
         "not told": list(result.identifiability.directions),
         "checks": [asdict(check) for check in result.checks],
