@@ -86,7 +86,7 @@ def _lag(levels: Sequence[Level]) -> Iterator[FrameTest]:
     evidence = strongest([[z] for z in every])
     share = sum(shares) / len(shares)
     sentence = f"{share:.1%} of the noise of a frame persists in the next frame, as by lag"
-    kept = min(max(share, 0.0), 0.5)
+    kept = min(abs(share), 0.5)
     lost = math.log((1 + 2 * kept) / (1 - kept))  # of the variance of a pair, where lag takes what it gives
     shifts = {"gain": lost, "noise": lost / 2}
     yield outcome("no lag", evidence, sentence, shifts, "the noise of a frame does not persist in the next frame")
