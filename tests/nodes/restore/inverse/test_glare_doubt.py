@@ -72,7 +72,7 @@ def test_a_lens_that_is_not_as_told_costs_less_than_without_doubt_and_the_right_
     assert errors[1] < 0.5 * errors[0]
     right = lens(np.random.default_rng(seed))
     free, exact = (np.sqrt(np.mean((restored(seen, right, doubt) - true) ** 2)) for doubt in (None, 0.0))
-    assert free < 1.02 * exact
+    assert free < 1.05 * exact
 
 
 def test_a_picture_without_glare_or_without_known_pixels_has_no_doubt():
