@@ -16,13 +16,13 @@ from neusee.nodes.restore._points._point_frames import Seen
 from neusee.nodes.restore._points._point_model import Linear, State, linear, moved, node_weights
 
 _SEARCH = 6  #: pixels by which a point may lie beside the first guess
-_STEPS = 12  #: Gauss-Newton steps, at most
-_ENOUGH = 1e-3  #: pixels by which no point moves any more at the end
+_STEPS = 20  #: Gauss-Newton steps, at most
+_ENOUGH = 1e-4  #: pixels by which no point moves any more at the end
 _MOST = 0.4  #: pixels by which a point may move in one step
 _SURE = 4.0  #: standard deviations below saturation from which a pixel counts
 _CALM = 1e-9  #: share of the largest curvature that is added to each, in a step alone
 _ITERATIONS = 300  #: of conjugate gradients
-_RESIDUAL = 1e-7  #: squared residual over the first, at which they end
+_RESIDUAL = 1e-8  #: squared residual over the first, at which they end
 _LOCAL = 5  #: pixels a side over which chi-square is averaged
 
 
@@ -40,6 +40,7 @@ def fitted(seen: Seen, shape: tuple[int, int], zones: tuple[int, int], window: t
     """Return the PSFs at the nodes and draws of them; raise ValueError where no pixel tells of a part of a PSF."""
     share = node_weights(seen.middle, shape, zones)
     state, weight = _start(seen, share, window)
+    _refuse_unseen(linear(seen, state, share), weight)
     for _ in range(_STEPS):
         near = linear(seen, state, share)
         residual = seen.light - near.model(state.background)
@@ -155,22 +156,32 @@ def _curvature(near: Linear, weight: Tensor) -> State:
 
 
 def _solved(near: Linear, weight: Tensor, right: State) -> State:
-    """Return the step for a slope, by conjugate gradients that the curvature of each entry speeds up."""
+    """Return the step for a slope, by conjugate gradients that the curvature of each entry speeds up.
+
+    A shift of all points is a shift of the PSFs: the points move only as no shift of the PSFs at the nodes can.
+    """
     diagonal = _curvature(near, weight)
     inverse = State(*(1.0 / x for x in diagonal))
     calm = State(*(_CALM * x.amax() * torch.ones_like(x) for x in diagonal))
     x = State(*(torch.zeros_like(part) for part in right))
-    rest, way = right, right.times(inverse)
+    bound = near.share @ torch.linalg.pinv(near.share)
+    free = torch.eye(len(bound), dtype=bound.dtype) - bound
+    rest = right._replace(offset=free @ right.offset)
+    way = rest.times(inverse)
+    way = way._replace(offset=free @ way.offset)
     size = rest.dot(way)
     first = size
     for _ in range(_ITERATIONS):
         if float(size) <= _RESIDUAL * float(first):
             break
         image = near.slope(weight * near.change(way)).plus(way.times(calm))
-        image = image._replace(background=image.background + way.background / near.seen.doubt)
+        image = image._replace(
+            background=image.background + way.background / near.seen.doubt, offset=free @ image.offset
+        )
         step = size / way.dot(image)
         x, rest = x.plus(way, step), rest.plus(image, -step)
         turned = rest.times(inverse)
+        turned = turned._replace(offset=free @ turned.offset)
         size, before = rest.dot(turned), size
         way = turned.plus(way, size / before)
     return x

@@ -50,8 +50,8 @@ def hats(at: Tensor, size: int, count: int) -> Tensor:
 def shifting(offset: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Return matrices (point, size, size) that shift samples by ``offset`` (point,), and their slopes.
 
-    The interpolation is a sinc with a Kaiser window: its error is below 1e-4 for up to 0.4 periods in a pixel. Samples
-    beyond the ends count as equal to the last ones.
+    The interpolation is a sinc with a Kaiser window: its error is below 1e-4 for up to 0.4 periods in a pixel. The slope
+    of the samples is continued beyond their ends.
     """
     apart = torch.arange(size)[:, None] - torch.arange(size + 2 * _REACH) + _REACH
     at = apart.double() - offset[:, None, None]
@@ -70,10 +70,14 @@ def shifting(offset: Tensor, size: int) -> tuple[Tensor, Tensor]:
 
 
 def _folded(matrix: Tensor) -> Tensor:
-    """Return matrices whose columns beyond the ends are added to the first and the last column."""
+    """Return matrices whose columns beyond the ends act on the samples within, mirrored at the ends and turned over."""
     inner = matrix[..., _REACH:-_REACH].clone()
-    inner[..., 0] += matrix[..., :_REACH].sum(-1)
-    inner[..., -1] += matrix[..., -_REACH:].sum(-1)
+    reach = min(_REACH, inner.shape[-1] - 1)
+    left, right = matrix[..., _REACH - reach : _REACH], matrix[..., -_REACH : matrix.shape[-1] - _REACH + reach]
+    inner[..., 0] += 2.0 * left.sum(-1)
+    inner[..., 1 : reach + 1] -= left.flip(-1)
+    inner[..., -1] += 2.0 * right.sum(-1)
+    inner[..., -1 - reach : -1] -= right.flip(-1)
     return inner
 
 

@@ -9,7 +9,7 @@ from neusee.nodes.restore import measured_psf
 from neusee.nodes.restore._points._point_fit import gauged
 from neusee.nodes.restore._points._point_frames import read_points
 from neusee.nodes.restore._points._point_model import State, hats, linear, node_weights, shifting
-from tests.nodes.restore.points.independent_camera import CAMERA, OFFSET, centred, numbers, place_in, points
+from tests.nodes.restore.points.independent_camera import CAMERA, centred, numbers, place_in, points
 
 TRIPLE = torch.ones(3, 5)
 
@@ -61,7 +61,7 @@ def test_a_long_exposure_tells_of_the_wings_and_not_of_the_core(one_zone, tmp_pa
 def test_points_are_where_they_were_drawn(tmp_path):
     rng, shape = np.random.default_rng(0), (60, 100)
     places = [(20.3, 25.4), (38.7, 71.2)]
-    np.save(tmp_path / "p.npy", points(rng, shape, places, [1e5, 4e4]))
+    np.save(tmp_path / "p.npy", points(rng, shape, places, [1e5, 4e4], lobe=0.0))
     found = measure(tmp_path, shape, (11, 11), draws=4).places.numpy()
     apart = np.array(places) - np.array(places)[0]
     np.testing.assert_allclose(found[:, 1:3] - found[0, 1:3], apart, atol=0.05)
@@ -71,7 +71,7 @@ def test_points_are_where_they_were_drawn(tmp_path):
 def test_dark_frames_take_the_place_of_the_offset_and_hot_pixels_are_no_points(tmp_path):
     rng, shape = np.random.default_rng(1), (44, 44)
     pattern = rng.uniform(0, 40, (3, *shape))
-    pattern[:, 5, 5], pattern[:, 22, 25] = 5000, 300  # a hot pixel alone, and a warm one in the window
+    pattern[:, 5, 5], pattern[:, 22, 25] = 5000, 900  # a hot pixel alone, and a warm one in the window
     for number in range(4):
         frame = points(rng, shape, [beside((22, 22), rng)], [1.2e5], dark=pattern)
         np.save(tmp_path / f"p{number}.npy", frame)
@@ -83,8 +83,8 @@ def test_dark_frames_take_the_place_of_the_offset_and_hot_pixels_are_no_points(t
     alone = tuple(sorted(tmp_path.glob("p*.npy")))
     seed = torch.Generator().manual_seed(1)
     without = measured_psf(TRIPLE, files=alone, window=(11, 11), shape=shape, rng=seed, **CAMERA)
-    near = abs(without.kernels[0, 0, :, 5, 8].numpy() - truth[:, 5, 8])
-    assert (near > 3 * abs(found.kernels[0, 0, :, 5, 8].numpy() - truth[:, 5, 8])).all()
+    near, nearer = (abs(x.kernels[0, 0].numpy() - truth)[:, 4:7, 7:10].mean() for x in (without, found))
+    assert near > 2 * nearer
 
 
 def test_a_psf_too_sharp_for_the_pixels_is_said_by_chi_square(tmp_path):
@@ -93,7 +93,7 @@ def test_a_psf_too_sharp_for_the_pixels_is_said_by_chi_square(tmp_path):
     for number in range(5):
         place = beside((20, 20), rng)
         near = np.maximum(abs(y - place[0]), abs(x - place[1]))
-        light = 6e4 * np.exp(-(near**2) / 0.9) / 2 + 5.0
+        light = 1.5e4 * np.exp(-(near**2) / 0.9) + 5.0
         np.save(tmp_path / f"p{number}.npy", numbers(np.stack([light] * 3), rng))
     found = measure(tmp_path, shape, (9, 9), draws=8)
     assert float(found.fit.max()) > 1.5
@@ -210,7 +210,9 @@ def test_zones_without_a_point_that_is_not_saturated_are_named(tmp_path):
     np.save(tmp_path / "a.npy", points(rng, (40, 40), [(10, 10), (30, 30)], [5e4, 9e5]))
     parameter, text = refused(tmp_path, zones=(2, 2))
     assert parameter == "zones"
-    assert text.startswith("3 of 2 x 2 zones have no point with an unsaturated core, (row, column) (1, 2), (2, 1), (2, 2)")
+    assert text.startswith(
+        "3 of 2 x 2 zones have no point with an unsaturated core, (row, column) (1, 2), (2, 1), (2, 2)"
+    )
 
 
 def test_no_frames_and_dark_frames_alone_are_refused(tmp_path):
@@ -225,7 +227,7 @@ def test_a_core_that_is_saturated_in_every_frame_is_refused(tmp_path):
     rng = np.random.default_rng(0)
     frame = points(rng, (40, 40), [(20, 20)], [1e5])
     frame[:, 18, 18] = 65535  # a pixel that the point does not fill, in the window of the only point
-    frame[:, 22:24, 22:24] = int((CAMERA["full_well"] - OFFSET + OFFSET) * CAMERA["gain"])
+    frame[:, 22:24, 22:24] = int((CAMERA["full_well"]) * CAMERA["gain"])
     np.save(tmp_path / "a.npy", frame)
     with pytest.raises(ValueError, match="pixels of the PSF are saturated, or beyond the edge, in every frame"):
         measure(tmp_path, (40, 40), (11, 11))
