@@ -56,9 +56,11 @@ def test_another_number_of_channels_is_refused():
 
 
 def test_the_error_of_the_psf_makes_the_interval_wider():
-    electrons, clipped = picture((20, 20))
+    rng = np.random.default_rng(0)
+    light = blurred(2e4 * chinese_house(56, rng), (32, 32), reach=8)
+    electrons, clipped = torch.tensor(rng.poisson(light).astype(float)), torch.zeros(3, 32, 32, dtype=torch.bool)
     kernels = centred((0.0, 0.0), (9, 9))[None, None]
-    wrong = np.random.default_rng(0).normal(0, 0.01, (8, *kernels.shape))
+    wrong = rng.normal(0, 0.01, (8, *kernels.shape))
     draws = torch.tensor(kernels + wrong - wrong.mean((-2, -1), keepdims=True))
     sure, doubted = (
         spread_by_field(electrons, psf, clipped, COLOURS, draws=8, read_noise=READ,
