@@ -16,9 +16,10 @@ from neusee.nodes.restore._points._point_frames import Seen
 from neusee.nodes.restore._points._point_model import Linear, State, linear, moved, node_weights
 
 _SEARCH = 6  #: pixels by which a point may lie beside the first guess
-_STEPS = 20  #: Gauss-Newton steps, at most
+_STEPS = 30  #: Gauss-Newton steps, at most
 _ENOUGH = 1e-4  #: pixels by which no point moves any more at the end
 _MOST = 0.4  #: pixels by which a point may move in one step
+_HALVED = 8  #: times that a step is halved, at most
 _SURE = 4.0  #: standard deviations below saturation from which a pixel counts
 _CALM = 1e-9  #: share of the largest curvature that is added to each, in a step alone
 _ITERATIONS = 300  #: of conjugate gradients
@@ -45,11 +46,10 @@ def fitted(seen: Seen, shape: tuple[int, int], zones: tuple[int, int], window: t
         near = linear(seen, state, share)
         residual = seen.light - near.model(state.background)
         step = _solved(near, weight, _slope(near, state, weight, residual))
-        offset = step.offset.clamp(-_MOST, _MOST)
-        state = state.plus(step._replace(offset=offset))
-        state = _even(state)
+        before = state.offset
+        state = _ahead(seen, state, share, weight, step._replace(offset=step.offset.clamp(-_MOST, _MOST)))
         weight = _weight(seen, linear(seen, state, share).model(state.background))
-        if float(offset.abs().max()) < _ENOUGH:
+        if float((state.offset - before).abs().max()) < _ENOUGH:
             break
     near = linear(seen, state, share)
     residual = seen.light - near.model(state.background)
@@ -138,10 +138,21 @@ def _slope(near: Linear, state: State, weight: Tensor, residual: Tensor) -> Stat
     return slope._replace(background=slope.background + known)
 
 
-def _even(state: State) -> State:
-    """Return the state with PSFs of mean sum 1, which the signals make up for."""
-    total = state.kernels.sum((-2, -1)).mean(0)
-    return state._replace(kernels=state.kernels / total[:, None, None], signal=state.signal * total)
+def _ahead(seen: Seen, state: State, share: Tensor, weight: Tensor, step: State) -> State:
+    """Return the state after a step, halved until the frames fit better; the state itself if none does."""
+    worst = _square(seen, state, linear(seen, state, share), weight)
+    for _ in range(_HALVED):
+        ahead = state.plus(step)
+        if float(_square(seen, ahead, linear(seen, ahead, share), weight)) < float(worst):
+            return ahead
+        step = State(*(0.5 * part for part in step))
+    return state
+
+
+def _square(seen: Seen, state: State, near: Linear, weight: Tensor) -> Tensor:
+    """Return chi-square of the frames and of what is known of their backgrounds."""
+    known = (seen.background - state.background).square() / seen.doubt
+    return (weight * (seen.light - near.model(state.background)).square()).sum() + known.sum()
 
 
 def _curvature(near: Linear, weight: Tensor) -> State:
@@ -158,33 +169,36 @@ def _curvature(near: Linear, weight: Tensor) -> State:
 def _solved(near: Linear, weight: Tensor, right: State) -> State:
     """Return the step for a slope, by conjugate gradients that the curvature of each entry speeds up.
 
-    A shift of all points is a shift of the PSFs: the points move only as no shift of the PSFs at the nodes can.
+    A shift of all points is a shift of the PSFs: the points move only as no shift of the PSFs at the nodes can. A
+    factor of a PSF is one of the signals: the sum of each PSF stays as it is.
     """
     diagonal = _curvature(near, weight)
     inverse = State(*(1.0 / x for x in diagonal))
     calm = State(*(_CALM * x.amax() * torch.ones_like(x) for x in diagonal))
     x = State(*(torch.zeros_like(part) for part in right))
     bound = near.share @ torch.linalg.pinv(near.share)
-    free = torch.eye(len(bound), dtype=bound.dtype) - bound
-    rest = right._replace(offset=free @ right.offset)
-    way = rest.times(inverse)
-    way = way._replace(offset=free @ way.offset)
+    rest = _free(right, bound)
+    way = _free(rest.times(inverse), bound)
     size = rest.dot(way)
     first = size
     for _ in range(_ITERATIONS):
         if float(size) <= _RESIDUAL * float(first):
             break
         image = near.slope(weight * near.change(way)).plus(way.times(calm))
-        image = image._replace(
-            background=image.background + way.background / near.seen.doubt, offset=free @ image.offset
-        )
+        image = image._replace(background=image.background + way.background / near.seen.doubt)
+        image = _free(image, bound)
         step = size / way.dot(image)
         x, rest = x.plus(way, step), rest.plus(image, -step)
-        turned = rest.times(inverse)
-        turned = turned._replace(offset=free @ turned.offset)
+        turned = _free(rest.times(inverse), bound)
         size, before = rest.dot(turned), size
         way = turned.plus(way, size / before)
     return x
+
+
+def _free(change: State, bound: Tensor) -> State:
+    """Return a change without the part that does not change the frames; ``bound`` (point, point) projects on it."""
+    kernels = change.kernels - change.kernels.mean((-2, -1), keepdim=True)
+    return change._replace(kernels=kernels, offset=change.offset - bound @ change.offset)
 
 
 def _refuse_unseen(near: Linear, weight: Tensor) -> None:

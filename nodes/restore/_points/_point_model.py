@@ -50,8 +50,8 @@ def hats(at: Tensor, size: int, count: int) -> Tensor:
 def shifting(offset: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Return matrices (point, size, size) that shift samples by ``offset`` (point,), and their slopes.
 
-    The interpolation is a sinc with a Kaiser window: its error is below 1e-4 for up to 0.4 periods in a pixel. The slope
-    of the samples is continued beyond their ends.
+    The interpolation is a sinc with a Kaiser window: its error is below 1e-4 for up to 0.4 periods in a pixel. The
+    slope of the samples is continued beyond their ends.
     """
     apart = torch.arange(size)[:, None] - torch.arange(size + 2 * _REACH) + _REACH
     at = apart.double() - offset[:, None, None]

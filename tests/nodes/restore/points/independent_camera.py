@@ -20,7 +20,7 @@ def over_pixel(at, deviation):
 
 
 def spread(down, right, field, channel, lobe=0.13, far=2.2):
-    """Give the share of the light ``down`` and ``right`` pixels from a point at ``field``, from -0.5 to 0.5 of the frame."""
+    """Give the share of the light at a distance from a point at ``field``, which runs from -0.5 to 0.5 of the frame."""
     v, u = field
     sharp = 1.15 + 0.05 * channel
     parts = (
@@ -53,7 +53,7 @@ def points(rng, shape, places, signals, ground=5.0, dark=0.0, channels=3, **kind
 
 
 def centred(field, window, **kind):
-    """Give the true PSF (channel, y, x) of sum 1, shifted so that the centre of its squared mean is the middle pixel."""
+    """Give the true PSF (channel, y, x) of sum 1, the centre of its squared mean shifted into the middle pixel."""
     y, x = (np.arange(n) - n // 2 for n in window)
     shift = np.zeros(2)
     for _ in range(30):
