@@ -10,6 +10,7 @@ from neusee.nodes.values import Bands, MeasuredPsf, Psf
 from tests.nodes.restore.inverse.test_posterior_spread import chinese_house
 from tests.nodes.restore.points.independent_camera import CAMERA, READ, blurred, centred, place_in, points
 
+STRONG = {"lobe": 0.5, "far": 12.0}  #: half of the light moves by 12 pixels over the field
 ONE, COLOURS = torch.ones(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
 
 
@@ -75,28 +76,32 @@ def seen():
     """A picture behind a PSF that changes strongly over the field, and the grid of its nodes."""
     rng, shape = np.random.default_rng(7), (100, 100)
     scene = 6000 * chinese_house(140, rng)
-    light = blurred(scene, shape, lobe=0.35, far=6.0)
+    light = blurred(scene, shape, **STRONG)
     electrons = torch.tensor(rng.poisson(light) + rng.normal(0, READ, light.shape))
     nodes = [(y, x) for y in (24.5, 74.5) for x in (24.5, 74.5)]
-    true = np.stack([centred(place_in(p, shape), (25, 25), lobe=0.35, far=6.0) for p in nodes])
+    true = np.stack([centred(place_in(p, shape), (25, 25), **STRONG) for p in nodes])
     return electrons, scene[:, 20:-20, 20:-20], nodes, true.reshape(2, 2, 3, 25, 25)
 
 
-def psnr(restored, truth):
-    """Score within the rim, after the small shift and the level that explain most of the difference."""
+def scored(restored, truth):
+    """Give PSNR and difference within the rim, after the shift, scale and turn that explain most of the difference.
+
+    The centre of a measured PSF is its own choice at each node: a distortion of the picture is not measured.
+    """
     inner = (slice(None), slice(8, -8), slice(8, -8))
-    down, right = np.gradient(restored, axis=(1, 2))
-    columns = [x[inner].ravel() for x in (down, right, np.ones_like(down))]
+    y, x = np.indices(truth.shape[1:]) / truth.shape[1] - 0.5
+    slopes = [slope * way for slope in np.gradient(restored, axis=(1, 2)) for way in (1.0, y, x)]
+    columns = np.stack([part[inner].ravel() for part in (*slopes, np.ones_like(restored))], 1)
     rest = (truth - restored)[inner].ravel()
-    rest = rest - np.stack(columns, 1) @ np.linalg.lstsq(np.stack(columns, 1), rest, rcond=None)[0]
-    return 10 * np.log10(truth.max() ** 2 / (rest**2).mean())
+    rest = rest - columns @ np.linalg.lstsq(columns, rest, rcond=None)[0]
+    return 10 * np.log10(truth.max() ** 2 / (rest**2).mean()), rest.reshape(restored[inner].shape)
 
 
 def taken(folder, nodes, signals, seed):
     rng = np.random.default_rng(seed)
     for number, signal in enumerate(signals):
         places = [tuple(c + rng.uniform(-0.5, 0.5) for c in p) for p in nodes]
-        np.save(folder / f"p{number}.npy", points(rng, (100, 100), places, [signal] * 4, lobe=0.35, far=6.0))
+        np.save(folder / f"p{number}.npy", points(rng, (100, 100), places, [signal] * 4, **STRONG))
     files = tuple(sorted(folder.iterdir()))
     return measured_psf(torch.ones(3, 3), files=files, window=(25, 25), zones=(2, 2), draws=24, shape=(100, 100),
                         rng=torch.Generator().manual_seed(1), **CAMERA)  # fmt: skip
@@ -109,28 +114,28 @@ def test_restoring_with_the_measured_psf_comes_near_restoring_with_the_true_one(
     found = taken(tmp_path, nodes, [6e4, 6e4, 6e5, 6e5], 3)
     middle = known(kernels.mean((0, 1), keepdims=True))
     measured, told, mean = (
-        psnr(wiener_by_field(electrons, psf, clipped, read_noise=READ).numpy(), truth)
+        scored(wiener_by_field(electrons, psf, clipped, read_noise=READ).numpy(), truth)[0]
         for psf in (found, known(kernels), middle)
     )
-    raw = psnr(electrons.numpy(), truth)
+    raw, _ = scored(electrons.numpy(), truth)
     print(f"measured {measured:.3f} dB, told {told:.3f} dB, one PSF {mean:.3f} dB, raw {raw:.3f} dB")
     assert abs(measured - told) < 0.05
-    assert measured > mean + 0.2
+    assert measured > mean + 0.3
     assert measured > raw + 1
 
 
 @pytest.mark.slow
 def test_the_interval_holds_the_scene_when_the_psf_is_poorly_known(seen, tmp_path):
-    """One faint frame: without the draws of the PSF the interval is too narrow."""
+    """Two faint frames: without the draws of the PSF the interval is far too narrow."""
     electrons, truth, nodes, _ = seen
     clipped = torch.zeros(electrons.shape, dtype=torch.bool)
-    found = taken(tmp_path, nodes, [4e3, 4e3], 5)
-    restored = wiener_by_field(electrons, found, clipped, read_noise=READ).numpy()
+    found = taken(tmp_path, nodes, [2e3, 2e3], 5)
+    _, wrong = scored(wiener_by_field(electrons, found, clipped, read_noise=READ).numpy(), truth)
     inside = []
     for psf in (found, known(found.kernels)):
         seed = torch.Generator().manual_seed(2)
         deviation = spread_by_field(electrons, psf, clipped, COLOURS, draws=8, read_noise=READ, rng=seed).numpy()
-        inside.append((abs(restored - truth) < t.ppf(0.95, 8) * deviation)[:, 8:-8, 8:-8].mean())
+        inside.append((abs(wrong) < t.ppf(0.95, 8) * deviation[:, 8:-8, 8:-8]).mean())
     print(f"90 % intervals hold {inside[0]:.1%} with the error of the PSF, {inside[1]:.1%} without")
     assert 0.8 < inside[0] < 0.97
-    assert inside[0] > inside[1] + 0.02
+    assert inside[0] > inside[1] + 0.1
