@@ -78,9 +78,8 @@ def main(cameras=8, clean=200):
     seeds = range(int(cameras))
     plain = np.array([gain_and_noise(levels(seed)) for seed in range(24)])
     sd, centre = plain.std(0), plain[: len(seeds)]
-    print(
-        "| fault | amplitudes | found | bias, sd | found half of the time at | biases by one sd at |\n|---|---|---|---|---|---|"
-    )
+    print("| fault | amplitudes | found | bias, sd | found half of the time at | biases by one sd at |")
+    print("|---|---|---|---|---|---|")
     for name, amplitudes in AMPLITUDES.items():
         shares, biases = [], []
         for amplitude in amplitudes:

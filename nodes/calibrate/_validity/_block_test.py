@@ -11,7 +11,7 @@ from torch import Tensor
 from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Level, outcome, strongest
 
 _BLOCK = 8  #: pixels of a block on a side
-_STEPS = range(2, 33)  #: DN, steps to which compression may round the cosines of a block
+_STEPS = range(1, 33)  #: DN, steps to which compression may round the cosines of a block
 _SMOOTH = 1.2  #: standard deviations of a cosine over a step, above which noise covers the step evenly
 _LEVELS, _SIDE = 4, 256  #: levels, and pixels on a side, whose cosines are computed
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.fft import dctn
-from scipy.stats import chi2, kstest, norm
+from scipy.stats import chi2, kstest, kurtosis, kurtosistest, norm
 
 from neusee.nodes.calibrate._validity._block_test import _cosines, _kept_to, products
 from neusee.nodes.calibrate._validity._frame_pairs import normal_limit, outcome, strongest, studentised
-from neusee.nodes.calibrate._validity._noise_tests import _core, _hilferty
+from neusee.nodes.calibrate._validity._noise_tests import _core, _glynn, _hilferty
 
 
 def test_limits_are_those_of_the_normal_law():
@@ -26,6 +26,13 @@ def test_a_chi_square_number_becomes_a_normal_one():
     for freedom in (31, 500):
         for p in (0.5, 0.1, 1e-3, 1e-6):
             assert _hilferty(chi2.isf(p, freedom), freedom) == pytest.approx(norm.isf(p), abs=0.05)
+
+
+def test_the_kurtosis_becomes_a_normal_number_as_in_scipy():
+    rng = np.random.default_rng(4)
+    for n in (100, 4096):
+        for x in (rng.standard_normal(n), rng.standard_t(4, n), rng.uniform(-1, 1, n)):
+            assert _glynn(kurtosis(x, fisher=False), n) == pytest.approx(kurtosistest(x).statistic, rel=1e-9)
 
 
 def test_cosines_of_blocks_are_those_of_scipy():
