@@ -19,6 +19,7 @@ from neusee.nodes.restore._networks._own_network import OwnNetwork, own_network,
 from neusee.nodes.restore._networks._restorer import Restorer, parameter_groups, start_network
 from neusee.nodes.restore._networks._unet import UNet, unet
 from neusee.nodes.restore._sensor_likelihood import MeasuringSensor, measuring_sensor
+from neusee.nodes.restore._shading._shading_node import shading
 from neusee.nodes.restore._white_level import white_level
 
 __all__ = [
@@ -49,6 +50,7 @@ __all__ = [
     "parameter_groups",
     "require_exportable",
     "richardson_lucy",
+    "shading",
     "skip_critic_draws",
     "start_network",
     "try_network",

@@ -34,7 +34,7 @@ def frame(responses: Tensor, *, file: DataFile, shape: Shape, bits: Bits = 16) -
             depth or numbers that do not fit the sensor.
     Source: EMVA Standard 1288, release 4.0 (digital numbers of a camera).
     """
-    if problem := _problem(file, len(responses), tuple(shape), bits):
+    if problem := frame_problem(file, len(responses), tuple(shape), bits):
         raise ParameterError("file", problem)
     return torch.from_numpy(np.ascontiguousarray(_read(file).values, dtype=np.float32))
 
@@ -42,7 +42,7 @@ def frame(responses: Tensor, *, file: DataFile, shape: Shape, bits: Bits = 16) -
 @frame.preflight
 def _(*, responses: Tensor | None = None, file: Path, shape: Shape, bits: int = 16) -> list[str]:
     channels = None if responses is None else len(responses)
-    if problem := _problem(file, channels, tuple(shape), bits):
+    if problem := frame_problem(file, channels, tuple(shape), bits):
         raise ParameterError("file", problem)
     return []
 
@@ -59,7 +59,7 @@ class _Frame(NamedTuple):
 
 
 @once_per_version
-def _problem(file: Path, channels: int | None, shape: tuple[int, int], bits: int) -> str:
+def frame_problem(file: Path, channels: int | None, shape: tuple[int, int], bits: int) -> str:
     """Return why a file is no frame of this sensor, in one sentence, or an empty text."""
     try:
         values, depth = _read(file)

@@ -36,7 +36,7 @@ def test_a_node_without_a_tensor_says_why(path):
     line = dict.fromkeys(TRANSFORMS, "–")
     assert TABLE[path] == {"of": "", **line, "why": NOTHING_TO_FOLLOW[path]}
     inputs = BY_PATH[path].inputs  # a stop only says where the samples lie
-    assert inputs in ((), ("stop",)) or path in ("scene.hyperspectral", "sensor.frame")  # which read
+    assert inputs in ((), ("stop",)) or path in ("restore.shading", "scene.hyperspectral", "sensor.frame")  # which read
 
 
 @pytest.mark.parametrize("path", sorted(set(BY_PATH) - set(NOTHING_TO_FOLLOW)))
