@@ -83,6 +83,7 @@ def _shading(found: Shading) -> str:
     if not bool(found.identifiable):
         return (
             f"Dirt is not identifiable: {told}, and the probability that there is none is {float(found.clean):.0%}. "
+            "At least 8 different scenes, half of the variance and at most 5% are needed. "
             f"The frame is left as it is. The logarithm of a transmission stays unknown to {width} in half of the "
             "field; the interval of the picture includes this."
         )

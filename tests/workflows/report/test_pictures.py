@@ -139,7 +139,7 @@ def drawings(light: SimpleNamespace, table_arguments: dict) -> dict[str, tuple]:
         ),
         "height": (optics.height, dict(pupil=pupil(4.0))),
         "psf": (optics.psf, dict(plain=light.plain, mask=light.mask, bands=bands(), pixel_pitch=PIXEL)),
-        "shading": (shading_field.shading_field, dict(shading=shading())),
+        "shading": (shading_field.transmission, dict(shading=shading())),
         "suppression": (
             optics.suppression,
             dict(lsr=light.lsr, bands=bands(), psf=light.mask, bsr=torch.full((B,), 0.9)),

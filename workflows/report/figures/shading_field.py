@@ -11,7 +11,7 @@ NORMAL = 1.645  #: standard deviations at the ends of an interval of 90 %
 
 
 @drawn
-def shading_field(*, shading: Shading) -> Any:
+def transmission(*, shading: Shading) -> Any:
     """Draw the estimated transmission at each knot, and half the width of its 90 % interval."""
     figure, axes = canvas(8.0, 4.0, 1, 2)
     wide = NORMAL * shading.deviation
