@@ -25,6 +25,7 @@ from neusee.nodes.restore._networks._nafnet import nafnet
 from neusee.nodes.restore._networks._network_node import network
 from neusee.nodes.restore._networks._own_network import tried
 from neusee.nodes.restore._networks._unet import unet
+from neusee.nodes.restore._points._by_field import spread_by_field, wiener_by_field
 from neusee.nodes.restore._shading._frame_cells import grid
 from neusee.nodes.restore._shading._shading_node import shading
 from neusee.nodes.restore._white_level import white_level
@@ -44,7 +45,7 @@ _LAWS = 400.0  #: bytes, and operations, of the laws of a scene for each element
 _FIELD = 60.0  #: products of matrices of the knots
 _LAYER = 1e-3  #: operations of a transform that take as long as one of a layer
 
-for node in (electrons, wiener, richardson_lucy, fft_mamba, nafnet, network, unet):
+for node in (electrons, wiener, wiener_by_field, richardson_lucy, fft_mamba, nafnet, network, unet):
     node.shape(like_first)
 
 
@@ -146,6 +147,11 @@ def _(
     electrons: Tensor, psf: Any, illuminant: Any, responses: Any, bands: Any, clipped: Any, matrix: Tensor,
     *glare: Any, **params: Any,
 ) -> Tensor:  # fmt: skip
+    return blank(len(matrix), *electrons.shape[-2:], dtype=at_least_single(electrons))
+
+
+@spread_by_field.shape
+def _(electrons: Tensor, measured: Any, clipped: Any, matrix: Tensor, **params: Any) -> Tensor:
     return blank(len(matrix), *electrons.shape[-2:], dtype=at_least_single(electrons))
 
 
