@@ -148,6 +148,20 @@ class FoundLasers(NamedTuple):
     correlation: Tensor  #: (laser, value, value) float64, of n_y, n_x, wavelength and the strength of each channel
 
 
+class Shading(NamedTuple):
+    """The smooth transmission that frames of one camera share: dirt on lens and window, and fall-off to the corners."""
+
+    transmission: Tensor  #: (y, x) by which a frame is divided; its geometric mean is 1; 1 where not identifiable
+    spread: Tensor  #: (y, x) standard deviation of its logarithm, of what the division leaves
+    estimate: Tensor  #: (knot y, knot x) float64, posterior mean of the logarithm
+    deviation: Tensor  #: (knot y, knot x) float64, posterior standard deviation of the logarithm
+    told: Tensor  #: () float64, share of the variance of the field that the frames tell, 0 to 1
+    clean: Tensor  #: () float64, probability that there is no field
+    identifiable: Tensor  #: () bool: True if the frames tell the field
+    frames: Tensor  #: () int64, how many there were
+    alike: Tensor  #: () float64, correlation of the details of two scenes: 0 for scenes that differ
+
+
 class MeasuredPsf(NamedTuple):
     """PSFs that frames of point sources gave, at the nodes of a grid over the frame, and how sure they are.
 

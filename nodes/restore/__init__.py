@@ -21,6 +21,7 @@ from neusee.nodes.restore._networks._unet import UNet, unet
 from neusee.nodes.restore._points._by_field import spread_by_field, wiener_by_field
 from neusee.nodes.restore._points._measured_psf import measured_psf
 from neusee.nodes.restore._sensor_likelihood import MeasuringSensor, measuring_sensor
+from neusee.nodes.restore._shading._shading_node import shading
 from neusee.nodes.restore._white_level import white_level
 
 __all__ = [
@@ -52,6 +53,7 @@ __all__ = [
     "parameter_groups",
     "require_exportable",
     "richardson_lucy",
+    "shading",
     "skip_critic_draws",
     "spread_by_field",
     "start_network",

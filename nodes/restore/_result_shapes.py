@@ -1,6 +1,7 @@
 """Shapes of the results of the restoring nodes, and the work of the deconvolution and of the networks."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -25,9 +26,11 @@ from neusee.nodes.restore._networks._network_node import network
 from neusee.nodes.restore._networks._own_network import tried
 from neusee.nodes.restore._networks._unet import unet
 from neusee.nodes.restore._points._by_field import spread_by_field, wiener_by_field
+from neusee.nodes.restore._shading._frame_cells import grid
+from neusee.nodes.restore._shading._shading_node import shading
 from neusee.nodes.restore._white_level import white_level
 from neusee.nodes.shape_rules import at_least_single, blank, double, like_first, transform_operations
-from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
+from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil, Shading
 
 _SYSTEM = 35.0  #: bytes for each element of a dense system: the matrix, its factors and copies
 _INVERTED = 0.30  #: operations of a transform that take as long as one of the cube of the side of an inverted matrix
@@ -38,6 +41,8 @@ _MODE = 24.0  #: bytes for each pixel of a pattern that the glare may have: its 
 _SEARCHED = 150.0  #: bytes for each pixel of a frame in which lasers are searched: patterns, and slopes of a fit
 _LINES = 61  #: spectral lines that a search tries, each with five transforms
 _KEPT = 1 / 8  #: bytes of inner results of a network that need as much memory as a byte of the usual work of a node
+_LAWS = 400.0  #: bytes, and operations, of the laws of a scene for each element of their matrices
+_FIELD = 60.0  #: products of matrices of the knots
 _LAYER = 1e-3  #: operations of a transform that take as long as one of a layer
 
 for node in (electrons, wiener, wiener_by_field, richardson_lucy, fft_mamba, nafnet, network, unet):
@@ -57,6 +62,21 @@ def _(channels: Tensor, matrix: Tensor) -> Tensor:
 @colour_matrix.shape
 def _(bands: Any, illuminant: Any, responses: Tensor, *inputs: Any, **params: Any) -> Tensor:
     return double(3, len(responses))
+
+
+@shading.shape
+def _(responses: Any, *, shape: Sequence[int], **params: Any) -> Shading:
+    y, x = shape
+    knots, one = grid((y, x)), double()
+    counts = blank(dtype=torch.bool), blank(dtype=torch.int64)
+    return Shading(blank(y, x), blank(y, x), double(*knots), double(*knots), one, one, *counts, one)
+
+
+@shading.work
+def _(result: Shading, *inputs: Any, files: Sequence[Any] = (), **params: Any) -> tuple[float, float]:
+    y, x = result.transmission.shape
+    knots = result.estimate.numel()
+    return 100.0 * y * x + _LAWS * knots**2, _FIELD * knots**3 + 10.0 * len(files) * (y * x + _LAWS * knots**2)
 
 
 @nearby_glare.shape

@@ -489,7 +489,7 @@ _ELSEWHERE = {
         "calibrate.density", "calibrate.least_squares", "calibrate.levels", "calibrate.prior", "calibrate.reduce",
         "calibrate.stray_light", "calibrate.stray_prior", "calibrate.sufficient", "restore.find_lasers",
         "restore.found_glare", "restore.found_nearby", "restore.measured_psf", "restore.nearby_glare",
-        "restore.richardson_lucy", "restore.wiener", "restore.wiener_by_field", "spectra.compress"),
+        "restore.richardson_lucy", "restore.shading", "restore.wiener", "restore.wiener_by_field", "spectra.compress"),
     "copies, counts or states": ("laser.bright_pixels", "laser.damaged_pixels", "laser.dazzle", "laser.dazzle_curve",
         "metrics.saturated", "optics.stop", "restore.clipped", "sensor.crop", "sensor.limits", "spectra.filters"),
     "has a stated error above 1e-11": ("flare.stray_light", "flare.stray_shares", "metrics.quality",
