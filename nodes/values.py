@@ -148,6 +148,20 @@ class FoundLasers(NamedTuple):
     correlation: Tensor  #: (laser, value, value) float64, of n_y, n_x, wavelength and the strength of each channel
 
 
+class WienerProblem(NamedTuple):
+    """The deconvolution of `restore.wiener`: a linear problem for a scene of mean 0 and variance 1, and its answer."""
+
+    picture: Tensor  #: (channel, y, x), without the glare, of mean 0 and in units of ``scale``
+    weight: Tensor  #: (channel, y, x), 1 / variance of the noise; 0 where a pixel is clipped
+    psf: Tensor  #: (channel, any, any), of a sum near 1
+    glare: Tensor  #: (pattern, channel, y, x), patterns that are added with any strength
+    doubts: Tensor  #: (pattern, channel, y, x), patterns that are added with a strength of mean 0 and variance 1
+    answer: Tensor  #: (channel, y, x), what the filter restores, in units of ``scale``
+    seen: Tensor  #: (channel, y, x), the blurred answer, in which light from beyond the frame counts too
+    scale: Tensor  #: (channel, 1, 1) e-, of the answer behind a perfect lens
+    mean: Tensor  #: (channel, 1, 1) e-, of the scene behind a perfect lens
+
+
 #: for each class, the fields with one entry per band
 BAND_FIELDS: dict[type, tuple[str, ...]] = {
     Bands: Bands._fields,

@@ -29,6 +29,7 @@ from neusee.workflows.training.parallel.band_shards import Shards
 from neusee.workflows.training.parallel.picture_rounds import Pictures
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
+from neusee.workflows.training.posed_pictures import Given, PosedPictures, given_of, tensors_of
 from neusee.workflows.training.stored_pool import StoredPool
 
 _LASER = ("optics.laser_irradiance", "strength")  #: the node of a laser, and the parameter that is 0 without a laser
@@ -44,11 +45,17 @@ class Sample:
     truth: Tensor  #: (n, 3, y, x), the true picture
     light: Tensor  #: (band,), the fraction of the light of the scene that the mask keeps
     drawn: Mapping[str, Any]  #: the values that were sampled for the picture
+    given: Given = ()  #: what the network needs beside the picture
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """Return picture, true picture and light by name."""
-        return {"picture": self.picture, "truth": self.truth, "light": self.light}
+        """Return picture, true picture, light, and what the network needs beside the picture, by name."""
+        return {"picture": self.picture, "truth": self.truth, "light": self.light, **tensors_of(self.given)}
+
+    @classmethod
+    def of(cls, tensors: Mapping[str, Tensor], drawn: Mapping[str, Any]) -> Sample:
+        """Return the training picture whose tensors `tensors` named."""
+        return cls(tensors["picture"], tensors["truth"], tensors["light"], drawn, given_of(tensors))
 
 
 class TrainingStream:
@@ -70,11 +77,14 @@ class TrainingStream:
         self.seed, self.mesh, self.held_out = recipe.seed, mesh, held_out
         self._pool = settings.pool if frozen else None
         self._kept: dict[tuple[int, int], Sample] = {}
-        outputs = (settings.picture, settings.truth, settings.light, settings.psf)
+        outputs: tuple[str, ...] = (settings.picture, settings.truth, settings.light, settings.psf)
         require_steps(recipe, "train", (*outputs, settings.scene, *([learn] if learn else [])))
         self._inputs = Inputs.of(recipe, outputs) if recipe.uncertain and recipe.uncertain.names else None
         self.shape = _frame(recipe, settings.scene)
+        self._posed = PosedPictures.of(recipe, settings)
         recipe = in_precision(frozen or recipe, settings.dtype)
+        if self._posed:
+            recipe, outputs = self._posed.within(recipe), self._posed.outputs
         recipe = with_substitutions(recipe, outputs, {learn} if learn else ())
         order = needed(recipe, outputs)
         self._stored = StoredPool(recipe, settings, store, device) if self._pool and settings.keep_pool else None
@@ -102,7 +112,7 @@ class TrainingStream:
         self._whole = [name for name in border if name in read]
         caller = self.shards.call
         self.shared = as_function(recipe, learn, outputs=border, caller=caller, **ways) if learn else None
-        outputs = [settings.picture, settings.truth, settings.light]
+        outputs = [*(self._posed.steps if self._posed else (settings.picture,)), settings.truth, settings.light]
         self._each = Pictures(recipe, [*border, settings.scene, *self._readers], outputs, noise, self.shards, ways)
 
     @property
@@ -178,8 +188,8 @@ class TrainingStream:
         if self._stored is None or stage == HELD_OUT:
             return simulated()
         given = {name: theta[name] for name in self._readers}
-        return Sample(**self._stored.picture(theta[self.settings.scene], given, noise, lambda: simulated().tensors),
-                      drawn=drawn)  # fmt: skip
+        kept = self._stored.picture(theta[self.settings.scene], given, noise, lambda: simulated().tensors)
+        return Sample.of(kept, drawn)
 
     def _drawn(self, stage: int, number: int) -> tuple[dict[str, Any], int, dict[str, Any]]:
         """Sample the random inputs of a training picture; return the inputs, the noise seed, and all values by name."""
@@ -202,7 +212,12 @@ class TrainingStream:
         Antialiased `kornia.geometry.transform.resize` lets stripes alias: at 2/3 of the size the finest stripes keep a
         contrast of 0.69 with kornia, and of 0.09 with `resize`.
         """
-        both = [values[name].to(self.settings.dtype) for name in (self.settings.picture, self.settings.truth)]
+        truth = values[self.settings.truth]
+        if self._posed is not None:
+            told, given = self._posed.read(values)
+            pair = (told.to(self.settings.dtype)[None], truth.to(self.settings.dtype)[None])
+            return Sample(*pair, values[self.settings.light], drawn, given)
+        both = [picture.to(self.settings.dtype) for picture in (values[self.settings.picture], truth)]
         if self.settings.size is not None:
             both = [resize(picture, *self.settings.size) for picture in both]
         picture, truth = self._patches(torch.stack(both), drawn["noise"])

@@ -14,14 +14,15 @@ LOWEST = 512  #: pixels a side, up to which each step solves the lowest frequenc
 _PIECE = 2**18  #: numbers of a spectrum worked on at a time, which fit in the cache
 
 
-def descend(seen: Blurred, x: Tensor, steps: int, enough: float) -> Tensor:
+def descend(seen: Blurred, x: Tensor, steps: int, enough: float, inverse: Preconditioner | None = None) -> Tensor:
     """Improve the half spectrum `x` of a picture in place by at most `steps` conjugate-gradient steps, and return `x`.
 
     The steps end early when the squared distance from the solution, in units of the posterior, is about `enough`.
+    `inverse` is the preconditioner of the problem, where the caller has it: it depends on no pixel of the picture.
     """
     if steps < 1:
         return x
-    normal, inverse = _Normal(seen), _Inverse(seen)
+    normal, inverse = _Normal(seen), inverse or Preconditioner(seen)
     left, way, change = normal.slope(x), torch.empty_like(x), torch.empty_like(x)
     size = inverse(left, way)
     enough = max(enough, 1e-20 * float(size))
@@ -101,8 +102,8 @@ class _Normal:
             result[:, rows].mul_(self.seen.transfer[:, rows].conj()).add_(prior, alpha=sign)
 
 
-class _Inverse:
-    """The preconditioner: the inverse normal matrix of a picture without edges, exact at the lowest frequencies."""
+class Preconditioner:
+    """The inverse normal matrix of a picture without edges, made exact at the lowest frequencies."""
 
     def __init__(self, seen: Blurred) -> None:
         own, shared = inverse_colour(len(seen.picture), seen.grey)

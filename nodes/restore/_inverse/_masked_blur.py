@@ -37,6 +37,12 @@ class Blurred:
         y, x = self.picture.shape[-2:]
         return blurred(self.transfer, spectrum, self.torus, (y, x))
 
+    def first(self, spectrum: Tensor) -> Tensor:
+        """Return the pixels of x in the frame of the picture, given half the spectrum of x."""
+        y, x = self.picture.shape[-2:]
+        parts = [torch.fft.irfft2(s, s=self.torus)[:y, :x] for s in spectrum]  # one batch takes twice as long
+        return torch.stack(parts)
+
     def gathered(self, pixels: Tensor) -> Tensor:
         """Return half the spectrum that results from the adjoint of `blur`, applied to a picture."""
         return gathered(self.transfer, pixels, self.torus)
