@@ -109,6 +109,15 @@ WEAK = {
     "evaluation.comparison_pictures:_WEAKEST": 30.0,
     "evaluation.comparison_pictures:CASES": {name: LASERS[name] for name in ("green", "red", NONE)},
 }
+PROTOCOL = (
+    "scene.shape=[28,28]", "sensor.shape=[24,24]", "--scenes", "1", "--strengths", "0,30", "--pipelines",
+    "flat+none, half_ring+none", "--equal-protection", "1e-5",
+)  # fmt: skip
+#: two of the six lasers of the protocol's page, and weak ones
+TWO_OF_SIX = {
+    "evaluation.comparison_pictures:_WEAKEST": 30.0,
+    "evaluation.measured_points:SIX": {name: LASERS[name] for name in ("green", "red", NONE)},
+}
 #: settings of an accuracy study, each measured once
 FEW_POINTS = {
     "studies.accuracy.accuracy_study:_FEWER": (1e-1,), "studies.accuracy.accuracy_study:TIMES": 1,
@@ -154,6 +163,11 @@ STAND_INS = {
         "ten minutes", more=(*TRAINING, *ONE)),
     "train train_small train.photographs=my_photographs train.augment.symmetries=all train.augment.exposure=2 "
     "train.augment.colour=0.3": StandIn("ten minutes", more=(*TRAINING, *ONE)),
+    "train train_small train.photographs=my_photographs train.picture=restored +mismatch=usual": StandIn(
+        "ten minutes", more=(*TRAINING, *ONE)),
+    "train train_small train.photographs=my_photographs train.picture=restored +height_error=smooth "
+    "\"train.mismatch={height_error.rms: 'uniform(0 nm, 20 nm)', height_error.depth: 'normal(0, 0.01)'}\"": StandIn(
+        "ten minutes", more=(*TRAINING, *ONE)),
     'train my/train_smallnet.yaml "train.export=[pt2]"': StandIn("minutes", more=SMALLNET),
     "train train_hour train.photographs=my_photographs": StandIn("a quarter of an hour", more=(
         *TRAINING[:-2], "train.network.width=4", "train.stages.2.iterations=1", "train.stages.2.batch=2")),
@@ -206,6 +220,8 @@ STAND_INS = {
         "minutes", more=PROTECTION, instead={"3": "2"}, constants=FEW_STOPS),
     "study protection axicon doe.waves=5 --light continuous --draws 6": StandIn(
         "minutes", more=PROTECTION, instead={"6": "2"}, constants=FEW_STOPS),
+    "evaluate paper_protocol --data photographs": StandIn(
+        "days: the camera of the paper has 2160 x 2160 samples", more=PROTOCOL, constants=TWO_OF_SIX),
     f"{EVALUATE} --scenes 3 --strengths 0,1e3,1e6": StandIn(
         "a minute", instead={**FIELD, "3": "1", "0,1e3,1e6": "0,30"}, constants=WEAK),
     f"{EVALUATE} --scenes 3 --strengths 1e4,1e6 "

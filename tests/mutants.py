@@ -421,8 +421,8 @@ MUTANTS = (
     ),
     Mutant(
         "workflows/evaluation/confidence_intervals.py",
-        ", len(x) - 1)",
-        ", len(x))",
+        ", count - 1)) * spread",
+        ", count)) * spread",
         within("workflows/evaluation", "run_evaluation.py::test_an_interval_is_that_of_students_table"),
     ),
 )

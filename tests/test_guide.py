@@ -15,6 +15,7 @@ from typer.main import get_command
 from neusee.workflows.cli import app, catalogue
 from neusee.workflows.cli.command_frame import split
 from neusee.workflows.evaluation.pipelines import compose_pipelines, read_pipelines
+from neusee.workflows.evaluation.run_evaluation import read_settings
 from neusee.workflows.placement.machine_file import read_machines
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.sweeps.axes import points, read_words
@@ -81,7 +82,8 @@ def test_every_command_line_parses_and_its_recipe_loads(words, folder, monkeypat
     if command == "train":
         assert recipe.training or recipe.lifting
     if command == "evaluate":
-        compose_pipelines(name, changes, read_pipelines(values["pipelines"], folder), folder)
+        asked = values["pipelines"] or read_settings(name, changes, folder).pipelines
+        compose_pipelines(name, changes, read_pipelines(asked, folder), folder)
 
 
 # --- what pages say ---------------------------------------------------------------------------------------------------
@@ -133,7 +135,7 @@ def test_the_gallery_has_a_section_with_command_picture_and_time_for_each_recipe
     sections = dict(re.findall(r"^## `(\w+)`\n(.*?)(?=^## )", text, re.MULTILINE | re.DOTALL))
     assert sorted(sections) == sorted(path.stem for path in (ROOT / "recipes").glob("*.yaml"))
     for name, section in sections.items():
-        assert re.search(rf"^    neusee (run|train|safety) {name}\b", section, re.MULTILINE), name
+        assert re.search(rf"^    neusee (run|train|safety|evaluate) {name}\b", section, re.MULTILINE), name
         assert "<!-- picture " in section, name
         assert re.search(r"^Time: (\d+ s\b|half an hour|hours|days)", section, re.MULTILINE), name
 

@@ -357,53 +357,40 @@ HOUSE_RULES = (classes, names, places, lengths, offers)
 
 # --- the tests --------------------------------------------------------------------------------------------------------
 
-every_file = pytest.mark.parametrize("path", NODES + WORKFLOWS, ids=lambda p: str(p.relative_to(ROOT)))
-every_node_file = pytest.mark.parametrize("path", NODES, ids=lambda p: str(p.relative_to(ROOT)))
-every_workflow_file = pytest.mark.parametrize("path", WORKFLOWS, ids=lambda p: p.name)
+#: modules of nodes/ itself, each with the modules of neusee.nodes that it may import
+BELOW = {
+    **{name: set() for name in ("units.py", "constants.py", "values.py", "_error_bound.py", "own_modules.py")},
+    "_node.py": {"neusee.nodes._error_bound", "neusee.nodes.own_modules"},
+}
 
 
-@every_file
-def test_the_house_is_imported_by_its_full_name(path):
-    assert not [e for e in imports(parsed(path)) if outer(e.module) in ("nodes", "workflows", "recipes")]
+def where(paths, offends):
+    """The imports that offend, each with its file and line."""
+    return [
+        f"{path.relative_to(ROOT)}:{each.line}: {each.full}"
+        for path in paths
+        for each in imports(parsed(path))
+        if offends(each)
+    ]
 
 
-@every_node_file
-def test_nodes_know_only_physics(path):
-    names = [e.full for e in imports(parsed(path))]
-    assert not [n for n in names if n.startswith(("neusee.workflows", "neusee.recipes"))]
-    assert not [n for n in names if outer(n) in FORBIDDEN_IN_NODES]
+def test_the_house_is_imported_by_its_full_name():
+    assert not where(NODES + WORKFLOWS, lambda each: outer(each.module) in ("nodes", "workflows", "recipes"))
 
 
-@every_node_file
-def test_units_below_node_below_the_families(path):
-    names = {e.module for e in imports(parsed(path)) if e.module.startswith("neusee.nodes")}
-    allowed = {
-        "units.py": set(),
-        "constants.py": set(),
-        "values.py": set(),
-        "_node.py": {"neusee.nodes._error_bound", "neusee.nodes.own_modules"},
-        "_error_bound.py": set(),
-        "own_modules.py": set(),
-    }
-    if path.parent == ROOT / "nodes" and path.name in allowed:
-        assert names <= allowed[path.name]
+def test_nodes_know_only_physics():
+    assert not where(NODES, lambda each: each.full.startswith(("neusee.workflows", "neusee.recipes")))
+    assert not where(NODES, lambda each: outer(each.full) in FORBIDDEN_IN_NODES)
 
 
-@every_file
-def test_heavy_imports_wait_until_they_are_needed(path):
-    if path.is_relative_to(ROOT / "nodes"):
-        assert not [e for e in imports(parsed(path)) if e.when == "top" and outer(e.module) in HEAVY]
+@pytest.mark.parametrize("name", BELOW)
+def test_units_below_node_below_the_families(name):
+    names = {e.module for e in imports(parsed(ROOT / "nodes" / name)) if e.module.startswith("neusee.nodes")}
+    assert names <= BELOW[name]
 
 
-@every_workflow_file
-def test_only_calibration_imports_emcee(path):
-    assert not list(samplers(alone(path.relative_to(HOUSE).as_posix())))
-
-
-@every_workflow_file
-def test_no_room_of_workflows_imports_one_above_it(path):
-    files = alone(path.relative_to(HOUSE).as_posix())
-    assert not [*direction(files), *siblings(files)]
+def test_heavy_imports_wait_until_they_are_needed():
+    assert not where(NODES, lambda each: each.when == "top" and outer(each.module) in HEAVY)
 
 
 @pytest.mark.parametrize("rule", FILE_RULES + HOUSE_RULES, ids=lambda rule: rule.__name__)

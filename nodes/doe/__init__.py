@@ -5,6 +5,7 @@ from neusee.nodes.doe._analytic_masks import axicon, cubic, flat, half_rings, sp
 from neusee.nodes.doe._equal_filter import equal_filter
 from neusee.nodes.doe._fabrication_limits import fabricate
 from neusee.nodes.doe._glass_table import index_rows
+from neusee.nodes.doe._height_error import height_error
 from neusee.nodes.doe._height_map_files import read_height_map
 from neusee.nodes.doe._minimum_feature import smooth
 from neusee.nodes.doe._parametrisations import PARAMETRISATIONS, Drawn, Modes, Pixels, Rings, Written
@@ -32,6 +33,7 @@ __all__ = [
     "fabricate",
     "flat",
     "half_rings",
+    "height_error",
     "height_map",
     "index_curve",
     "index_rows",

@@ -7,6 +7,7 @@ from torch import Tensor
 from neusee.nodes.doe._analytic_masks import axicon, cubic, flat, half_rings, spiral_axicon, vortex, zernike
 from neusee.nodes.doe._equal_filter import equal_filter
 from neusee.nodes.doe._fabrication_limits import fabricate
+from neusee.nodes.doe._height_error import height_error
 from neusee.nodes.doe._minimum_feature import smooth
 from neusee.nodes.doe._refractive_index import material
 from neusee.nodes.doe._sampled_height_map import pixelwise
@@ -17,6 +18,7 @@ from neusee.nodes.values import Bands, Shade, Stop
 
 equal_filter.shape(like_first)
 fabricate.shape(like_first)
+height_error.shape(like_first)
 smooth.shape(like_first)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,7 +19,7 @@ _PICTURES = frozenset({".png", ".jpg", ".jpeg", ".jpe", ".webp", ".tif", ".tiff"
 _ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}  #: first bytes of a format -> end mark of a file of this format
 _TAIL = 1 << 16  #: bytes at the end of a file that must contain the end mark: some cameras write more after it
 _ORDER, _PART, _DRAW = 0, 1, 2  #: random streams of one seed
-_KEPT = 64  #: decoded photographs that a process keeps
+_KEPT = 1 << 30  #: bytes of decoded photographs that a process keeps
 _TRIES = 100  #: broken photographs in a row, after which drawing stops with an error
 
 Index = int | Sequence[int]  #: the number of a scene, or (stage, number) of a picture for training
@@ -82,10 +81,20 @@ def crop_photograph(path: Path, shape: tuple[int, int], seed: int, index: Index)
     return picture[:, top : top + shape[0], left : left + shape[1]].contiguous()
 
 
-@functools.lru_cache(maxsize=_KEPT)
+_pictures: dict[Path, Tensor] = {}  #: the decoded photographs, the last used one last
+
+
 def _decoded(path: Path) -> Tensor:
-    picture: Tensor = photograph(file=path)
+    """Return a photograph as linear sRGB (3, y, x), from memory if it is one of the last that were used."""
+    picture: Tensor = _pictures.pop(path) if path in _pictures else photograph(file=path)
+    _pictures[path] = picture
+    while len(_pictures) > 1 and sum(map(_size, _pictures.values())) > _KEPT:
+        del _pictures[next(iter(_pictures))]
     return picture
+
+
+def _size(picture: Tensor) -> int:
+    return picture.numel() * picture.element_size()
 
 
 def _indices(index: Index) -> list[int]:

@@ -1,12 +1,14 @@
 """How often lasers are found in one frame, how exactly, and how often no laser is taken for one.
 
     python tests/benchmarks/bench_laser_search.py results.jsonl --seeds 1000 40
+    python tests/benchmarks/bench_laser_search.py results.jsonl --seeds 1000 50 --only empty --side 64
     python tests/benchmarks/bench_laser_search.py results.jsonl --report
 
 The frames come from `tests/nodes/restore/lasers/own_camera.py`, a camera in NumPy alone. Each seed makes, for each
 mask, two frames without a laser, one of them with lamps, one with a laser of 1000 or more, and one with a weaker laser.
-A frame that stands in the file is not computed again, so that a run that was stopped continues. The patterns on the
-axis, which depend on the mask alone, are computed once.
+``--only`` keeps the frames without a laser, or those with one. A frame that stands in the file is not computed again,
+so that a run that was stopped continues. The patterns on the axis, which depend on the mask alone, are computed once.
+Intervals of rates are those of Clopper and Pearson, 90 %.
 """
 
 import argparse
@@ -19,6 +21,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
+from scipy.stats import beta
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
@@ -27,7 +30,6 @@ from neusee.nodes.restore._lasers import _find_lasers  # noqa: E402
 from tests.nodes.restore.lasers import own_camera as own  # noqa: E402
 from tests.nodes.restore.lasers.as_inputs import found_in, kept_templates  # noqa: E402
 
-SIDE = 128
 MASKS = ("plain", "half_ring", "cubic")
 STRONG, WEAK = (1e3, 1e4, 1e5, 1e6), (1.0, 10.0, 100.0)
 KINDS = ("sample", "leaves", "noise")
@@ -42,18 +44,18 @@ def cases(seed):
         yield f"{mask}-weak", mask, WEAK[seed % len(WEAK)], 0
 
 
-def row(seed, name, mask, strength, lamps):
+def row(seed, name, mask, strength, lamps, side):
     """What is true of one frame, and what was found."""
     rng = np.random.default_rng([seed, *name.encode()])
     kind = KINDS[int(rng.integers(len(KINDS)))]
-    spot, wavelength = tuple(rng.uniform(-0.35, 0.35, 2) * SIDE), rng.uniform(420e-9, 670e-9)
+    spot, wavelength = tuple(rng.uniform(-0.35, 0.35, 2) * side), rng.uniform(420e-9, 670e-9)
     lasers = [own.Laser(spot, wavelength, strength)] if strength else []
-    frame = own.frame(mask, kind, SIDE, lasers, rng, lamps)
+    frame = own.frame(mask, kind, side, lasers, rng, lamps)
     start = time.process_time()
     found = found_in(frame, mask)
     pixel = own.PITCH / own.FOCAL
     return {
-        "seed": seed, "name": name, "mask": mask, "strength": strength, "lamps": lamps, "kind": kind,
+        "seed": seed, "name": name, "side": side, "mask": mask, "strength": strength, "lamps": lamps, "kind": kind,
         "clipped": float(frame.clipped.any(0).mean()), "seconds": round(time.process_time() - start, 2),
         "spot": list(spot), "nm": wavelength * 1e9, "channels": lasers[0].channels.tolist() if lasers else None,
         "number": int(found.number), "found_spot": (found.direction[0] / pixel).tolist(),
@@ -64,17 +66,18 @@ def row(seed, name, mask, strength, lamps):
     }  # fmt: skip
 
 
-def run(path, first, count):
+def run(path, first, count, side, only):
     """Append the frames that the file lacks."""
-    done = {(r["seed"], r["name"]) for r in rows(path)}
+    done = {(r["seed"], r["name"], r["side"]) for r in rows(path)}
     keep = functools.cache(kept_templates)
     for seed in range(first, first + count):
         for name, mask, strength, lamps in cases(seed):
-            if (seed, name) not in done:
-                with patch.object(_find_lasers, "line_templates", lambda *_, mask=mask: keep(mask, SIDE)):
-                    each = row(seed, name, mask, strength, lamps)
-                with path.open("a") as file:
-                    file.write(json.dumps(each) + "\n")
+            if (seed, name, side) in done or only == ("lasers" if strength == 0 else "empty"):
+                continue
+            with patch.object(_find_lasers, "line_templates", lambda *_, mask=mask: keep(mask, side)):
+                each = row(seed, name, mask, strength, lamps, side)
+            with path.open("a") as file:
+                file.write(json.dumps(each) + "\n")
 
 
 def rows(path):
@@ -85,13 +88,27 @@ def inside(value, ends):
     return ends[0] <= value <= ends[1]
 
 
+def rate(count, of):
+    """A share with its interval of 90 %, in percent."""
+    low, high = beta.ppf([0.05, 0.95], [count, count + 1], [of - count + 1, of - count])
+    return f"{count:3} of {of:3}, {0 if count == 0 else 100 * low:3.0f} to {100 if count == of else 100 * high:.1f} %"
+
+
 def report(all_rows):
     """Print the rates of each mask and strength."""
     free = [r for r in all_rows if not r["strength"]]
-    print(f"without a laser: {sum(r['number'] > 0 for r in free)} of {len(free)} frames with a false alarm")
     for lamps in (False, True):
         some = [r for r in free if bool(r["lamps"]) == lamps]
-        print(f"  {'with' if lamps else 'no'} lamps: {sum(r['number'] > 0 for r in some)} of {len(some)}")
+        alarms = rate(sum(r["number"] > 0 for r in some), len(some))
+        print(f"false alarms {'with' if lamps else 'without'} lamps: {alarms}")
+    print(f"false alarms: {rate(sum(r['number'] > 0 for r in free), len(free))}")
+    seconds = np.array([r["seconds"] for r in all_rows])
+    print(f"seconds of a processor a frame: {np.median(seconds):.1f} in the median, {seconds.max():.1f} at most")
+    print("strength: found where it is (0.2 px and 5 nm), with the interval of 90 % of that rate")
+    for strength in (*WEAK, *STRONG):
+        some = [r for r in all_rows if r["strength"] == strength]
+        if some:
+            print(f"  {strength:7g}: {rate(sum(map(right, some)), len(some))}")
     print(
         "mask, strength: frames, found, identifiable, place within 0.2 px, within 5 nm, coverage of place, nm, channels"
     )
@@ -103,6 +120,12 @@ def report(all_rows):
         print(f"{mask:9} {strength:7g}: {line(some)}")
     extra = [r for r in all_rows if r["strength"] and r["number"] > 1]
     print(f"more than one laser found where there is one: {len(extra)} of {sum(r['strength'] > 0 for r in all_rows)}")
+
+
+def right(r):
+    """True if the strongest laser found is the one of the frame."""
+    near = max(abs(np.subtract(r["spot"], r["found_spot"]))) < 0.2
+    return r["number"] > 0 and near and abs(r["nm"] - r["found_nm"]) < 5
 
 
 def line(some):
@@ -122,10 +145,12 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("file", type=Path)
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "COUNT"))
+    parser.add_argument("--side", type=int, default=128, help="pixels a side")
+    parser.add_argument("--only", choices=["empty", "lasers"])
     parser.add_argument("--report", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
     if given.seeds:
-        run(given.file, *given.seeds)
+        run(given.file, *given.seeds, given.side, given.only)
     if given.report:
         report(rows(given.file))

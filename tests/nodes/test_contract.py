@@ -24,8 +24,6 @@ NODES = sorted(
     key=lambda n: n.path,
 )
 FILES = sorted([*ROOT.glob("nodes/**/*.py"), *ROOT.glob("workflows/**/*.py")])
-every_node = pytest.mark.parametrize("node", NODES, ids=lambda n: n.path)
-every_file = pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
 
 
 def test_the_walk_finds_the_families():
@@ -33,82 +31,82 @@ def test_the_walk_finds_the_families():
     assert len({n.path for n in NODES}) == len(NODES)
 
 
-@every_node
-def test_docstring_begins_with_one_sentence_of_physics(node):
-    first = inspect.getdoc(node.fn).split("\n\n")[0]
-    assert first.endswith("."), "the first paragraph is a sentence"
-    assert first[0].isupper()
-    assert len(first) <= 240, "one sentence, not a story"
+def test_docstring_begins_with_one_sentence_of_physics():
+    for node in NODES:
+        first = inspect.getdoc(node.fn).split("\n\n")[0]
+        assert first.endswith("."), f"{node.path}: the first paragraph is a sentence"
+        assert first[0].isupper(), node.path
+        assert len(first) <= 240, f"{node.path}: one sentence, not a story"
 
 
-@every_node
 @pytest.mark.parametrize("word", ["Shapes:", "Units:", "Error:", "Source:"])
-def test_docstring_names(node, word):
-    lines = [line for line in (inspect.getdoc(node.fn) or "").splitlines() if line.startswith(word)]
-    assert len(lines) == 1, f"{node.path}: one line that begins with {word}"
-    assert len(lines[0].removeprefix(word).strip()) >= 2
+def test_docstring_names(word):
+    for node in NODES:
+        lines = [line for line in (inspect.getdoc(node.fn) or "").splitlines() if line.startswith(word)]
+        assert len(lines) == 1, f"{node.path}: one line that begins with {word}"
+        assert len(lines[0].removeprefix(word).strip()) >= 2, node.path
 
 
-@every_node
-def test_a_node_that_raises_says_so(node):
-    raises = any(isinstance(item, ast.Raise) for item in ast.walk(ast.parse(inspect.getsource(node.fn))))
-    assert not raises or "Raises:" in node.__doc__
+def test_a_node_that_raises_says_so():
+    for node in NODES:
+        raises = any(isinstance(item, ast.Raise) for item in ast.walk(ast.parse(inspect.getsource(node.fn))))
+        assert not raises or "Raises:" in node.__doc__, node.path
 
 
-@every_node
-def test_every_argument_is_annotated_and_the_model_of_parameters_builds(node):
-    for name in inspect.signature(node.fn).parameters:
-        assert name in node.hints, f"{node.path}: {name} has no annotation"
-    assert "return" in node.hints
-    assert set(node.params.model_fields) == {p.name for p in node._keyword_only}
+def test_every_argument_is_annotated_and_the_model_of_parameters_builds():
+    for node in NODES:
+        for name in inspect.signature(node.fn).parameters:
+            assert name in node.hints, f"{node.path}: {name} has no annotation"
+        assert "return" in node.hints, node.path
+        assert set(node.params.model_fields) == {p.name for p in node._keyword_only}, node.path
 
 
-@every_node
-def test_the_family_exports_its_node(node):
-    family = importlib.import_module(f"neusee.nodes.{node.path.split('.')[0]}")
-    assert getattr(family, node.fn.__name__) is node
-    assert node.fn.__name__ in family.__all__
+def test_the_family_exports_its_node():
+    for node in NODES:
+        family = importlib.import_module(f"neusee.nodes.{node.path.split('.')[0]}")
+        assert getattr(family, node.fn.__name__) is node
+        assert node.fn.__name__ in family.__all__, node.path
 
 
-@every_node
-def test_hooks_take_what_the_node_takes(node):
-    own = set(inspect.signature(node.fn).parameters)
-    for hook in (
-        node.hooks.reference,
-        node.hooks.skip_bound,
-        node.hooks.preflight,
-        node.hooks.shape,
-        node.hooks.check,
-    ):
-        taken = {} if hook is None else inspect.signature(hook).parameters
-        for p in taken.values():
-            known = p.name in own or p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL) or p.name == "result"
-            assert known or p.kind is not p.KEYWORD_ONLY, f"{node.path}: a hook asks for {p.name}"
+def test_hooks_take_what_the_node_takes():
+    for node in NODES:
+        own = set(inspect.signature(node.fn).parameters)
+        for hook in (
+            node.hooks.reference,
+            node.hooks.skip_bound,
+            node.hooks.preflight,
+            node.hooks.shape,
+            node.hooks.check,
+        ):
+            taken = {} if hook is None else inspect.signature(hook).parameters
+            for p in taken.values():
+                known = p.name in own or p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL) or p.name == "result"
+                assert known or p.kind is not p.KEYWORD_ONLY, f"{node.path}: a hook asks for {p.name}"
 
 
-@pytest.mark.parametrize("path", sorted(ROOT.glob("nodes/**/*.py")), ids=lambda p: str(p.relative_to(ROOT)))
-def test_rules_for_shapes_are_used_by_nothing_that_computes_a_result(path):
+def test_rules_for_shapes_are_used_by_nothing_that_computes_a_result():
     """No cache key covers a file of rules, so only the family imports the file, to attach the rules to its nodes."""
-    imported = {
-        name
-        for item in ast.walk(ast.parse(path.read_text()))
-        if isinstance(item, ast.ImportFrom)
-        for name in (item.module, *(f"{item.module}.{alias.name}" for alias in item.names))
-    }
-    assert path.name == "_result_shapes.py" or "neusee.nodes.shape_rules" not in imported
-    assert path.name == "__init__.py" or not [name for name in imported if name.endswith("._result_shapes")]
+    for path in ROOT.glob("nodes/**/*.py"):
+        imported = {
+            name
+            for item in ast.walk(ast.parse(path.read_text()))
+            if isinstance(item, ast.ImportFrom)
+            for name in (item.module, *(f"{item.module}.{alias.name}" for alias in item.names))
+        }
+        assert path.name == "_result_shapes.py" or "neusee.nodes.shape_rules" not in imported, path
+        assert path.name == "__init__.py" or not [n for n in imported if n.endswith("._result_shapes")], path
 
 
-@every_file
-def test_files_and_functions_are_small(path):
-    text = path.read_text()
-    assert len(text.splitlines()) < 300, f"{path} is too long: split it"
-    for item in ast.walk(ast.parse(text)):
-        if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef):
-            kernel = any(ast.unparse(each) == "triton.jit" for each in item.decorator_list)  # has all in registers
-            assert _code_lines(item) <= (60 if kernel else 40), (
-                f"{path}:{item.lineno} {item.name} is too long: split it"
-            )
+def test_files_and_functions_are_small():
+    for path in FILES:
+        text = path.read_text()
+        assert len(text.splitlines()) < 300, f"{path} is too long: split it"
+        for item in ast.walk(ast.parse(text)):
+            if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef):
+                kernel = any(ast.unparse(each) == "triton.jit" for each in item.decorator_list)  # has all in registers
+                assert _code_lines(item) <= (60 if kernel else 40), (
+                    f"{path}:{item.lineno} {item.name} is too long: split it"
+                )
 
 
 def _code_lines(item):

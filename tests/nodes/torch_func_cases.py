@@ -157,6 +157,7 @@ CASES = {
     "doe.equal_filter": Case("1", (RAW, rand(4), BANDS, [LINE])),
     "doe.fabricate": Case("0", (HEIGHT,), {"wrap_at": 550e-9, "levels": 4}),
     "doe.half_rings": Case("waves.0", (STOP,), {"waves": [number(2.0), number(1.0)]}),
+    "doe.height_error": Case("0", (HEIGHT, STOP), {"rms": 1e-8, "depth": 0.01}),
     "doe.material": Case("0.centres", (BANDS,)),
     "doe.shade": Case("transmittance", (STOP,), {"transmittance": number(0.3), "diameter": 0.8}),
     "doe.smooth": Case("0", (HEIGHT, STOP), {"feature": 1e-3}),

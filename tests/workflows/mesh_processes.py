@@ -23,6 +23,7 @@ import torch
 
 from neusee.workflows import Store, load
 from neusee.workflows.training.parallel.process_mesh import Mesh, joined
+from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.run_training import _photographs, train
 from neusee.workflows.training.training_iteration import Learner
 from neusee.workflows.training.training_pictures import TrainingStream
@@ -45,6 +46,18 @@ def step(job: dict[str, Any], mesh: Mesh) -> None:
         torch.save({"grads": grads, "losses": losses, "shared": shared}, Path(job["folder"], "step.pt"))
 
 
+def pooled(job: dict[str, Any], mesh: Mesh) -> None:
+    """Two rounds of a pool behind a fixed mask: the pictures of this process, and how often it drew values."""
+    recipe = load("train_small", job["words"])
+    how, store = recipe.training, Store(Path(job["store"]))
+    samples = TrainingStream(recipe, how, _photographs(recipe, how, True), store, "cpu", recipe, mesh)
+    usual, drawn = samples._drawn, []
+    samples._drawn = lambda *place: drawn.append(place) or usual(*place)  # type: ignore[method-assign, func-returns-value]
+    found = [(i, sample.tensors) for first in (0, 2, 4, 6) for i, sample in samples.batch(Shared.of({}), 2, first, 2)]
+    torch.save({"pictures": found, "drawn": len(drawn), "by band": samples._each.by_band},
+               Path(job["folder"], f"pool_{mesh.rank}.pt"))  # fmt: skip
+
+
 def learn(job: dict[str, Any], mesh: Mesh) -> None:
     """A training as the command does it."""
     recipe = load("train_small", job["words"])
@@ -64,7 +77,7 @@ def fail(job: dict[str, Any], mesh: Mesh) -> None:
     learn(job, mesh)
 
 
-DO = {"step": step, "train": learn, "fail": fail}
+DO = {"step": step, "pool": pooled, "train": learn, "fail": fail}
 
 
 def work(job: dict[str, Any], rank: int, world: int, port: int) -> None:

@@ -97,7 +97,7 @@ def test_a_long_name_is_broken_and_shortened(name, copies, shown):
 
 
 def test_an_evaluation_without_a_value_has_axes():
-    table = MetricTable((0.0, 10.0), {name: np.array([[np.nan, 0.2]]) for name in ("l1", "l1 small")})
+    table = MetricTable((0.0, 10.0), {name: np.array([[np.nan, 0.2]]) for name in ("l1", "l1 small")}, np.zeros(1))
     axes = evaluation_figures.strengths.__wrapped__({"a": table}, 64).axes
     assert axes[0].get_ylim() == pytest.approx((0.0, 0.21))
 

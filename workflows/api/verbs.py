@@ -115,7 +115,7 @@ def train(
 def evaluate(
     recipe: Named,
     *,
-    pipelines: str | Sequence[Pipeline],
+    pipelines: str | Sequence[Pipeline] | None = None,
     changes: Changes = (),
     store: Store | None = None,
     device: str = "cpu",
@@ -123,36 +123,36 @@ def evaluate(
     progress: Progress = silent,
     command: Sequence[str] = (),
     data: Named | None = None,
-    scenes: int = 20,
+    scenes: int | None = None,
     strengths: Sequence[float] | None = None,
     small: int = 256,
     reference: str = "",
     equal_protection: float | None = None,
-    by: str = "best",
+    by: str | None = None,
 ) -> Path:
     """Compare masks and restorers on the same scenes and laser strengths, and return the folder of results.
 
+    What is None is that of the recipe's block ``evaluate``, such as all photographs in ``paper_protocol``.
+
     Args: pipelines: a mask and a restorer each, ``"flat+none, five_half_rings+wiener"``. data: a folder of photographs;
-    None means the recipe's own scene. scenes: number of scenes. strengths: of the laser, in multiples of saturation;
-    None means the strengths in the paper. small: the shorter side in pixels of reduced pictures, also compared.
-    reference: the pipeline with which all others are compared. equal_protection: the peak of a laser as a share
-    of that of the plain lens, to which filters and stops bring every pipeline; by: ``best``, ``filter`` or ``stop``.
+    None means the recipe's own scene. scenes: number of scenes, else 20. strengths: of the laser, in multiples of
+    saturation; None means the strengths in the paper. small: the shorter side in pixels of reduced pictures, which are
+    compared too. reference: the pipeline with which all others are compared. equal_protection: the peak of a laser as a
+    share of that of the plain lens, to which filters and stops bring every pipeline; by: ``best``, ``filter`` or
+    ``stop``.
     Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` if a step fails.
     """
     from neusee.workflows.evaluation import run_evaluation
-    from neusee.workflows.evaluation.equal_protection import read_protection
 
-    here = Path.cwd()
+    here, name, words = Path.cwd(), _name(recipe, "evaluate"), _arguments(changes)
+    own = run_evaluation.read_settings(name, words, here)
     return run_evaluation.evaluate(
-        _name(recipe, "evaluate"),
-        run_evaluation.read_pipelines(pipelines, here) if isinstance(pipelines, str) else pipelines,
-        _arguments(changes),
+        name,
+        changes=words,
+        **run_evaluation.options_of(own, pipelines, scenes, reference, equal_protection, by, here),
         data=None if data is None else Path(data).expanduser(),
-        count=scenes,
         strengths=run_evaluation.STRENGTHS if strengths is None else strengths,
         small=small,
-        reference=reference,
-        equal=read_protection(equal_protection, by),
         store=store,
         runs=writable_folder(out),
         command=command,

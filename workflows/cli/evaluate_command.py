@@ -23,7 +23,7 @@ from neusee.workflows.cli.command_options import (
 from neusee.workflows.cli.interruption import kept_in, resumable, say_folder
 
 Pipelines = Annotated[
-    str, typer.Option("--pipelines", help="MASK[@file]+RESTORER[@weights], …; none restores nothing.")
+    str | None, typer.Option("--pipelines", help="MASK[@file]+RESTORER[@weights], …; none restores nothing.")
 ]
 Strengths = Annotated[str, typer.Option("--strengths", help="Strengths of the laser, multiples of saturation.")]
 Reference = Annotated[
@@ -33,19 +33,19 @@ EqualPeak = Annotated[
     float | None,
     typer.Option("--equal-protection", help="Peak of a laser to which filters and stops bring each pipeline, 0 to 1."),
 ]
-By = Annotated[str, typer.Option("--by", help="What brings it there: best (stop and filter), filter or stop.")]
+By = Annotated[str | None, typer.Option("--by", help="What brings it there: best (stop and filter), filter or stop.")]
 
 
 def evaluate(
     words: Words = None,
-    pipelines: Pipelines = "flat+none, five_half_rings+wiener",
+    pipelines: Pipelines = None,
     data: Annotated[str, typer.Option("--data", help="Folder of photographs; else the recipe's own scene.")] = "",
-    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of scenes.")] = 20,
+    scenes: Annotated[int | None, typer.Option("--scenes", min=1, help="Number of scenes, else 20.")] = None,
     strengths: Strengths = "0,1e1,1e2,1e3,1e4,1e5,1e6",
     small: Annotated[int, typer.Option("--small", min=11, help="Shorter side of the reduced pictures.")] = 256,
     reference: Reference = "",
     equal_protection: EqualPeak = None,
-    by: By = "best",
+    by: By = None,
     device: OneDevice = "cpu",
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -57,14 +57,13 @@ def evaluate(
     A pipeline is a mask and a restorer. Every pipeline sees the same scenes, lasers and noise. The page has L1, PSNR
     and SSIM with 95 % confidence intervals, suppression by wavelength (LSR, BSR), the contrast that is left, and the
     bound that no mask can pass. With --equal-protection each pipeline gets the filter and the stop that bring its peak
-    to one share of the plain lens's. Values that the recipe gives as distributions are drawn for each scene. Run the
-    same command again to continue.
+    to one share of the plain lens's. Values that the recipe gives as distributions are drawn for each scene. Options
+    that are not given are those of the recipe's block evaluate. Run the same command again to continue.
     """
     name, changes, _ = split(words)
     check_device(device)
     options = {"data": data, "scenes": scenes, "strengths": strengths, "small": small, "reference": reference}
-    if equal_protection is not None:
-        options |= {"equal-protection": equal_protection, "by": by}
+    shared = {"pipelines": pipelines, "equal-protection": equal_protection, "by": by}
     folder = _evaluate(
         name,
         changes=changes,
@@ -79,7 +78,7 @@ def evaluate(
         device=device,
         out=out,
         progress=progress_lines(quiet or as_json),
-        command=["neusee", "evaluate", name, *changes, *option_words({"pipelines": pipelines, **options})],
+        command=["neusee", "evaluate", name, *changes, *option_words(options | shared)],
     )
     say_folder(folder, as_json)
 

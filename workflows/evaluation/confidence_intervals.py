@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 
 Numbers = NDArray[np.float64]
 CONFIDENCE = 0.95
-_AGAIN = 10_000  #: sets of scenes that the bootstrap draws for the interval of a ratio
-_AT_ONCE = 500  #: sets in memory at once
-_FEW = 5  #: smallest number of scenes for the bootstrap
+FEW = 5  #: smallest number of photographs for the bootstrap
 METRICS = ("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "saturated", "peak", "damaged")
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean over scenes and its 95 % confidence interval, with NaN as limits if there are too few scenes."""
+    """A mean over scenes and its 95 % confidence interval, with NaN as limits if there are too few photographs."""
 
     mean: float
     low: float
@@ -42,61 +40,61 @@ class MetricTable:
 
     strengths: tuple[float, ...]
     values: Mapping[str, Numbers]
+    photographs: Numbers  #: (scene,) the number of the photograph of each scene
 
     def scenes(self, metric: str) -> Numbers:
         """Return the mean of a metric over all laser strengths, for each scene."""
         means: Numbers = np.nanmean(self.values[metric], axis=1)
         return means
 
-    def at(self, metric: str, strength: int) -> Numbers:
-        """Return the values of a metric at one laser strength, one for each scene that has a value."""
-        column: Numbers = self.values[metric][:, strength]
-        return column[~np.isnan(column)]
+    def mean(self, metric: str) -> Interval:
+        """Return the mean of a metric over strengths and scenes, and its confidence interval."""
+        return mean(self.scenes(metric), self.photographs)
+
+    def at(self, metric: str, strength: int) -> Interval:
+        """Return the mean of a metric at one laser strength, over the scenes that have a value, and its interval."""
+        column = self.values[metric][:, strength]
+        kept = ~np.isnan(column)
+        return mean(column[kept], self.photographs[kept])
 
 
-def mean(values: Sequence[float] | Numbers) -> Interval:
-    """Return the mean over scenes of a metric, and its confidence interval from Student's t distribution."""
+def sums_by_photograph(values: Numbers, photographs: Numbers) -> Numbers:
+    """Return the sum of the values of the pictures of each photograph."""
+    _, number = np.unique(photographs, return_inverse=True)
+    return np.bincount(number.reshape(-1), weights=values).astype(np.float64)
+
+
+def mean(values: Sequence[float] | Numbers, photographs: Sequence[float] | Numbers | None = None) -> Interval:
+    """Return the mean over scenes of a metric, and its confidence interval from Student's t distribution.
+
+    ``photographs`` has the number of the photograph of each scene; without it each scene has a photograph of its own.
+    The interval is over photographs: several scenes of one photograph count as one draw.
+    """
     x = np.asarray(values, dtype=np.float64)
-    centre = float(x.mean()) if len(x) else math.nan
-    if len(x) < 2:
+    owner = np.asarray(range(len(x)) if photographs is None else photographs, dtype=np.float64)
+    centre, count = float(x.mean()) if len(x) else math.nan, len(np.unique(owner))
+    if count < 2:
         return Interval(centre, math.nan, math.nan)
     from scipy.stats import t
 
-    half = float(t.ppf((1 + CONFIDENCE) / 2, len(x) - 1)) * float(x.std(ddof=1)) / math.sqrt(len(x))
+    rest = sums_by_photograph(x - centre, owner)
+    spread = math.sqrt(float((rest**2).sum()) * count / (count - 1)) / len(x)
+    half = float(t.ppf((1 + CONFIDENCE) / 2, count - 1)) * spread
     return Interval(centre, centre - half, centre + half)
 
 
-def gain(values: Numbers, reference: Numbers, seed: int) -> Interval:
-    """Return by which fraction the mean of a metric lies below the mean of the reference, such as 0.101 for 10.1 %.
+def metric_table(
+    points: Sequence[Mapping[float, Mapping[str, float]]],
+    strengths: Sequence[float],
+    photographs: Sequence[int] | None = None,
+) -> MetricTable:
+    """Arrange the metrics of one mask and restorer as arrays (scene, laser strength).
 
-    The interval comes from a bootstrap with the seed ``seed``, which draws the same scenes for both pipelines.
+    ``photographs`` has the number of the photograph of each scene; without it every scene has its own.
     """
-    fraction = 1.0 - float(values.mean()) / float(reference.mean())
-    if len(values) < _FEW:
-        return Interval(fraction, math.nan, math.nan)
-    rng = np.random.default_rng(seed)
-    drawn: list[Numbers] = []
-    for _ in range(0, _AGAIN, _AT_ONCE):
-        at = rng.integers(0, len(values), (_AT_ONCE, len(values)))
-        drawn.append(1.0 - values[at].mean(1) / reference[at].mean(1))
-    low, high = np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return Interval(fraction, float(low), float(high))
-
-
-def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict[str, Interval]:
-    """Return the decrease of L1 error against the reference: absolute, relative, and relative for small pictures."""
-    own, other = values.scenes("l1"), reference.scenes("l1")
-    return {
-        "l1 less": mean(other - own),
-        "l1 gain": gain(own, other, seed),
-        "l1 small gain": gain(values.scenes("l1 small"), reference.scenes("l1 small"), seed),
-    }
-
-
-def metric_table(points: Sequence[Mapping[float, Mapping[str, float]]], strengths: Sequence[float]) -> MetricTable:
-    """Arrange the metrics of one mask and restorer as arrays (scene, laser strength)."""
     each = {
         metric: np.array([[point.get(k, {}).get(metric, math.nan) for k in strengths] for point in points])
         for metric in METRICS
     }
-    return MetricTable(tuple(strengths), each)
+    owner = range(len(points)) if photographs is None else photographs
+    return MetricTable(tuple(strengths), each, np.array(owner, dtype=np.float64))

@@ -121,8 +121,8 @@ def protection_section(result: EvaluationResult) -> list[Section]:
         "filter": "a grey filter",
         "stop": "a smaller stop, and a filter for the rest",
     }
-    text = f"""Every pipeline lowers the peak of a laser to {result.protection.level:g} of that behind the plain lens,
-        at the worst wavelength: each has {ways[result.protection.way]}. Mask alone: its peak without them. Stop:
-        diameter relative to the lens. Filter: transmittance. A picture that is not restored is as dark as its filter
-        makes it; a Wiener filter knows the PSF with filter and stop, and brightens it."""
+    text = f"""Every pipeline of this table lowers the peak of a laser to {result.protection.level:g} of that behind the
+        plain lens, at the worst wavelength: each has {ways[result.protection.way]}. Mask alone: its peak without them.
+        Stop: diameter relative to the lens. Filter: transmittance. A picture that is not restored is as dark as its
+        filter makes it; a Wiener filter knows the PSF with filter and stop, and brightens it."""
     return [Section("Equal protection", text, COLUMNS, protection_rows(result))]

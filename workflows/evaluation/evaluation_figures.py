@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -10,12 +11,13 @@ import numpy as np
 import torch
 
 from neusee.nodes.metrics import most_contrast
-from neusee.workflows.evaluation.confidence_intervals import MetricTable, mean
+from neusee.workflows.evaluation.confidence_intervals import MetricTable, Numbers
 from neusee.workflows.report.figures.camera_overview import high
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, encoded, picture
 
 if TYPE_CHECKING:
     from neusee.workflows.evaluation.comparison_pictures import Panel
+    from neusee.workflows.evaluation.evaluation_result import EvaluationResult
     from neusee.workflows.evaluation.mask_optics import MaskOptics
 
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE, "#56B4E9", "#CC79A7", BLACK, "#777777")
@@ -85,7 +87,7 @@ def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
 
 
 def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], name: str) -> None:
-    intervals = [mean(table.at(metric, i)) for i in range(len(table.strengths))]
+    intervals = [table.at(metric, i) for i in range(len(table.strengths))]
     at = _places(table.strengths)
     ax.plot(at, [x.mean for x in intervals], marker="o", markersize=4, linewidth=1.4, label=name, **look)
     low, up = [x.low for x in intervals], [x.high for x in intervals]
@@ -94,7 +96,7 @@ def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], nam
 
 def _top(tables: Iterable[MetricTable], metric: str) -> float:
     """Return the end of an axis that shows every mean, and intervals up to three times the largest mean."""
-    found = [mean(table.at(metric, i)) for table in tables for i in range(len(table.strengths))]
+    found = [table.at(metric, i) for table in tables for i in range(len(table.strengths))]
     largest = max((x.mean for x in found if x.mean > 0), default=0.0)
     return 1.05 * max(largest, min(3 * largest, max([x.high for x in found if x.high > 0], default=0.0))) or 1.0
 
@@ -103,6 +105,35 @@ def _places(values: Sequence[float]) -> list[float]:
     """Return the positions of laser strengths on a logarithmic axis, with strength 0 one decade below the others."""
     logs = [float(np.log10(k)) for k in values if k > 0]
     return [float(np.log10(k)) if k > 0 else (min(logs) - 1 if logs else 0.0) for k in values]
+
+
+@drawn
+def wavelengths(result: EvaluationResult) -> Any:
+    """Draw the L1 error of the reduced pictures at the largest strength over the drawn wavelength of each scene."""
+    figure, axes = canvas(11.0, 4.2)
+    ax, looks = axes[0, 0], _looks([p.name for p in result.pipelines])
+    x = np.array([math.nan if metres is None else metres * 1e9 for metres in result.wavelengths])
+    for p in result.pipelines:
+        y = result.tables[p.name].values["l1 small"][:, -1]
+        ax.plot(x, y, ".", markersize=5, alpha=0.6, color=looks[p.name]["color"])
+        ax.plot(*_means(x, y), linewidth=1.6, label=p.name, **looks[p.name])
+    ax.set_xlabel("wavelength of the laser (nm)")
+    ax.set_ylabel("L1 (sRGB, 0 to 1)")
+    ax.set_ylim(bottom=0)
+    handles, labels = ax.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(3, len(labels)))
+    return figure
+
+
+def _means(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
+    """Return the mean of x and y in each sixth of the range of x that has a value."""
+    kept = ~np.isnan(x + y)
+    x, y = x[kept], y[kept]
+    if not len(x):
+        return x, y
+    part = np.minimum((6 * (x - x.min()) / max(float(np.ptp(x)), 1e-9)).astype(int), 5)
+    each = [i for i in range(6) if (part == i).any()]
+    return np.array([x[part == i].mean() for i in each]), np.array([y[part == i].mean() for i in each])
 
 
 @drawn

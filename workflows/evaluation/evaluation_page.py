@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 from neusee.workflows.evaluation import evaluation_figures as figures
 from neusee.workflows.evaluation.confidence_intervals import METRICS, Interval, mean
 from neusee.workflows.evaluation.equal_protection import protection_section
-from neusee.workflows.evaluation.pipelines import CASES
+from neusee.workflows.evaluation.paired_intervals import gains_by_strength
+from neusee.workflows.evaluation.pipelines import CASES, DRAWN
 from neusee.workflows.report.study_page import Mark, Section
 
 if TYPE_CHECKING:
@@ -26,7 +27,8 @@ _DIGITS = {"psnr": ".2f", "l1": ".4f", "ssim": ".3f", "saturated": ".0f", "damag
 
 def draw_pictures(result: EvaluationResult) -> dict[str, bytes]:
     """Draw the figures of the evaluation page, and return the PNG files by name."""
-    return {
+    waves = {"wavelengths": figures.wavelengths(result)} if _drawn(result) else {}
+    return waves | {
         "cases": figures.cases(result.panels),
         "strengths": figures.strengths(result.tables, result.small),
         "curves": figures.curves(result.masks),
@@ -40,7 +42,7 @@ def summary(result: EvaluationResult) -> dict[str, Any]:
         p.name: {
             "mask": p.front,
             "restorer": p.back,
-            **{metric: asdict(mean(result.tables[p.name].scenes(metric))) for metric in METRICS},
+            **{metric: asdict(result.tables[p.name].mean(metric)) for metric in METRICS},
             "against": {name: asdict(x) for name, x in result.against[p.name].items()},
         }
         for p in result.pipelines
@@ -51,9 +53,7 @@ def rows(result: EvaluationResult) -> list[Sequence[Any]]:
     """Return the rows of ``table.csv``, one for each mask and restorer, with the numbers from `summary`."""
     listed: list[Sequence[Any]] = []
     for p in result.pipelines:
-        each = [mean(result.tables[p.name].scenes(metric)) for metric in METRICS] + list(
-            result.against[p.name].values()
-        )
+        each = [result.tables[p.name].mean(metric) for metric in METRICS] + list(result.against[p.name].values())
         numbers = [x for interval in each for x in astuple(interval)]
         listed.append((p.name, p.front, p.back, len(result.scenes), *("" if math.isnan(x) else x for x in numbers)))
     return listed
@@ -62,15 +62,17 @@ def rows(result: EvaluationResult) -> list[Sequence[Any]]:
 def lead(result: EvaluationResult) -> str:
     """Return a few sentences with the main result of the evaluation."""
     best = min(result.pipelines, key=lambda p: float(result.tables[p.name].scenes("l1").mean()))
-    least = _with_interval(mean(result.tables[best.name].scenes("l1")), "l1")
+    least = _with_interval(result.tables[best.name].mean("l1"), "l1")
     strengths = ", ".join("none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in result.strengths)
-    enough = len(result.scenes) >= len(CASES)
+    enough = len(result.scenes) >= len(CASES) or _drawn(result)
     few = "" if enough else f" These are too few scenes for all {len(CASES)} lasers of the protocol."
     uncertain = result.recipe.uncertain
     names = [name for name in (uncertain.names if uncertain else ()) if not name.startswith("lasers.")]
-    drawn = f" These values are drawn for each scene: {', '.join(names)}." if names else ""
+    laser = " The wavelength of the laser of each scene is drawn by the law of the recipe." if _drawn(result) else ""
+    drawn = f"{laser} These values are drawn for each scene: {', '.join(names)}." if names else laser
     level = result.protection.level if result.protection else 0.0
-    equal = f" Filters and stops bring every pipeline to a peak of {level:g} of the plain lens's." if level else ""
+    which = "every pipeline" if all(p.shade for p in result.pipelines) else "each of them once more"
+    equal = f" Filters and stops bring {which} to a peak of {level:g} of the plain lens's." if level else ""
     return f"""{len(result.scenes)} scenes, laser strengths {strengths} (1 saturates a pixel of the plain lens),
         {len(result.pipelines)} pipelines of a mask and a restorer. Lowest L1: {best.name}, {least}.
         {few}{drawn}{equal}"""
@@ -78,13 +80,21 @@ def lead(result: EvaluationResult) -> str:
 
 def sections(result: EvaluationResult, shown: Mapping[str, bytes]) -> list[Section]:
     """Return all sections of the report page of an evaluation."""
-    parts = [*protection_section(result), _crossed(result), _numbers(result), _compared(result), *_mistold(result)]
+    compared = (_compared(result, name) for name in dict.fromkeys(result.references.values()))
+    gained = (_gained(result, name) for name in dict.fromkeys(result.references.values()))
+    parts = [*protection_section(result), _crossed(result), _by_strength(result), *gained, _numbers(result), *compared]
+    parts += _mistold(result)
     text = """Mean over scenes and its 95 % interval. A scene without a laser counts only at the strength none, so
         that every scene of the other points has a laser. The axis ends at most at three times the largest mean; an
         interval of few scenes may reach beyond."""
     parts.append(Section("Error over strength", text, picture=shown["strengths"]))
+    if "wavelengths" in shown:
+        text = f"""One dot for each scene: its drawn wavelength, and its L1 at the strength {max(result.strengths):g} at
+            {result.small} pixels. Lines: means over sixths of the range."""
+        parts.append(Section("Error over wavelength", text, picture=shown["wavelengths"]))
     text = """The first scene with each laser of the protocol and without a laser, all with the same scale. The rows are
-        the truth, the picture of the plain lens without restoration, and every pipeline."""
+        the truth, the picture of the plain lens without restoration, and every pipeline; the figure with six lasers has
+        the pictures of the sensor behind each mask too."""
     parts.append(Section("With each laser and without a laser", text, picture=shown["cases"]))
     return [*parts, _suppression(result, shown["curves"]), _plane(result, shown["plane"]), *_data(result)]
 
@@ -92,11 +102,45 @@ def sections(result: EvaluationResult, shown: Mapping[str, bytes]) -> list[Secti
 def _crossed(result: EvaluationResult) -> Section:
     masks = list(dict.fromkeys(p.front for p in result.pipelines))
     restorers = list(dict.fromkeys(p.back for p in result.pipelines))
-    l1 = {(p.front, p.back): _with_interval(mean(result.tables[p.name].scenes("l1")), "l1") for p in result.pipelines}
+    l1 = {(p.front, p.back): _with_interval(result.tables[p.name].mean("l1"), "l1") for p in result.pipelines}
     listed = [(mask, *(l1.get((mask, back)) for back in restorers)) for mask in masks]
     text = """L1 at full size (sRGB from 0 to 1, as a display shows it): the mean over the strengths of each scene, then
-        mean and 95 % confidence interval over scenes (Student's t)."""
+        mean and 95 % confidence interval (Student's t). Scenes of one photograph count as one draw."""
     return Section("Mask by restorer", text, ("mask", *restorers), listed)
+
+
+def _drawn(result: EvaluationResult) -> bool:
+    return any(scene.case == DRAWN for scene in result.scenes)
+
+
+def _strength_names(result: EvaluationResult) -> list[str]:
+    return ["none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in result.strengths]
+
+
+def _by_strength(result: EvaluationResult) -> Section:
+    text = f"""L1 of the pictures reduced to {result.small} pixels of their shorter side, at each laser strength: mean
+        and 95 % interval."""
+    columns = ("pipeline", *_strength_names(result))
+    listed = [
+        (p.name, *(_with_interval(result.tables[p.name].at("l1 small", i), "l1") for i in range(len(columns) - 1)))
+        for p in result.pipelines
+    ]
+    return Section(f"L1 by strength, {result.small} pixels", text, columns, listed)
+
+
+def _gained(result: EvaluationResult, reference: str) -> Section:
+    text = f"""By which fraction the L1 of the reduced pictures lies below that of {reference} on the same pictures, at
+        each laser strength, with 95 % intervals as below. A colour marks an interval without zero."""
+    listed: list[Sequence[Any]] = []
+    marks: dict[tuple[int, int], Mark] = {}
+    for name in (name for name, other in result.references.items() if other == reference != name):
+        found = gains_by_strength(result.tables[name], result.tables[reference], result.recipe.seed)
+        for i, x in enumerate(found, 1):
+            if x.excludes_zero:
+                marks[len(listed), i] = "pass" if x.mean > 0 else "fail"
+        listed.append((name, *(_between(x, ".1%") for x in found)))
+    columns = ("pipeline", *_strength_names(result))
+    return Section(f"Gain by strength over {reference}", text, columns, listed, marks=marks)
 
 
 def _with_interval(x: Interval, metric: str) -> str:
@@ -113,7 +157,7 @@ def _numbers(result: EvaluationResult) -> Section:
     metrics = [metric for metric in METRICS if metric != "peak"]
     columns = ("pipeline", *(_column(metric) for metric in metrics))
     listed = [
-        (p.name, *(_with_interval(mean(result.tables[p.name].scenes(metric)), metric) for metric in metrics))
+        (p.name, *(_with_interval(result.tables[p.name].mean(metric), metric) for metric in metrics))
         for p in result.pipelines
     ]
     return Section("All numbers", text, columns, listed)
@@ -145,15 +189,15 @@ def _column(metric: str) -> str:
     return name + units.get(metric.partition(" ")[0], "")
 
 
-def _compared(result: EvaluationResult) -> Section:
-    text = f"""Differences from {result.reference} in the same scenes. L1 less: by how much L1 is lower, with interval
-        of Student's t. Gain: the same as a fraction of the mean L1 of the reference, with an interval from 10 000 draws
-        of the scenes (bootstrap); fewer than five scenes have no interval. A colour marks an interval without zero. If
-        many pipelines are compared with one reference, about one in twenty is marked by chance."""
+def _compared(result: EvaluationResult, reference: str) -> Section:
+    text = f"""Differences from {reference} in the same scenes. L1 less: by how much L1 is lower. Gain: the same
+        as a fraction of the mean L1 of the reference. Intervals of 95 % come from 10 000 draws of the photographs
+        (bootstrap-t); fewer than five photographs have no interval. A colour marks an interval without zero. If many
+        pipelines are compared with one reference, about one in twenty is marked by chance."""
     listed: list[Sequence[Any]] = []
     marks: dict[tuple[int, int], Mark] = {}
     for p in result.pipelines:
-        if p.name == result.reference:
+        if p.name == reference or result.references[p.name] != reference:
             continue
         less, share, small = result.against[p.name].values()
         for column, interval in ((1, less), (2, share), (3, small)):
@@ -161,7 +205,7 @@ def _compared(result: EvaluationResult) -> Section:
                 marks[len(listed), column] = "pass" if interval.mean > 0 else "fail"
         listed.append((p.name, _between(less, ".4f"), _between(share, ".1%"), _between(small, ".1%")))
     columns = ("pipeline", "L1 less", "gain", "gain, small")
-    return Section(f"Against {result.reference}", text, columns, listed, marks=marks)
+    return Section(f"Against {reference}", text, columns, listed, marks=marks)
 
 
 def _between(x: Interval, digits: str) -> str:

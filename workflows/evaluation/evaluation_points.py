@@ -17,9 +17,10 @@ from neusee.nodes.metrics import quality
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import call, place
 from neusee.workflows.evaluation.evaluation_scenes import Scene
-from neusee.workflows.evaluation.mistold_filter import TOLD, shifted
+from neusee.workflows.evaluation.mistold_filter import shifted
 from neusee.workflows.evaluation.pipelines import BEAM, NONE, PipelineRecipes
 from neusee.workflows.graph.recipe_graph import Recipe, Step, dependents, needed
+from neusee.workflows.graph.told_copies import TOLD
 from neusee.workflows.keys.cache_key import device_kind, digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
@@ -54,7 +55,7 @@ class EvaluationPoints:
         self.computed = 0  #: evaluation points that were not in the store
         self.seconds = 0.0  #: computing time of these evaluation points
         self._code = Code(store.code_memo)
-        self._functions: dict[tuple[str, str], Any] = {}
+        self._functions: dict[tuple[str, str, int], Any] = {}  #: a recipe is known by its identity
         #: by identity of a recipe; the recipe is kept too, so that no other recipe gets the same identity
         self._drawn: dict[Any, tuple[Recipe, Inputs | None]] = {}
         self._fixed: dict[str, Any] = {}  #: by key, results that do not depend on a scene: one copy for all functions
@@ -63,7 +64,7 @@ class EvaluationPoints:
     def point(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
         """Return the metrics of an evaluation point from the store, or compute and store the metrics."""
         compute = partial(self._measure, pipeline, point)
-        return compute_once(self.store, self.key(pipeline, point), dict, compute, {"step": "evaluate"}, small=True)
+        return compute_once(self.store, self.key(pipeline, point), dict, compute, {"step": "evaluate"})
 
     def _measure(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
         began = time.perf_counter()
@@ -88,6 +89,13 @@ class EvaluationPoints:
         self._functions = {name: f for name, f in self._functions.items() if name[1] == NONE}
         used = {id(value) for f in self._functions.values() for value in f.fixed.values()}
         self._fixed = {key: value for key, value in self._fixed.items() if id(value) in used}
+        self._kept.clear()
+
+    def release(self) -> None:
+        """Remove all results from memory, before pipelines with other recipes are evaluated."""
+        self._functions.clear()
+        self._drawn.clear()
+        self._fixed.clear()
         self._kept.clear()
 
     def key(self, pipeline: PipelineRecipes, point: PointRequest) -> str:
@@ -118,12 +126,12 @@ class EvaluationPoints:
         return keys
 
     def _function(self, pipeline: PipelineRecipes, case: str, outputs: tuple[str, ...]) -> Any:
-        name = (f"{pipeline.name} {outputs}", case)
+        name = (f"{pipeline.name} {outputs}", case, id(pipeline.recipe))
         if name not in self._functions:
-            recipe = pipeline.recipe(case)
+            recipe = (pipeline.true or pipeline.recipe)(case)
             whole = with_substitutions(recipe, outputs)  # as in `run`, but the scene is an argument
             steps = set(needed(whole, outputs))
-            inputs = self._inputs(recipe, outputs)
+            inputs = self._inputs(pipeline, case, outputs)
             free = ["scene", *(r for r in (inputs.readers if inputs else ()) if r.rpartition(".")[0] in steps)]
             if case != NONE:
                 free += [f"direction[{BEAM}].angle", *(f"{spot}.strength" for spot in _spots(recipe, outputs))]
@@ -140,7 +148,7 @@ class EvaluationPoints:
         A copy of a step from which the restorer is told gets the same values, with the error of the pipeline.
         """
         recipe = pipeline.recipe(point.lit)
-        inputs = self._inputs(recipe, outputs)
+        inputs = self._inputs(pipeline, point.lit, outputs)
         changed = inputs.theta(point.scene.draw(inputs)) if inputs else {}
         if point.lit != NONE:
             changed[f"direction[{BEAM}].angle"] = point.scene.angle(recipe)
@@ -150,8 +158,12 @@ class EvaluationPoints:
         told = {TOLD + name: shifted(x, wrong[name]) if name in wrong else x for name, x in copies.items()}
         return changed | told
 
-    def _inputs(self, recipe: Recipe, outputs: Sequence[str]) -> Inputs | None:
-        """Return the uncertain inputs of a recipe, or None if no output depends on an uncertain input."""
+    def _inputs(self, pipeline: PipelineRecipes, case: str, outputs: Sequence[str]) -> Inputs | None:
+        """Return the uncertain inputs of a pipeline, or None if no output depends on an uncertain input.
+
+        A restorer that is told an error gets the values of the recipe without the error, whose steps it copies.
+        """
+        recipe = (pipeline.true or pipeline.recipe)(case)
         if recipe.uncertain is None or not recipe.uncertain.names:
             return None
         key = (id(recipe), tuple(outputs))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,7 +37,7 @@ class EvaluationResult:
     broken: Sequence[tuple[Path, str]]
     strengths: tuple[float, ...]
     small: int  #: pixels of the shorter side of the reduced pictures
-    reference: str  #: the pipeline with which all others are compared
+    references: Mapping[str, str]  #: by pipeline, the pipeline with which it is compared
     points: dict[str, list[dict[float, PointNumbers]]]  #: by pipeline and scene
     tables: dict[str, MetricTable]  #: by pipeline
     against: dict[str, dict[str, Interval]]  #: by pipeline, decrease of L1 against the reference
@@ -45,4 +45,10 @@ class EvaluationResult:
     panels: Sequence[Panel]
     pipelines: Sequence[Pipeline]
     mistold: Sequence[MistoldPoint] = ()
-    protection: EqualProtection | None = None  #: if all pipelines were brought to one peak
+    protection: EqualProtection | None = None  #: if pipelines were brought to one peak
+    wavelengths: Sequence[float | None] = ()  #: of the laser of each scene, in m
+
+    @property
+    def reference(self) -> str:
+        """Return the pipeline with which the first pipeline and those like it are compared."""
+        return next(iter(self.references.values()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +14,7 @@ from neusee.nodes import ParameterError
 from neusee.nodes.scene import choose_photograph, crop_photograph, list_photographs
 from neusee.workflows.engine.node_call import call
 from neusee.workflows.engine.runner import run
-from neusee.workflows.evaluation.pipelines import BEAM, CASES, NONE, EvaluationRefused, PipelineRecipes, one_line
+from neusee.workflows.evaluation.pipelines import BEAM, NONE, EvaluationRefused, PipelineRecipes, one_line
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
@@ -23,6 +24,10 @@ from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
 
 _PHOTOGRAPH = "scene.photograph"
+
+
+class UnreadablePhotograph(EvaluationRefused):
+    """Error for a photograph that has the header and the end of a picture, but cannot be decoded."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +59,9 @@ class Scene:
         try:
             return crop_photograph(self.path, self.shape, self.recipe.seed, self.number)
         except (ParameterError, OSError, ValueError, SyntaxError) as error:
-            text = "remove this file and run the same command again; all other points are kept"
-            raise EvaluationRefused(f"{self.path}: {error}: {text}") from error
+            raise UnreadablePhotograph(
+                f"{self.path}: {error}: remove this file, and run the same command again"
+            ) from error
 
     def key(self, code: Code) -> str:
         """Return the cache key of the picture of the scene."""
@@ -77,9 +83,21 @@ class Scene:
         drawn = call(step, [], step.params, self.seed, "cpu")
         return float(drawn[0]), float(drawn[1])
 
+    def wavelength(self, recipe: Recipe, inputs: Inputs | None) -> float:
+        """Return the wavelength of the laser in m, drawn if the recipe has a law."""
+        name = f"lasers.{BEAM}.wavelength"
+        if inputs is not None and name in inputs.names:
+            return self.draw(inputs)[name]
+        return float(recipe.steps[f"line[{BEAM}]"].params["wavelength"])
 
-def scenes(recipe: Recipe, store: Store, root: Path | None, count: int) -> tuple[list[Scene], list[tuple[Path, str]]]:
-    """Return ``count`` scenes with the lasers in turn, and the photographs that cannot be read, with reasons."""
+
+def scenes(
+    recipe: Recipe, store: Store, root: Path | None, count: int | None, cases: Sequence[str]
+) -> tuple[list[Scene], list[tuple[Path, str]]]:
+    """Return ``count`` scenes with the lasers ``cases`` in turn, and the photographs that cannot be read, with reasons.
+
+    Without ``count`` every photograph is in one scene.
+    """
     broken: list[tuple[Path, str]] = []
     own = recipe.steps["scene"]
     shape = _shape(recipe)
@@ -91,26 +109,49 @@ def scenes(recipe: Recipe, store: Store, root: Path | None, count: int) -> tuple
         if not paths:
             reason = f"; {broken[0][0].name}: {broken[0][1]}" if broken else ""
             raise EvaluationRefused(f"--data {root}: the folder contains no readable PNG or JPEG file{reason}")
-    cases, shown = list(CASES), []
-    for i in range(count):
+    shown = []
+    for i in range(max(1, len(paths)) if count is None else count):
         path = choose_photograph(paths, recipe.seed, i) if paths else None
         name = own.node.path if path is None else path.relative_to(root).as_posix() if root else path.name
         shown.append(Scene(i, cases[i % len(cases)], name, path, shape, recipe, store))
     return shown, broken
 
 
+def photographs(shown: Sequence[Scene]) -> list[int]:
+    """Return the number of the photograph of each scene, over which intervals are drawn.
+
+    Scenes that are all of one photograph differ in laser and noise only; each then counts as one draw.
+    """
+    names = list(dict.fromkeys(scene.name for scene in shown))
+    return [names.index(scene.name) for scene in shown] if len(names) > 1 else list(range(len(shown)))
+
+
+def wavelengths(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> list[float | None]:
+    """Return the wavelength of the laser of each scene in m, or None for a scene without a laser."""
+    inputs: dict[str, Inputs | None] = {}
+    for case in {scene.case for scene in shown if scene.case != NONE}:
+        inputs[case] = None
+        with suppress(ValueError):  # nothing is drawn
+            inputs[case] = Inputs.of(pipeline.recipe(case), pipeline.pipeline.outputs)
+    return [
+        scene.wavelength(pipeline.recipe(scene.case), inputs[scene.case]) if scene.case != NONE else None
+        for scene in shown
+    ]
+
+
 def refuse_directions(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> None:
     """Raise `EvaluationRefused` if the laser of a scene comes from where the pupil of the recipe does not reach.
 
-    Of each laser only the scenes with the largest angles along y and x are tried.
+    Of each laser only the scenes with the largest angles over wavelength along y and x are tried.
     """
+    each = dict(zip((scene.number for scene in shown), wavelengths(pipeline, shown), strict=True))
     wrong: dict[str, None] = {}
     for case in dict.fromkeys(scene.case for scene in shown if scene.case != NONE):
         lit = [(scene, scene.angle(pipeline.recipe(case))) for scene in shown if scene.case == case]
         for axis in (0, 1):
-            scene, direction = max(lit, key=lambda pair: abs(pair[1][axis]))
+            scene, direction = max(lit, key=lambda pair: abs(pair[1][axis]) / (each[pair[0].number] or 1.0))
             try:
-                pipeline.recipe(case, direction)
+                pipeline.recipe(case, direction, each[scene.number])
             except RecipeError as error:
                 wrong |= dict.fromkeys(f"scene {scene.number + 1} ({case}): {one_line(p)}" for p in error.diagnostics)
     if wrong:

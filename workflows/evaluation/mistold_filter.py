@@ -10,12 +10,9 @@ from dataclasses import replace
 from typing import Any
 
 from neusee.workflows.evaluation.pipelines import BEAM
-from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, dependents, needed
+from neusee.workflows.graph.recipe_graph import Recipe, Step, dependents, needed
+from neusee.workflows.graph.told_copies import FRAME, knowers, known, with_copies
 from neusee.workflows.recipe.blocks.evaluate_block import Mismatch
-
-TOLD = "told_"  #: prefix of the copies
-_KNOWLEDGE = ("psf", "glare", "nearby")  #: inputs of a restorer that say what the optics and the laser are
-_RAW = "raw[mask]"
 
 
 def errors_of(recipe: Recipe, mismatch: Mismatch) -> dict[str, Mapping[str, Any]]:
@@ -23,7 +20,7 @@ def errors_of(recipe: Recipe, mismatch: Mismatch) -> dict[str, Mapping[str, Any]
 
     A parameter with None is removed: the input ``dirt`` of a pupil. The result is empty if the restorer knows nothing.
     """
-    told = _known(recipe)
+    told = known(recipe, _readers(recipe))
     if not told:
         return {}
     pupils = [name for name in needed(recipe, told) if recipe.steps[name].node.path == "optics.pupil"]
@@ -50,19 +47,13 @@ def mistold(recipe: Recipe, error: Mapping[str, Any]) -> Recipe:
     """Return the recipe with a copy of each step that the error changes, from which alone the restorer knows."""
     added = {name: value for name, value in error.items() if name.rpartition(".")[0] in recipe.steps}
     changed = {name.rpartition(".")[0] for name in added}
+    readers = _readers(recipe)
     copied = {
         name
-        for name in dependents(recipe, changed) & set(needed(recipe, _known(recipe)))
+        for name in dependents(recipe, changed) & set(needed(recipe, known(recipe, readers)))
         if not recipe.steps[name].node.random or name in changed  # another name would draw anew
     }
-    steps = dict(recipe.steps)
-    for name in copied:
-        steps[TOLD + name] = _copy(recipe.steps[name], copied, added)
-    for name in _readers(recipe):
-        step = recipe.steps[name]
-        wires = {key: _told(wire, copied) if key in _KNOWLEDGE else wire for key, wire in step.wires.items()}
-        steps[name] = replace(step, wires=wires)
-    return replace(recipe, steps=steps)
+    return with_copies(recipe, readers, copied, lambda step: _changed(step, added))
 
 
 def shifted(value: Any, by: Any) -> Any:
@@ -72,21 +63,11 @@ def shifted(value: Any, by: Any) -> Any:
 
 def _readers(recipe: Recipe) -> list[str]:
     """Return the steps that restore the picture of the mask and know optics or lasers."""
-    if _RAW not in recipe.steps:
-        return []
-    later = dependents(recipe, [_RAW])
-    return [name for name in later if any(recipe.steps[name].wires.get(key) for key in _KNOWLEDGE)]
+    return knowers(recipe, dependents(recipe, [FRAME])) if FRAME in recipe.steps else []
 
 
-def _known(recipe: Recipe) -> list[str]:
-    """Return the steps whose results tell a restorer what optics and lasers are."""
-    wires = (recipe.steps[name].wires.get(key) for name in _readers(recipe) for key in _KNOWLEDGE)
-    return [name for wire in wires for name in ((wire,) if isinstance(wire, str) else wire or ())]
-
-
-def _copy(step: Step, copied: set[str], error: Mapping[str, Any]) -> Step:
-    params = dict(step.params)
-    wires = {key: _told(wire, copied) for key, wire in step.wires.items()}
+def _changed(step: Step, error: Mapping[str, Any]) -> Step:
+    params, wires = dict(step.params), dict(step.wires)
     for full, by in error.items():
         name, _, param = full.rpartition(".")
         if name != step.name:
@@ -95,10 +76,4 @@ def _copy(step: Step, copied: set[str], error: Mapping[str, Any]) -> Step:
             wires[param] = None
         elif params[param] is not None:  # a direction is drawn for each scene
             params[param] = shifted(params[param], by)
-    return replace(step, name=TOLD + step.name, params=params, wires=wires)
-
-
-def _told(wire: Wire, copied: set[str]) -> Wire:
-    if isinstance(wire, str):
-        return TOLD + wire if wire in copied else wire
-    return None if wire is None else tuple(TOLD + name if name in copied else name for name in wire)
+    return replace(step, params=params, wires=wires)

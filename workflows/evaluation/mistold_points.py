@@ -51,10 +51,10 @@ def told_with_errors(
 
 def _variant(pipeline: PipelineRecipes, text: str, error: Mapping[str, Any]) -> PipelineRecipes:
     @cache
-    def recipe(case: str, direction: tuple[float, float] | None = None) -> Recipe:
-        return mistold(pipeline.recipe(case, direction), error)
+    def recipe(case: str, *laser: Any) -> Recipe:
+        return mistold(pipeline.recipe(case, *laser), error)
 
-    return PipelineRecipes(pipeline.pipeline, recipe, text, error)
+    return PipelineRecipes(pipeline.pipeline, recipe, text, error, pipeline.recipe)
 
 
 def mistold_rows(points: Sequence[MistoldPoint]) -> list[Sequence[Any]]:

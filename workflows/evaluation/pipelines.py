@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
@@ -17,7 +17,7 @@ from neusee.workflows.recipe.text.composition import compose
 from neusee.workflows.recipe.text.overrides import Override
 
 NONE = "none"  #: name of the restorer that restores nothing, and of the case without a laser
-_FLAT = "flat"  #: option of `doe` without a mask
+FLAT = "flat"  #: option of `doe` without a mask
 BEAM = "beam"  #: name of the laser in every recipe of an evaluation
 
 #: the lasers of the paper with wavelengths in m: where the paper names only a colour, a common laser of this colour
@@ -29,6 +29,10 @@ CASES: dict[str, float | None] = {
     "red": 650e-9,
     NONE: None,
 }
+DRAWN = "drawn"  #: name of a laser whose wavelength follows the law of the recipe
+#: lasers of the figure with six lasers, with wavelengths in m
+SIX: dict[str, float | None] = {"violet": 405e-9, "blue": 450e-9, "cyan": 488e-9, **dict(list(CASES.items())[2:])}
+_WAVELENGTHS = {name: metres for name, metres in SIX.items() if metres is not None}
 _PIPELINE = re.compile(r"(?P<mask>[\w-]+)(?:@(?P<height>[^+]+))?\+(?P<restorer>[\w-]+)(?:@(?P<weights>.+))?")
 _HOW = "write MASK+RESTORER, such as flat+none, five_half_rings+wiener or pixelwise@mask.npy+nafnet@net.safetensors"
 
@@ -60,7 +64,7 @@ class Pipeline:
         file = f"@{self.height_file.name}" if self.height_file else ""
         if self.shade is None:
             return self.mask + file
-        spoken = "plain lens" if self.mask == _FLAT else self.mask.replace("half_ring", "half-ring").replace("_", " ")
+        spoken = "plain lens" if self.mask == FLAT else self.mask.replace("half_ring", "half-ring").replace("_", " ")
         return spoken + file + self.shade.said
 
     @property
@@ -89,9 +93,10 @@ class PipelineRecipes:
     """A pipeline (mask and restorer) with one recipe for each laser, which differ only in the laser wavelength."""
 
     pipeline: Pipeline
-    recipe: Callable[..., Recipe]  #: returns the recipe of a laser by name, and by its direction if one is given
+    recipe: Callable[..., Recipe]  #: returns the recipe of a laser by name; also by direction, and then by wavelength
     told: str = ""  #: the error in what the restorer is told, as text
     error: Mapping[str, Any] = field(default_factory=dict)  #: what is added to which parameters of what it is told
+    true: Callable[..., Recipe] | None = None  #: the same without the error
 
     @property
     def name(self) -> str:
@@ -123,13 +128,13 @@ def compose_pipelines(
     recipe: str, changes: Sequence[str | Override], pipelines: Sequence[Pipeline], folder: Path
 ) -> list[PipelineRecipes]:
     """Return each pipeline (mask and restorer) with its recipes; raise `EvaluationRefused` with all mistakes."""
-    fwhm = _fwhm(recipe, changes, folder)
+    own = _own_laser(recipe, changes, folder)
     found: list[PipelineRecipes] = []
     wrong: dict[str, None] = {}
     for pipeline in pipelines:
         try:
             words = [*changes, *_words(pipeline, partial(_takes, recipe, changes, folder))]
-            recipe_of = cache(partial(_with_laser, recipe, words, fwhm, folder))
+            recipe_of = cache(partial(_with_laser, recipe, words, own, folder))
             for case in (NONE, next(iter(CASES))):
                 _check(recipe_of(case), pipeline)
             found.append(PipelineRecipes(pipeline, recipe_of))
@@ -177,28 +182,56 @@ def _takes(recipe: str, changes: Sequence[str | Override], folder: Path, group: 
 def _with_laser(
     recipe: str,
     words: Sequence[str | Override],
-    fwhm: float,
+    own: _OwnLaser,
     folder: Path,
     case: str,
     direction: tuple[float, float] | None = None,
+    wavelength: float | None = None,
 ) -> Recipe:
     """Load a recipe with the laser ``case``; its strength, and usually its direction, is set later for each point."""
     laser = ""
-    if (metres := CASES[case]) is not None:
-        line = f"wavelength: {metres * 1e9:g} nm, fwhm: {fwhm * 1e9:g} nm"
+    if case != NONE:
+        metres = wavelength or _WAVELENGTHS.get(case)
+        line = own.drawn if metres is None else f"wavelength: {metres * 1e9:.12g} nm, fwhm: {own.fwhm * 1e9:g} nm"
         angle = "null" if direction is None else f"[{direction[0]!r} rad, {direction[1]!r} rad]"
         laser = f"{BEAM}: {{{line}, strength: 1, angle: {angle}}}"
     return load(recipe, [*words, f"lasers={{{laser}}}"], folder)
 
 
-def _fwhm(recipe: str, changes: Sequence[str | Override], folder: Path) -> float:
-    """Return the spectral width (FWHM) in m of the first laser of a recipe, or 10 nm if there is no laser."""
+class _OwnLaser(NamedTuple):
+    """The first laser of a recipe, or one of 10 nm width if there is no laser."""
+
+    fwhm: float  #: spectral width in m
+    drawn: str  #: wavelength and width as written in the recipe, with their laws
+
+
+def _own_laser(recipe: str, changes: Sequence[str | Override], folder: Path) -> _OwnLaser:
+    """Return the first laser of a recipe."""
+    steps = base_recipe(recipe, changes, folder).steps
+    widths = [step.params["fwhm"] for name, step in steps.items() if name.startswith("line[")]
+    fwhm = float(widths[0]) if widths else 10e-9
+    written = compose(recipe, changes, folder).root.below(["lasers"])
+    laser = next(iter(written.items.values()), None) if written else None
+    texts = {"fwhm": f"{fwhm * 1e9:g} nm", **(laser.plain if laser else {})}
+    return _OwnLaser(fwhm, ", ".join(f"{k}: '{texts[k]}'" for k in ("wavelength", "fwhm") if k in texts))
+
+
+def base_recipe(recipe: str, changes: Sequence[str | Override], folder: Path) -> Recipe:
+    """Load the recipe of an evaluation; raise `EvaluationRefused` with all mistakes in it."""
     try:
-        steps = load(recipe, changes, folder).steps
+        return load(recipe, changes, folder)
     except RecipeError as error:
         raise EvaluationRefused("\n".join(dict.fromkeys(map(one_line, error.diagnostics)))) from None
-    widths = [step.params["fwhm"] for name, step in steps.items() if name.startswith("line[")]
-    return float(widths[0]) if widths else 10e-9
+
+
+def refuse_fixed_laser(recipe: Recipe) -> None:
+    """Raise `EvaluationRefused` if the first laser of a recipe has no law from which its wavelength is drawn."""
+    first = next((name.partition("[")[2][:-1] for name in recipe.steps if name.startswith("line[")), None)
+    if recipe.uncertain is None or f"lasers.{first}.wavelength" not in recipe.uncertain.names:
+        raise EvaluationRefused(
+            "evaluate.lasers is drawn, but no law says which wavelength the first laser of the recipe has: add "
+            'laser=drawn, or write a law such as wavelength: "uniform(400 nm, 700 nm)"'
+        )
 
 
 def _check(recipe: Recipe, pipeline: Pipeline) -> None:

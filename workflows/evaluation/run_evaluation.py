@@ -10,38 +10,55 @@ all points, so that an interrupted evaluation continues.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from neusee.workflows.evaluation import equal_protection
-from neusee.workflows.evaluation.comparison_pictures import panels
-from neusee.workflows.evaluation.confidence_intervals import METRICS, compare_with, metric_table
-from neusee.workflows.evaluation.equal_protection import protect
-from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointNumbers, PointRequest
+from neusee.workflows.evaluation.confidence_intervals import METRICS, metric_table
+from neusee.workflows.evaluation.equal_protection import protect, read_protection
+from neusee.workflows.evaluation.evaluation_points import EvaluationPoints
 from neusee.workflows.evaluation.evaluation_result import EvaluationResult
-from neusee.workflows.evaluation.evaluation_scenes import Scene, refuse_directions, scenes
-from neusee.workflows.evaluation.mask_optics import masks
-from neusee.workflows.evaluation.mistold_points import mistold_rows, told_with_errors
+from neusee.workflows.evaluation.evaluation_scenes import (
+    Scene,
+    photographs,
+    refuse_directions,
+    scenes,
+    wavelengths,
+)
+from neusee.workflows.evaluation.measured_points import AskedCamera, Measured, measure
+from neusee.workflows.evaluation.mistold_points import mistold_rows
+from neusee.workflows.evaluation.paired_intervals import compare_with
 from neusee.workflows.evaluation.pipelines import (
-    NONE,
+    CASES,
+    DRAWN,
     EvaluationRefused,
     Pipeline,
     PipelineRecipes,
+    base_recipe,
     compose_pipelines,
     read_pipelines,
+    refuse_fixed_laser,
 )
+from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.protection.equal_shade import EqualProtection
-from neusee.workflows.recipe.loading import load
+from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport, StudyRun, silent
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 
-__all__ = ["STRENGTHS", "EvaluationRefused", "EvaluationResult", "evaluate", "read_pipelines"]
+__all__ = [
+    "STRENGTHS",
+    "EvaluationRefused",
+    "EvaluationResult",
+    "evaluate",
+    "options_of",
+    "read_pipelines",
+    "read_settings",
+]
 
 STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  #: strengths of the paper, in multiples of saturation
 SMALL = 256  #: pixels of the shorter side of the pictures that the paper restores
@@ -53,7 +70,7 @@ def evaluate(
     changes: Sequence[str | Override] = (),
     *,
     data: Path | None = None,
-    count: int = 20,
+    count: int | None = 20,
     strengths: Sequence[float] = STRENGTHS,
     small: int = SMALL,
     reference: str = "",
@@ -67,34 +84,90 @@ def evaluate(
 ) -> Path:
     """Evaluate every pipeline on ``count`` scenes at all laser ``strengths``, and return the folder of the results.
 
-    Args: recipe, changes: the camera, as for `load`. data: a folder of photographs, by default the scene of the recipe.
+    Args: recipe, changes: the camera, as for `load`; its block ``evaluate`` says which lasers the scenes have. data: a
+    folder of photographs, by default the scene of the recipe. count: by default 20, None means every photograph once.
     small: shorter side of the reduced pictures, which are compared too. reference: the pipeline with which all other
     pipelines are compared, by default the first pipeline. equal: the peak to which filters and stops bring every
     pipeline. progress: receives a line for each scene.
     Raises: `EvaluationRefused` with every mistake before anything runs.
     """
-    store, place = store or open_store(), folder or Path.cwd()
-    each = compose_pipelines(recipe, changes, pipelines, place)
+    place = folder or Path.cwd()
+    base, settings = base_recipe(recipe, changes, place), read_settings(recipe, changes, place)
+    asked = AskedCamera(recipe, changes, place, store or open_store(), settings, progress)
+    bare = compose_pipelines(recipe, changes, pipelines, place)
     strengths, reference = _strengths(strengths), _reference(reference, pipelines)
-    each = protect(recipe, changes, each, equal, store, place, progress) if equal else each
-    reference = {old.name: new.name for old, new in zip(pipelines, each, strict=True)}[reference]
-    base = load(recipe, changes, place)
     study_run = StudyRun("evaluate", base, command)
-    shown, broken = scenes(base, store, data, count)
-    refuse_directions(each[0], shown)
+    if settings.lasers == "drawn":
+        refuse_fixed_laser(base)
+    shown, broken = scenes(base, asked.store, data, count, [DRAWN] if settings.lasers == "drawn" else list(CASES))
+    refuse_directions(bare[0], shown)
+    each, references = _equalled(asked, bare, reference, equal)
     _report_scenes(shown, broken, strengths, each, progress)
-    bench = EvaluationPoints(store, small, device)
-    points = _points(bench, each, shown, strengths, progress)
-    mistold = told_with_errors(bench, each, shown, strengths, progress)
-    optics = masks(each, store, device, points)
-    drawn = panels(bench, each, shown[0], strengths)
-    tables = {name: metric_table(own, strengths) for name, own in points.items()}
-    least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
-    more = {name: compare_with(own, tables[reference], base.seed) for name, own in tables.items()}
-    rest = (reference, points, tables, more, optics, drawn, [p.pipeline for p in each], mistold, equal)
-    result = EvaluationResult(base, shown, broken, strengths, least, *rest)
+    bench = EvaluationPoints(asked.store, small, device)
+    found = measure(asked, bench, each, shown, strengths)
+    waves = tuple(wavelengths(bare[0], found.scenes))
+    result = _result(base, strengths, small, references, found, [p.pipeline for p in each], equal, broken, waves)
     document = study_run.document(_document(result, bench))
     return study_run.write(runs, digest(document["summary"]), document, _report(result))
+
+
+def read_settings(recipe: str, changes: Sequence[str | Override], folder: Path) -> EvaluateSettings:
+    """Return the block ``evaluate`` of a recipe; raise `EvaluationRefused` with all mistakes in the recipe."""
+    return base_recipe(recipe, changes, folder).evaluation or EvaluateSettings()
+
+
+def options_of(
+    settings: EvaluateSettings,
+    pipelines: str | Sequence[Pipeline] | None,
+    scenes: int | None,
+    reference: str,
+    equal_protection: float | None,
+    by: str | None,
+    folder: Path,
+) -> dict[str, Any]:
+    """Return arguments of `evaluate`: those that are given, and else those of the settings of the recipe."""
+    lines = settings.pipelines if pipelines is None else pipelines
+    level = settings.equal_protection if equal_protection is None else equal_protection
+    return {
+        "pipelines": read_pipelines(lines, folder) if isinstance(lines, str) else lines,
+        "count": scenes or (None if settings.scenes == "all" else settings.scenes),
+        "reference": reference or (settings.reference if pipelines is None else ""),
+        "equal": read_protection(level, by or settings.by),
+    }
+
+
+def _equalled(
+    asked: AskedCamera, bare: list[PipelineRecipes], reference: str, equal: EqualProtection | None
+) -> tuple[list[PipelineRecipes], dict[str, str]]:
+    """Return the pipelines, at equal protection if that was asked for, and the name of the reference of each."""
+    if equal is None:
+        return bare, dict.fromkeys((p.name for p in bare), reference)
+    shaded = protect(asked.recipe, asked.changes, bare, equal, asked.store, asked.folder, asked.progress)
+    rival = {old.name: new.name for old, new in zip(bare, shaded, strict=True)}[reference]
+    references = dict.fromkeys((p.name for p in shaded), rival)
+    if not asked.settings.beside:
+        return shaded, references
+    return [*bare, *shaded], {**dict.fromkeys((p.name for p in bare), reference), **references}
+
+
+def _result(
+    base: Recipe,
+    strengths: tuple[float, ...],
+    small: int,
+    references: dict[str, str],
+    found: Measured,
+    pipelines: Sequence[Pipeline],
+    equal: EqualProtection | None,
+    broken: Sequence[tuple[Path, str]],
+    waves: Sequence[float | None],
+) -> EvaluationResult:
+    """Return the result of an evaluation with its statistics over scenes."""
+    owners, lost = photographs(found.scenes), [*broken, *found.broken]
+    tables = {name: metric_table(own, strengths, owners) for name, own in found.points.items()}
+    least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
+    more = {name: compare_with(own, tables[references[name]], base.seed) for name, own in tables.items()}
+    rest = (found.masks, found.panels, pipelines, found.mistold, equal, waves)
+    return EvaluationResult(base, found.scenes, lost, strengths, least, references, found.points, tables, more, *rest)
 
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
@@ -127,28 +200,6 @@ def _report_scenes(
         progress(f"not read: {len(broken) - 5} more")
 
 
-def _points(
-    bench: EvaluationPoints,
-    each: Sequence[PipelineRecipes],
-    shown: Sequence[Scene],
-    strengths: Sequence[float],
-    progress: Progress,
-) -> dict[str, list[dict[float, PointNumbers]]]:
-    """Compute all evaluation points laser by laser, because scenes with the same laser have common optical results."""
-    points: dict[str, list[dict[float, PointNumbers]]] = {p.name: [{} for _ in shown] for p in each}
-    before, order = "", [scene.case for scene in shown]
-    for done, scene in enumerate(sorted(shown, key=lambda scene: order.index(scene.case)), 1):
-        if before not in ("", scene.case):
-            bench.forget()
-        before, alone = scene.case, replace(scene)  # a copy, which releases the picture when it is deleted
-        for strength in strengths if scene.case != NONE else (0.0,):
-            for pipeline in each:
-                point = bench.point(pipeline, PointRequest(alone, strength))
-                points[pipeline.name][scene.number][strength] = point
-        progress(f"scene {done} of {len(shown)} ({scene.case}, {scene.name}): {bench.computed} points computed")
-    return points
-
-
 # --- the folder -------------------------------------------------------------------------------------------------------
 
 
@@ -161,6 +212,7 @@ def _document(result: EvaluationResult, bench: EvaluationPoints) -> dict[str, An
         "strengths": list(result.strengths),
         "small": result.small,
         "reference": result.reference,
+        "lasers": [None if metres is None else metres * 1e9 for metres in result.wavelengths],
         **equal_protection.as_document(result),
         "computed": bench.computed,
         "seconds a point": bench.seconds / bench.computed if bench.computed else None,
@@ -175,7 +227,7 @@ def _report(result: EvaluationResult) -> StudyReport:
     tables: dict[str, CsvTable] = {
         "points.csv": ((*_POINT, *METRICS), _point_rows(result)),
         "table.csv": (COLUMNS, rows(result)),
-        "mistold.csv": ((*_POINT[:1], "told", *_POINT[3:], *METRICS), mistold_rows(result.mistold)),
+        "mistold.csv": ((*_POINT[:1], "told", *_POINT[3:6], *_POINT[7:], *METRICS), mistold_rows(result.mistold)),
         "suppression.csv": (("mask", "wavelength (nm)", "lsr", "bsr", "floor"), _curve_rows(result)),
     }
     if result.protection is not None:
@@ -185,14 +237,15 @@ def _report(result: EvaluationResult) -> StudyReport:
     return StudyReport(title, lead(result), sections(result, pictures), pictures, tables, shown=shown)
 
 
-_POINT = ("pipeline", "mask", "restorer", "scene", "photograph", "laser", "strength")
+_POINT = ("pipeline", "mask", "restorer", "scene", "photograph", "laser", "wavelength (nm)", "strength")
 
 
 def _point_rows(result: EvaluationResult) -> list[Sequence[Any]]:
+    waves = ["" if metres is None else f"{metres * 1e9:.6g}" for metres in result.wavelengths]
     return [
-        (p.name, p.front, p.back, s.number, s.name, s.case, f"{k:g}", *(point[metric] for metric in METRICS))
+        (p.name, p.front, p.back, s.number, s.name, s.case, nm, f"{k:g}", *(point[metric] for metric in METRICS))
         for p in result.pipelines
-        for s, at in zip(result.scenes, result.points[p.name], strict=True)
+        for s, at, nm in zip(result.scenes, result.points[p.name], waves, strict=True)
         for k, point in at.items()
     ]
 

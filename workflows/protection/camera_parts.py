@@ -16,7 +16,7 @@ from neusee.nodes.metrics import PixelNoise
 from neusee.nodes.values import Bands, Psf, Pupil, Stop
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.recipe.distributions.unknown_conditions import Condition
+from neusee.workflows.protection.unknown_conditions import Condition
 from neusee.workflows.store.result_store import Store
 
 _NEEDED = ("psf[mask]", "pupil[mask]", "pupil[plain]", "illuminant", "responses", "read[mask]", "well[mask]")

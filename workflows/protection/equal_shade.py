@@ -13,7 +13,7 @@ from neusee.nodes import metrics
 from neusee.workflows.protection.camera_parts import ProtectionCamera
 from neusee.workflows.protection.equal_rivals import Candidate, best
 from neusee.workflows.protection.front_optics import Front, FrontBench, FrontSettings
-from neusee.workflows.recipe.distributions.unknown_conditions import usual_condition
+from neusee.workflows.protection.unknown_conditions import usual_condition
 from neusee.workflows.store.result_store import Store
 
 WAYS = ("best", "filter", "stop")  #: what is added to a lens: stop and filter, a filter alone, or a stop alone

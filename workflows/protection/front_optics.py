@@ -29,7 +29,7 @@ from neusee.workflows.keys.cache_key import digest, plain
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.input_file_digest import file_digest
 from neusee.workflows.protection.camera_parts import ProtectionCamera
-from neusee.workflows.recipe.distributions.unknown_conditions import Condition
+from neusee.workflows.protection.unknown_conditions import Condition
 from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 

@@ -22,7 +22,7 @@ from neusee.workflows.protection.equal_rivals import (
     quiet_picture,
 )
 from neusee.workflows.protection.front_optics import Front, FrontBench
-from neusee.workflows.recipe.distributions.unknown_conditions import Condition, usual_condition
+from neusee.workflows.protection.unknown_conditions import Condition, usual_condition
 
 LIGHTS = (10.0, 30.0, 100.0, 300.0, 1e3, 3e3, 1e4)  #: e- a pixel
 LEVELS = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4)  #: share of the clear lens's peak, or heat

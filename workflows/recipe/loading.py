@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.final_values import Config, Setting
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
+from neusee.workflows.recipe.distributions.mismatch_laws import read_mismatch
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
 from neusee.workflows.recipe.expected_numbers import unaffected_expectations
 from neusee.workflows.recipe.global_settings import expectations, outputs_of, seed_and_tolerance
@@ -121,6 +122,7 @@ def check(composed: Composed) -> Recipe:
     composed, training, lifting, evaluation = read
     composed, uncertain = settle(composed)
     diagnostics = list(composed.diagnostics)
+    uncertain = _with_mismatch(composed, uncertain, blocks[0] if training else None, diagnostics)
     root, references = composed.root, References(composed.root, diagnostics, dict(composed.replaced))
     checker = Checker([], own=own.modules)
     checker.files[(KEY,)] = own.places
@@ -147,6 +149,16 @@ def check(composed: Composed) -> Recipe:
     notes = (*composed.notes, *own.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
     parts = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
     return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting, evaluation=evaluation, safety=safety)
+
+
+def _with_mismatch(
+    composed: Composed, uncertain: Uncertain | None, block: Value | None, diagnostics: list[Diagnostic]
+) -> Uncertain | None:
+    """Return the uncertain values of a recipe with the differences that ``train.mismatch`` states, if any."""
+    given = block.child("mismatch") if block else None
+    if given is None or not (mismatch := read_mismatch(given, composed.root, diagnostics)):
+        return uncertain
+    return replace(uncertain or Uncertain(replace(composed, diagnostics=()), {}, None), mismatch=mismatch)
 
 
 def _safety(

@@ -29,7 +29,6 @@ class PosedPictures:
 
     filter: str
     matrix: str
-    outputs: tuple[str, ...]  #: all steps that a training picture needs
 
     @classmethod
     def of(cls, recipe: Recipe, settings: Training) -> PosedPictures | None:
@@ -48,12 +47,12 @@ class PosedPictures:
                 f"restore: wiener and {KEY}.picture: restored"
             )
             raise ValueError(f"{given.source if given else recipe.name}   {KEY}.picture   {text}")
-        return cls(channels, matrix, (channels, matrix, settings.truth, settings.light, settings.psf))
+        return cls(channels, matrix)
 
     @property
     def steps(self) -> tuple[str, str]:
         """Return the steps from which `read` makes the input of the network."""
-        return self.filter, self.matrix
+        return (self.filter, self.matrix)
 
     def within(self, recipe: Recipe) -> Recipe:
         """Return the recipe whose filter poses the problem and solves it."""

@@ -18,6 +18,7 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.blocks.train_block import KEY, Stage, Training
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training import held_out
+from neusee.workflows.training.camera_mismatch import CameraMismatch
 from neusee.workflows.training.exported_files import require_exports, write_exports
 from neusee.workflows.training.held_out import Best, Split, Validation
 from neusee.workflows.training.loop.checkpoint import export
@@ -65,6 +66,7 @@ def train(
     if MASK in stages and mesh.size > 1:
         raise MeshError("--stage mask runs in a single process: start the training without torchrun")
     _require_equal_shares(recipe, settings, mesh)
+    CameraMismatch.of(recipe, settings)  # raises its mistakes before any work
     photographs = _photographs(recipe, settings, bool(with_pictures))
     parts = held_out.split(recipe, settings, photographs)
     start = WarmStart.of(recipe, settings)

@@ -7,7 +7,7 @@ of the noise. So a picture of another optics, sensor, laser, distribution or cod
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -29,9 +29,9 @@ _CODE = ("training.stored_pool", "training.training_pictures")
 class StoredPool:
     """The pictures of a pool behind a fixed mask, each in the store under a key of its own."""
 
-    def __init__(self, recipe: Recipe, settings: Training, store: Store, device: str) -> None:
+    def __init__(self, recipe: Recipe, settings: Training, outputs: Sequence[str], store: Store, device: str) -> None:
         self.recipe, self.settings, self.store, self.device = recipe, settings, store, device
-        self._outputs = (settings.picture, settings.truth, settings.light)
+        self._outputs = tuple(outputs)
         self._order = [name for name in needed(recipe, self._outputs) if name != settings.scene]
         self._code = Code(store.code_memo)
         self._resize = self._code.digest("neusee.nodes.bicubic_resize")

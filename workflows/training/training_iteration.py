@@ -175,8 +175,8 @@ class Learner:
 
         Processes have different bands, or the same bands with smaller weights, so that each band counts once.
         """
-        psf: Psf = shared.values[self.settings.psf]
-        count, times = samples.counted(self.settings.psf, len(psf.clear_peak))
+        psf: Psf = shared.values[samples.psf]
+        count, times = samples.counted(samples.psf, len(psf.clear_peak))
         with torch.no_grad():
             peaks: Tensor = metrics.lsr(psf)
         if self.stage.lsr:

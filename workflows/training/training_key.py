@@ -24,7 +24,7 @@ def key_of_training(
     items = recipe.config.settings.items()
     left_out = (f"{KEY}.", OWN_NODES)
     values = {name: str(setting.value) for name, setting in items if not name.startswith(left_out)}
-    defaults = {"mask": MaskSettings(), "clip": 10.0, "reduction": "mean", "augment": Augment()}
+    defaults = {"mask": MaskSettings(), "clip": 10.0, "reduction": "mean", "augment": Augment(), "mismatch": None}
     usual = {name for name, x in defaults.items() if getattr(settings, name) == x}  # so that older trainings continue
     if not parts.held_out:
         usual |= {"held_out", "held_out_pictures", "validate_every", "patience"}

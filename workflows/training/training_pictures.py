@@ -19,18 +19,20 @@ from torch import Tensor
 from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.scene import Change, Photographs, symmetry
 from neusee.workflows.engine.differentiable_function import as_function
-from neusee.workflows.graph.diagnostics import nearest
-from neusee.workflows.graph.recipe_graph import Recipe, Step, dependents, needed
+from neusee.workflows.graph.recipe_graph import Recipe, dependents, needed
+from neusee.workflows.graph.told_copies import TOLD
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+from neusee.workflows.training.camera_mismatch import CameraMismatch
 from neusee.workflows.training.parallel.band_shards import Shards
 from neusee.workflows.training.parallel.picture_rounds import Pictures
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.posed_pictures import Given, PosedPictures, given_of, tensors_of
 from neusee.workflows.training.stored_pool import StoredPool
+from neusee.workflows.training.training_recipe import frame_of, in_precision, require_steps
 
 _LASER = ("optics.laser_irradiance", "strength")  #: the node of a laser, and the parameter that is 0 without a laser
 _SEEDS = 2**31
@@ -43,7 +45,7 @@ class Sample:
 
     picture: Tensor  #: (n, 3, y, x), the developed picture of the camera
     truth: Tensor  #: (n, 3, y, x), the true picture
-    light: Tensor  #: (band,), the fraction of the light of the scene that the mask keeps
+    light: Tensor  #: (band,), the fraction of the light of the scene that the mask keeps; empty where no loss reads it
     drawn: Mapping[str, Any]  #: the values that were sampled for the picture
     given: Given = ()  #: what the network needs beside the picture
 
@@ -56,6 +58,9 @@ class Sample:
     def of(cls, tensors: Mapping[str, Tensor], drawn: Mapping[str, Any]) -> Sample:
         """Return the training picture whose tensors `tensors` named."""
         return cls(tensors["picture"], tensors["truth"], tensors["light"], drawn, given_of(tensors))
+
+
+_NOTHING = Sample(torch.zeros(0), torch.zeros(0), torch.zeros(0), {})  #: of a process without a picture in a round
 
 
 class TrainingStream:
@@ -77,30 +82,50 @@ class TrainingStream:
         self.seed, self.mesh, self.held_out = recipe.seed, mesh, held_out
         self._pool = settings.pool if frozen else None
         self._kept: dict[tuple[int, int], Sample] = {}
+        self._rounds: dict[tuple[int, ...], Sample] = {}  #: by stage and numbers, of processes that divide the bands
         outputs: tuple[str, ...] = (settings.picture, settings.truth, settings.light, settings.psf)
         require_steps(recipe, "train", (*outputs, settings.scene, *([learn] if learn else [])))
         self._inputs = Inputs.of(recipe, outputs) if recipe.uncertain and recipe.uncertain.names else None
-        self.shape = _frame(recipe, settings.scene)
+        self._mismatch = CameraMismatch.of(recipe, settings)
+        self.shape = frame_of(recipe, settings.scene)
+        believed = in_precision(frozen or recipe, settings.dtype)
         self._posed = PosedPictures.of(recipe, settings)
-        recipe = in_precision(frozen or recipe, settings.dtype)
         if self._posed:
-            recipe, outputs = self._posed.within(recipe), self._posed.outputs
+            believed = self._posed.within(believed)
+        stage = settings.stages.get(2 if frozen else 1)
+        light = (settings.light,) if stage is not None and stage.bsr else ()  # else no loss reads it
+        seen = self._posed.steps if self._posed else (settings.picture,)
+        self._made = (*seen, settings.truth, *light)
+        recipe, self.psf = self._mismatch.camera(believed, self._made, settings.psf)
+        outputs = (*self._made, self.psf)
         recipe = with_substitutions(recipe, outputs, {learn} if learn else ())
         order = needed(recipe, outputs)
-        self._stored = StoredPool(recipe, settings, store, device) if self._pool and settings.keep_pool else None
+        self._stored = (
+            StoredPool(recipe, settings, self._made, store, device) if self._pool and settings.keep_pool else None
+        )
         self._lasers = [f"{n}.{_LASER[1]}" for n in order if recipe.steps[n].node.path == _LASER[0]]
-        readers = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
-        self._readers = {name: _given(recipe, name) for name in readers}
-        fixed = set(needed(recipe, [settings.psf]))  # random effects in the PSF, such as dirt, are constant
+        self._readers = self._read(believed, order)
+        readers = self._readers
+        fixed = set(needed(recipe, [self.psf]))  # random effects in the PSF, such as dirt, are constant
         noise = {name for name in order if recipe.steps[name].node.random and name not in fixed}
         drawn = dependents(recipe, noise | {settings.scene, *(name.rpartition(".")[0] for name in readers)}, order)
         learnt = dependents(recipe, {learn} if learn else (), order)
-        if settings.psf in drawn:
+        if self.psf in drawn:
             raise ValueError(f"train.psf: {settings.psf} changes with each picture: name a step with a constant PSF")
-        self.shards = Shards.of(recipe, settings.psf, outputs, drawn | learnt, store, mesh)
+        self.shards = Shards.of(recipe, self.psf, outputs, drawn | learnt, store, mesh)
         drawn |= self.shards.behind
-        read = _sources(recipe, drawn) | {settings.psf}
+        read = _sources(recipe, drawn) | {self.psf}
         self._divide(recipe, learn, [n for n in order if n in (learnt - drawn) & read], drawn, noise, store)
+
+    def _read(self, believed: Recipe, order: Sequence[str]) -> dict[str, Any]:
+        """Return the parameters that change with each picture, with the values that the recipe states.
+
+        What is drawn for the camera is told to the restorer too, but for the differences of ``train.mismatch``.
+        """
+        drawn = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
+        told, steps = [TOLD + name for name in drawn], set(order)
+        each = [name for name in (*drawn, *told, *self._mismatch.moved) if name.rpartition(".")[0] in steps]
+        return {name: _given(believed, name.removeprefix(TOLD)) for name in each}
 
     def _divide(
         self, recipe: Recipe, learn: str | None, border: list[str], drawn: set[str], noise: set[str], store: Store
@@ -112,8 +137,10 @@ class TrainingStream:
         self._whole = [name for name in border if name in read]
         caller = self.shards.call
         self.shared = as_function(recipe, learn, outputs=border, caller=caller, **ways) if learn else None
-        outputs = [*(self._posed.steps if self._posed else (settings.picture,)), settings.truth, settings.light]
-        self._each = Pictures(recipe, [*border, settings.scene, *self._readers], outputs, noise, self.shards, ways)
+        free = [*border, settings.scene, *self._readers]
+        self._each = Pictures(recipe, free, self._made, noise, self.shards, ways)
+        if self._each.by_band:
+            self._stored = None  # a picture that several processes compute stays in memory
 
     @property
     def pool_counts(self) -> dict[str, int]:
@@ -145,11 +172,19 @@ class TrainingStream:
                 if mine is not None:
                     yield mine, self._turned(self(shared.seen, stage, first + mine), stage, first + mine)
                 continue
-            begun = {i: self._drawn(stage, self._number(stage, first + i)) for i in together}
+            key = (stage, *(self._number(stage, first + i) for i in together))
+            if key in self._rounds:  # in the memory of all processes, or of none
+                if mine is not None:
+                    yield mine, self._turned(self._rounds[key], stage, first + mine)
+                continue
+            begun = {i: self._drawn(stage, number) for i, number in zip(together, key[1:], strict=True)}
             parts = {i: (theta, noise) for i, (theta, noise, _) in begun.items()}
             with self._each.together(shared, parts, mine) as values:
+                sample = _NOTHING if mine is None else self._sample(values, begun[mine][2])
                 if mine is not None:
-                    yield mine, self._turned(self._sample(values, begun[mine][2]), stage, first + mine)
+                    yield mine, self._turned(sample, stage, first + mine)
+            if self._pool is not None and stage != HELD_OUT:
+                self._rounds[key] = sample
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
         """Return the training picture with the given number, which does not depend on order or process."""
@@ -199,6 +234,10 @@ class TrainingStream:
             values = self._inputs.at(rng.standard_normal((1, len(self._inputs.names))))[0]
             drawn = dict(zip(self._inputs.names, map(float, values), strict=True))
             theta |= self._inputs.theta(drawn)
+        theta |= {name: theta[name.removeprefix(TOLD)] for name in theta if name.startswith(TOLD)}
+        differences = self._mismatch.drawn((self.seed, stage, number))
+        theta |= self._mismatch.truth(theta, differences)
+        drawn |= {f"mismatch {path}": value for path, value in differences.items()}
         if rng.random() < self.settings.laser_free:
             theta |= dict.fromkeys(self._lasers, 0.0)
             drawn["laser"] = "none"
@@ -212,16 +251,13 @@ class TrainingStream:
         Antialiased `kornia.geometry.transform.resize` lets stripes alias: at 2/3 of the size the finest stripes keep a
         contrast of 0.69 with kornia, and of 0.09 with `resize`.
         """
-        truth = values[self.settings.truth]
-        if self._posed is not None:
-            told, given = self._posed.read(values)
-            pair = (told.to(self.settings.dtype)[None], truth.to(self.settings.dtype)[None])
-            return Sample(*pair, values[self.settings.light], drawn, given)
-        both = [picture.to(self.settings.dtype) for picture in (values[self.settings.picture], truth)]
+        light = values.get(self.settings.light, torch.zeros(0))
+        picture, given = self._posed.read(values) if self._posed else (values[self.settings.picture], ())
+        both = [x.to(self.settings.dtype) for x in (picture, values[self.settings.truth])]
         if self.settings.size is not None:
             both = [resize(picture, *self.settings.size) for picture in both]
         picture, truth = self._patches(torch.stack(both), drawn["noise"])
-        return Sample(picture, truth, values[self.settings.light], drawn)
+        return Sample(picture, truth, light, drawn, given)
 
     def _patches(self, both: Tensor, seed: int) -> Tensor:
         """Cut patches from a training picture and the true picture at the same positions, as a tensor (2, n, 3, y, x).
@@ -237,32 +273,6 @@ class TrainingStream:
         count = self.settings.patches
         places = [[int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)] for _ in range(count)]
         return torch.stack([both[..., y : y + patch[0], x : x + patch[1]] for y, x in places], 1)
-
-
-def in_precision(recipe: Recipe, dtype: torch.dtype) -> Recipe:
-    """Return the recipe with steps in float64 if ``dtype`` is float64: steps with a choice of precision are double."""
-    if dtype != torch.float64:
-        return recipe
-    steps = {name: _precise(step) if "precision" in step.params else step for name, step in recipe.steps.items()}
-    return replace(recipe, steps=steps)
-
-
-def _precise(step: Step) -> Step:
-    return replace(step, params={**step.params, "precision": "double"})
-
-
-def require_steps(recipe: Recipe, block: str, names: Sequence[str]) -> None:
-    """Raise ValueError unless the recipe has all steps ``names``, which the settings block ``block`` names."""
-    for name in names:
-        if name not in recipe.steps:
-            raise ValueError(f"{block}: the recipe has no step {name}; {nearest(name, recipe.steps)}")
-
-
-def _frame(recipe: Recipe, scene: str) -> tuple[int, int]:
-    shape = recipe.steps[scene].params.get("shape")
-    if shape is None:
-        raise ValueError(f"train: the step {scene} has no shape: set {scene}.shape in pixels, such as [96, 96]")
-    return shape[0], shape[1]
 
 
 def _given(recipe: Recipe, name: str) -> Any:

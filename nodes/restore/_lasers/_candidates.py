@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from neusee.nodes.values import Bands, Pupil
 
 _STEP = 5e-9  #: m between the wavelengths that are tried
 _REACH = 192  #: pixels from the spot, as far as a pattern is compared before it is fitted
+_MORE = (1.0, 2.0)  #: clipped pixels of a pattern that are tried, over those of the frame
 _APART = (1.5, 8e-9)  #: pixels and m, by which two candidates differ at least
 
 
@@ -53,33 +55,13 @@ def line_templates(pupil: Pupil, responses: Tensor, bands: Bands, lens: Lens) ->
 
 def candidates(residual: Tensor, use: Filter, weights: Weights, templates: Templates, count: int) -> list[Candidate]:
     """Return the most likely places and wavelengths of one more pattern in a filtered residual, the best first."""
-    return _scanned(residual, use, weights, templates, count, None)
-
-
-def clipped_candidates(
-    picture: Tensor, full: float, use: Filter, weights: Weights, templates: Templates, count: int
-) -> list[Candidate]:
-    """Return candidates for a pattern that the sensor clips, in a frame with clipped pixels at ``full``.
-
-    Each pattern is cut off so that as many of its pixels are clipped as in the frame.
-    """
-    return _scanned(
-        use.sharp(picture), use, weights, templates, count, (int((picture >= 0.98 * full).any(0).sum()), full)
-    )
-
-
-def _scanned(
-    residual: Tensor, use: Filter, weights: Weights, templates: Templates, count: int, cut: tuple[int, float] | None
-) -> list[Candidate]:
     residual = residual.float()  # a start needs no more
     weights = Weights(*(x.float() for x in weights))
     white, frame = weights(residual), residual.shape[-2:]
     found: list[Candidate] = []
     for line, pattern, heard in zip(*templates, strict=True):
-        window = pattern.shape[-2:]
-        size = [fast_size(n + k - 1) for n, k in zip(frame, window, strict=True)]
-        level = None if cut is None else _level(pattern, cut[0])
-        own = use.sharp(pattern.to(residual) if level is None else pattern.to(residual).clamp_max(level))
+        size = _size(frame, pattern)
+        own = use.sharp(pattern.to(residual))
         by = weights(heard.to(residual)[:, None, None].expand_as(residual))
         if len(pattern) == 1:
             top, low = (by * white).sum(0, keepdim=True), by.square().sum(0, keepdim=True)
@@ -87,12 +69,46 @@ def _scanned(
             top, low = heard.to(residual)[:, None, None] * weights(white), by.square()
         product = _correlated(top, own, size).sum(0)
         norm = _correlated(low, own.square(), size).sum(0).clamp_min(0.0)
-        gain = 0.5 * product.clamp_min(0.0).square() / (norm + 1e-6 * norm.max() + 1e-30)
-        strength = product / norm.clamp_min(1e-30)
-        if level is not None and cut is not None:
-            strength = torch.full_like(strength, cut[1] / (level * float(heard.max())))
-        found += _peaks(gain, strength, float(line), frame, window, count)
+        found += _peaks(_gain(product, norm), product / norm.clamp_min(1e-30), float(line), pattern, frame, count)
     return _apart(sorted(found, reverse=True), count)
+
+
+def clipped_candidates(
+    picture: Tensor, full: float, use: Filter, weights: Weights, templates: Templates, count: int
+) -> list[Candidate]:
+    """Return candidates for a pattern that the sensor clips, in a frame with clipped pixels at ``full``.
+
+    Each pattern is so strong that as many of its pixels are clipped as in the frame, or `_MORE` times as many, of which
+    some lie beyond the frame. Each channel is clipped by itself: those that hardly see a wavelength show more of its
+    pattern.
+    """
+    clipped = int((picture >= 0.98 * full).any(0).sum())
+    picture, frame = picture.float(), picture.shape[-2:]
+    weights = Weights(*(x.float() for x in weights))
+    size = _size(frame, templates.patterns[0])
+    pairs = list(itertools.combinations_with_replacement(range(len(picture)), 2))
+    both = torch.fft.rfft2(weights.twice(use.sharp(picture)), s=size)
+    inverse = torch.fft.rfft2(torch.stack([weights.pair(*pair) * (1 + (pair[0] != pair[1])) for pair in pairs]), s=size)
+    found: list[Candidate] = []
+    for (line, pattern, heard), more in itertools.product(zip(*templates, strict=True), _MORE):
+        share, level = (heard / heard.max()).to(picture), _level(pattern, round(more * clipped))
+        own = use.sharp((share[:, None, None] * pattern.to(picture) / level).clamp_max(1.0))
+        squares = torch.stack([own[one] * own[other] for one, other in pairs])
+        product, norm = (
+            torch.fft.irfft2((data * torch.fft.rfft2(model, s=size).conj()).sum(0), s=size)
+            for data, model in ((both, own), (inverse, squares))
+        )
+        strength = torch.full_like(norm, full / (level * float(heard.max())))
+        found += _peaks(_gain(product, norm.clamp_min(0.0)), strength, float(line), pattern, frame, count)
+    return _apart(sorted(found, reverse=True), count)
+
+
+def _size(frame: torch.Size, pattern: Tensor) -> list[int]:
+    return [fast_size(n + k - 1) for n, k in zip(frame, pattern.shape[-2:], strict=True)]
+
+
+def _gain(product: Tensor, norm: Tensor) -> Tensor:
+    return 0.5 * product.clamp_min(0.0).square() / (norm + 1e-6 * norm.max() + 1e-30)
 
 
 def _level(pattern: Tensor, count: int) -> float:
@@ -108,11 +124,12 @@ def _correlated(picture: Tensor, pattern: Tensor, size: list[int]) -> Tensor:
 
 
 def _peaks(
-    gain: Tensor, strength: Tensor, line: float, frame: torch.Size, window: torch.Size, count: int
+    gain: Tensor, strength: Tensor, line: float, pattern: Tensor, frame: torch.Size, count: int
 ) -> list[Candidate]:
     """Return the largest gains with the spot within the frame."""
     rows, columns = (
-        (torch.arange(n, device=gain.device) - k // 2) % s for n, k, s in zip(frame, window, gain.shape, strict=True)
+        (torch.arange(n, device=gain.device) - k // 2) % s
+        for n, k, s in zip(frame, pattern.shape[-2:], gain.shape, strict=True)
     )
     inside, sizes = gain[rows[:, None], columns], strength[rows[:, None], columns]
     best = torch.topk(inside.flatten(), min(3 * count, inside.numel()))

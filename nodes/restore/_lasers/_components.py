@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -9,12 +10,13 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.restore._inverse._wiener import grey_shares
-from neusee.nodes.restore._lasers._line_pattern import Lens, line_pattern, response_at
+from neusee.nodes.restore._lasers._line_pattern import Lens, deviation, line_moves, line_pattern, response_at
 from neusee.nodes.restore._lasers._whitening import fast_size
 from neusee.nodes.values import Bands, Psf, Pupil
 
 NANOMETRE = 1e-9
-_STEP = (0.02, 0.02, 0.1)  #: pixels, pixels and nm, over which the slope of a pattern is taken
+_WIDTH = 0.5  #: nm^2, standard deviation of the variance of a line, or that variance itself where it is more
+_WIDEST = 50.0  #: nm^2, most that is added to the variance of a line
 _KNOWN = 0.03  #: relative standard deviation of the response of a channel to one line
 _BLIND = 0.003  #: the same as a share of the largest response, for a channel that hardly sees the line
 _TILT = 50e-9  #: m, the scale of the tilt and the bend of a lamp's spectrum
@@ -32,15 +34,27 @@ class Camera(NamedTuple):
 
 @dataclass(frozen=True)
 class Laser:
-    """A laser: place (y, x) of the spot in pixels from the middle, wavelength in nm, strength, errors of response."""
+    """A laser: place (y, x) of the spot in pixels from the middle, wavelength in nm, strength, width, errors."""
 
     camera: Camera
-    values: Tensor  #: (4 + channel,): y, x, nm, electrons at response 1, errors of the responses over their spread
+    #: (5 + channel,): y, x, nm, electrons at response 1, nm^2 of the variance of the line beyond that of the camera's
+    #: ``fwhm``, and the errors of the responses over their spread
+    values: Tensor
 
     @property
     def precision(self) -> Tensor:
         """Return the prior precision of each value."""
-        return torch.cat([torch.zeros(4), torch.ones(len(self.values) - 4)]).to(self.values)
+        width = torch.tensor([max(self._variance(), _WIDTH) ** -2])
+        return torch.cat([torch.zeros(4), width, torch.ones(len(self.values) - 5)]).to(self.values)
+
+    @property
+    def fwhm(self) -> Tensor:
+        """Return the width of the line in m, at half maximum: () float64."""
+        variance = (self._variance() + self.values[4].double()).clamp_min(0.0)
+        return self.camera.fwhm * (variance / self._variance()).sqrt()
+
+    def _variance(self) -> float:
+        return float(deviation(self.camera.fwhm) / NANOMETRE) ** 2
 
     def electrons(self) -> Tensor:
         """Return the light of the laser in each pixel of each channel."""
@@ -49,25 +63,32 @@ class Laser:
     def channels(self) -> Tensor:
         """Return the electrons of each channel over the whole pattern."""
         heard, spread = self._response(self.values[2])
-        return self.values[3] * (heard + spread * self.values[4:])
+        return self.values[3] * (heard + spread * self.values[5:])
 
-    def columns(self) -> Tensor:
-        """Return the change of the light for a unit change of each value: (value, channel, y, x)."""
-        pattern, channels = self._pattern(self.values[:3]), self.channels()[:, None, None]
-        columns = []
-        for i, step in enumerate(_STEP):
-            move = torch.zeros(3).to(self.values)
-            move[i] = step
-            ends = [self._pattern(self.values[:3] + sign * move) for sign in (1, -1)]
-            columns.append(channels * (ends[0] - ends[1]) / (2 * step))
-        columns[2] = columns[2] + self._response_slope()[:, None, None] * pattern
+    def columns(self, of: Callable[[Tensor], Tensor]) -> Tensor:
+        """Return ``of`` of the change of the light for a unit change of each value: (value, channel, ...).
+
+        ``of`` is linear, treats each channel by itself, and takes pictures (picture, 1 or channel, y, x).
+        """
+        seen = of(self._slopes()[:, None])  # one picture for all channels before, one for each after
+        ones = (1,) * (seen.ndim - 2)
+        channels = self.channels().view(-1, *ones)
         heard, spread = self._response(self.values[2])
-        columns.append((channels / self.values[3].clamp_min(1e-9)) * pattern)
+        wave = channels * seen[3] + self._response_slope().view(-1, *ones) * seen[0]
+        columns = [channels * seen[1], channels * seen[2], wave, (channels / self.values[3].clamp_min(1e-9)) * seen[0]]
+        columns.append(channels * seen[4])
         for i in range(len(heard)):
             one = torch.zeros_like(heard)
             one[i] = self.values[3] * spread[i]
-            columns.append(one[:, None, None] * pattern)
+            columns.append(one.view(-1, *ones) * seen[0])
         return torch.stack(columns)
+
+    def _slopes(self) -> Tensor:
+        """Return the pattern and its change with y, x (pixels), wavelength (nm) and variance (nm^2): (5, y, x)."""
+        camera, at = self.camera, self.values[:3].double()
+        moves = line_moves(camera.pupil, at[:2], at[2] * NANOMETRE, camera.lens, self.fwhm)
+        moves = moves._replace(wave=moves.wave * NANOMETRE, blur=moves.blur * NANOMETRE**2)
+        return torch.stack(list(moves)).to(self.values)
 
     def moved(self, step: Tensor) -> Laser:
         """Return the laser after a step, which stays in the range of the bands and near the frame."""
@@ -79,6 +100,7 @@ class Laser:
             values[i] = values[i].clamp(-0.5 * shape[i] - 1, 0.5 * shape[i] + 1)
         values[2] = values[2].clamp(float(centres.min()), float(centres.max()))
         values[3] = values[3].clamp_min(1e-3 * self.values[3].abs())
+        values[4] = values[4].clamp(-self._variance(), _WIDEST)
         return replace(self, values=values)
 
     def channel_slopes(self) -> Tensor:
@@ -86,8 +108,8 @@ class Laser:
         heard, spread = self._response(self.values[2])
         slopes = torch.zeros(len(heard), len(self.values)).to(self.values)
         slopes[:, 2] = self._response_slope()
-        slopes[:, 3] = heard + spread * self.values[4:]
-        slopes[:, 4:] = torch.diag(self.values[3] * spread)
+        slopes[:, 3] = heard + spread * self.values[5:]
+        slopes[:, 5:] = torch.diag(self.values[3] * spread)
         return slopes
 
     def _response(self, nm: Tensor) -> tuple[Tensor, Tensor]:
@@ -102,7 +124,7 @@ class Laser:
         lens = self.camera.lens
         at = at.double()  # phases need that
         towards = at[:2] * (lens.pixel_pitch / lens.focal_length)
-        pattern = line_pattern(self.camera.pupil, towards, at[2] * NANOMETRE, lens, self.camera.fwhm)
+        pattern = line_pattern(self.camera.pupil, towards, at[2] * NANOMETRE, lens, self.fwhm)
         return pattern.to(self.values)
 
 
@@ -163,18 +185,21 @@ class Lamp:
         """Return the light of the lamp in each pixel of each channel."""
         return self._pictures(self._spectra())
 
-    def columns(self) -> Tensor:
-        """Return the change of the light for a unit change of each value: (value, channel, y, x)."""
+    def columns(self, of: Callable[[Tensor], Tensor]) -> Tensor:
+        """Return ``of`` of the change of the light for a unit change of each value: (value, channel, ...).
+
+        ``of`` is linear, treats each channel by itself, and takes pictures (picture, channel, y, x).
+        """
         (kinds, channels), (y, x) = self.light.spectra.shape[:2], self.light.torus
         whole = self._spectra()
         fy, fx = torch.fft.fftfreq(y).to(self.values)[:, None], torch.fft.rfftfreq(x).to(self.values)
-        places = [self._pictures(-2j * torch.pi * turns * whole) for turns in (fy, fx)]
-        patterns = self._pictures(self.light.spectra * self._phase())
-        amounts = torch.zeros(kinds * channels, channels, *self.shape).to(patterns)
+        spectra = [-2j * torch.pi * fy * whole, -2j * torch.pi * fx * whole, *(self.light.spectra * self._phase())]
+        seen = of(self._pictures(torch.stack(spectra)))
+        amounts = seen.new_zeros(kinds * channels, *seen.shape[1:])
         for k in range(kinds):
             for c in range(channels):
-                amounts[k * channels + c, c] = patterns[k, c]
-        return torch.cat([torch.stack(places), amounts])
+                amounts[k * channels + c, c] = seen[2 + k, c]
+        return torch.cat([seen[:2], amounts])
 
     def moved(self, step: Tensor) -> Lamp:
         """Return the lamp after a step of at most a pixel."""

@@ -8,7 +8,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from neusee.nodes import Check, node
+from neusee.nodes import Check, ParameterError, node
 from neusee.nodes._half_precision import refuse_not_finite
 from neusee.nodes.restore._inverse._wiener import refuse_other_pictures
 from neusee.nodes.restore._lasers._candidates import line_templates
@@ -22,6 +22,10 @@ from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
 _WIDEST = (0.5, 10.0)  #: pixels and nm; half of a wider interval does not identify
 _RIVAL = 5.0  #: log likelihood by which the fit exceeds one at another place or wavelength, to identify
 _CHANNELS, _SMALLEST = 3, 20
+_COLOURS = (
+    "lasers are found in a frame of 3 colour channels (3, y, x) alone, because the ratio of the channels tells a laser "
+    "from a lamp: give a camera of 3 channels, or restore without a search, as `restore=wiener_blind` does"
+)
 _PRECISE = 256  #: pixels a side, up to which all is computed in float64
 
 
@@ -91,6 +95,14 @@ def find_lasers(
         return _table(found, known, most)
 
 
+@find_lasers.preflight
+def _(*, responses: Any = None, **_: Any) -> list[str]:
+    """Refuse a camera of another number of channels, where its responses are known before the run."""
+    if responses is not None and len(responses) != _CHANNELS:
+        raise ParameterError("responses.camera", f"the camera has {_told(len(responses))}: {_COLOURS}")
+    return []
+
+
 @find_lasers.check
 def _(
     result: FoundLasers, electrons: Tensor, *inputs: Any, focal_length: float, pixel_pitch: float, **_: Any
@@ -111,10 +123,7 @@ def _(
 
 def _refuse(electrons: Tensor, clipped: Tensor, psf: Psf, pupil: Pupil, responses: Tensor, bands: Bands) -> None:
     if electrons.ndim != 3 or len(electrons) != _CHANNELS:
-        raise ValueError(
-            f"electrons {tuple(electrons.shape)}: lasers are found in a frame of 3 colour channels (3, y, x) alone, "
-            "because the ratio of the channels tells a laser from a lamp: give such a frame"
-        )
+        raise ValueError(f"electrons {tuple(electrons.shape)}: {_COLOURS}")
     refuse_other_pictures(electrons, psf, responses, clipped, None)
     if min(electrons.shape[-2:]) < _SMALLEST:
         raise ValueError(
@@ -128,10 +137,14 @@ def _refuse(electrons: Tensor, clipped: Tensor, psf: Psf, pupil: Pupil, response
     refuse_not_finite("no laser can be found", pupil=pupil.path.sum() + pupil.height.sum() + pupil.amplitude.sum())
 
 
+def _told(channels: int) -> str:
+    return f"{channels} channel{'s' * (channels != 1)}"
+
+
 def _table(found: Found, known: Known, most: int) -> FoundLasers:
     """Return what was found in SI units, the laser of the largest gain first."""
     at = [n for n, part in enumerate(found.fit.parts) if isinstance(part, Laser)]
-    spread = covariances(found.fit, tuple(known.electrons.shape)) if at else []
+    spread = covariances(found.fit, known.seen) if at else []
     order = sorted(range(len(at)), key=lambda n: -found.choices[at[n]].gain)
     result = _empty(most, len(known.electrons))
     pixel = known.camera.lens.pixel_pitch / known.camera.lens.focal_length
@@ -144,7 +157,7 @@ def _table(found: Found, known: Known, most: int) -> FoundLasers:
         ends = torch.stack([values - half, values + half], -1)
         result.direction[row], result.direction_interval[row] = pixel * values[:2], pixel * ends[:2]
         result.wavelength[row], result.wavelength_interval[row] = NANOMETRE * values[2], NANOMETRE * ends[2]
-        result.fwhm[row] = part.camera.fwhm
+        result.fwhm[row] = part.fwhm
         result.strength[row], result.strength_interval[row] = values[3:], ends[3:]
         choice = found.choices[at[n]]
         alone = choice.rival > _RIVAL

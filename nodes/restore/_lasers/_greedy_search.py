@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,8 +9,10 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.restore._lasers._candidates import Candidate, Templates, candidates, clipped_candidates
+from neusee.nodes.restore._lasers._censored import censored
 from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Lamp, LampLight, Laser
-from neusee.nodes.restore._lasers._joint_fit import Fit, Parts, fitted
+from neusee.nodes.restore._lasers._joint_fit import Data, Fit, Parts, fitted, misfit_of
+from neusee.nodes.restore._lasers._line_pattern import grid_patterns, response_at
 from neusee.nodes.restore._lasers._whitening import Filter, Weights, filter_of, noise_of, weights_of
 
 _AHEAD = 10.0  #: log likelihood by which a laser is ahead of a lamp at least
@@ -20,6 +21,9 @@ _HALVES, _NEAR = (-0.6, -0.3, 0.0, 0.3, 0.6), (-3.0, -1.5, 0.0, 1.5, 3.0)  #: pi
 _AROUND = 256  #: pixels a side of the window in which these are compared
 _FEW = 4  #: clipped pixels, fewer of which need no explanation
 _TRIED = 2  #: candidates that are fitted before one of them is chosen
+_CLIPPED = 4  #: candidates for clipped pixels, whose surroundings are searched before any is fitted
+_BEHIND = 0.25  #: share of a gain, candidates below which are not fitted
+_WIDER = 1.5  #: times the first width, up to which a fitted width is not compared with others
 _FIRST, _LAST = 5, 12  #: steps of a fit of one part, and of all parts
 
 
@@ -49,8 +53,7 @@ class Found(NamedTuple):
 
     fit: Fit
     choices: tuple[Choice, ...]  #: each part as it was when it was found
-    use: Filter
-    weights: Weights
+    data: Data
 
 
 def search(known: Known, most: int, lamps: int, least: float, margin: float) -> Found:
@@ -58,29 +61,30 @@ def search(known: Known, most: int, lamps: int, least: float, margin: float) -> 
     parts: Parts = ()
     chosen: list[Choice] = []
     while True:
-        use, weights = _filters(known, parts)
-        fit = fitted(known.electrons, parts, use, weights, _LAST) if parts else _empty(known, use, weights)
+        data = _data(known, parts)
+        fit = fitted(data, parts, _LAST) if parts else _empty(data)
         parts = fit.parts
-        best = _best(known, fit, use, weights, least, margin)
+        best = _best(known, fit, data, least, margin)
         if best is None or best.gain < least or _full(best.part, parts, most, lamps):
             break
         parts, chosen = (*parts, best.part), [*chosen, best]
-    return _pruned(known.electrons, Found(fit, tuple(chosen), use, weights), least)
+    return _pruned(Found(fit, tuple(chosen), data), least)
 
 
-def _pruned(electrons: Tensor, found: Found, least: float) -> Found:
+def _pruned(found: Found, least: float) -> Found:
     """Return what was found without parts that later parts made needless, each with its gain beside the rest."""
     parts, chosen = found.fit.parts, found.choices
+    data = found.data._replace(clipped=None)
     while len(parts) > 1:
-        now = fitted(electrons, parts, found.use, found.weights, 1).misfit
+        now = misfit_of(data, parts, 1)[1]
         others = [parts[:n] + parts[n + 1 :] for n in range(len(parts))]
-        costs = [fitted(electrons, rest, found.use, found.weights, _FIRST).misfit - now for rest in others]
+        costs = [misfit_of(data, rest, _FIRST)[1] - now for rest in others]
         chosen = tuple(choice._replace(gain=cost) for choice, cost in zip(chosen, costs, strict=True))
         least_needed = min(range(len(parts)), key=lambda n: costs[n])
         if costs[least_needed] >= least:
             break
         parts, chosen = others[least_needed], chosen[:least_needed] + chosen[least_needed + 1 :]
-    fit = fitted(electrons, parts, found.use, found.weights, _LAST) if len(parts) < len(found.fit.parts) else found.fit
+    fit = fitted(found.data, parts, _LAST) if len(parts) < len(found.fit.parts) else found.fit
     return found._replace(fit=fit, choices=chosen)
 
 
@@ -94,61 +98,102 @@ def _light(known: Known, parts: Parts) -> Tensor:
     return sum((part.electrons() for part in parts), torch.zeros_like(known.electrons))
 
 
-def _filters(known: Known, parts: Parts) -> tuple[Filter, Weights]:
-    """Return the filter and the weights that the frame without the parts asks for."""
+def _data(known: Known, parts: Parts) -> Data:
+    """Return the frame with the filter and the weights that the frame without the parts asks for."""
     noise = noise_of(known.electrons, known.seen, known.read_noise)
     scene = known.electrons - _light(known, parts)
     use = filter_of(scene, noise, known.seen)
-    return use, weights_of(use(scene), use, noise, scene)
+    weights = weights_of(use(scene), use, noise, scene)
+    return Data(known.electrons, use, weights, censored(known.electrons, known.seen, scene, known.read_noise))
 
 
-def _empty(known: Known, use: Filter, weights: Weights) -> Fit:
-    rest = weights(use(known.electrons)).flatten()
+def _empty(data: Data) -> Fit:
+    rest = data.weights(data.use(data.electrons)).flatten()
     none = rest.new_zeros(0, 0)
     return Fit((), 0.5 * float(rest.square().sum()), none, none, rest)
 
 
-def _best(known: Known, fit: Fit, use: Filter, weights: Weights, least: float, margin: float) -> Choice | None:
+class _Left(NamedTuple):
+    """What the parts found so far leave, in float32, which is enough to choose between candidates."""
+
+    known: Known
+    data: Data
+    before: float  #: misfit
+
+
+def _rough(known: Known, fit: Fit, data: Data) -> _Left:
+    left = (known.electrons - _light(known, fit.parts)).float()
+    weights = Weights(*(x.float() for x in data.weights))
+    camera = known.camera._replace(responses=known.camera.responses.float())
+    light, seen = known.lamp, known.seen.float()
+    lamp = LampLight(light.spectra.to(torch.complex64), light.torus, light.colour.float(), light.patterns.float())
+    less = known._replace(electrons=known.electrons.float(), seen=seen, camera=camera, lamp=lamp)
+    rough = Data(left, Filter(seen, data.use.kernel.float()), weights)
+    return _Left(less, rough, misfit_of(rough, (), 0)[1])
+
+
+def _best(known: Known, fit: Fit, data: Data, least: float, margin: float) -> Choice | None:
     """Return the laser or lamp that explains most of what is left; None if nothing does."""
-    left = known.electrons - _light(known, fit.parts)
-    residual = use(left)
-    lamp = Templates(torch.zeros(1).double(), known.lamp.patterns[None], known.lamp.colour[None])
-    starts = [*candidates(residual, use, weights, known.lines, _TRIED), *candidates(residual, use, weights, lamp, 1)]
-    starts += [_nearest(known, residual, one, use, weights) for one in _clipped_starts(known, fit.parts, use)]
-    before = 0.5 * float(weights(residual).square().sum())
-
-    def grown(these: list[Candidate]) -> list[Choice]:
-        found = [_grown(known, left, start, use, weights, before) for start in these]
-        return sorted((each for each in found if each is not None), key=lambda each: -each.gain)
-
-    found = [each for each in grown(starts) if not _known_already(each.part, fit.parts)]
+    left = _rough(known, fit, data)
+    residual = left.data.use(left.data.electrons)
+    choose = (residual, left.data.use, left.data.weights)
+    lamp = Templates(torch.zeros(1).double(), left.known.lamp.patterns[None], left.known.lamp.colour[None])
+    starts = [*candidates(*choose, known.lines, _TRIED), *candidates(*choose, lamp, 1)]
+    clipped = _clipped_starts(known, fit.parts, data.use)
+    near = [_nearest(left, residual, one) for one in clipped if one.gain >= _BEHIND * clipped[0].gain]
+    starts += sorted(near, reverse=True)[:_TRIED]
+    grown = _all_grown(left, sorted(starts, reverse=True))
+    found = [each for each in grown if not _known_already(each.part, fit.parts)]
     lasers = [each for each in found if isinstance(each.part, Laser)]
-    if not lasers:
-        return found[0] if found else None
+    best = _ahead(left, found, lasers, least, margin) if lasers else (found[0] if found else None)
+    return best and best._replace(part=_precise(best.part, known))
+
+
+def _ahead(left: _Left, found: list[Choice], lasers: list[Choice], least: float, margin: float) -> Choice | None:
+    """Return the best laser, or the best lamp where the laser is not ahead of it enough; None for too little gain."""
     if found[0].gain < least:
         return None
-    lasers[0] = _widened(known, left, lasers[0], use, weights, before)
-    best, (y, x) = lasers[0], (round(float(at)) for at in lasers[0].part.values[:2])
-    others = [each for each in found if isinstance(each.part, Lamp)]
-    others = sorted(
-        [*others, *grown([Candidate(0.0, (y, x), 0.0, float(best.part.values[3]))])], key=lambda each: -each.gain
-    )
-    ahead = best.gain - (others[0].gain if others else 0.0)
-    if others and ahead < max(margin * best.gain, _AHEAD):
-        return others[0]._replace(margin=-ahead)
+    best = _widened(left, lasers[0])
+    y, x = (round(float(at)) for at in best.part.values[:2])
+    lamps = [each for each in found if isinstance(each.part, Lamp)]
+    lamps += _all_grown(left, [Candidate(0.0, (y, x), 0.0, float(best.part.values[3]))])
+    lamps.sort(key=lambda each: -each.gain)
+    ahead = best.gain - (lamps[0].gain if lamps else 0.0)
+    if lamps and ahead < max(margin * best.gain, _AHEAD):
+        return lamps[0]._replace(margin=-ahead)
     rival = max((each.gain for each in lasers[1:] if _elsewhere(best.part, each.part)), default=0.0)
     return best._replace(margin=ahead, rival=best.gain - rival)
 
 
-def _widened(known: Known, left: Tensor, one: Choice, use: Filter, weights: Weights, before: float) -> Choice:
-    """Return a laser with the width of its line that explains most."""
-    best = one
-    for width in known.widths[1:]:
-        camera = known.camera._replace(fwhm=known.camera.fwhm.new_tensor(width))
+def _precise(part: Laser | Lamp, known: Known) -> Laser | Lamp:
+    """Return a part in the precision of the frame."""
+    values = part.values.to(known.electrons)
+    if isinstance(part, Lamp):
+        return replace(part, light=known.lamp, values=values)
+    return replace(part, camera=known.camera._replace(fwhm=part.camera.fwhm), values=values)
+
+
+def _all_grown(left: _Left, starts: list[Candidate]) -> list[Choice]:
+    """Return what grows from candidates that are not far behind what others have grown to, the largest gain first."""
+    found: list[Choice] = []
+    for start in starts:
+        if start.gain >= _BEHIND * max((each.gain for each in found), default=0.0):
+            found += filter(None, [_grown(left, start)])
+    return sorted(found, key=lambda each: -each.gain)
+
+
+def _widened(left: _Left, one: Choice) -> Choice:
+    """Return a laser with the width of its line that explains most; one of a narrow line stays as it is."""
+    best, widths = one, left.known.widths
+    assert isinstance(one.part, Laser)
+    if float(one.part.fwhm) < _WIDER * widths[0]:
+        return one
+    for width in widths[1:]:
+        camera = left.known.camera._replace(fwhm=left.known.camera.fwhm.new_tensor(width))
         assert isinstance(best.part, Laser)
-        alone = fitted(left, (replace(best.part, camera=camera),), use, weights, _FIRST)
-        if before - alone.misfit > best.gain:
-            best = best._replace(part=alone.parts[0], gain=before - alone.misfit)
+        parts, misfit = misfit_of(left.data, (replace(best.part, camera=camera),), _FIRST)
+        if left.before - misfit > best.gain:
+            best = best._replace(part=parts[0], gain=left.before - misfit)
     return best
 
 
@@ -173,26 +218,34 @@ def _clipped_starts(known: Known, parts: Parts, use: Filter) -> list[Candidate]:
     every = Filter(torch.ones_like(known.seen), use.kernel)
     noise = noise_of(known.electrons, every.seen, known.read_noise)
     weights = weights_of(every(picture), every, noise, picture)
-    return clipped_candidates(picture, float(full.max()), every, weights, known.lines, _TRIED)
+    return clipped_candidates(picture, float(full.max()), every, weights, known.lines, _CLIPPED)
 
 
-def _nearest(known: Known, residual: Tensor, start: Candidate, use: Filter, weights: Weights) -> Candidate:
+def _nearest(left: _Left, residual: Tensor, start: Candidate) -> Candidate:
     """Return the best of the candidates around one, because the rings far from a clipped spot are narrow."""
     window, middle = _window(residual, start.spot)
-    seen = Filter(use.seen[..., *window], use.kernel)
-    within = Weights(*(x[..., *window] for x in weights))
-    white, best = within(residual[..., *window]), (0.0, start)
-    near = known._replace(camera=_of_shape(known.camera, (white.shape[-2], white.shape[-1])))
-    for y, x, nm in itertools.product(_HALVES, _HALVES, _NEAR):
-        spot = (start.spot[0] + y, start.spot[1] + x)
-        moved = start._replace(spot=spot, wavelength=start.wavelength + nm * NANOMETRE)
-        here = moved._replace(spot=(spot[0] - middle[0], spot[1] - middle[1]))
-        light = within(seen(_laser(near, here, white).electrons()))
-        product, norm = float((light * white).sum()), float(light.square().sum())
-        gain = product**2 / norm if product > 0 else 0.0
-        if gain > best[0]:
-            best = (gain, moved._replace(strength=max(product / norm, 0.01) * start.strength))
-    return best[1]
+    seen = Filter(left.data.use.seen[..., *window], left.data.use.kernel)
+    within = Weights(*(x[..., *window] for x in left.data.weights))
+    white, best, camera = within(residual[..., *window]), start._replace(gain=0.0), left.known.camera
+    lens = camera.lens._replace(shape=(white.shape[-2], white.shape[-1]))
+    down, right = (
+        torch.tensor([at + half - m for half in _HALVES], dtype=torch.float64, device=white.device)
+        for at, m in zip(start.spot, middle, strict=True)
+    )
+    for nm in _NEAR:
+        wavelength = torch.tensor(start.wavelength + nm * NANOMETRE, dtype=torch.float64, device=white.device)
+        heard = start.strength * response_at(wavelength, camera.responses, camera.bands).to(white)
+        patterns = grid_patterns(camera.pupil, down, right, wavelength, lens).to(white)
+        light = within(heard[:, None, None] * seen(patterns.flatten(0, 1)[:, None]))
+        product, norm = (light * white).sum((1, 2, 3)), light.square().sum((1, 2, 3)).clamp_min(1e-30)
+        gain = 0.5 * product.clamp_min(0.0).square() / norm
+        n = int(gain.argmax())
+        if float(gain[n]) > best.gain:
+            y, x = divmod(n, len(_HALVES))
+            spot = (start.spot[0] + _HALVES[y], start.spot[1] + _HALVES[x])
+            strength = max(float(product[n] / norm[n]), 0.01) * start.strength
+            best = Candidate(float(gain[n]), spot, float(wavelength), strength)
+    return best
 
 
 def _window(frame: Tensor, spot: tuple[float, float]) -> tuple[tuple[slice, slice], tuple[int, int]]:
@@ -206,12 +259,8 @@ def _window(frame: Tensor, spot: tuple[float, float]) -> tuple[tuple[slice, slic
     return (window[0], window[1]), (middle[0], middle[1])
 
 
-def _of_shape(camera: Camera, shape: tuple[int, int]) -> Camera:
-    return camera._replace(lens=camera.lens._replace(shape=shape))
-
-
 def _laser(known: Known, start: Candidate, like: Tensor) -> Laser:
-    rest = torch.zeros(2 + len(like)).to(like)
+    rest = torch.zeros(3 + len(like)).to(like)
     rest[0], rest[1] = start.wavelength / NANOMETRE, max(start.strength, 1.0)
     return Laser(known.camera, torch.cat([torch.tensor(start.spot).to(like), rest]))
 
@@ -222,16 +271,17 @@ def _elsewhere(one: Laser | Lamp, other: Laser | Lamp) -> bool:
     return bool(max(away[:2]) > 0.5 or away[2] > 5.0)
 
 
-def _grown(known: Known, left: Tensor, start: Candidate, use: Filter, weights: Weights, before: float) -> Choice | None:
+def _grown(left: _Left, start: Candidate) -> Choice | None:
     """Return the part that grows from a candidate, and its gain; None for no gain."""
-    spot = torch.tensor(start.spot).to(left)
+    electrons, known = left.data.electrons, left.known
+    spot = torch.tensor(start.spot).to(electrons)
     part: Laser | Lamp
     if start.wavelength:
-        part = _laser(known, start, left)
+        part = _laser(known, start, electrons)
     else:
         amounts = torch.zeros_like(known.lamp.spectra[:, :, 0, 0].real)
         amounts[0] = max(start.strength, 1.0) * known.lamp.colour
         part = Lamp(known.lamp, known.camera.lens.shape, torch.cat([spot, amounts.flatten()]))
-    alone = fitted(left, (part,), use, weights, _FIRST)
-    gain = before - alone.misfit
-    return Choice(alone.parts[0], gain, 0.0, 0.0) if gain > 0 else None
+    parts, misfit = misfit_of(left.data, (part,), _FIRST)
+    gain = left.before - misfit
+    return Choice(parts[0], gain, 0.0, 0.0) if gain > 0 else None

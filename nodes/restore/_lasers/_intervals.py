@@ -13,19 +13,23 @@ NORMAL = 1.6448536269514722  #: standard deviations on each side of a 90 % inter
 _BLOCK = 8  #: pixels a side of blocks whose residuals count as independent of one another
 _MODEL = (0.002, 0.002, 0.02)  #: pixels, pixels and nm, standard deviations of what the model neglects
 _SHAPE = 0.03  #: standard deviation of the wavelength from the unknown shape of a line, over the width of the line
-_AMOUNT = 0.003  #: the same of the electrons of each channel, relative
+_AMOUNT = 0.0015  #: the same of the electrons of each channel, relative
 
 
-def covariances(fit: Fit, shape: tuple[int, ...]) -> list[Tensor]:
+def covariances(fit: Fit, seen: Tensor) -> list[Tensor]:
     """Return for each laser the covariance of y, x (pixels), nm, and the electrons of each channel.
 
-    ``shape`` is that of the frame. The inverse of the second derivatives is enlarged where the slopes of blocks of the
-    frame scatter more than the model says.
+    ``seen`` (channel, y, x) is 0 for clipped pixels, which the fit has after all others, if at all. The inverse of the
+    second derivatives is enlarged where the slopes of blocks of the frame scatter more than the model says.
     """
     count = len(fit.normal)
     inverse = solved(fit.normal, torch.eye(count).to(fit.normal))
-    scores = (fit.columns * fit.rest).double().view(count, *shape).sum(1)
-    y, x = (-n % _BLOCK for n in shape[-2:])
+    each = (fit.columns * fit.rest).double()
+    pictures = each[:, : seen.numel()].view(count, *seen.shape)
+    if each.shape[1] > seen.numel():
+        pictures[:, seen == 0] = each[:, seen.numel() :]  # a clipped pixel has no residual
+    scores = pictures.sum(1)
+    y, x = (-n % _BLOCK for n in seen.shape[-2:])
     blocks = pad(scores, (0, x, 0, y)).unfold(1, _BLOCK, _BLOCK).unfold(2, _BLOCK, _BLOCK).sum((-2, -1)).flatten(1)
     prior = fit.normal - (fit.columns @ fit.columns.T).double()
     scattered = inverse @ (blocks @ blocks.T + prior) @ inverse
@@ -48,6 +52,6 @@ def _of_channels(laser: Laser, own: Tensor) -> Tensor:
     to[3:] = slopes
     neglected = torch.zeros(len(to)).to(own)
     neglected[:3] = torch.tensor(_MODEL).to(own).square()
-    neglected[2] += (_SHAPE * laser.camera.fwhm.to(own) / NANOMETRE).square()
+    neglected[2] += (_SHAPE * laser.fwhm.to(own) / NANOMETRE).square()
     neglected[3:] = (_AMOUNT * laser.channels()).square().to(own)
     return to @ own @ to.T + neglected.diag()

@@ -6,6 +6,7 @@ import math
 from typing import Literal, NamedTuple
 
 import torch
+from numpy.polynomial.hermite_e import hermegauss
 from torch import Tensor
 
 from neusee.nodes.optics._notch import passed_by_notches
@@ -13,7 +14,8 @@ from neusee.nodes.values import Bands, Pupil
 
 Sensor = Literal["point", "integrated"]
 
-_WIDE = 2.5e-9  #: m; parts of a line are about this wide
+_COUNTS, _MOST = ((2.5e-9, 3), (6e-9, 5)), 7  #: widths of a line in m, each with the number of its parts; then the most
+_NARROW = 0.1e-9  #: m, width of a line, below which slopes are those of a line so wide
 _GAUSS = (
     (-0.7745966692414834, 5 / 18),
     (0.0, 8 / 18),
@@ -36,19 +38,29 @@ def line_pattern(pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens
     The result has derivatives with respect to every tensor. Beyond half the alias-free field from the spot it is 0,
     because a sampled pupil repeats its pattern there.
     """
-    count = max(1, round(float(fwhm.detach()) / _WIDE))
-    at = (torch.arange(count, dtype=torch.float64, device=fwhm.device) + 0.5) / count
-    offsets = torch.special.ndtri(at) * (fwhm / (2.0 * math.sqrt(2.0 * math.log(2.0))))
-    patterns = [_pattern(pupil, direction, wavelength + offset, lens) for offset in offsets]
-    return torch.stack(patterns).mean(0)
+    offsets, shares = _parts(fwhm)
+    patterns = [_pattern(pupil, direction, wavelength + at * deviation(fwhm), lens) for at in offsets]
+    return sum((share * each for share, each in zip(shares, patterns, strict=True)), torch.zeros_like(patterns[0]))
+
+
+def deviation(fwhm: Tensor) -> Tensor:
+    """Return the standard deviation of a Gaussian line in m, from its full width at half maximum."""
+    return fwhm / (2.0 * math.sqrt(2.0 * math.log(2.0)))
+
+
+def _parts(fwhm: Tensor) -> tuple[list[float], list[float]]:
+    """Return the wavelengths that stand for a Gaussian line, in standard deviations, and their shares of its light.
+
+    The sums over them are exact for every polynomial of the wavelength up to degree 5, 9 or 13 (Gauss and Hermite).
+    """
+    at, weights = hermegauss(next((count for most, count in _COUNTS if float(fwhm.detach()) < most), _MOST))
+    return at.tolist(), (weights / weights.sum()).tolist()
 
 
 def _pattern(pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens) -> Tensor:
     field = _field(pupil, wavelength)
     spot = direction.to(wavelength) * (lens.focal_length / lens.pixel_pitch)
-    reach = (
-        pupil.pitch.to(wavelength) * lens.pixel_pitch / (wavelength * lens.focal_length)
-    )  # turns by sample and pixel
+    reach = _reach(pupil, wavelength, lens)
     light = torch.zeros(lens.shape, dtype=field.real.dtype, device=field.device)
     for y, wy in _points(lens.sensor):
         for x, wx in _points(lens.sensor):
@@ -57,9 +69,84 @@ def _pattern(pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens) ->
             )
             far = rows @ field @ columns.T
             light = light + wy * wx * (far.real.square() + far.imag.square())
+    return light * _share(pupil, wavelength, reach).to(light)
+
+
+def _reach(pupil: Pupil, wavelength: Tensor, lens: Lens) -> Tensor:
+    """Return the phase that one sample of the pupil and one pixel add, in turns."""
+    return pupil.pitch.to(wavelength) * lens.pixel_pitch / (wavelength * lens.focal_length)
+
+
+def _share(pupil: Pupil, wavelength: Tensor, reach: Tensor) -> Tensor:
+    """Return the factor from the squared sum over the pupil to the share of its light in one pixel."""
     area = pupil.aperture.double().square().sum()
     passed = passed_by_notches(pupil._replace(wavelengths=wavelength[None]))[0]
-    return light * (reach.square() * passed / area).to(light)
+    return reach.square() * passed / area
+
+
+def _turns(samples: int, reach: Tensor, field: Tensor) -> Tensor:
+    """Return the factor (sample,) of a phasor's change when the spot moves by a pixel."""
+    at = torch.arange(samples, dtype=torch.float64, device=field.device) - (samples - 1) / 2
+    return 2j * math.pi * (reach * at).to(field)
+
+
+class Moves(NamedTuple):
+    """A pattern and how it changes with the place of its spot, and with its wavelength: (y, x)."""
+
+    pattern: Tensor
+    down: Tensor  #: by pixel, as right
+    right: Tensor
+    wave: Tensor  #: by m
+    blur: Tensor  #: by m^2 of the variance of the line
+
+
+def line_moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens, fwhm: Tensor) -> Moves:
+    """Return the pattern of `line_pattern` and its slopes, for a spot in pixels; no derivative.
+
+    The slopes with wavelength and variance are means over the line too, by parts of the integral over a Gaussian line.
+    """
+    wide = fwhm.clamp_min(_NARROW)
+    sigma, sums = deviation(wide), [torch.zeros(1)] * 5
+    for at, share in zip(*_parts(wide), strict=True):
+        still, down, right = _moves(pupil, spot, wavelength + at * sigma, lens)
+        by = (share * still, share * down, share * right, share * at / sigma * still)
+        blur = share * (at * at - 1.0) / (2.0 * sigma.square()) * still
+        sums = [total.to(each) + each for total, each in zip(sums, (*by, blur), strict=True)]
+    return Moves(*sums)
+
+
+def _moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the pattern of one wavelength, and its slopes along y and x by pixel."""
+    field, reach = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
+    turn_y, turn_x = (_turns(n, reach, field) for n in field.shape)
+    light = [torch.zeros(lens.shape, dtype=field.real.dtype, device=field.device) for _ in range(3)]
+    for y, wy in _points(lens.sensor):
+        rows = _axis(lens.shape[0], reach, spot[0] - y, field, 0)
+        for x, wx in _points(lens.sensor):
+            columns = _axis(lens.shape[1], reach, spot[1] - x, field, 1)
+            both = field @ torch.cat([columns, turn_x * columns]).T
+            far, right = (rows @ both).chunk(2, dim=1)
+            down = (turn_y * rows) @ both[:, : len(columns)]
+            light[0] += wy * wx * (far.real.square() + far.imag.square())
+            light[1] += (2 * wy * wx) * (far.real * down.real + far.imag * down.imag)
+            light[2] += (2 * wy * wx) * (far.real * right.real + far.imag * right.imag)
+    share = _share(pupil, wavelength, reach).to(light[0])
+    return share * light[0], share * light[1], share * light[2]
+
+
+def grid_patterns(pupil: Pupil, down: Tensor, right: Tensor, wavelength: Tensor, lens: Lens) -> Tensor:
+    """Return the patterns (row, column, y, x) of one wavelength with spots at each of ``down`` x ``right`` pixels."""
+    field, reach = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
+    y, x = lens.shape
+    light = torch.zeros(len(down) * y, len(right) * x, dtype=field.real.dtype, device=field.device)
+    for at_y, wy in _points(lens.sensor):
+        rows = torch.cat([_axis(y, reach, at - at_y, field, 0) for at in down])
+        for at_x, wx in _points(lens.sensor):
+            columns = torch.cat([_axis(x, reach, at - at_x, field, 1) for at in right])
+            far = rows @ (field @ columns.T)
+            light += wy * wx * (far.real.square() + far.imag.square())
+    share = _share(pupil, wavelength, reach).to(light)
+    return share * light.view(len(down), y, len(right), x).transpose(1, 2)
 
 
 def _points(sensor: Sensor) -> tuple[tuple[float, float], ...]:

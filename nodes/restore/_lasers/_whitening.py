@@ -17,7 +17,7 @@ _RADIUS = 8  #: pixels, of the filter
 _AROUND = 9  #: pixels a side, over which the variance of details is averaged
 _MEAN = 5  #: pixels a side, over which the mean that photon noise follows is averaged
 _UNSEEN = 1e12  #: e-^2, variance that stands for a pixel that is not seen
-_LOST = 0.3  #: variance of a filled pixel, as a share of that of the channel
+LOST = 0.3  #: variance of a filled pixel, as a share of that of the channel
 _LEAST = 0.05  #: variance of details at a pixel, as a share of that of the frame
 
 
@@ -32,6 +32,17 @@ class Weights(NamedTuple):
         """Return filtered pictures (..., channel, y, x) as numbers of mean 0 and variance 1."""
         own = self.diagonal * filtered
         return own - self.grey * (self.share * (self.grey * own).sum(-3, keepdim=True))
+
+    def twice(self, filtered: Tensor) -> Tensor:
+        """Return the product of these weights' transpose and of what they make of filtered pictures."""
+        white = self(filtered)
+        return self.diagonal * (white - self.grey * (self.share * (self.grey * white).sum(-3, keepdim=True)))
+
+    def pair(self, one: int, other: int) -> Tensor:
+        """Return the element (y, x) of the inverse covariance for two channels."""
+        total = self.grey.square().sum(0)
+        lost = (2.0 - self.share[0] * total) * self.share[0] * self.grey[one] * self.grey[other]
+        return self.diagonal[one] * self.diagonal[other] * (float(one == other) - lost)
 
 
 class Filter(NamedTuple):
@@ -132,8 +143,8 @@ def noise_of(electrons: Tensor, seen: Tensor, read_noise: float) -> Tensor:
 def weights_of(filtered: Tensor, use: Filter, noise: Tensor, picture: Tensor) -> Weights:
     """Return what each pixel of a filtered residual is divided by: noise, and the details around that pixel."""
     seen = use.seen
-    spread = _masked_variance(picture, seen)
-    own = use.squared(noise) + _LOST * spread * use.squared(1.0 - seen)
+    spread = masked_variance(picture, seen)
+    own = use.squared(noise) + LOST * spread * use.squared(1.0 - seen)
     colour = (picture * seen).sum((-2, -1)) / seen.sum((-2, -1)).clamp_min(1.0)
     colour = (colour / colour.abs().max().clamp_min(1e-9)).clamp_min(0.05)[:, None, None]
     inverse = seen / own
@@ -156,7 +167,8 @@ def _around(values: Tensor, seen: Tensor) -> Tensor:
     return box(values * seen, _AROUND) / box(seen.expand_as(values), _AROUND).clamp_min(1e-9)
 
 
-def _masked_variance(picture: Tensor, seen: Tensor) -> Tensor:
+def masked_variance(picture: Tensor, seen: Tensor) -> Tensor:
+    """Return the variance of the pixels that are seen, of each channel: (channel, 1, 1)."""
     count = seen.sum((-2, -1), keepdim=True).clamp_min(1.0)
     mean = (picture * seen).sum((-2, -1), keepdim=True) / count
     return ((picture - mean).square() * seen).sum((-2, -1), keepdim=True) / count

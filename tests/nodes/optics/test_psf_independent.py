@@ -4,6 +4,7 @@ The heights and the index are inputs of both. Everything after that, the stop in
 """
 
 import sys
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -42,17 +43,24 @@ MASKS = {
 LENS = {540: 14.96e-6, 1080: 7.48e-6, 2160: 3.74e-6}  #: samples and pitch of the pupil
 
 
-def both(mask, samples, precision, side=64):
-    """Return the intensity of the node, that of the reference, (y, x) float64, and the peak of the clear lens."""
+@lru_cache(maxsize=2)  # sizes alternate, and both precisions follow each other
+def reference(mask, samples, side):
+    """Return the stop, the height map, and the intensity of the reference, (y, x) float64."""
     stop = optics.stop(samples=samples, pitch=LENS[samples], diameter=8e-3)
     height = MASKS[mask](stop)
-    pupil = optics.pupil(height, INDEX, LINE, stop)
-    sensor = {"focal_length": FOCAL_LENGTH, "pixel_pitch": PIXEL_PITCH, "shape": (side, side), "angle": ANGLE}
-    found = optics.psf(pupil, **sensor, precision=precision)
     expected = window(
         height.numpy(), np.zeros((samples, samples)), round_stop(samples, LENS[samples], 8e-3), float(INDEX[0]),
         float(LINE.centres[0]), LENS[samples], FOCAL_LENGTH, PIXEL_PITCH, (side, side), ANGLE,
     )  # fmt: skip
+    return stop, height, expected
+
+
+def both(mask, samples, precision, side=64):
+    """Return the intensity of the node, that of the reference, (y, x) float64, and the peak of the clear lens."""
+    stop, height, expected = reference(mask, samples, side)
+    pupil = optics.pupil(height, INDEX, LINE, stop)
+    sensor = {"focal_length": FOCAL_LENGTH, "pixel_pitch": PIXEL_PITCH, "shape": (side, side), "angle": ANGLE}
+    found = optics.psf(pupil, **sensor, precision=precision)
     return found.intensity[0].double().numpy(), expected, float(found.clear_peak[0])
 
 

@@ -9,11 +9,12 @@ from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
 from neusee.workflows.evaluation.evaluation_scenes import scenes
-from neusee.workflows.evaluation.mistold_filter import TOLD, errors_of, mistold
+from neusee.workflows.evaluation.mistold_filter import errors_of, mistold
 from neusee.workflows.evaluation.mistold_points import told_with_errors
-from neusee.workflows.evaluation.pipelines import compose_pipelines, read_pipelines
+from neusee.workflows.evaluation.pipelines import CASES, compose_pipelines, read_pipelines
 from neusee.workflows.evaluation.run_evaluation import evaluate
 from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.told_copies import TOLD
 from neusee.workflows.recipe.blocks.evaluate_block import Mismatch
 from neusee.workflows.store.result_store import Store
 
@@ -118,7 +119,7 @@ def test_what_is_copied_is_what_the_error_changes():
 def test_points_are_those_of_the_recipe_with_the_error(store):
     """The direction that a scene draws, moved by half a pixel, and the strength of the point."""
     (pipeline,) = composed("flat+wiener", "+evaluate.mismatch={wavelength: 0 nm, defocus: 0 waves, scenes: 1}")
-    shown, _ = scenes(load("first_light", SMALL), store, None, 2)
+    shown, _ = scenes(load("first_light", SMALL), store, None, 2, list(CASES))
     bench = EvaluationPoints(store, 16)
     (found,) = told_with_errors(bench, [pipeline], shown, (0.0, 1e5), lambda _: None)
     assert found.true == bench.point(pipeline, PointRequest(shown[0], 1e5))

@@ -12,7 +12,7 @@ from neusee.workflows import load
 from neusee.workflows.protection.camera_parts import ProtectionCamera
 from neusee.workflows.protection.equal_rivals import MEASURES, Candidate, best, quiet_picture
 from neusee.workflows.protection.front_optics import Front, FrontBench, FrontSettings
-from neusee.workflows.recipe.distributions.unknown_conditions import draw_conditions, usual_condition
+from neusee.workflows.protection.unknown_conditions import draw_conditions, usual_condition
 from neusee.workflows.store.result_store import Store
 
 SMALL = ["optics.samples=128", "optics.pitch=63.125 um", "optics.bands=3", "optics.window=[64, 64]"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import struct
@@ -168,6 +169,24 @@ def test_a_run_without_restoration_has_an_overview():
 NAMES = [f.name for f in contents.FIGURES] + ["graph"]
 
 
+@pytest.fixture(scope="module")
+def figure_of(drawings):
+    """The figure of a drawing itself, laid out; several tests look at one."""
+    import matplotlib
+
+    from neusee.workflows.report.figures.style import _RC
+
+    @functools.cache
+    def figure_of(name):
+        draw, arguments = drawings[name]
+        with matplotlib.rc_context(dict(_RC)):
+            figure = draw.__wrapped__(**arguments)
+            figure.canvas.draw()
+        return figure
+
+    return figure_of
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_every_figure_is_a_picture_and_the_same_one_each_time(drawings, name):
     draw, arguments = drawings[name]
@@ -181,25 +200,17 @@ def test_every_figure_is_a_picture_and_the_same_one_each_time(drawings, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_texts_are_large_enough_and_none_lies_on_another(drawings, name):
-    import matplotlib
+def test_texts_are_large_enough_and_none_lies_on_another(figure_of, name):
     from matplotlib.text import Text
 
-    from neusee.workflows.report.figures.style import _RC
-
-    draw, arguments = drawings[name]
-    with matplotlib.rc_context(dict(_RC)):
-        figure = draw.__wrapped__(**arguments)
-        figure.canvas.draw()
-        inside = [t for ax in figure.axes for t in _ticks_shown(ax)]
-        ticks = {
-            id(t) for ax in figure.axes for axis in (ax.xaxis, ax.yaxis) for t in axis.get_ticklabels(which="both")
-        }
-        texts = [t for t in figure.findobj(Text) if t.get_text().strip() and t.get_visible() and id(t) not in ticks]
-        texts += inside
-        assert texts
-        assert min(t.get_fontsize() for t in texts if "mathdefault" not in t.get_text()) >= 9
-        boxes = [(t.get_text(), t.get_window_extent()) for t in texts]
+    figure = figure_of(name)
+    inside = [t for ax in figure.axes for t in _ticks_shown(ax)]
+    ticks = {id(t) for ax in figure.axes for axis in (ax.xaxis, ax.yaxis) for t in axis.get_ticklabels(which="both")}
+    texts = [t for t in figure.findobj(Text) if t.get_text().strip() and t.get_visible() and id(t) not in ticks]
+    texts += inside
+    assert texts
+    assert min(t.get_fontsize() for t in texts if "mathdefault" not in t.get_text()) >= 9
+    boxes = [(t.get_text(), t.get_window_extent()) for t in texts]
     if name in ("error_time",):
         return  # where its labels fall is up to the clock
     for (a, one), (b, other) in itertools.combinations(boxes, 2):
@@ -219,7 +230,7 @@ def _ticks_shown(ax):
     return shown
 
 
-def test_axes_say_their_unit(drawings):
+def test_axes_say_their_unit(figure_of):
     units = {
         "tables": "nm",
         "psf": "µm",
@@ -230,15 +241,13 @@ def test_axes_say_their_unit(drawings):
         "height": "mm",
     }
     for name, unit in units.items():
-        draw, arguments = drawings[name]
-        labels = [ax.get_xlabel() for ax in draw.__wrapped__(**arguments).axes]
+        labels = [ax.get_xlabel() for ax in figure_of(name).axes]
         assert any(unit in label for label in labels), f"{name}: {labels}"
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_axes_are_empty(drawings, name):
-    draw, arguments = drawings[name]
-    for ax in draw.__wrapped__(**arguments).axes:
+def test_no_axes_are_empty(figure_of, name):
+    for ax in figure_of(name).axes:
         curves = [line for line in ax.lines if len(line.get_xdata()) > 2 or line.get_linestyle() == "None"]
         assert curves or ax.images or ax.patches or ax.collections or ax.texts, ax.get_title()
 

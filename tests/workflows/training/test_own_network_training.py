@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from neusee.workflows import RecipeError, Store, load, run
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
 from neusee.workflows.evaluation.evaluation_scenes import scenes
-from neusee.workflows.evaluation.pipelines import EvaluationRefused, compose_pipelines, read_pipelines
+from neusee.workflows.evaluation.pipelines import CASES, EvaluationRefused, compose_pipelines, read_pipelines
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.run_training import train
@@ -141,7 +141,7 @@ def evaluated(tmp_path, weights):
     _, pipeline = compose_pipelines("mine.yaml", TINY, words, tmp_path)
     assert pipeline.name == f"five_half_rings+mine@{weights.name}"
     store = Store(tmp_path / "cache")
-    (scene,), _ = scenes(load("mine.yaml", TINY, tmp_path), store, None, 1)
+    (scene,), _ = scenes(load("mine.yaml", TINY, tmp_path), store, None, 1, list(CASES))
     return EvaluationPoints(store, 16).point(pipeline, PointRequest(scene, 0.0))
 
 

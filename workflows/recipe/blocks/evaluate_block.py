@@ -1,8 +1,8 @@
-"""Settings of an evaluation: with which errors the restorer is told optics and laser."""
+"""Settings of an evaluation: lasers, scenes and pipelines, and the errors in what the restorer is told."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -28,6 +28,14 @@ class EvaluateSettings(SettingsBlock):
     """Settings of `neusee evaluate` in the recipe key ``evaluate``."""
 
     mismatch: Mismatch | None = Mismatch()  #: null: the restorer is always told the truth
+    lasers: Literal["in turn", "drawn"] = "in turn"  #: drawn: the first laser of the recipe, its wavelength by its law
+    scenes: Number | Literal["all"] = 20  #: all: every photograph of the folder once
+    pipelines: str = "flat+none, five_half_rings+wiener"
+    reference: str = ""  #: of these pipelines; empty: the first
+    equal_protection: Annotated[float, Field(gt=0, lt=1)] | None = None  #: peak of a laser behind each pipeline
+    by: Literal["best", "filter", "stop"] = "best"
+    beside: bool = False  #: true: the pipelines as they are are evaluated too, beside those of equal protection
+    figure: tuple[str, ...] = ()  #: changes of the recipe for the figure with the lasers, such as sensor.c1=0.2
 
 
 def read_evaluate(composed: Composed) -> tuple[Composed, EvaluateSettings | None]:

@@ -123,6 +123,7 @@ class Training(SettingsBlock):
     pool: Number | None = None  #: images that are reused while the mask is fixed; None: always new images
     keep_pool: bool = True  #: keep the pictures of the pool in the cache, for later trainings
     augment: Augment = Augment()
+    mismatch: dict[str, Any] | None = None  #: by path, laws of how the camera differs from what its restorer is told
     critics: Critics = Critics()
     betas: tuple[Beta, Beta] = (0.9, 0.999)
     rates: Rates = Rates()

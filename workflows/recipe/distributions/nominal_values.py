@@ -13,6 +13,7 @@ from typing import Any
 from neusee.nodes.units import read_any
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.recipe.distributions.joint import BARE_GAIN, GAIN_UNIT, Joint, Posterior, read_posterior, summary
+from neusee.workflows.recipe.distributions.mismatch_laws import Difference
 from neusee.workflows.recipe.distributions.scalar import Law, is_law, read_law, written
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.references import BROKEN
@@ -59,6 +60,7 @@ class Uncertain:
     notes: tuple[str, ...] = ()
     source: str = ""  #: of the posterior
     units: Mapping[str, str] = field(default_factory=dict)  #: SI unit by path of the values in the joint distribution
+    mismatch: Mapping[str, Difference] = field(default_factory=dict)  #: by path, of the true values of a training
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,6 +90,12 @@ def _fault(kind: str, first: float, second: float) -> str:
     if not first < second:
         return "the first value must be smaller than the second"
     return "" if kind == "uniform" or first > 0 else "the least value must be greater than 0"
+
+
+def draw_laws(laws: Mapping[str, Law], count: int, seed: Sequence[int], first: int = 0) -> dict[str, list[float]]:
+    """Return ``count`` independent draws of each law in SI, from the number ``first`` on, by the name of the law."""
+    z = np.random.default_rng(list(seed)).standard_normal((first + count, len(laws)))[first:]
+    return {name: law.at(z[:, i]).tolist() for i, (name, law) in enumerate(laws.items())}
 
 
 def written(value: float, unit: str) -> str | float:

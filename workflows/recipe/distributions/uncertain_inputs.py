@@ -81,7 +81,7 @@ class Inputs:
             step, _, param = reader.rpartition(".")
             parameters[reader] = self.recipe.steps[step].params[param]
             for index, name in inputs:
-                parameters[reader] = _put(parameters[reader], index, values[name])
+                parameters[reader] = put_at(parameters[reader], index, values[name])
         return parameters
 
     def at(self, z: FloatArray) -> FloatArray:
@@ -164,12 +164,13 @@ def _changed(before: Any, after: Any) -> Iterator[tuple[Index, Any]]:
         yield (), after
 
 
-def _put(value: Any, index: Index, new: float) -> Any:
+def put_at(value: Any, index: Index, new: float) -> Any:
+    """Return a parameter with another number at an index; the index is empty for the parameter itself."""
     if not index:
         return new
     if isinstance(value, Mapping):
-        return {**value, index[0]: _put(value[index[0]], index[1:], new)}
-    return type(value)(_put(v, index[1:], new) if i == index[0] else v for i, v in enumerate(value))
+        return {**value, index[0]: put_at(value[index[0]], index[1:], new)}
+    return type(value)(put_at(v, index[1:], new) if i == index[0] else v for i, v in enumerate(value))
 
 
 def _label(uncertain: Uncertain, name: str) -> str:

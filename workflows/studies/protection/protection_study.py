@@ -13,7 +13,7 @@ from neusee.workflows.protection.camera_parts import ProtectionCamera
 from neusee.workflows.protection.equal_rivals import CONTRAST, MEASURES
 from neusee.workflows.protection.front_optics import FrontBench, FrontSettings
 from neusee.workflows.protection.protection_result import DRAWN, LIGHTS, ProtectionResult, measure_protection
-from neusee.workflows.recipe.distributions.unknown_conditions import Condition, UnknownLaws, draw_conditions
+from neusee.workflows.protection.unknown_conditions import Condition, UnknownLaws, draw_conditions
 from neusee.workflows.report.study_folder import SHOWN, Progress, StudyReport, StudyRun
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.protection.protection_page import draw_pictures, quotable, sections

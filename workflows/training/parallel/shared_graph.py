@@ -26,7 +26,7 @@ class Shared:
     @classmethod
     def of(cls, made: Mapping[str, Any], shards: Shards | None = None, whole: Sequence[str] = ()) -> Shared:
         """Detach results from the autograd graph, and gather all spectral bands of the results named in ``whole``."""
-        leaves = {name: each_tensor(leaf, value) for name, value in made.items()}
+        leaves: dict[str, Any] = each_tensor(leaf, dict(made))  # two results may be one tensor
         if shards is None or not leaves:
             return cls(made, leaves)
         every = {name: _alike(shards.gathered(name, leaves[name]), leaves[name]) for name in whole}

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from scipy.stats import norm
 
 from neusee.nodes import restore
-from neusee.nodes.restore._lasers._line_pattern import Lens, index_at, line_pattern
+from neusee.nodes.restore._lasers._censored import censored
+from neusee.nodes.restore._lasers._line_pattern import Lens, grid_patterns, index_at, line_moves, line_pattern
 from neusee.nodes.restore._lasers._whitening import filled, filter_of
 from tests.nodes.restore.lasers import own_camera as own
 from tests.nodes.restore.lasers.as_inputs import BANDS, LENS, found_in, inputs, pupil_of, tensor
@@ -51,9 +53,89 @@ def test_a_pixel_between_two_points_of_it_sees_their_mean():
     assert np.abs(found - expected).max() < 6e-3 * expected.max()
 
 
-def test_a_strong_laser_is_found_where_it_is():
+@pytest.mark.parametrize("fwhm", [1e-9, 5e-9])
+def test_the_slopes_of_a_line_are_differences_of_direct_sums(fwhm):
+    """Differences of a line summed by the rule of the trapezium over ten deviations, over the largest of each kind."""
+    at = np.linspace(-5, 5, 31)
+
+    def line(down=0.0, right=0.0, wave=0.0, variance=0.0):
+        spread = np.sqrt((fwhm / 2.3548200450309493) ** 2 + variance)
+        parts = [own.pattern("half_ring", 533e-9 + wave + x * spread, (3.3 + down, -8.2 + right), (24, 20)) for x in at]
+        return np.average(parts, 0, np.exp(-0.5 * at**2))
+
+    def slope(step, **move):
+        (name,) = move
+        return (line(**{name: step}) - line(**{name: -step})) / (2 * step)
+
+    lens = Lens(own.FOCAL, own.PITCH, (24, 20))
+    moves = line_moves(pupil_of("half_ring", torch.float64), number([3.3, -8.2]), number(533e-9), lens, number(fwhm))
+    wanted = (line(), slope(0.01, down=0), slope(0.01, right=0), slope(1e-11, wave=0), slope(fwhm**2 / 200, variance=0))
+    for found, expected, bound in zip(moves, wanted, (1e-4, 1e-3, 1e-3, 2e-3, 2e-2), strict=True):
+        assert np.abs(found.numpy() - expected).max() < bound * np.abs(expected).max()
+
+
+def test_patterns_at_several_places_are_those_of_direct_sums():
+    lens = Lens(own.FOCAL, own.PITCH, (24, 30))
+    found = grid_patterns(pupil_of("cubic", torch.float64), number([1.0, -2.3]), number([0.4]), number(533e-9), lens)
+    for n, y in enumerate((1.0, -2.3)):
+        expected = own.pattern("cubic", 533e-9, (y, 0.4), (24, 30))
+        assert np.abs(found[n, 0].numpy() - expected).max() < 1e-6 * expected.max()
+
+
+def test_a_clipped_pixel_counts_as_at_least_full():
+    """The misfit of a clipped pixel is minus the logarithm of the probability in closed form, by SciPy."""
+    electrons = torch.full((3, 16, 16), 100.0, dtype=torch.float64)
+    seen = torch.ones_like(electrons)
+    seen[0, 8, 8] = 0
+    electrons[0, 8, 8] = 20000.0
+    clipped = censored(electrons, seen, electrons, read_noise=5.0)
+    assert censored(electrons, torch.ones_like(seen), electrons, 5.0) is None
+    sigma = np.sqrt(20000 + 25)  # the scene around is even, so nothing but photons and read noise is not known
+    spot = torch.zeros_like(electrons)
+    spot[0, 8, 8] = 1.0
+    for over in (-3.0, -0.5, 0.0, 1.5, 3.0):
+
+        def cost(shift, over=over):
+            light = 20000 - 100 + (over + shift) * sigma
+            return 0.5 * float(clipped.misfits(electrons - light * spot).square().sum())
+
+        wanted = -np.log(0.01 + 0.99 * norm.cdf(over)) / 9
+        assert cost(0.0) == pytest.approx(wanted, rel=1e-9)
+        rest = electrons - (19900 + over * sigma) * spot
+        slope = clipped.slopes(rest, clipped.of(clipped.lit(spot))[None])
+        fall = float((slope[0] * clipped.misfits(rest)).sum()) * sigma
+        assert fall == pytest.approx((cost(-1e-4) - cost(1e-4)) / 2e-4, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_the_strength_of_a_wider_line_lies_in_its_interval():
+    """A line of 3 nm, of which no width is tried: its rings fade, which must not count as a weaker laser."""
+    laser = own.Laser((4.3, -7.8), 560e-9, 1e4, 3e-9)
+    found = found_in(frame_of([laser], "plain"), "plain", lamps=0, most=1)
+    ends = found.strength_interval[0].numpy()
+    assert ((ends[:, 0] < laser.channels) & (laser.channels < ends[:, 1])).all()
+    assert (ends[:2, 1] - ends[:2, 0] < 0.05 * laser.channels[:2]).all()
+    assert float(found.fwhm[0]) == pytest.approx(3e-9, rel=0.15)
+
+
+@pytest.mark.slow
+def test_a_strong_laser_behind_a_mask_is_found_among_its_clipped_pixels():
+    laser = own.Laser((-9.0, 0.8), 634e-9, 1e4)
+    found = found_in(frame_of([laser], "cubic", "leaves", seed=2), "cubic", lamps=0, most=1)
+    assert (found.direction[0] / PIXEL).tolist() == pytest.approx(laser.spot, abs=0.1)
+    assert float(found.wavelength[0]) == pytest.approx(laser.wavelength, abs=1e-9)
+
+
+@pytest.fixture(scope="module")
+def strong():
+    """A strong laser, a frame with it, and what is found there."""
     laser = own.Laser((4.3, -7.8), 533e-9, 1e3)
-    found = found_in(frame_of([laser]), "half_ring", lamps=1)
+    frame = frame_of([laser])
+    return laser, frame, found_in(frame, "half_ring", lamps=1)
+
+
+def test_a_strong_laser_is_found_where_it_is(strong):
+    laser, _, found = strong
     assert int(found.number) == 1
     assert (found.direction[0] / PIXEL).tolist() == pytest.approx(laser.spot, abs=0.2)
     assert float(found.wavelength[0]) == pytest.approx(laser.wavelength, abs=5e-9)
@@ -71,10 +153,8 @@ def test_no_laser_is_found_where_there_is_none():
     assert not any(bool(x.any()) for x in found)
 
 
-def test_the_glare_found_is_the_light_of_the_laser():
-    laser = own.Laser((4.3, -7.8), 533e-9, 1e3)
-    frame = frame_of([laser])
-    found = found_in(frame, "half_ring", lamps=1, widths=(1e-9,))
+def test_the_glare_found_is_the_light_of_the_laser(strong):
+    laser, frame, found = strong
     picture = tensor(frame.electrons).float()
     glare = restore.found_glare(found, pupil_of("half_ring"), picture, rank=1, **LENS).numpy()
     expected = laser.electrons("half_ring", (SIDE, SIDE))

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import types
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +60,13 @@ def loop(u, dt, A, B, C):
     return torch.from_numpy((states * C[:, :, None]).sum(-1))
 
 
+@lru_cache(maxsize=24)
+def long_line(rate, kind, even, d=4, n=4, seed=0):
+    """A line of 65536 with its truth: the loop of as many steps is run once for all backends and plans."""
+    values = draw(65_536, d, n, rate=rate, kind=kind, even=even, seed=seed)
+    return values, loop(*values)
+
+
 def worst(found, truth):
     assert found.shape == truth.shape
     assert bool(found.isfinite().all())
@@ -73,8 +81,7 @@ def gradients(scan, values, seen):
 @pytest.mark.parametrize("even", [False, True])
 @pytest.mark.parametrize("rate", RATES)
 def test_a_long_line_is_that_of_the_loop(rate, even, backend):
-    values = draw(65_536, rate=rate, kind=torch.float32, even=even)
-    truth = loop(*values)
+    values, truth = long_line(rate, torch.float32, even)
     assert worst(selective_scan(*values, backend=backend), truth) < (8e-7 if backend == "torch" else 3e-7)
 
 
@@ -82,14 +89,15 @@ def test_a_long_line_is_that_of_the_loop(rate, even, backend):
 @pytest.mark.parametrize("steps", [(16, 1), (10, 9)])
 def test_a_state_that_hardly_decays_is_not_rounded_away_in_wide_lines(monkeypatch, steps, seed):
     """As many carries as lines of 1536 numbers and more have; 2e-6 where they are in single precision."""
-    values = draw(65_536, 2, 2, rate=1e-6, kind=torch.float32, even=True, seed=seed)
+    values, truth = long_line(1e-6, torch.float32, True, 2, 2, seed)
     monkeypatch.setattr(_torch_scan, "plan", lambda *_: _torch_scan.Plan(*steps))
-    assert worst(selective_scan(*values, backend="torch"), loop(*values)) < 4e-7
+    assert worst(selective_scan(*values, backend="torch"), truth) < 4e-7
 
 
 @pytest.mark.parametrize("rate", [1e-6, "mix", 200.0])
 def test_a_long_line_in_double_precision(rate, backend):
-    assert worst(selective_scan(*(values := draw(65_536, rate=rate)), backend=backend), loop(*values)) < 1e-12
+    values, truth = long_line(rate, torch.float64, False)
+    assert worst(selective_scan(*values, backend=backend), truth) < 1e-12
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from neusee.workflows.protection.camera_parts import ProtectionCamera
 from neusee.workflows.protection.equal_rivals import MEASURES
 from neusee.workflows.protection.front_optics import Front, FrontBench, FrontSettings
 from neusee.workflows.protection.protection_result import LIGHTS
-from neusee.workflows.recipe.distributions.unknown_conditions import usual_condition
+from neusee.workflows.protection.unknown_conditions import usual_condition
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.protection.protection_page import crossing
 from neusee.workflows.studies.run_study import study_recipe

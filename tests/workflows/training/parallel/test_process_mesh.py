@@ -116,6 +116,27 @@ def test_what_is_imaged_in_a_few_planes_needs_the_gathered_psf(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_pool_is_simulated_once_under_every_mesh_and_with_a_camera_that_is_not_known(tmp_path):
+    """Each process has the pictures of one process, of which it draws the values in the first round alone."""
+    defocus = "train.mismatch={optics.defocus: 'normal(0 waves, 0.3 waves)'}"
+    words = [*EVERY, "doe=half_ring", "train.learn=null", "train.pool=4", "train.keep_pool=false", defocus,
+             "train.picture=restored"]  # fmt: skip
+    done = processes(tmp_path, [("pool", mesh, "pool", words) for mesh in ("1x1", "1x2", "2x1")])
+    assert not any(code for folder in done.values() for code in codes(folder)), [errors(f) for f in done.values()]
+    (one,), band, data = ([torch.load(file, weights_only=True) for file in sorted(done["pool", mesh].glob("pool_*"))]
+                          for mesh in ("1x1", "1x2", "2x1"))  # fmt: skip
+    assert [each["by band"] for each in band] == [True, True]
+    assert (one["drawn"], [each["drawn"] for each in band], [each["drawn"] for each in data]) == (4, [4, 4], [2, 2])
+    for each in (band, data):
+        for rank in range(2):
+            mine = [tensors for i, tensors in one["pictures"] if i == rank]
+            assert [i for i, _ in each[rank]["pictures"]] == [rank] * 4
+            for (_, found), expected in zip(each[rank]["pictures"], mine, strict=True):
+                assert float((found["picture"] - expected["picture"]).abs().max()) <= 1e-9
+                assert torch.equal(found["truth"], expected["truth"])
+
+
+@pytest.mark.slow
 def test_one_that_fails_ends_all(done):
     broken = done["broken", "2x1"]
     assert codes(broken) == [1, 1], "each ends by itself, and with an error"

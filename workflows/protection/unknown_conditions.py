@@ -2,7 +2,7 @@
 
 Studies and trainings draw the same conditions for the same seed: the wavelength and the direction of the laser, the
 defocus of the lens, the grease on the window, and the light that the lens scatters. A study draws a list, and a
-training, which imports the same sampler, draws the condition of one iteration at a time.
+training draws by the same `draw_laws` how the camera of one picture differs from what its restorer is told.
 """
 
 from __future__ import annotations
@@ -10,9 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
-import numpy as np
-
-from neusee.workflows.recipe.distributions.scalar import read_law
+from neusee.workflows.recipe.distributions.scalar import draw_laws, read_law
 
 _MOST_SCATTER = 0.99  #: share of the light; a lens that scatters all light has no picture
 
@@ -59,9 +57,7 @@ def draw_conditions(count: int, seed: int, laws: UnknownLaws | None = None, firs
     The draw of a number depends only on the seed and the laws, so that a larger ``count`` begins with the same draws.
     """
     given: Mapping[str, str] = asdict(laws or UnknownLaws())
-    read = {name: read_law(text) for name, text in given.items()}
-    z = np.random.default_rng([seed, 4]).standard_normal((first + count, len(read)))[first:]
-    columns = {name: law.at(z[:, i]).tolist() for i, (name, law) in enumerate(read.items())}
+    columns = draw_laws({name: read_law(text) for name, text in given.items()}, count, [seed, 4], first)
     return [
         Condition(
             wavelength=columns["wavelength"][i],
