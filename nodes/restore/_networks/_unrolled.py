@@ -16,7 +16,7 @@ from neusee.nodes.exact_convolution import exact_convolutions
 from neusee.nodes.network_weights import loaded, same_layout
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred
-from neusee.nodes.restore._inverse._prior_mean import STEPS, Untold
+from neusee.nodes.restore._inverse._pulled_answer import STEPS, pulled
 from neusee.nodes.restore._inverse._wiener import Doubt, pose
 from neusee.nodes.restore._inverse._wiener_problem import unpacked
 from neusee.nodes.restore._networks._nafnet import NAFNet
@@ -26,20 +26,21 @@ from neusee.nodes.values import Bands, Psf
 
 Steps = Annotated[Count, Field(le=16)]
 _MAPS = 15  #: maps that a prior sees: five of each of three channels
+_PRECISION, _REACH = 10.0, 5.0  #: of what a network says, at first, and the range of its logarithm to either side
 _BRIGHT = 1e3  #: of a glare pattern of maximum 1, so that its far rings are seen
 
 
 class Unrolled(Restorer):
-    """Steps of the Wiener filter, each with a prior whose mean a network finds in the picture of the step before.
+    """Steps of the Wiener filter, each with a second prior that a network finds in the picture of the step before.
 
-    Step k has the prior mean c and gives c + F (y - B c), where F is the filter and B the blur: the picture keeps to
-    the frame y where the frame is certain, and to c where it is not. Without a mean (c = 0) a step is the filter.
+    In step k a network says what the picture is, c, and how precisely it knows this; the step returns the most likely
+    picture under the frame, the prior of the filter, and c. A network that says nothing leaves the filter's answer.
     """
 
     def __init__(self, width: int = 16, steps: int = 2, iterations: int = STEPS) -> None:
         super().__init__()
         self.iterations = iterations  #: of the conjugate gradients in each step
-        self.priors = nn.ModuleList(NAFNet(width, (1, 1, 1), 1, inputs=_MAPS) for _ in range(steps))
+        self.priors = nn.ModuleList(NAFNet(width, (1, 1, 1), 1, inputs=_MAPS, outputs=6) for _ in range(steps))
         self.multiple = 8
 
     def begin(self) -> None:
@@ -60,20 +61,20 @@ class Unrolled(Restorer):
 
     def change(self, seen: Blurred, answer: Tensor, blurred: Tensor) -> Tensor:
         """Return what the steps add to the filter's answer (3, y, x), given this answer and its blur by the camera."""
-        untold = Untold(seen, self.iterations)
         added = of_added = torch.zeros_like(answer)
         for prior in self.priors:
-            added, of_added = untold(_mean(prior, seen, answer + added, blurred + of_added))
+            found, precision = _found(prior, seen, answer + added, blurred + of_added)
+            added, of_added = pulled(seen, added + found, precision, self.iterations)
         return added
 
 
-def _mean(prior: nn.Module, seen: Blurred, x: Tensor, blurred: Tensor) -> Tensor:
-    """Return the prior mean (channel, y, x) that a network finds in the picture of the step before, and in its blur."""
+def _found(prior: nn.Module, seen: Blurred, x: Tensor, blurred: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the change of the picture of the step before that a network wants, and its precision (channel, y, x)."""
     rows, columns = seen.picture.shape[-2:]
     weight = next(prior.parameters())
     maps = mirrored(_maps(seen, x, blurred).to(weight)[None], -rows % 8, -columns % 8)
-    change: Tensor = prior.change(maps)[0, :, :rows, :columns]  # type: ignore[operator]
-    return change.to(x)
+    change, certain = prior.change(maps)[0, :, :rows, :columns].to(x).split(3)  # type: ignore[operator]
+    return change, _PRECISION * torch.exp(_REACH * torch.tanh(certain.mean((-2, -1), keepdim=True))).expand_as(change)
 
 
 def _maps(seen: Blurred, x: Tensor, blurred: Tensor) -> Tensor:
