@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from neusee.nodes import restore
@@ -61,11 +62,14 @@ class PosedPictures:
         posed = replace(step, node=restore.wiener_problem, params=params)
         return replace(recipe, steps={**recipe.steps, self.filter: posed})
 
-    def read(self, values: Mapping[str, Any]) -> tuple[Tensor, tuple[WienerProblem, Tensor]]:
-        """Return the picture of the filter (3, y, x), and what the network needs beside it."""
+    def read(self, values: Mapping[str, Any], dtype: torch.dtype) -> tuple[Tensor, tuple[WienerProblem, Tensor]]:
+        """Return the picture of the filter (3, y, x), and what the network needs beside it in the given precision.
+
+        The filter solves small pictures in float64; the steps of a training take half the time in float32.
+        """
         problem, matrix = values[self.filter], values[self.matrix]
         told: Tensor = restore.colour(problem.answer * problem.scale + problem.mean, matrix)
-        return told, (problem, matrix)
+        return told, (WienerProblem._make(part.to(dtype) for part in problem), matrix.to(dtype))
 
 
 def tensors_of(given: Given) -> dict[str, Tensor]:

@@ -252,8 +252,9 @@ class TrainingStream:
         contrast of 0.69 with kornia, and of 0.09 with `resize`.
         """
         light = values.get(self.settings.light, torch.zeros(0))
-        picture, given = self._posed.read(values) if self._posed else (values[self.settings.picture], ())
-        both = [x.to(self.settings.dtype) for x in (picture, values[self.settings.truth])]
+        dtype = self.settings.dtype
+        picture, given = self._posed.read(values, dtype) if self._posed else (values[self.settings.picture], ())
+        both = [x.to(dtype) for x in (picture, values[self.settings.truth])]
         if self.settings.size is not None:
             both = [resize(picture, *self.settings.size) for picture in both]
         picture, truth = self._patches(torch.stack(both), drawn["noise"])

@@ -31,7 +31,7 @@ class Blurred:
     glare: tuple[Tensor, ...] = ()  #: (channel, y, x) patterns of unknown strength that are added to the picture
     pull: Tensor | None = None  #: (channel, fy, fx), a further term of the log posterior's gradient
     bounded: int = 0  #: how many patterns, the last ones, have strengths of mean 0 and variance 1, not any strength
-    held: Tensor | None = None  #: (channel, y, x), precision of a further prior of x in the frame, of mean 0 (`descend`)
+    held: Tensor | None = None  #: (channel, y, x), precision of a further prior of x in the frame; see `descend`
 
     def blur(self, spectrum: Tensor) -> Tensor:
         """Return the blurred picture, given half the spectrum of x."""
