@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from neusee.nodes.restore._inverse._conjugate_gradients import Preconditioner, descend
+from neusee.nodes.restore._inverse._hidden_pixels import fixed
 from neusee.nodes.restore._inverse._masked_blur import Blurred
 
 STEPS = 10  #: of conjugate gradients, which leave 2e-3 to 4e-3 of a change behind half-rings
@@ -28,21 +29,19 @@ def pulled(seen: Blurred, towards: Tensor, precision: Tensor, steps: int = STEPS
     `towards` (channel, y, x) is c - x0, and `precision` of the same shape the diagonal of R. Both results are exactly 0
     where all of `towards` is. They have derivatives of first order, also with respect to the problem itself.
     """
-    tensors = (seen.weight, seen.transfer, *seen.glare)
-    followed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
-    with torch.no_grad():
-        fixed = replace(
-            seen, picture=torch.zeros_like(seen.picture), weight=seen.weight.detach(), transfer=seen.transfer.detach(),
-            glare=tuple(pattern.detach() for pattern in seen.glare), held=precision.detach(),
-        )  # fmt: skip
-        solver = _Solver(fixed, steps)
-        change = solver(torch.fft.rfft2(precision * towards, s=seen.torus))
     y, x = seen.picture.shape[-2:]
-    rest = pad(precision * (towards - seen.first(change)), (0, seen.torus[1] - x, 0, seen.torus[0] - y))
-    if followed:
-        slope = replace(seen, picture=torch.zeros_like(seen.picture), pull=None).slope(change)
-        rest = rest + torch.fft.irfft2(slope, s=seen.torus)
-    pixels: Tensor = _Followed.apply(rest, torch.fft.irfft2(change, s=seen.torus), solver)  # type: ignore[no-untyped-call]
+    right = precision * towards
+    still = replace(seen, picture=torch.zeros_like(seen.picture), held=precision)
+    solver = _Solver(fixed(still), steps)
+    with torch.no_grad():
+        change = solver(torch.fft.rfft2(right, s=seen.torus))
+    tensors = (seen.weight, seen.transfer, *seen.glare)
+    if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
+        rest = torch.fft.irfft2(replace(still, pull=torch.fft.rfft2(right, s=seen.torus)).slope(change), s=seen.torus)
+    else:  # what else is in the residual is constant
+        rest = pad(right - precision * seen.first(change), (0, seen.torus[1] - x, 0, seen.torus[0] - y))
+    whole = torch.fft.irfft2(change, s=seen.torus)
+    pixels: Tensor = _Followed.apply(rest, whole, solver)  # type: ignore[no-untyped-call]
     return pixels[..., :y, :x], seen.blur(torch.fft.rfft2(pixels))
 
 

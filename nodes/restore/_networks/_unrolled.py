@@ -109,20 +109,21 @@ def unrolled(
 ) -> Tensor:
     """Deconvolve a picture by `restore.wiener` with a learned prior: the filter and a network take turns.
 
-    Each of the ``steps`` asks a small NAFNet of its own for the mean c of the prior, and gives c + F (y - B c), where F
-    is the filter, y the picture without glare and B the blur. The network sees the picture of the step before, the
-    residual y - B x over its noise, how certain each pixel is, which pixels are not clipped, and the glare. Without
-    ``weights`` the restorer is the filter: a network that says nothing (c = 0) leaves the filter's result as it is.
+    Each of the ``steps`` asks a small NAFNet of its own what the picture is, c, and how precisely it knows this (one
+    precision R for each channel), and gives the most likely picture under the frame, the prior of the filter and a
+    Gaussian prior of mean c and precision R in the frame. Beyond the frame c says nothing. The network sees the picture
+    of the step before, the residual y - B x over its noise, how certain each pixel is, which pixels are not clipped,
+    and the glare. Without ``weights`` the restorer is the filter, and so it is where the network says nothing.
 
     Shapes: as `restore.wiener`, of three channels -> (channel, y, x).
     Units:  as `restore.wiener`.
-    Error:  the filter's own; in each step conjugate gradients leave 4e-4 of what the network adds (64 pixels a side,
-            behind a half-ring), and 5e-3 of its gradients; the network is float32, 1e-5. Gradients of the exact answer,
-            first order only; the weights receive none. Of the restoration, the error that the training reached: a
-            network may invent what the frame does not tell.
+    Error:  the filter's own; in each step conjugate gradients leave 2e-3 to 4e-3 of what the network adds (64 pixels a
+            side, behind a half-ring and five half-rings); the network is float32, 1e-5. Gradients of first order only;
+            the weights receive none. Of the restoration, the error that the training reached: a network may invent
+            what the frame does not tell.
     Raises: ParameterError before the run where the weights do not fit; ValueError as `restore.wiener`, and for a
             sensor without three channels.
-    Source: unrolling with a filter in each step as in Aggarwal et al., MoDL, IEEE Trans. Med. Imaging 38, 394 (2019);
+    Source: unrolling with a data term in each step: Aggarwal et al., MoDL, IEEE Trans. Med. Imaging 38, 394 (2019);
             Chen et al., Simple Baselines for Image Restoration, ECCV 2022 (NAFNet); the maps are ours.
     """
     electrons, light = single(electrons), (glare, nearby, ghosts)
