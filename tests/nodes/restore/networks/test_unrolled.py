@@ -107,14 +107,16 @@ def test_from_the_start_the_last_layers_have_gradients():
     assert all(float(prior.last.weight.grad[:3].abs().max()) > 0 for prior in net.priors)
 
 
-def test_gradients_of_the_node_agree_with_differences(tmp_path):
+def test_gradients_of_the_node_agree_with_differences(tmp_path, monkeypatch):
+    """With conjugate gradients that end: after ten steps, sums that nearly cancel are a third off."""
+    monkeypatch.setattr(Unrolled.__init__, "__defaults__", (16, 2, 100))
     electrons, *others = frame(16, 16)
     how = written(network(0.2), tmp_path)
     picture, way = electrons.double().requires_grad_(), random(3, 16, 16, seed=12) - 0.5
     call = lambda e: (unrolled(e, *others, **how) * random(3, 16, 16, seed=13)).sum()  # noqa: E731
     (slope,) = torch.autograd.grad(call(picture), picture)
     with torch.no_grad():
-        step = 20.0
+        step = 3.0
         rise = float(call(picture + step * way) - call(picture - step * way)) / (2 * step)
     assert rise == pytest.approx(float((slope * way).sum()), rel=0.02)
 
