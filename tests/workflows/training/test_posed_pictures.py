@@ -46,6 +46,7 @@ def test_the_picture_is_that_of_any_network_behind_the_filter_and_the_problem_ha
     assert torch.allclose(told, one.picture[0], rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_store_gives_back_the_bits_of_picture_and_problem(photograph, store):
     first, again = (stream(POSED, photograph, store)({}, 2, 1) for _ in range(2))
     assert len(first.tensors) == 13
@@ -53,6 +54,7 @@ def test_the_store_gives_back_the_bits_of_picture_and_problem(photograph, store)
     assert type(again.given[0]) is type(first.given[0])
 
 
+@pytest.mark.slow
 def test_under_a_mismatch_the_problem_is_that_of_the_recipe(photograph, store):
     plain = stream(POSED, photograph, store)({}, 2, 0)
     moved = stream([*POSED, "+train.mismatch.optics.defocus=0.3 waves"], photograph, store)({}, 2, 0)

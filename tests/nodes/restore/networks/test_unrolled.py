@@ -107,6 +107,7 @@ def test_from_the_start_the_last_layers_have_gradients():
     assert all(float(prior.last.weight.grad[:3].abs().max()) > 0 for prior in net.priors)
 
 
+@pytest.mark.slow
 def test_gradients_of_the_node_agree_with_differences(tmp_path, monkeypatch):
     """With conjugate gradients that end: after ten steps, sums that nearly cancel are a third off."""
     monkeypatch.setattr(Unrolled.__init__, "__defaults__", (16, 2, 100))
