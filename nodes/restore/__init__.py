@@ -20,6 +20,8 @@ from neusee.nodes.restore._networks._own_network import OwnNetwork, own_network,
 from neusee.nodes.restore._networks._restorer import Restorer, parameter_groups, start_network
 from neusee.nodes.restore._networks._unet import UNet, unet
 from neusee.nodes.restore._networks._unrolled import Unrolled, unrolled
+from neusee.nodes.restore._points._by_field import spread_by_field, wiener_by_field
+from neusee.nodes.restore._points._measured_psf import measured_psf
 from neusee.nodes.restore._sensor_likelihood import MeasuringSensor, measuring_sensor
 from neusee.nodes.restore._white_level import white_level
 
@@ -44,6 +46,7 @@ __all__ = [
     "found_glare",
     "found_nearby",
     "frame_blur",
+    "measured_psf",
     "measuring_sensor",
     "nafnet",
     "nearby_glare",
@@ -53,12 +56,14 @@ __all__ = [
     "require_exportable",
     "richardson_lucy",
     "skip_critic_draws",
+    "spread_by_field",
     "start_network",
     "try_network",
     "unet",
     "unrolled",
     "white_level",
     "wiener",
+    "wiener_by_field",
     "wiener_problem",
     "wiener_spread",
 ]
