@@ -162,6 +162,20 @@ class Shading(NamedTuple):
     alike: Tensor  #: () float64, correlation of the details of two scenes: 0 for scenes that differ
 
 
+class WienerProblem(NamedTuple):
+    """The deconvolution of `restore.wiener`: a linear problem for a scene of mean 0 and variance 1, and its answer."""
+
+    picture: Tensor  #: (channel, y, x), without the glare, of mean 0 and in units of ``scale``
+    weight: Tensor  #: (channel, y, x), 1 / variance of the noise; 0 where a pixel is clipped
+    psf: Tensor  #: (channel, any, any), of a sum near 1
+    glare: Tensor  #: (pattern, channel, y, x), patterns that are added with any strength
+    doubts: Tensor  #: (pattern, channel, y, x), patterns that are added with a strength of mean 0 and variance 1
+    answer: Tensor  #: (channel, y, x), what the filter restores, in units of ``scale``
+    seen: Tensor  #: (channel, y, x), the blurred answer, in which light from beyond the frame counts too
+    scale: Tensor  #: (channel, 1, 1) e-, of the answer behind a perfect lens
+    mean: Tensor  #: (channel, 1, 1) e-, of the scene behind a perfect lens
+
+
 class MeasuredPsf(NamedTuple):
     """PSFs that frames of point sources gave, at the nodes of a grid over the frame, and how sure they are.
 

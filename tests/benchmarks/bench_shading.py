@@ -3,8 +3,8 @@
     python tests/benchmarks/bench_shading.py photographs/ [side]
 
 A camera in NumPy: a field of twelve blurred grains that takes up to half of the light, 15 % of it, or nothing; scenes
-from photographs, Poisson and read noise, clipping. The gain is that of a frame with an error of 28 dB, as a restored one
-has, divided by the field or not, each at its best scale. Nothing here is shared with the estimate but its cells.
+from photographs, Poisson and read noise, clipping. The gain is that of a frame with an error of 28 dB, as a restored
+one has, divided by the field or not, each at its best scale. Nothing here is shared with the estimate but its cells.
 """
 
 import sys
