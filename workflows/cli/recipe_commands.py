@@ -212,7 +212,7 @@ def report(
 ) -> None:
     """Write the page of a run again from stored results."""
     from neusee.workflows.report.run_folder import find_run
-    from neusee.workflows.report.run_page import rebuild
+    from neusee.workflows.report.run_html import rebuild
 
     with failing(FileNotFoundError):
         say([str(rebuild(find_run(folder, out)))])

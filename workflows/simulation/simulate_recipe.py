@@ -19,7 +19,7 @@ from neusee.workflows.explain.why_rerun import explained
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.report import run_page, run_timing
+from neusee.workflows.report import run_html, run_page, run_timing
 from neusee.workflows.report.contents import wanted
 from neusee.workflows.report.data_exports import exports
 from neusee.workflows.report.run_code import code_text
@@ -108,7 +108,7 @@ def _write(
     folder.write_rows("metrics.csv", ("step", "field", "index", "value"), doc["metrics"])
     folder.write_rows("timing.csv", run_timing.COLUMNS, run_timing.rows(doc["steps"]))
     folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False, allow_nan=True))
-    folder.write("report.html", run_page.page(doc, shown))
+    folder.write("report.html", run_html.page(doc, shown))
     return doc
 
 
