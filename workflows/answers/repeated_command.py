@@ -20,7 +20,8 @@ from neusee.workflows.answers.answer_upkeep import make_room
 from neusee.workflows.answers.installed_program import ROOT, SITES, SOURCES, program_state, standard_library
 from neusee.workflows.answers.opened_files import Folders, Opened
 from neusee.workflows.answers.results_folder import kept_files, printed, write_again
-from neusee.workflows.answers.stored_answer import Answer, read_answer, used, write_answer
+from neusee.workflows.answers.stored_answer import RUN, Answer, read_answer, used, write_answer
+from neusee.workflows.answers.stored_results import note_use, still_there
 from neusee.workflows.answers.typed_command import command_name
 from neusee.workflows.answers.witnesses import Unsettled, Witnesses, hold, witnesses_of
 from neusee.workflows.report.run_folder import writable_folder
@@ -28,6 +29,7 @@ from neusee.workflows.store.environment import budget_bytes, default_root
 from neusee.workflows.store.shared_folder import Disk
 
 if TYPE_CHECKING:
+    from neusee.workflows.answers.repeated_run import RunResults
     from neusee.workflows.graph.recipe_graph import Recipe
     from neusee.workflows.report.study_folder import StudyReport
 
@@ -65,6 +67,10 @@ class Results(NamedTuple):
     out: Path  #: the folder that has it
     report: StudyReport  #: that was written there
 
+    def fields(self) -> dict[str, Any]:
+        """Return the fields of the answer that say what the folder holds."""
+        return {"files": kept_files(self.folder, self.report)}
+
 
 class Command:
     """A command whose answer may be stored, from its begin."""
@@ -82,20 +88,41 @@ class Command:
         Raises `OSError` if the folder of results cannot be written.
         """
         answer = read_answer(self._disk, self.name)
-        if answer and answer.state == self._state.digest and self._fits(answer) and hold(answer.witnesses):
+        if answer and self._holds(answer):
             with suppress(ValueError, KeyError, TypeError, AttributeError):  # a document that is none
-                folder = write_again(answer, time.perf_counter() - self._began) if answer.key else None
+                text = self._given_again(answer)
                 used(self._disk, self.name)
-                return printed(answer, folder / "report.html") if folder else answer.text
+                return text
         running[:] = [self]
         self._opened.listen()
         return None
+
+    def _holds(self, answer: Answer) -> bool:
+        """Return True if everything that decided an answer is as it was."""
+        return (
+            answer.state == self._state.digest
+            and self._fits(answer)
+            and hold(answer.witnesses)
+            and still_there(self._disk, answer.stored)
+        )
+
+    def _given_again(self, answer: Answer) -> str:
+        """Write the folder of an answer again, if it has one, and return the text to print."""
+        if not answer.key:
+            return answer.text
+        if answer.kind != RUN:
+            return printed(answer, write_again(answer, time.perf_counter() - self._began) / "report.html")
+        from neusee.workflows.answers.repeated_run import said_again, write_run_again
+
+        folder, document = write_run_again(answer, self._disk, time.perf_counter() - self._began)
+        note_use(self._disk, answer.stored)
+        return said_again(answer, folder, document)
 
     def doubt(self) -> None:
         """Keep no answer: the command has said something that its text does not hold, such as a warning."""
         self._doubtful = True
 
-    def keep(self, text: str, as_json: bool, recipe: Recipe, results: Results | None = None) -> None:
+    def keep(self, text: str, as_json: bool, recipe: Recipe, results: Results | RunResults | None = None) -> None:
         """Keep the answer of a command that has ended well; do so only if nothing that it rests on is in doubt.
 
         Args: text: of the terminal, with `results_folder.PAGE` for the path of the page. recipe: that of the command.
@@ -106,11 +133,9 @@ class Command:
             witnesses = self._witnesses(results.out if results else None, _input_files(recipe))
             if self._is_doubtful() or not (results or os.path.isdir(self._disk.folder)):
                 return
-            of_folder: tuple[str, str, str, dict[str, bytes]] = "", "", "", {}
-            if results:
-                files = kept_files(results.folder, results.report)
-                of_folder = (str(results.out), *_parts(results.folder.name), files)
-            answer = Answer(self._state.digest, witnesses, text, as_json, *of_folder)
+            place = (str(results.out), *_parts(results.folder.name)) if results else ("", "", "")
+            fields = results.fields() if results else {"files": {}}
+            answer = Answer(self._state.digest, witnesses, text, as_json, *place, **fields)
             if write_answer(self._disk, self.name, answer):
                 make_room(self._disk, budget_bytes(None))
 

@@ -13,6 +13,8 @@ from neusee.workflows.answers import repeated_command
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
     from neusee.workflows.report.study_folder import StudyReport
+    from neusee.workflows.simulation.simulate_recipe import Simulation
+    from neusee.workflows.store.result_store import Store
 
 _COMPUTED = {"-h", "--help", "--debug"}  #: words of a command that no stored answer answers
 
@@ -48,6 +50,20 @@ def keep_answer(
 
     for command in repeated_command.running:
         command.keep(text(PAGE), as_json, recipe, repeated_command.Results(folder, out, report))
+
+
+def keep_run(
+    text: Callable[[str, str], str], as_json: bool, out: Path, done: Simulation, recipe: Recipe, store: Store
+) -> None:
+    """Keep what a run has printed and written, if all its results came from the cache.
+
+    ``text`` returns the text of the command for the path of the folder of the run and the seconds that it took.
+    """
+    from neusee.workflows.answers.repeated_run import FOLDER, TOOK, RunResults
+
+    for command in repeated_command.running:
+        results = RunResults(done.folder, out, done.document, done.taken, store)
+        command.keep(text(FOLDER, TOOK), as_json, recipe, results)
 
 
 def doubt_answer() -> None:

@@ -8,11 +8,22 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from neusee.workflows.report.run_crate import remove_crate, restore_crate
 from neusee.workflows.report.study_page import filled
+
+
+def document_text(doc: Mapping[str, Any]) -> str:
+    """Return the document of a run as the text of its file ``provenance.json``."""
+    return json.dumps(doc, indent=1, ensure_ascii=False, allow_nan=True)
+
+
+def present_time() -> str:
+    """Return the present time as the page of a run shows it."""
+    return datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
 
 
 def page(doc: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:

@@ -14,7 +14,6 @@ import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,7 @@ from neusee.workflows.report.contents import FIGURES, compared
 from neusee.workflows.report.frame_story import said_of_frame
 from neusee.workflows.report.mask_story import story
 from neusee.workflows.report.result_numbers import expected, metrics, table
+from neusee.workflows.report.run_html import present_time
 from neusee.workflows.report.run_timing import said_of, timing
 from neusee.workflows.report.spectral_sampling import spectral_error
 from neusee.workflows.report.tolerance_spent import spent
@@ -67,7 +67,7 @@ def document(
         "title": recipe.title,
         "version": version_of("neusee"),
         "command": shlex.join(command),
-        "started": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %Z"),
+        "started": present_time(),
         "device": result.device,
         "seconds": result.seconds,
         "tolerance": recipe.tolerance,
