@@ -111,6 +111,8 @@ def unpacked(name: str, raw: bytes) -> Answer:
         raise ValueError("the files of the answer are not as long as it says")
     witnesses = Witnesses(**fields.pop("witnesses"))
     stored = checked(fields.pop("stored"))
+    for file in stored.taken:
+        _checked(_FILE, file)
     answer = Answer(**fields, witnesses=witnesses, files=files, stored=stored)
     if answer.key or answer.label:
         _checked(_LABEL, answer.label)

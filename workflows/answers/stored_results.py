@@ -83,6 +83,8 @@ def checked(fields: Mapping[str, Any]) -> StoredResults:
     Raises `ValueError` or `TypeError` for what `stored_results` never gives.
     """
     found = StoredResults(**{**fields, "loaded": tuple(fields.get("loaded", ()))})
+    if not all(isinstance(each, dict) for each in (found.results, found.files, found.taken)):
+        raise ValueError("a field of the answer is not of its type")
     names = [(_KEY, [*found.results, *found.loaded]), (_FILE, [*found.files, *found.taken.values()])]
     if any(not form.fullmatch(name) for form, many in names for name in many):
         raise ValueError("the answer names what is no result and no file of a cache")

@@ -1,4 +1,4 @@
-"""`neusee safety` in processes of its own: the repeated command imports no torch, and says and writes the same."""
+"""Commands in processes of their own: the repeated command imports no torch, and says and writes the same."""
 
 import json
 import os
@@ -15,7 +15,7 @@ import sys
 
 class Refuse:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in ("torch", "numpy", "pydantic", "ruamel", "typer", "jinja2", "rich"):
+        if name.partition(".")[0] in ("torch", "numpy", "pydantic", "ruamel", "typer", "rich"):
             raise RuntimeError(f"{name} is imported")
 
 sys.meta_path.insert(0, Refuse())
@@ -47,6 +47,16 @@ class Terminal:
 @pytest.fixture
 def neusee(tmp_path):
     return Terminal(tmp_path)
+
+
+RUN = """# A frame that a user took.
+steps:
+  frame:
+    node: scene.photograph
+    with: {file: frame.png, shape: "${size.shape}"}
+size: {shape: [16, 16]}
+outputs: [frame]
+"""
 
 
 def refuses(done):
@@ -100,3 +110,73 @@ def test_a_recipe_with_a_mistake_or_code_of_its_own_has_no_stored_answer(neusee)
     (neusee.folder / "sensor").mkdir()
     (neusee.folder / "sensor" / "neusee.yaml").write_text((ROOT / "recipes/sensor/neusee.yaml").read_text())
     assert refuses(neusee("config", "first_light", light=True))
+
+
+def picture(neusee, level):
+    from PIL import Image
+
+    Image.new("RGB", (24, 20), (level, 90, 30)).save(neusee.folder / "frame.png")
+
+
+@pytest.mark.slow
+def test_a_run_from_the_cache_is_given_again_until_anything_changes(neusee):
+    (neusee.folder / "mine.yaml").write_text(f"{RUN}defaults: [size: small]\n".replace("size: {shape: [16, 16]}\n", ""))
+    (neusee.folder / "size").mkdir()
+    (neusee.folder / "size" / "small.yaml").write_text("size: {shape: [16, 16]}\n")
+    picture(neusee, 200)
+    words = ("run", "mine.yaml")
+
+    def kept(*words):
+        """Return the answer without torch, after the runs that compute, load and keep."""
+        done = [neusee(*words) for _ in range(2)]
+        assert [each[0] for each in done] == [0, 0], done
+        again = neusee(*words, light=True)
+        assert again[0] == 0, again
+        assert again[2] == ""
+        seconds = re.compile(r"[0-9.]+ s\)")
+        assert seconds.sub("", plain(again[1])) == seconds.sub("", plain(done[1][1]))
+        return json.loads((neusee.folder / "runs/latest/provenance.json").read_text())
+
+    assert refuses(neusee(*words, light=True)), "nothing is computed yet"
+    assert neusee(*words)[0] == 0
+    assert refuses(neusee(*words, light=True)), "the first run has computed its step"
+    first = kept(*words)
+    assert first["counts"] == "1 cached"
+    assert refuses(neusee(*words, "--json", light=True))
+    assert refuses(neusee(*words, "size.shape=[8, 8]", light=True))
+    other = kept(*words, "size.shape=[8, 8]")
+    assert other["steps"][0]["key"] != first["steps"][0]["key"]
+    changes = {
+        "a frame": lambda: picture(neusee, 201),
+        "an option": lambda: (neusee.folder / "size/small.yaml").write_text("size: {shape: [16, 14]}\n"),
+        "the recipe": lambda: (neusee.folder / "mine.yaml").write_text(
+            f"{RUN}seed: 3\n".replace("16, 16", "16, 12"),
+        ),
+        "the environment": lambda: neusee.env.update(NEUSEE_CACHE_VERIFY="sampled"),
+        "a module that hides a package": lambda: (neusee.folder / "scipy.py").write_text("x = 1\n"),
+    }
+    seen = {first["steps"][0]["key"]}
+    for name, change in changes.items():
+        change()
+        assert refuses(neusee(*words, light=True)), name
+        if name == "a module that hides a package":
+            break
+        seen.add(kept(*words)["steps"][0]["key"])
+    assert len(seen) == 4, "frame, option and recipe each give another result; the environment does not"
+
+
+@pytest.mark.slow
+def test_a_run_with_a_node_of_the_user_is_never_given_again(neusee):
+    (neusee.folder / "helper.py").write_text("factor = 2\n")
+    (neusee.folder / "mine.py").write_text(
+        "import torch\nfrom neusee.nodes import node\nfrom helper import factor\n\n"
+        "@node()\ndef made(*, x: float) -> torch.Tensor:\n    return torch.tensor(x * factor)\n"
+    )
+    (neusee.folder / "mine.yaml").write_text(
+        "steps:\n  made: {node: mine.made, with: {x: 3.0}}\noutputs: [made]\nnodes: [mine.py]\n"
+    )
+    for _ in range(2):
+        done = neusee("run", "mine.yaml")
+        assert done[0] == 0, done
+    assert refuses(neusee("run", "mine.yaml", light=True))
+    assert not (neusee.cache / "answers").exists()
