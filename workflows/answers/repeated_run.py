@@ -7,8 +7,6 @@ is made of the document and the pictures, as `neusee report` makes it.
 from __future__ import annotations
 
 import json
-import resource
-import sys
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from neusee.workflows.answers.results_folder import DOCUMENT, NotRepeatable
 from neusee.workflows.answers.stored_answer import RUN, Answer
 from neusee.workflows.answers.stored_results import stored_results
+from neusee.workflows.engine.memory_use import process_peak
 from neusee.workflows.report.json_output import json_line
 from neusee.workflows.report.run_crate import CRATE
 from neusee.workflows.report.run_folder import new_run
@@ -90,7 +89,7 @@ def said_again(answer: Answer, folder: Path, document: Mapping[str, Any]) -> str
 
 def _of_now(document: dict[str, Any], seconds: float) -> dict[str, Any]:
     """Return the document of a run with the time and the memory of this process, and with the run that it repeats."""
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    memory = process_peak()
     now = {"engine": f"{seconds:.3f} s", "peak memory": format_size(memory)}
     facts = [[name, now.get(name, value)] for name, value in document["facts"]]
     facts.append(["answer", f"that of the run of {document['started']}, all of whose results are still in the cache"])

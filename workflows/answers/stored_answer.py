@@ -40,6 +40,7 @@ class Answer:
     files: Mapping[str, bytes]  #: of this folder by name, with marks in place of date and seconds
     stored: StoredResults = NOTHING  #: what of the cache the answer rests on
     kind: str = AS_KEPT  #: how the folder is written again
+    memory: int = 0  #: bytes that must be free
 
 
 def answer_path(disk: Disk, name: str) -> str:
@@ -127,6 +128,8 @@ def _refuse_other_types(answer: Answer) -> None:
     texts = [answer.state, answer.text, answer.out, answer.label, answer.key, answer.kind]
     for mapping in (files, recipes, listed):
         texts += [*mapping, *mapping.values()]
+    if type(answer.memory) is not int:
+        raise ValueError("a field of the answer is not of its type")
     if not isinstance(absent, list) or not all(isinstance(text, str) for text in [*texts, *absent]):
         raise ValueError("a field of the answer is not of its type")
 

@@ -181,15 +181,17 @@ def plan(
     from neusee.workflows.explain import run_forecast
 
     check_device(device)
+    store = the_store()
     if devices:
         with refusing():
-            found = run_forecast.Forecast(run_forecast.simulated_lines(recipe, the_store(), devices), [], {}, False)
+            found = run_forecast.Forecast(run_forecast.simulated_lines(recipe, store, devices), [], {}, False)
     else:
-        found = run_forecast.forecast(recipe, the_store(), device, memory_limit(memory))
-    if as_json:
-        say_json({"command": shlex.join(command), **asdict(found)})
+        found = run_forecast.forecast(recipe, store, device, memory_limit(memory))
+    text = json_line({"command": shlex.join(command), **asdict(found)}) if as_json else "\n".join(found.lines)
+    if found.totals.get("steps") == 0 and not found.refused:
+        say_and_keep(text, recipe, store, found.totals["memory_of_report"] or 0.0)
     else:
-        say(found.lines)
+        say([text])
     if found.refused:
         raise typer.Exit(FAILED)
 
@@ -208,8 +210,10 @@ def why(
     recipe, _ = load(words, before=1)
     from neusee.workflows.explain.why_rerun import why_lines
 
+    store = the_store()
     with failing(ValueError):
-        say(why_lines(recipe, the_store(), step, device))
+        lines = why_lines(recipe, store, step, device)
+    say_and_keep("\n".join(lines), recipe, store)
 
 
 def config(words: Words = None, debug: Debug = False) -> None:

@@ -9,6 +9,7 @@ from shutil import get_terminal_size
 from typing import TYPE_CHECKING
 
 from neusee.workflows.answers import repeated_command
+from neusee.workflows.answers.repeated_command import Said
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -32,11 +33,14 @@ def say_stored_answer(words: Sequence[str]) -> bool:
     return True
 
 
-def say_and_keep(text: str, recipe: Recipe) -> None:
-    """Print the text of a command that writes nothing, and keep this text as the answer of the command."""
+def say_and_keep(text: str, recipe: Recipe, store: Store | None = None, memory: float = 0.0) -> None:
+    """Print the text of a command that writes nothing, and keep this text as the answer of the command.
+
+    ``store``: the store on which the answer rests. ``memory``: bytes that must be free, without which it would differ.
+    """
     print(text, flush=True)
     for command in repeated_command.running:
-        command.keep(text, False, recipe)
+        command.keep(text, False, recipe, Said(store, memory) if store else None)
 
 
 def keep_answer(

@@ -98,6 +98,7 @@ def test_a_damaged_answer_is_missing_and_moved_aside(disk, stored, raw):
         {"witnesses": {"files": {}, "absent": [1], "recipes": {}, "listed": {}}},
         {"witnesses": {"files": {"/a": 1}, "absent": [], "recipes": {}, "listed": {}}},
         {"kind": 1},
+        {"memory": "0"},
         {"stored": None},
         {"stored": {"evil": {}}},
         {"stored": {"results": {"../../evil": ""}}},

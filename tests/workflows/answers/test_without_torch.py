@@ -180,3 +180,29 @@ def test_a_run_with_a_node_of_the_user_is_never_given_again(neusee):
         assert done[0] == 0, done
     assert refuses(neusee("run", "mine.yaml", light=True))
     assert not (neusee.cache / "answers").exists()
+
+
+@pytest.mark.slow
+def test_plan_and_why_are_given_again_until_the_cache_says_something_else(neusee):
+    (neusee.folder / "mine.yaml").write_text(RUN)
+    picture(neusee, 200)
+    plan, why = ("plan", "mine.yaml"), ("why", "frame", "mine.yaml")
+    assert neusee(*plan)[0] == 0
+    assert refuses(neusee(*plan, light=True)), "a step would run, and its time and the free memory count"
+    assert neusee("run", "mine.yaml")[0] == 0
+    for words in (plan, why, (*plan, "--json")):
+        first = neusee(*words)
+        assert first[0] == 0, first
+        assert neusee(*words, light=True) == first
+    assert "0 of 1 steps would run" in neusee(*plan, light=True)[1]
+    assert neusee("run", "mine.yaml", "size.shape=[8, 8]")[0] == 0
+    assert refuses(neusee(*why, light=True)), "the journal has one more result, with which this one is compared"
+    for words in (plan, why):
+        assert neusee(*words)[0] == 0
+    key = json.loads((neusee.folder / "runs/latest/provenance.json").read_text())["steps"][0]["key"]
+    (neusee.cache / key[:2] / f"{key}.json").unlink()
+    assert neusee(*plan, light=True)[0] == 0, "another result is gone"
+    for each in neusee.cache.glob("??/*.safetensors"):
+        each.unlink()
+    for words in (plan, why):
+        assert refuses(neusee(*words, light=True)), "the value is gone"
