@@ -148,6 +148,20 @@ class FoundLasers(NamedTuple):
     correlation: Tensor  #: (laser, value, value) float64, of n_y, n_x, wavelength and the strength of each channel
 
 
+class MeasuredPsf(NamedTuple):
+    """PSFs that frames of point sources gave, at the nodes of a grid over the frame, and how sure they are.
+
+    Node (i, j) lies in the middle of its zone, which is one of rows x columns equal parts of the frame.
+    """
+
+    kernels: Tensor  #: (row, column, channel, y, x) float64, each of sum 1
+    deviation: Tensor  #: (row, column, channel, y, x) float64, standard deviation of each pixel of the kernels
+    draws: Tensor  #: (draw, row, column, channel, y, x) float32, kernels that the frames allow as well
+    places: Tensor  #: (point, 4) float64: file from 0, y and x of each point in pixels, and its signal in e-
+    fit: Tensor  #: (channel,) float64, chi-square of the frames per seen pixel, 1 for a model as good as the noise
+    outside: Tensor  #: (channel,) float64, bound of the light beyond the window, as a share of the light within
+
+
 #: for each class, the fields with one entry per band
 BAND_FIELDS: dict[type, tuple[str, ...]] = {
     Bands: Bands._fields,

@@ -112,6 +112,7 @@ def write_reader_files(folder: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
     _write_frames(folder / "my")
+    _write_points(folder / "points")
     shutil.copy(ROOT / "recipes" / "samples" / "camera_levels.csv", folder / "my.csv")
     (folder / "camera.csv").write_text("wavelength,red,green,blue\n400,0,0,1\n550,0,1,0\n700,1,0,0\n")
     network = start_network(partial(NAFNet, width=16), torch.Generator().manual_seed(0))
@@ -132,6 +133,17 @@ def write_reader_files(folder: Path) -> None:
     (folder / "mylab").mkdir()
     (folder / "mylab" / "__init__.py").write_text('"""A package of nodes."""\n', encoding="utf-8")
     shutil.copy(folder / "my" / "bloom.py", folder / "mylab" / "optics.py")
+
+
+def _write_points(folder: Path) -> None:
+    """Write frames of a point source as the small camera takes them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rng, at = np.random.default_rng(0), np.arange(24) - 12.0
+    for number in range(4):
+        down, right = (np.exp(-((at - shift) ** 2) / 2.6) for shift in rng.uniform(-0.5, 0.5, 2))
+        light = 4000.0 * down[:, None, None] * right[:, None] * np.array([0.8, 1.0, 0.7])
+        electrons = rng.poisson(light) + rng.normal(0.0, 2.4, light.shape)
+        np.save(folder / f"point{number}.npy", np.clip(np.round(electrons / 0.37 + 1054.0), 0, 65535).astype(np.uint16))
 
 
 def _write_frames(folder: Path) -> None:

@@ -142,6 +142,8 @@ STAND_INS = {
     'run train optics=small sensor=small "scene.shape=[768,768]"': StandIn(
         "a field of 768 x 768", instead={"scene.shape=[768,768]": "scene.shape=[36,36]"}
     ),
+    "restore runs/latest/data/raw_mask.png --camera plain_lens --psf points points.window=[33,33]": StandIn(
+        "a frame of 24 x 24", instead={"points.window=[33,33]": "points.window=[5,5]"}),
     "run six_lasers": StandIn("two of the six lasers", more=TWO_LASERS),
     "run six_lasers --executor dask:2": StandIn(
         "two lasers, other noise, and one process", more=(*TWO_LASERS, "seed=8"), instead={"dask:2": "dask:1"}),

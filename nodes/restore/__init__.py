@@ -18,6 +18,8 @@ from neusee.nodes.restore._networks._network_node import network
 from neusee.nodes.restore._networks._own_network import OwnNetwork, own_network, try_network
 from neusee.nodes.restore._networks._restorer import Restorer, parameter_groups, start_network
 from neusee.nodes.restore._networks._unet import UNet, unet
+from neusee.nodes.restore._points._by_field import spread_by_field, wiener_by_field
+from neusee.nodes.restore._points._measured_psf import measured_psf
 from neusee.nodes.restore._sensor_likelihood import MeasuringSensor, measuring_sensor
 from neusee.nodes.restore._white_level import white_level
 
@@ -41,6 +43,7 @@ __all__ = [
     "found_glare",
     "found_nearby",
     "frame_blur",
+    "measured_psf",
     "measuring_sensor",
     "nafnet",
     "nearby_glare",
@@ -50,10 +53,12 @@ __all__ = [
     "require_exportable",
     "richardson_lucy",
     "skip_critic_draws",
+    "spread_by_field",
     "start_network",
     "try_network",
     "unet",
     "white_level",
     "wiener",
+    "wiener_by_field",
     "wiener_spread",
 ]

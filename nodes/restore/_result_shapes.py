@@ -24,6 +24,7 @@ from neusee.nodes.restore._networks._nafnet import nafnet
 from neusee.nodes.restore._networks._network_node import network
 from neusee.nodes.restore._networks._own_network import tried
 from neusee.nodes.restore._networks._unet import unet
+from neusee.nodes.restore._points._by_field import spread_by_field, wiener_by_field
 from neusee.nodes.restore._white_level import white_level
 from neusee.nodes.shape_rules import at_least_single, blank, double, like_first, transform_operations
 from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
@@ -39,7 +40,7 @@ _LINES = 61  #: spectral lines that a search tries, each with five transforms
 _KEPT = 1 / 8  #: bytes of inner results of a network that need as much memory as a byte of the usual work of a node
 _LAYER = 1e-3  #: operations of a transform that take as long as one of a layer
 
-for node in (electrons, wiener, richardson_lucy, fft_mamba, nafnet, network, unet):
+for node in (electrons, wiener, wiener_by_field, richardson_lucy, fft_mamba, nafnet, network, unet):
     node.shape(like_first)
 
 
@@ -126,6 +127,11 @@ def _(
     electrons: Tensor, psf: Any, illuminant: Any, responses: Any, bands: Any, clipped: Any, matrix: Tensor,
     *glare: Any, **params: Any,
 ) -> Tensor:  # fmt: skip
+    return blank(len(matrix), *electrons.shape[-2:], dtype=at_least_single(electrons))
+
+
+@spread_by_field.shape
+def _(electrons: Tensor, measured: Any, clipped: Any, matrix: Tensor, **params: Any) -> Tensor:
     return blank(len(matrix), *electrons.shape[-2:], dtype=at_least_single(electrons))
 
 

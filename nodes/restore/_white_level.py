@@ -13,7 +13,7 @@ from neusee.nodes.restore._inverse._wiener import effective_psf
 from neusee.nodes.sensor._exposure import channel_weights
 from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.units import PositiveLength, Time
-from neusee.nodes.values import Bands, Psf
+from neusee.nodes.values import Bands, MeasuredPsf, Psf
 
 White = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _BRIGHT = 0.995  #: quantile of the unclipped pixels that counts as white
@@ -24,7 +24,7 @@ _SAMPLE = 2**22  #: pixels whose quantile is taken, at most
 def white_level(
     signal: Tensor,
     clipped: Tensor,
-    psf: Psf,
+    psf: Psf | MeasuredPsf,
     bands: Bands,
     illuminant: Tensor,
     responses: Tensor,
@@ -40,7 +40,7 @@ def white_level(
     A white surface gives ``white`` full wells in the brightest channel. Without ``white``, the pixel at the 99.5 %
     quantile of the unclipped pixels counts as white. This choice sets how bright the picture is shown and nothing else.
 
-    Shapes: signal and clipped (channel, y, x), psf (band,), illuminant (band,), responses (channel, band)
+    Shapes: signal and clipped (channel, y, x), psf (band,) or measured, illuminant (band,), responses (channel, band)
             -> (band,) float64.
     Units:  signal e-; white full wells; result W/m2 per unit of the illuminant, as `sensor.level`.
     Error:  a choice, not a measurement: a scene without white is shown too bright, and a blurred one too bright too.
@@ -53,13 +53,20 @@ def white_level(
     counts = weights.sum(-1) * quantum_efficiency
     if white is not None:
         return one * (white * full_well / float(counts.max()))
-    passed = effective_psf(psf, illuminant, responses, bands).sum((-2, -1)).double().cpu()
+    passed = _passed(psf, bands, illuminant, responses)
     whole = (counts * passed).clamp_min(1e-300).to(signal.device)
     known = ~clipped.any(-3)
     shown = (single(signal).double() / whole[:, None, None]).amax(-3)
     found = shown[known] if bool(known.any()) else shown.flatten()
     sample = found[:: max(1, len(found) // _SAMPLE)]
     return one * torch.quantile(sample, _BRIGHT).clamp_min(1e-300).cpu()
+
+
+def _passed(psf: Psf | MeasuredPsf, bands: Bands, illuminant: Tensor, responses: Tensor) -> Tensor:
+    """Return the share of the light that the PSF of each channel holds: 1 for one that was measured."""
+    if isinstance(psf, MeasuredPsf):
+        return torch.ones(len(responses), dtype=torch.float64)
+    return effective_psf(psf, illuminant, responses, bands).sum((-2, -1)).double().cpu()
 
 
 @white_level.check

@@ -34,15 +34,15 @@ def frame(responses: Tensor, *, file: DataFile, shape: Shape, bits: Bits = 16) -
             depth or numbers that do not fit the sensor.
     Source: EMVA Standard 1288, release 4.0 (digital numbers of a camera).
     """
-    if problem := _problem(file, len(responses), tuple(shape), bits):
+    if problem := frame_problem(file, len(responses), tuple(shape), bits):
         raise ParameterError("file", problem)
-    return torch.from_numpy(np.ascontiguousarray(_read(file).values, dtype=np.float32))
+    return torch.from_numpy(np.ascontiguousarray(read_frame(file).values, dtype=np.float32))
 
 
 @frame.preflight
 def _(*, responses: Tensor | None = None, file: Path, shape: Shape, bits: int = 16) -> list[str]:
     channels = None if responses is None else len(responses)
-    if problem := _problem(file, channels, tuple(shape), bits):
+    if problem := frame_problem(file, channels, tuple(shape), bits):
         raise ParameterError("file", problem)
     return []
 
@@ -53,16 +53,16 @@ def _(result: Tensor, *inputs: Any, bits: int = 16, **params: Any) -> list[Check
     return [Check(f"numbers from {low:.0f} to {high:.0f} of {top} DN, mean {float(result.mean()):.4g}", high > low)]
 
 
-class _Frame(NamedTuple):
+class FrameNumbers(NamedTuple):
     values: NDArray[Any]  #: (channel, y, x)
     depth: int | None  #: bits of the numbers in the file; None for a file of floating-point numbers
 
 
 @once_per_version
-def _problem(file: Path, channels: int | None, shape: tuple[int, int], bits: int) -> str:
+def frame_problem(file: Path, channels: int | None, shape: tuple[int, int], bits: int) -> str:
     """Return why a file is no frame of this sensor, in one sentence, or an empty text."""
     try:
-        values, depth = _read(file)
+        values, depth = read_frame(file)
     except ParameterError as error:
         return str(error)
     name, found = file.name, values.shape[1:]
@@ -122,7 +122,7 @@ def _other_numbers(name: str, values: NDArray[Any], bits: int) -> str:
 # --- files ------------------------------------------------------------------------------------------------------------
 
 
-def _read(file: Path) -> _Frame:
+def read_frame(file: Path) -> FrameNumbers:
     """Read a frame; raise ParameterError for a file that cannot be read or has another form than a frame."""
     reader = _READERS.get(file.suffix.lower())
     if reader is None:
@@ -137,7 +137,7 @@ def _read(file: Path) -> _Frame:
         raise ParameterError("file", _DAMAGED.format(name=file.name, error=text)) from None
 
 
-def _png(file: Path) -> _Frame:
+def _png(file: Path) -> FrameNumbers:
     from kornia_rs import io
     from PIL import Image
 
@@ -152,10 +152,10 @@ def _png(file: Path) -> _Frame:
     with Image.open(file) as image:
         image.verify()
     read = io.read_image_png_u16 if depth == 16 else io.read_image_png_u8
-    return _Frame(_first(np.asarray(read(str(file), "rgb" if channels == 3 else "mono"))), depth)
+    return FrameNumbers(_first(np.asarray(read(str(file), "rgb" if channels == 3 else "mono"))), depth)
 
 
-def _tiff(file: Path) -> _Frame:
+def _tiff(file: Path) -> FrameNumbers:
     from kornia_rs import io
 
     kinds = ((io.read_image_tiff_u16, 16), (io.read_image_tiff_u8, 8), (io.read_image_tiff_f32, None))
@@ -163,14 +163,14 @@ def _tiff(file: Path) -> _Frame:
     for read, depth in kinds:
         for mode in ("rgb", "mono"):
             try:
-                return _Frame(_first(np.asarray(read(str(file), mode))), depth)
+                return FrameNumbers(_first(np.asarray(read(str(file), mode))), depth)
             except Exception as error:  # another kind of pixels, or a damaged file
                 said = str(error).partition("\n")[0]
     text = f"{file.name} cannot be read as grey or RGB of 8 or 16 bits ({said}): save it so, without compression"
     raise ParameterError("file", text)
 
 
-def _exr(file: Path) -> _Frame:
+def _exr(file: Path) -> FrameNumbers:
     import OpenEXR
 
     with OpenEXR.File(str(file), separate_channels=True) as opened:
@@ -179,18 +179,18 @@ def _exr(file: Path) -> _Frame:
     if len(names) not in (1, 3):
         text = f"{file.name} has the channels {', '.join(channels)}: save R, G and B, or one channel alone"
         raise ParameterError("file", text)
-    return _Frame(np.stack([channels[name].astype(np.float64) for name in names]), None)
+    return FrameNumbers(np.stack([channels[name].astype(np.float64) for name in names]), None)
 
 
-def _npy(file: Path) -> _Frame:
+def _npy(file: Path) -> FrameNumbers:
     array = np.load(file, mmap_mode="r", allow_pickle=False)
     refuse_large_array(file, array.shape)
     if array.dtype.kind not in "uif" or array.ndim not in (2, 3) or not array.size:
         text = f"{file.name} is {array.dtype} of shape {array.shape}: give numbers of shape {_ARRAY}"
         raise ParameterError("file", text)
     if array.ndim == 3 and array.shape[0] in (1, 3):
-        return _Frame(np.array(array), None)
-    return _Frame(_first(np.array(array)), None)
+        return FrameNumbers(np.array(array), None)
+    return FrameNumbers(_first(np.array(array)), None)
 
 
 def _first(pixels: NDArray[Any]) -> NDArray[Any]:
@@ -198,7 +198,7 @@ def _first(pixels: NDArray[Any]) -> NDArray[Any]:
     return pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1)
 
 
-_READERS: dict[str, Callable[[Path], _Frame]] = {
+_READERS: dict[str, Callable[[Path], FrameNumbers]] = {
     ".png": _png,
     ".tif": _tiff,
     ".tiff": _tiff,

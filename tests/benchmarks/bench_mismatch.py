@@ -37,7 +37,9 @@ FILTERS = {
     "variance of 24 patterns, pixel by pixel": {"patterns": 24, "alone": True},
     "12 patterns": {"patterns": 12},
     "24 patterns": {"patterns": 24},
+    "likeliest doubt": {"doubt": None},
     "24 patterns and doubt 0.1": {"patterns": 24, "doubt": 0.1},
+    "24 patterns and likeliest doubt": {"patterns": 24, "doubt": None},
 }
 SEEN = ["signal[mask]", "clipped[mask]", "truth", "matrix", "illuminant", "responses", "bands"]
 TOLD = ["psf[mask]", f"laser_photons[mask,{LINE}]", f"laser_pupil[mask,{LINE}]", f"direction[{LINE}]", f"line[{LINE}]",

@@ -13,7 +13,7 @@ from neusee.nodes.restore._networks._fft_mamba import FFTMamba
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
 from neusee.nodes.restore._networks._unet import UNet
-from neusee.nodes.values import Channels, Dirt, FoundLasers, LowRankCube, Psf, Pupil
+from neusee.nodes.values import Channels, Dirt, FoundLasers, LowRankCube, MeasuredPsf, Psf, Pupil
 
 HERE = Path(__file__).parent
 
@@ -65,6 +65,12 @@ FOUND = FoundLasers(
     torch.stack([_NM - 2e-9, _NM + 2e-9], -1), torch.stack([0.9 * _AMOUNT, 1.1 * _AMOUNT], -1),
     torch.ones(1, 2, dtype=torch.bool), torch.tensor([[200.0, 100.0]], dtype=torch.float64),
     (0.9 * torch.eye(6, dtype=torch.float64) + 0.1)[None],
+)  # fmt: skip
+_KERNELS = rand(4, 1, 2, 3, 9, 9)
+_KERNELS = _KERNELS / _KERNELS.sum((-2, -1), keepdim=True)
+MEASURED = MeasuredPsf(
+    _KERNELS.mean(0), _KERNELS.std(0), _KERNELS.float(), torch.zeros(1, 4, dtype=torch.float64),
+    torch.ones(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64),
 )  # fmt: skip
 
 STOP = optics.stop(samples=16, pitch=5e-4, diameter=8e-3)
@@ -229,6 +235,14 @@ CASES = {
     "restore.white_level": Case(
         "0", (RAW, torch.zeros(RAW.shape, dtype=torch.bool), PSF, BANDS, LIGHT, RESPONSES), WELL
     ),
+    "restore.spread_by_field": Case(
+        "3",
+        (WIDE_RAW, MEASURED, torch.zeros(3, 48, 48, dtype=torch.bool), rand(3, 3)),
+        {"read_noise": 5.0, "draws": 2},
+    ),
+    "restore.wiener_by_field": Case(
+        "0", (WIDE_RAW, MEASURED, torch.zeros(3, 48, 48, dtype=torch.bool)), {"read_noise": 5.0}, to=1e-3
+    ),
     "restore.wiener_spread": Case(
         "6",
         (WIDE_RAW, PSF, LIGHT, RESPONSES, BANDS, torch.zeros(3, 48, 48, dtype=torch.bool), rand(3, 3)),
@@ -302,6 +316,7 @@ NOTHING_TO_FOLLOW = {
     "doe.unet": "draws a network that is to be trained",
     "doe.vortex": "has a whole charge alone",
     "optics.stop": "states the pupil grid, which other nodes read as plain numbers",
+    "restore.measured_psf": "reads files",
     "scene.exr": "reads a file",
     "sensor.frame": "reads a file",
     "scene.hyperspectral": "reads a file",

@@ -42,6 +42,7 @@ def restore(
     words: Frames,
     camera: Annotated[str, typer.Option("--camera", help="Recipe of the camera, or file of its sensor group.")],
     mask: Annotated[str, typer.Option("--mask", help="Mask: an option of the group doe, or a height-map file.")] = "",
+    psf: Annotated[str, typer.Option("--psf", help="Folder of frames of point sources: measure the PSF.")] = "",
     quiet: Quiet = False,
     as_json: AsJson = False,
     debug: Debug = False,
@@ -53,6 +54,7 @@ def restore(
 
     A frame has the digital numbers of the sensor in three channels, without a tone curve: PNG or TIFF of 8 or 16 bits,
     OpenEXR or .npy. Of the recipe --camera the lens, mask, sensor and illuminant count, not the scene and the laser.
+    With --psf, the PSF by field is measured from frames of point sources, and its error enters the uncertainty.
     The page has the picture, the uncertainty of each pixel, and what is invented because pixels were saturated.
     """
     frames, changes, first = split_frames(words)
@@ -63,9 +65,9 @@ def restore(
 
     with refusing():
         files = named_frames(frames, folder)
-        recipes = recipes_of(files, camera, mask, changes, folder, first)
+        recipes = recipes_of(files, camera, mask, changes, folder, first, psf)
     store, silent = the_store(), quiet or as_json
-    options = option_words({"camera": camera, "mask": mask})
+    options = option_words({"camera": camera, "mask": mask, "psf": psf})
     from neusee.workflows.graph.run_error import RunError
 
     with resumable(lambda: kept_in(store, "finished steps are")), failing(RunError, code=FAILED):

@@ -13,7 +13,8 @@ from neusee.workflows.report.result_numbers import Value
 
 _NEEDS = ("restored", "restored_spread", "raw[mask]", "clipped[mask]")
 _FRAME = "sensor.frame"
-_WIENER = "restore.wiener"
+_WIENER = ("restore.wiener", "restore.wiener_by_field")  #: filters of which the interval is
+_MEASURED = "restore.spread_by_field"
 
 
 def said_of_frame(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, str]:
@@ -70,9 +71,11 @@ def _doubtful(restored: Tensor, half: Tensor, invented: Tensor) -> str:
 
 def _limits(recipe: Recipe) -> str:
     step = recipe.steps.get("deconvolved")
-    own = step is not None and step.node.path == _WIENER and "deconvolved" in recipe.steps["restored"].sources
+    own = step is not None and step.node.path in _WIENER and "deconvolved" in recipe.steps["restored"].sources
     whose = "" if own else "The interval is that of a Wiener filter, not of the method that restored this picture. "
+    measured = recipe.steps["restored_spread"].node.path == _MEASURED
+    known = "blur, the error of the measured PSF" if measured else "blur"
     return (
-        f"{whose}The interval includes noise, blur and saturation. It does not include lasers that the filter is not "
-        "told of, errors of the camera's description, and colours that no three channels tell apart."
+        f"{whose}The interval includes noise, {known} and saturation. It does not include lasers that the filter is "
+        "not told of, errors of the camera's description, and colours that no three channels tell apart."
     )

@@ -15,6 +15,7 @@ from neusee.workflows.recipe.text.composition import compose, locate
 from neusee.workflows.recipe.text.option_groups import choices_of, shown
 from neusee.workflows.recipe.text.overrides import Override, read_override
 from neusee.workflows.recipe.text.yaml_values import read
+from neusee.workflows.restoration.frame_files import named_frames
 
 OUTPUTS = ("raw[mask]", "developed[mask]", "clipped[mask]", "restored", "restored_spread")
 PLAIN_CAMERA = "first_light"  #: recipe around a sensor file, with a plain lens
@@ -24,16 +25,17 @@ _STEM = re.compile(r"[^\w-]+")
 
 
 def recipes_of(
-    frames: Iterable[Path], camera: str, mask: str, changes: Sequence[str], folder: Path, first: int
+    frames: Iterable[Path], camera: str, mask: str, changes: Sequence[str], folder: Path, first: int, psf: str = ""
 ) -> list[Recipe]:
     """Return a checked recipe for each frame.
 
     ``camera`` is a recipe or the file of a sensor group, ``mask`` an option of the group `doe`, a file of a height map,
-    or empty; ``changes`` are the overrides of the user, numbered from ``first``.
+    or empty; ``changes`` are the overrides of the user, numbered from ``first``; ``psf`` is a folder of frames of point
+    sources, from which the PSF is measured, or empty.
     Raises `RecipeError` with the mistakes of all frames, each mistake once.
     """
     name, base, words = _camera(camera, folder)
-    words += _mask(mask, folder)
+    words += _mask(mask, folder) + _psf(psf, changes, folder, first)
     found, problems = list[Recipe](), dict[Diagnostic, None]()
     for frame in frames:
         try:
@@ -85,6 +87,23 @@ def _mask(mask: str, folder: Path) -> list[Override]:
         message = "no such file: give a height map, or the name of an option of the group doe"
         raise RecipeError([Diagnostic(Location("--mask"), mask, message)])
     return [_said("--mask", f"doe={mask}", folder)]
+
+
+def _psf(psf: str, changes: Sequence[str], folder: Path, first: int) -> list[Override]:
+    """Return the words that measure the PSF from the frames of a folder, in place of the PSF of the recipe."""
+    if not psf:
+        return []
+    for number, text in enumerate(changes, first):
+        if text.startswith("restore="):
+            message = "a measured PSF has a filter of its own: leave out --psf, or this restorer"
+            raise RecipeError([Diagnostic(Location(f"argument {number}"), text, message)])
+    try:
+        files = named_frames([psf], folder)
+    except RecipeError as error:
+        raise RecipeError([replace(each, mark=Location("--psf")) for each in error.diagnostics]) from None
+    listed = "points.files=[" + ", ".join(map(_quoted, files)) + "]"
+    words = [("restore=measured", ""), ("steps.level.from.psf=measured", ""), (listed, psf)]
+    return [_said("--psf", word, folder, shown_as) for word, shown_as in words]
 
 
 def _prepared(name: str, base: Path, own: Sequence[Override]) -> list[Override]:

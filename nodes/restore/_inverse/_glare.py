@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+_REACH = (1, 4, 16, 64)  #: pixels; radii of the squares around a pixel, an octave's light of counting alike
 _ROWS = 64  #: rows of a picture at a time, so that their float64 copies fit in the cache
 
 
@@ -16,6 +17,7 @@ class Glare(NamedTuple):
 
     patterns: list[Tensor]  #: (channel, y, x), of maximum 1
     nearby: list[Tensor | None]  #: (pattern, channel, y, x), in the same unit
+    around: list[Tensor] | None = None  #: (channel, y, x), of each pattern; by `with_light_around`, for a doubt
 
 
 class Light(NamedTuple):
@@ -35,13 +37,42 @@ def visible(patterns: Sequence[Tensor], nearby: Sequence[Tensor | None], known: 
     return Glare([p for p, _ in seen], [n for _, n in seen])
 
 
+def with_light_around(glare: Glare) -> Glare:
+    """Return the glare with the light around each pixel of its patterns."""
+    return glare._replace(around=[light_around(pattern) for pattern in glare.patterns])
+
+
+def light_around(pattern: Tensor) -> Tensor:
+    """Return the light around each pixel of a pattern (channel, y, x), in its unit.
+
+    The mean over squares of 3, 9, 33 and 129 pixels a side, each over its radius and summed: a point of light spreads
+    as 1 / distance^3, like the rings of a lens and the light that edges, dirt and defocus move. Beyond the picture is
+    no light.
+    """
+    exact = pattern.double()
+    total = sum((_square_mean(exact, radius) / radius for radius in _REACH), torch.zeros_like(exact))
+    return total.to(pattern)
+
+
+def _square_mean(picture: Tensor, radius: int) -> Tensor:
+    """Return the mean over a square around each pixel, by running sums."""
+    for dim in (-2, -1):
+        size = picture.shape[dim]
+        sums = torch.cat([torch.zeros_like(picture.narrow(dim, 0, 1)), picture.cumsum(dim)], dim)
+        at = torch.arange(size, device=picture.device)
+        upper, lower = (at + radius + 1).clamp(max=size), (at - radius).clamp(min=0)
+        picture = (sums.index_select(dim, upper) - sums.index_select(dim, lower)) / (2 * radius + 1)
+    return picture
+
+
 def doubted(
     electrons: Tensor, known: Tensor, glare: Glare, doubt: float, noise: Callable[[Tensor], Tensor]
 ) -> tuple[Tensor, Light, Tensor]:
     """Return the weights of pixels, an estimate of the glare, and the mean variance of its pattern by these weights.
 
-    If the patterns are uncertain, the estimate is made twice: a pixel then weighs noise / (noise + variance of the
-    glare). ``noise`` returns the variance of the noise for the mean of the picture without glare.
+    A ``doubt`` above 0 needs the light around the patterns. If they are uncertain, the estimate is made twice: a pixel
+    then weighs noise / (noise + variance of the glare). ``noise`` returns the variance of the noise for the mean of the
+    picture without glare.
     """
     light = _estimated(electrons, known, glare, doubt)
     if not (doubt or light.modes) or not glare.patterns:
@@ -59,7 +90,8 @@ def _estimated(electrons: Tensor, weights: Tensor, glare: Glare, doubt: float) -
     dark = torch.zeros_like(electrons)
     fit = strengths(electrons, weights, glare.patterns)
     parts = [strength * pattern for strength, pattern in zip(fit, glare.patterns, strict=True)]
-    own = sum(((doubt * part).square() for part in parts), dark) if doubt else dark
+    doubtful = zip(fit, glare.around or (), strict=True) if doubt else ()
+    own = sum(((doubt * strength * around).square() for strength, around in doubtful), dark)
     modes = [
         strength * (other - pattern) / len(others) ** 0.5
         for strength, pattern, others in zip(fit, glare.patterns, glare.nearby, strict=True)

@@ -11,8 +11,8 @@ from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.restore._inverse._frame_spectrum import fitted_power
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
-from neusee.nodes.restore._inverse._masked_blur import Blurred, mixed
-from neusee.nodes.restore._inverse._wiener import Doubt, effective_psf, known_and_light, posed, wrapped
+from neusee.nodes.restore._inverse._masked_blur import Blurred, blurred, mixed
+from neusee.nodes.restore._inverse._wiener import Doubt, Scaled, effective_psf, known_and_light, posed, wrapped
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf
 
@@ -66,14 +66,27 @@ def wiener_spread(
         power = scaled.problem.power
         if law == "frame":
             power = fitted_power(scaled.problem, wrapped(kernels / scaled.share, (fine.shape[-2], fine.shape[-1])))
-    total = fine.new_zeros(len(matrix), *fine.shape[-2:])
-    for _ in range(draws):
+    return drawn_deviation(scaled, power, matrix, draws, rng).to(single(electrons))
+
+
+def drawn_deviation(
+    scaled: Scaled, power: Tensor, matrix: Tensor, draws: int, rng: Generator, kernels: Tensor | None = None
+) -> Tensor:
+    """Return the root mean square error (colour, y, x) of the filter over drawn scenes and noise.
+
+    ``kernels`` (any, channel, y, x) are PSFs that blur these scenes in turn, in place of the PSF of the filter.
+    """
+    total = scaled.problem.picture.new_zeros(len(matrix), *scaled.problem.picture.shape[-2:])
+    for number in range(draws):
         with torch.no_grad():
-            spectrum, problem = _drawn(scaled.problem, power, rng)
+            true = scaled.problem.transfer
+            if kernels is not None:
+                other = kernels[number % len(kernels)].to(scaled.share) / scaled.share
+                true = torch.fft.rfft2(wrapped(other, scaled.problem.torus))
+            spectrum, problem = _drawn(scaled.problem, power, rng, true)
             error = scaled.pixels(spectrum - most_likely(problem))
         total = total + torch.tensordot(matrix.to(error), error, 1).square()
-    deviation: Tensor = (total / draws).sqrt().to(single(electrons))
-    return deviation
+    return (total / draws).sqrt()
 
 
 @wiener_spread.check
@@ -82,14 +95,17 @@ def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
     return [Check(f"deviation from {least:.2g} to {most:.2g}", math.isfinite(most) and least >= 0)]
 
 
-def _drawn(problem: Blurred, power: Tensor, rng: Generator) -> tuple[Tensor, Blurred]:
-    """Return the spectrum of a drawn scene, and the deconvolution of a drawn picture of this scene."""
+def _drawn(problem: Blurred, power: Tensor, rng: Generator, true: Tensor) -> tuple[Tensor, Blurred]:
+    """Return the spectrum of a drawn scene, and the deconvolution of a picture of it through the ``true`` transfer."""
     white = _normal((len(problem.picture), *problem.torus), problem.picture, rng)
     own, shared = _root_of_colour(len(white), problem.grey)
     spectrum = mixed(torch.fft.rfft2(white), own, shared) * power.clamp_min(0.0).sqrt()
     noise = _normal(problem.picture.shape, problem.picture, rng)
     seen = problem.weight > 0
-    picture = problem.blur(spectrum) + torch.where(seen, noise / problem.weight.where(seen, 1.0).sqrt(), 0.0)
+    y, x = problem.picture.shape[-2:]
+    picture = blurred(true, spectrum, problem.torus, (y, x)) + torch.where(
+        seen, noise / problem.weight.where(seen, 1.0).sqrt(), 0.0
+    )
     for pattern in problem.glare[len(problem.glare) - problem.bounded :]:
         picture = picture + _normal((), picture, rng) * pattern
     return spectrum, Blurred(

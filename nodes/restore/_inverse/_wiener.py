@@ -12,7 +12,8 @@ from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_not_finite, single
 from neusee.nodes.restore._inverse._conjugate_gradients import pieces
 from neusee.nodes.restore._inverse._fft_grid import torus
-from neusee.nodes.restore._inverse._glare import Glare, average, doubted, visible
+from neusee.nodes.restore._inverse._glare import Glare, average, doubted, visible, with_light_around
+from neusee.nodes.restore._inverse._glare_doubt import likeliest_doubt
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred, variance
 from neusee.nodes.sensor._digitization import crop
@@ -28,7 +29,9 @@ _PRECISE = (
 _LIGHT = 0.999  #: share of the light that the unknown border around the picture is wide enough for
 
 
-Doubt = Annotated[float, Field(ge=0, le=10)]  #: standard deviation of a glare pattern over its value
+#: standard deviation of a glare pattern in each pixel over its light around there; None: the likeliest for the picture
+Doubt = Annotated[float, Field(ge=0, le=10)] | None
+Settings = tuple[float, float, float | None]  #: balance, read noise and doubt
 
 
 @node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])
@@ -55,11 +58,13 @@ def wiener(
     spectrum of the prior falls as 1 / frequency^3, like that of edges, with the variance of this picture; channels have
     a correlation of 0.95. Clipped pixels and pixels beyond the edge are unknown. The patterns of `glare` and `ghosts`,
     wide as the scene, are removed, each with its own unknown strength. By default their shapes count as known exactly.
-    `doubt` is the standard deviation of a pattern in each pixel over its value there: the variance of the noise grows
-    by (doubt x glare)^2. `nearby` has other possible patterns of each glare, as `restore.nearby_glare` computes them:
-    their differences from the glare, averaged over the patterns, are its covariance. The glare in a variance is a
-    least-squares estimate, in which uncertain pixels count less. The iteration starts from the answer on
-    `coarser_grids`; without these it starts from a picture without contrast: faster, and right for a plain lens alone.
+    `doubt` is the standard deviation of a pattern in each pixel over the light of the pattern around this pixel, which
+    falls as 1 / distance^3 from each point of it: the variance of the noise grows by (doubt x this light)^2. Without a
+    number (null) it is the likeliest of 0, 0.01, 0.03, 0.1, 0.3, 1 and 3 for this picture. `nearby` has other possible
+    patterns of each glare, as `restore.nearby_glare` computes them: their differences from the glare, averaged over the
+    patterns, are its covariance. The glare in a variance is a least-squares estimate, in which uncertain pixels count
+    less. The iteration starts from the answer on `coarser_grids`; without these it starts from a picture without
+    contrast: faster, and right for a plain lens alone.
 
     Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses (channel, band),
             each glare and ghost (channel, at least y, at least x), cropped to the centre, each nearby
@@ -67,14 +72,14 @@ def wiener(
     Units:  e-; glare any, nearby as its glare; the result as behind a perfect lens without losses. `balance` multiplies
             the noise variance, without that of the glare; doubt none.
     Error:  a grey scene is assumed, and noise in the dark no smaller than that of the mean picture. Without `glare` a
-            laser that does not clip is taken for scene. The result may be negative: beside lamps hundreds of
-            times as bright as the scene it rings. The iteration ends by its residual, or after 20 steps on the finest
-            grid: rms from the converged answer over the contrast, for 96 pixels a side, 4e-4 to 5e-3 (medians behind
-            four masks) and at most 0.025; for 384, 0.010 behind five half-rings and 0.023 behind a half-ring, where it
-            costs 0.05 dB; 4e-3 without coarser grids behind a plain lens. Gradients: of the exact answer, first
-            order only. Up to 256 pixels a side all is float64, and rounding adds 1e-6 to both (`rtol` holds there); in
-            wider pictures float32 adds 3e-4 to the result and up to 2e-3 to the gradients; in pictures of 1e7 e-, 2e-2
-            and 8e-2.
+            laser that does not clip is taken for scene. The result may be negative: beside lamps hundreds of times as
+            bright as the scene it rings. The iteration ends by its residual, or after 20 steps on the finest grid: rms
+            from the converged answer over the contrast, for 96 pixels a side, 4e-4 to 5e-3 (medians behind four masks)
+            and at most 0.025; for 384, 0.010 behind five half-rings and 0.023 behind a half-ring, where it costs 0.05
+            dB; 4e-3 without coarser grids behind a plain lens. Gradients: of the exact answer, first order only; a
+            doubt that is found counts as constant. Up to 256 pixels a side all is float64, and rounding adds 1e-6 to
+            both (`rtol` holds there); in wider pictures float32 adds 3e-4 to the result and up to 2e-3 to the
+            gradients; in pictures of 1e7 e-, 2e-2 and 8e-2.
     Raises: ValueError where shapes or bands differ, and for pictures and PSFs that are not finite.
     Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; as least squares with a
             prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.
@@ -194,7 +199,7 @@ def _restored(
     known: Tensor,
     kernels: Tensor,
     glare: Glare,
-    settings: tuple[float, float, float],
+    settings: Settings,
     coarser: bool,
 ) -> Tensor:
     """Deconvolve a picture: scale the scene to mean 0 and variance 1, solve this problem, and scale the result back."""
@@ -202,16 +207,21 @@ def _restored(
     return scaled.pixels(most_likely(scaled.problem, coarser=coarser)) + scaled.mean
 
 
-def posed(
-    electrons: Tensor, known: Tensor, kernels: Tensor, glare: Glare, settings: tuple[float, float, float]
-) -> Scaled:
+def posed(electrons: Tensor, known: Tensor, kernels: Tensor, glare: Glare, settings: Settings) -> Scaled:
     """Return the deconvolution of a picture as a linear problem; ``settings`` are balance, read noise and doubt."""
     y, x = electrons.shape[-2:]
     balance, read, doubt = settings
     known = torch.where(known.amax((-2, -1), keepdim=True) > 0, known, 1.0)
     share = _power_of_two(kernels.sum((-2, -1), keepdim=True).detach())
     kernels = kernels / share  # the same bits, and the floors below concern the shape of the PSF, not a grey filter
-    trusted, light, wrong = doubted(electrons, known, glare, doubt, lambda mean: _noise(electrons, mean, read))
+
+    def own_noise(mean: Tensor) -> Tensor:
+        return _noise(electrons, mean, read)
+
+    if doubt != 0:
+        glare = with_light_around(glare)
+    doubt = likeliest_doubt(electrons, known, glare, own_noise) if doubt is None else doubt
+    trusted, light, wrong = doubted(electrons, known, glare, doubt, own_noise)
     picture = electrons - light.sum
     mean = average(picture, trusted)
     noise = balance * _noise(electrons, mean, read) + light.variance

@@ -131,6 +131,30 @@ def test_every_bad_frame_of_a_folder_is_named_before_work_starts(neusee, tmp_pat
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
+def test_a_folder_of_point_sources_gives_the_psf_and_its_error(neusee, tmp_path):
+    rng, side = np.random.default_rng(0), 32
+    camera = {"sensor.shape": f"[{side},{side}]", "points.window": "[7,7]", "points.draws": "4"}
+    y, x = np.indices((side, side))
+    for number in range(3):
+        down, right = np.array([y, x]) - side // 2 - rng.uniform(-0.5, 0.5, 2)[:, None, None]
+        light = 3000 * np.exp(-(down**2 + right**2) / 3.4)[..., None] * [0.9, 1.0, 0.7]
+        values = (rng.poisson(light) + rng.normal(0, 2.4, light.shape)) / 0.37 + 1054
+        save(tmp_path / "points" / f"p{number}.npy", np.clip(np.round(values), 0, 65535).astype(np.uint16))
+    save(tmp_path / "shot.npy", shot(side))
+    small = [word for word in QUICK if "shape" not in word] + [f"{name}={value}" for name, value in camera.items()]
+    code, out, err = neusee("shot.npy", "--camera", "plain_lens", "--psf", "points", *small, "--json", small=False)
+    assert (code, err) == (0, "")
+    document = json.loads(out)
+    assert "the error of the measured PSF" in str(document["story"])
+    steps = {step["step"]: step["node"] for step in document["steps"]}
+    assert steps["measured"] == "restore.measured_psf"
+    assert steps["deconvolved"] == "restore.wiener_by_field"
+    assert not [name for name in steps if name.startswith("psf[")]  # the PSF of the recipe is not computed
+    page = (tmp_path / document["report"]).read_text(encoding="utf-8")
+    assert "3 points; chi-square per pixel" in page
+
+
 GOOD = "shot.npy"
 BAD = {
     "no such frame": (["absent.png", "--camera", "half_ring"], "argument 1   absent.png   no such file or folder"),
@@ -148,6 +172,15 @@ BAD = {
     "unit": ([GOOD, "--camera", "half_ring", "sensor.read_noise=3 m"], "argument 2"),
     "a word": ([GOOD, "--camera", "half_ring", "sensor.bits=16", "more"], "more: not a change of a value"),
     "a step that a frame lacks": ([GOOD, "--camera", "half_ring", "outputs=[truht]"], "truht"),
+    "absent points": ([GOOD, "--camera", "half_ring", "--psf", "points"], "--psf   points   no such file or folder"),
+    "folder without points": ([GOOD, "--camera", "half_ring", "--psf", "frames"], "--psf   frames   the folder has no"),
+    "no point": ([GOOD, "--camera", "half_ring", "--psf", GOOD, "points.window=[5,5]"], "but its background needs 500"),
+    "points of another size": (
+        [GOOD, "--camera", "half_ring", "--psf", "small.npy"],
+        "small.npy has 12 x 12 pixels (y, x)",
+    ),
+    "window": ([GOOD, "--camera", "half_ring", "--psf", GOOD, "points.window=[4,5]"], "must be two odd numbers"),
+    "two restorers": ([GOOD, "--camera", "half_ring", "--psf", GOOD, "restore=wiener"], "a filter of its own"),
     "restorer": ([GOOD, "--camera", "half_ring", "restore=magic"], "no option magic in restore"),
     "draws": ([GOOD, "--camera", "half_ring", "frame.draws=1"], "frame.draws"),
     "white": ([GOOD, "--camera", "half_ring", "frame.white=-1"], "frame.white"),

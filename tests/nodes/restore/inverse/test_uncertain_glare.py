@@ -17,7 +17,7 @@ def dense(electrons, kernel, known, glare, nearby, doubt, balance):
     strengths, weights, own, modes = fitted(electrons, known, glare, nearby, doubt), known, 0, []
     for last in (False, False, True):
         light = np.tensordot(strengths, glare, 1)
-        own = doubt**2 * sum((s * g) ** 2 for s, g in zip(strengths, glare, strict=True))
+        own = doubt**2 * sum((s * around(g)) ** 2 for s, g in zip(strengths, glare, strict=True))
         modes = [s * (n - g) / len(near) ** 0.5
                  for s, g, near in zip(strengths, glare, nearby, strict=True) for n in near]  # fmt: skip
         every = own + sum(m**2 for m in modes)
@@ -46,6 +46,16 @@ def dense(electrons, kernel, known, glare, nearby, doubt, balance):
     data = data - free @ np.linalg.solve(free.T @ inverse @ free, free.T @ inverse @ data)
     found = (prior @ design.T @ inverse @ data).reshape(CHANNELS, *TORUS)[:, : SIZE[0], : SIZE[1]]
     return found + mean / kernel.sum()
+
+
+def around(glare):
+    """The light around each pixel, pixel by pixel: sums over squares, over their size and their radius."""
+    total = np.zeros(glare.shape)
+    for y, x in np.ndindex(*glare.shape[1:]):
+        for r in (1, 4, 16, 64):
+            square = glare[:, max(0, y - r) : y + r + 1, max(0, x - r) : x + r + 1]
+            total[:, y, x] += square.sum((1, 2)) / (2 * r + 1) ** 2 / r
+    return total
 
 
 def mean_of(picture, weights):

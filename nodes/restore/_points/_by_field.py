@@ -1,0 +1,136 @@
+"""Deconvolution with a PSF that was measured at several places of the frame, and what it does not know."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from pydantic import Field
+from torch import Generator, Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes._half_precision import single
+from neusee.nodes.restore._inverse._frame_spectrum import fitted_power
+from neusee.nodes.restore._inverse._posterior_spread import Draws, drawn_deviation
+from neusee.nodes.restore._inverse._wiener import edge, known_and_light, posed, wiener, wrapped
+from neusee.nodes.restore._points._point_model import hats
+from neusee.nodes.units import Electrons
+from neusee.nodes.values import Bands, MeasuredPsf, Psf
+
+Balance = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+@node(rtol=1e-5)
+def wiener_by_field(
+    electrons: Tensor, measured: MeasuredPsf, clipped: Tensor, *, balance: Balance = 1.0, read_noise: Electrons
+) -> Tensor:
+    """Deconvolve a picture with a PSF that was measured by field: `restore.wiener` around each node, blended.
+
+    The picture around each node of the grid is deconvolved with the PSF of the node, up to where its bilinear weight is
+    0 and by the radius that holds 99.9 % of the PSF beyond. The results are added with these weights, whose sum is 1.
+
+    Shapes: electrons and clipped (channel, y, x), measured.kernels (row, column, channel, any, any) -> (channel, y, x).
+    Units:  e-; the result as behind a perfect lens that loses the same light.
+    Error:  that of `restore.wiener`, of the PSF (`restore.spread_by_field` includes it), and of taking the PSF as
+            constant over each part: the blend of two restored pictures is not the restoration with the blended PSF.
+            Variance and mean of the prior are those of each part. Lasers are taken for scene.
+    Raises: ValueError where channels or pixels differ.
+    Source: overlap-add with a PSF that varies in space, Nagy and O'Leary, SIAM J. Sci. Comput. 19, 1063 (1998), applied
+            to the restored pictures.
+    """
+    _refuse_other(electrons, measured)
+    total = torch.zeros_like(single(electrons))
+    for part in _parts(electrons, measured):
+        seen = electrons[:, part.rows, part.columns]
+        found = wiener(seen, *_channelwise(part.kernels), clipped[:, part.rows, part.columns], balance=balance,
+                       read_noise=read_noise)  # fmt: skip
+        total[:, part.rows, part.columns] += part.weight.to(total) * found
+    return total
+
+
+@node()
+def spread_by_field(
+    electrons: Tensor, measured: MeasuredPsf, clipped: Tensor, matrix: Tensor, *, balance: Balance = 1.0,
+    draws: Draws = 8, read_noise: Electrons, rng: Generator,
+) -> Tensor:  # fmt: skip
+    """Compute the standard deviation of each pixel of `restore.wiener_by_field`, the error of the PSF included.
+
+    As `restore.wiener_spread` with the law `frame`, around each node. Each drawn scene is blurred with a PSF drawn from
+    the measurement, and restored with the mean PSF: noise, the lost detail and the error of the PSF enter together.
+
+    Shapes: as `restore.wiener_by_field`, matrix (colour, channel) -> (colour, y, x).
+    Units:  those of `restore.colour`.
+    Error:  as `restore.wiener_spread`. Between nodes the deviations are added with the weights of the blend, as if the
+            errors of both were the same: too wide where they are not. The change of the PSF within a part, and a
+            scene with lamps far brighter than its mean, are not included.
+    Raises: ValueError where channels or pixels differ.
+    Source: as `restore.wiener_spread`.
+    """
+    _refuse_other(electrons, measured)
+    total = torch.zeros(len(matrix), *electrons.shape[-2:], dtype=single(electrons).dtype, device=electrons.device)
+    for part in _parts(electrons, measured):
+        with torch.no_grad():
+            seen, ends = (x[:, part.rows, part.columns] for x in (single(electrons), clipped))
+            psf, _, responses, _ = _channelwise(part.kernels)
+            fine, known, light = known_and_light(psf, responses, seen, ends, None, None, None)
+            kernels = part.kernels.to(fine)
+            scaled = posed(fine, known, kernels, light, (balance, read_noise, 0.0))
+            size = (fine.shape[-2], fine.shape[-1])
+            power = fitted_power(scaled.problem, wrapped(kernels / scaled.share, size))
+        found = drawn_deviation(scaled, power, matrix, draws, rng, part.draws)
+        total[:, part.rows, part.columns] += part.weight.to(total) * found.to(total)
+    return total
+
+
+@wiener_by_field.check
+def _(result: Tensor, electrons: Tensor, measured: MeasuredPsf, *inputs: Any, **params: Any) -> list[Check]:
+    rows, columns = measured.kernels.shape[:2]
+    return [Check(f"{rows} x {columns} PSFs over the frame", math.isfinite(float(result.sum())))]
+
+
+@spread_by_field.check
+def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
+    least, most = float(result.min()), float(result.max())
+    return [Check(f"deviation from {least:.2g} to {most:.2g}", math.isfinite(most) and least >= 0)]
+
+
+class _Part(NamedTuple):
+    """The part of a frame around one node: its pixels, the PSFs there, and the weight of its result."""
+
+    rows: slice
+    columns: slice
+    weight: Tensor  #: (y, x) of these pixels
+    kernels: Tensor  #: (channel, y, x)
+    draws: Tensor  #: (draw, channel, y, x)
+
+
+def _parts(electrons: Tensor, measured: MeasuredPsf) -> Iterator[_Part]:
+    size = (electrons.shape[-2], electrons.shape[-1])
+    down, right = (hats(torch.arange(n), n, count) for n, count in zip(size, measured.kernels.shape[:2], strict=True))
+    for i in range(down.shape[1]):
+        for j in range(right.shape[1]):
+            kernels = measured.kernels[i, j]
+            reach = edge(kernels, size)
+            rows, columns = _around(down[:, i], reach[0]), _around(right[:, j], reach[1])
+            weight = down[rows, i, None] * right[columns, j]
+            yield _Part(rows, columns, weight, kernels, measured.draws[:, i, j])
+
+
+def _around(weight: Tensor, reach: int) -> slice:
+    inside = weight.nonzero()[:, 0]
+    return slice(max(int(inside[0]) - reach, 0), min(int(inside[-1]) + reach + 1, len(weight)))
+
+
+def _channelwise(kernels: Tensor) -> tuple[Psf, Tensor, Tensor, Bands]:
+    """Return PSF, illuminant, responses and bands of a camera whose channels each see one band with its own PSF."""
+    one = torch.ones(len(kernels), dtype=torch.float64)
+    return Psf(kernels, one), one, torch.eye(len(kernels), dtype=torch.float64), Bands(one, one, one)
+
+
+def _refuse_other(electrons: Tensor, measured: MeasuredPsf) -> None:
+    if (found := measured.kernels.shape[2]) != electrons.shape[-3]:
+        raise ValueError(
+            f"the measured PSF has {found} channels and the picture {electrons.shape[-3]}: use frames of one camera"
+        )
