@@ -184,7 +184,7 @@ def test_a_run_with_a_node_of_the_user_is_never_given_again(neusee):
 
 @pytest.mark.slow
 def test_plan_and_why_are_given_again_until_the_cache_says_something_else(neusee):
-    (neusee.folder / "mine.yaml").write_text(RUN)
+    (neusee.folder / "mine.yaml").write_text(RUN.replace("16, 16", "48, 48"))  # large enough for a file of its own
     picture(neusee, 200)
     plan, why = ("plan", "mine.yaml"), ("why", "frame", "mine.yaml")
     assert neusee(*plan)[0] == 0
