@@ -19,7 +19,7 @@ from pathlib import Path
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
 HEAD = "## A repeated command (`bench_repeated_command.py`)"
-COLUMNS = "| command | processor, s: least (median) | wall, s: least (median) | of `import torch`, medians |\n|---|---|---|---|\n"
+COLUMNS = "| command | processor, s | wall, s | times `import torch` |\n|---|---|---|---|\n"
 RECIPE = ["-m", "neusee", "safety", "safety_pointer", "--quiet"]
 VALIDATE = ["-m", "neusee", "validate", "first_light"]
 RUN, PLAN = ["-m", "neusee", "run", "first_light"], ["-m", "neusee", "plan", "first_light"]
@@ -60,7 +60,7 @@ def shown(seconds: list[float]) -> str:
 
 
 def line(name: str, rows: list[tuple[float, float]], alone: float) -> str:
-    """Return the row of a command in the table; ``alone`` is the median of the processor seconds of an import of torch."""
+    """Return the row of a command in the table; ``alone``: processor seconds of an import of torch, the median."""
     processor, wall = map(list, zip(*rows, strict=True))
     return f"| {name} | {shown(processor)} | {shown(wall)} | {statistics.median(processor) / alone:.2f} |\n"
 
@@ -93,7 +93,7 @@ def main() -> None:
     alone = statistics.median(processor for processor, _ in found[TORCH])
     lines = [line(name, rows, alone) for name, rows in found.items()]
     load = f"load of the machine {min(loads):.1f} to {max(loads):.1f} with {os.cpu_count()} cores"
-    write(lines, f"Whole processes of one thread, {times} of each in turns; {load}.")
+    write(lines, f"Whole processes of one thread, {times} of each in turns: least (median); {load}.")
     print("".join(lines), load)
 
 

@@ -21,7 +21,7 @@ from neusee.workflows.answers.installed_program import ROOT, SITES, SOURCES, pro
 from neusee.workflows.answers.opened_files import Folders, Opened
 from neusee.workflows.answers.results_folder import kept_files, printed, write_again
 from neusee.workflows.answers.stored_answer import RUN, Answer, read_answer, used, write_answer
-from neusee.workflows.answers.stored_results import note_use, still_there, stored_results
+from neusee.workflows.answers.stored_results import note_use, still_there, taken_from
 from neusee.workflows.answers.typed_command import command_name
 from neusee.workflows.answers.witnesses import Unsettled, Witnesses, hold, witnesses_of
 from neusee.workflows.report.run_folder import writable_folder
@@ -73,7 +73,7 @@ class Said(NamedTuple):
 
     def fields(self) -> dict[str, Any]:
         """Return the fields of the answer that say on what it rests."""
-        return {"files": {}, "stored": stored_results(self.store, {}), "memory": int(self.memory)}
+        return {"files": {}, "stored": taken_from(self.store, {}), "memory": int(self.memory)}
 
 
 class Results(NamedTuple):

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neusee.workflows.answers.results_folder import DOCUMENT, NotRepeatable
 from neusee.workflows.answers.stored_answer import RUN, Answer
-from neusee.workflows.answers.stored_results import stored_results
+from neusee.workflows.answers.stored_results import taken_from
 from neusee.workflows.engine.memory_use import process_peak
 from neusee.workflows.report.json_output import json_line
 from neusee.workflows.report.run_crate import CRATE
@@ -59,7 +59,7 @@ class RunResults(NamedTuple):
         made = page(said, _pictures(folder, self.taken))
         if made.encode() != (folder / PAGE).read_bytes() or document_text(said).encode() != files[DOCUMENT]:
             raise NotRepeatable("the page or the document is not the same when it is written again")
-        return {"kind": RUN, "files": files, "stored": stored_results(self.store, self.taken)}
+        return {"kind": RUN, "files": files, "stored": taken_from(self.store, self.taken)}
 
 
 def write_run_again(answer: Answer, disk: Disk, seconds: float) -> tuple[Path, dict[str, Any]]:

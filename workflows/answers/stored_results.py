@@ -41,7 +41,7 @@ class StoredResults(NamedTuple):
 NOTHING = StoredResults()
 
 
-def stored_results(store: Store, taken: Mapping[str, Path]) -> StoredResults:
+def taken_from(store: Store, taken: Mapping[str, Path]) -> StoredResults:
     """Return what a process has asked of a store so far, and the stored files that it took into a folder of results.
 
     Raises `Unsettled` for a file that is not in the store, and `OSError` for one that cannot be read.
@@ -80,7 +80,7 @@ def note_use(disk: Disk, then: StoredResults) -> None:
 def checked(fields: Mapping[str, Any]) -> StoredResults:
     """Return the results that the JSON of an answer names.
 
-    Raises `ValueError` or `TypeError` for what `stored_results` never gives.
+    Raises `ValueError` or `TypeError` for what `taken_from` never gives.
     """
     found = StoredResults(**{**fields, "loaded": tuple(fields.get("loaded", ()))})
     if not all(isinstance(each, dict) for each in (found.results, found.files, found.taken)):

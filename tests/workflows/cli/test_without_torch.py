@@ -103,7 +103,6 @@ def test_commands_that_compute_nothing_say_the_same_without_torch(place, monkeyp
         "cache gc --dry-run": 0,
         "run nosuch": 2,
         "plan nosuch.yaml": 2,
-        "validate first_light laser=nosuch": 2,
         "report nowhere": 2,
     }
     answers = asked(place, *commands)
