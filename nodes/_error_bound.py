@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _FEW = 64  #: up to this many elements, a loop in Python is faster than five calls of torch
 _PART, _ROW = 1 << 17, 1 << 10  #: elements of one part, and elements that are summed in the precision of the tensor
@@ -28,6 +28,8 @@ class TensorStats:
     @classmethod
     def of(cls, value: Any) -> TensorStats | None:
         """Return the statistics of a tensor, or of the first tensor in a named tuple; return None for other values."""
+        from torch import Tensor  # here, so that a command that computes nothing need not import torch
+
         if isinstance(value, tuple | list) and value:
             return cls.of(value[0])
         if not isinstance(value, Tensor):
@@ -47,6 +49,8 @@ class TensorStats:
 
 def _measure(flat: Tensor) -> tuple[float, float, float, int]:
     """Return minimum, maximum, sum and number of nonzero elements of a flat tensor, in parts for the CPU cache."""
+    import torch
+
     small = flat.dtype == torch.bool or (flat.is_floating_point() and flat.element_size() < 4)
     parts = []
     for part in torch.split(flat, _PART):

@@ -8,12 +8,14 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import PlainSerializer, PlainValidator, ValidationInfo
-from torch import nn
 
 from neusee.nodes.own_modules import import_missing, own_files
+
+if TYPE_CHECKING:
+    from torch import nn
 
 __depends__ = ["unaffected:importlib.import_module"]  #: the module of a class that is unpickled, which a key covers
 FAMILY = "family"  #: key of the pydantic context: a function that returns the module of a family, or raises LookupError
@@ -25,7 +27,7 @@ class Architecture:
     """A network class of a user and its name in a recipe, such as ``mynet.SmallUNet``."""
 
     name: str
-    network: type[nn.Module]
+    network: type[Any]  #: a class of `torch.nn.Module`
 
     def __str__(self) -> str:
         return self.name
@@ -54,6 +56,8 @@ class Architecture:
 
 def _read(given: Any, info: ValidationInfo) -> Architecture:
     """Return the network class that a recipe or a caller names; raise ValueError with the most similar name."""
+    from torch import nn
+
     if isinstance(given, Architecture):
         return given
     if isinstance(given, type) and issubclass(given, nn.Module):
@@ -85,6 +89,8 @@ NetworkClass = Annotated[
 
 def network_classes(module: ModuleType) -> dict[str, type[nn.Module]]:
     """Return the classes of `torch.nn.Module` that a module or package of a user defines, by name."""
+    from torch import nn
+
     return {
         name: value
         for name, value in vars(module).items()

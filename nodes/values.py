@@ -148,6 +148,34 @@ class FoundLasers(NamedTuple):
     correlation: Tensor  #: (laser, value, value) float64, of n_y, n_x, wavelength and the strength of each channel
 
 
+class Shading(NamedTuple):
+    """The smooth transmission that frames of one camera share: dirt on lens and window, and fall-off to the corners."""
+
+    transmission: Tensor  #: (y, x) by which a frame is divided; its geometric mean is 1; 1 where not identifiable
+    spread: Tensor  #: (y, x) standard deviation of its logarithm, of what the division leaves
+    estimate: Tensor  #: (knot y, knot x) float64, posterior mean of the logarithm
+    deviation: Tensor  #: (knot y, knot x) float64, posterior standard deviation of the logarithm
+    told: Tensor  #: () float64, share of the variance of the field that the frames tell, 0 to 1
+    clean: Tensor  #: () float64, probability that there is no field
+    identifiable: Tensor  #: () bool: True if the frames tell the field
+    frames: Tensor  #: () int64, how many there were
+    alike: Tensor  #: () float64, correlation of the details of two scenes: 0 for scenes that differ
+
+
+class WienerProblem(NamedTuple):
+    """The deconvolution of `restore.wiener`: a linear problem for a scene of mean 0 and variance 1, and its answer."""
+
+    picture: Tensor  #: (channel, y, x), without the glare, of mean 0 and in units of ``scale``
+    weight: Tensor  #: (channel, y, x), 1 / variance of the noise; 0 where a pixel is clipped
+    psf: Tensor  #: (channel, any, any), of a sum near 1
+    glare: Tensor  #: (pattern, channel, y, x), patterns that are added with any strength
+    doubts: Tensor  #: (pattern, channel, y, x), patterns that are added with a strength of mean 0 and variance 1
+    answer: Tensor  #: (channel, y, x), what the filter restores, in units of ``scale``
+    seen: Tensor  #: (channel, y, x), the blurred answer, in which light from beyond the frame counts too
+    scale: Tensor  #: (channel, 1, 1) e-, of the answer behind a perfect lens
+    mean: Tensor  #: (channel, 1, 1) e-, of the scene behind a perfect lens
+
+
 class MeasuredPsf(NamedTuple):
     """PSFs that frames of point sources gave, at the nodes of a grid over the frame, and how sure they are.
 

@@ -173,6 +173,9 @@ STAND_INS = {
     'train my/train_smallnet.yaml "train.export=[pt2]"': StandIn("minutes", more=SMALLNET),
     "train train_hour train.photographs=my_photographs": StandIn("a quarter of an hour", more=(
         *TRAINING[:-2], "train.network.width=4", "train.stages.2.iterations=1", "train.stages.2.batch=2")),
+    "train train_unrolled train.photographs=my_photographs": StandIn("half an hour", more=(
+        *TRAINING[:-2], "train.network.width=2", "train.pool=2", "train.stages.2.iterations=1",
+        "train.stages.2.batch=2")),
     "evaluate train_hour --data photographs --scenes 20 "
     '--pipelines "flat+none, five_half_rings+wiener, five_half_rings+nafnet@best.safetensors"': StandIn(
         "20 scenes", instead={"20": "1"}, more=("--strengths", "30", "+evaluate={mismatch: null}"), constants=WEAK),

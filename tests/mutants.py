@@ -65,8 +65,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/restore/_inverse/_wiener.py",
-        "_GREY = 0.95",
-        "_GREY = 0.30",
+        "GREY = 0.95",
+        "GREY = 0.30",
         within(
             "nodes/restore/inverse",
             "wiener.py::test_of_measured_colours_no_other_correlation_of_channels_tells_more_of_a_hidden_one",

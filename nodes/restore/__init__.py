@@ -8,6 +8,7 @@ from neusee.nodes.restore._inverse._nearby_glare import nearby_glare
 from neusee.nodes.restore._inverse._posterior_spread import wiener_spread
 from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
 from neusee.nodes.restore._inverse._wiener import wiener
+from neusee.nodes.restore._inverse._wiener_problem import wiener_problem
 from neusee.nodes.restore._lasers._find_lasers import find_lasers
 from neusee.nodes.restore._lasers._found_glare import found_glare, found_nearby
 from neusee.nodes.restore._networks._critic import critic_slopes, critics, skip_critic_draws
@@ -18,9 +19,11 @@ from neusee.nodes.restore._networks._network_node import network
 from neusee.nodes.restore._networks._own_network import OwnNetwork, own_network, try_network
 from neusee.nodes.restore._networks._restorer import Restorer, parameter_groups, start_network
 from neusee.nodes.restore._networks._unet import UNet, unet
+from neusee.nodes.restore._networks._unrolled import Unrolled, unrolled
 from neusee.nodes.restore._points._by_field import spread_by_field, wiener_by_field
 from neusee.nodes.restore._points._measured_psf import measured_psf
 from neusee.nodes.restore._sensor_likelihood import MeasuringSensor, measuring_sensor
+from neusee.nodes.restore._shading._shading_node import shading
 from neusee.nodes.restore._white_level import white_level
 
 __all__ = [
@@ -31,6 +34,7 @@ __all__ = [
     "OwnNetwork",
     "Restorer",
     "UNet",
+    "Unrolled",
     "clipped",
     "colour",
     "colour_matrix",
@@ -52,13 +56,16 @@ __all__ = [
     "parameter_groups",
     "require_exportable",
     "richardson_lucy",
+    "shading",
     "skip_critic_draws",
     "spread_by_field",
     "start_network",
     "try_network",
     "unet",
+    "unrolled",
     "white_level",
     "wiener",
     "wiener_by_field",
+    "wiener_problem",
     "wiener_spread",
 ]

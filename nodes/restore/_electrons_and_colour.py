@@ -9,19 +9,25 @@ from neusee.nodes.metrics._saturated_pixels import clipped as at_the_end
 from neusee.nodes.sensor._digitization import Bits
 from neusee.nodes.sensor._saturation import Well
 from neusee.nodes.units import Electrons, Gain
+from neusee.nodes.values import Shading
 
 
 @node()
-def electrons(raw: Tensor, *, gain: Gain, offset: Electrons, offset_subtracted: bool = True) -> Tensor:
+def electrons(
+    raw: Tensor, shading: Shading | None = None, *, gain: Gain, offset: Electrons, offset_subtracted: bool = True
+) -> Tensor:
     """Convert digital numbers to electrons: undo the gain of the sensor and subtract its offset.
 
-    Shapes: raw (..., y, x) -> (..., y, x).
+    With ``shading``, of `restore.shading`, the electrons are divided by its transmission.
+
+    Shapes: raw (..., y, x), shading (y, x) -> (..., y, x).
     Units:  raw DN; gain K, DN/e-; offset e-; result e-, negative where read noise was negative.
     Error:  the rounding of the converter, 0.29 DN rms; clipped pixels stay clipped. The quotient itself is float32,
             within 1.2e-7 of raw / gain.
     Source: NeuSee, Eq. (SensorImage), inverted.
     """
-    return single(raw) / gain - (offset if offset_subtracted else 0.0)
+    found = single(raw) / gain - (offset if offset_subtracted else 0.0)
+    return found if shading is None else found / shading.transmission.to(found)
 
 
 @electrons.preflight

@@ -1,6 +1,7 @@
 """Shapes of the results of the restoring nodes, and the work of the deconvolution and of the networks."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -16,7 +17,8 @@ from neusee.nodes.restore._inverse._lowest_frequencies import MODES, SHARE
 from neusee.nodes.restore._inverse._nearby_glare import nearby_glare
 from neusee.nodes.restore._inverse._posterior_spread import wiener_spread
 from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
-from neusee.nodes.restore._inverse._wiener import wiener
+from neusee.nodes.restore._inverse._wiener import PRECISE, wiener
+from neusee.nodes.restore._inverse._wiener_problem import wiener_problem
 from neusee.nodes.restore._lasers._find_lasers import find_lasers
 from neusee.nodes.restore._lasers._found_glare import found_glare, found_nearby
 from neusee.nodes.restore._networks._fft_mamba import fft_mamba
@@ -24,10 +26,13 @@ from neusee.nodes.restore._networks._nafnet import nafnet
 from neusee.nodes.restore._networks._network_node import network
 from neusee.nodes.restore._networks._own_network import tried
 from neusee.nodes.restore._networks._unet import unet
+from neusee.nodes.restore._networks._unrolled import unrolled
 from neusee.nodes.restore._points._by_field import spread_by_field, wiener_by_field
+from neusee.nodes.restore._shading._frame_cells import grid
+from neusee.nodes.restore._shading._shading_node import shading
 from neusee.nodes.restore._white_level import white_level
 from neusee.nodes.shape_rules import at_least_single, blank, double, like_first, transform_operations
-from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
+from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil, Shading, WienerProblem
 
 _SYSTEM = 35.0  #: bytes for each element of a dense system: the matrix, its factors and copies
 _INVERTED = 0.30  #: operations of a transform that take as long as one of the cube of the side of an inverted matrix
@@ -38,9 +43,11 @@ _MODE = 24.0  #: bytes for each pixel of a pattern that the glare may have: its 
 _SEARCHED = 150.0  #: bytes for each pixel of a frame in which lasers are searched: patterns, and slopes of a fit
 _LINES = 61  #: spectral lines that a search tries, each with five transforms
 _KEPT = 1 / 8  #: bytes of inner results of a network that need as much memory as a byte of the usual work of a node
+_LAWS = 400.0  #: bytes, and operations, of the laws of a scene for each element of their matrices
+_FIELD = 60.0  #: products of matrices of the knots
 _LAYER = 1e-3  #: operations of a transform that take as long as one of a layer
 
-for node in (electrons, wiener, wiener_by_field, richardson_lucy, fft_mamba, nafnet, network, unet):
+for node in (electrons, wiener, wiener_by_field, richardson_lucy, fft_mamba, nafnet, network, unet, unrolled):
     node.shape(like_first)
 
 
@@ -57,6 +64,21 @@ def _(channels: Tensor, matrix: Tensor) -> Tensor:
 @colour_matrix.shape
 def _(bands: Any, illuminant: Any, responses: Tensor, *inputs: Any, **params: Any) -> Tensor:
     return double(3, len(responses))
+
+
+@shading.shape
+def _(responses: Any, *, shape: Sequence[int], **params: Any) -> Shading:
+    y, x = shape
+    knots, one = grid((y, x)), double()
+    counts = blank(dtype=torch.bool), blank(dtype=torch.int64)
+    return Shading(blank(y, x), blank(y, x), double(*knots), double(*knots), one, one, *counts, one)
+
+
+@shading.work
+def _(result: Shading, *inputs: Any, files: Sequence[Any] = (), **params: Any) -> tuple[float, float]:
+    y, x = result.transmission.shape
+    knots = result.estimate.numel()
+    return 100.0 * y * x + _LAWS * knots**2, _FIELD * knots**3 + 10.0 * len(files) * (y * x + _LAWS * knots**2)
 
 
 @nearby_glare.shape
@@ -139,6 +161,35 @@ def _(electrons: Tensor, measured: Any, clipped: Any, matrix: Tensor, **params: 
 def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, draws: int = 8, **params: Any) -> tuple[float, float]:
     memory, operations = wiener.hooks.work(result, electrons, psf, *others[:4], *others[5:])  # type: ignore[misc]
     return 1.5 * memory, draws * operations
+
+
+@wiener_problem.shape
+def _(
+    electrons: Tensor, psf: Psf, illuminant: Any, responses: Any, bands: Any, clipped: Any, glare: Any = None,
+    nearby: Any = None, ghosts: Any = None, **params: Any,
+) -> WienerProblem:  # fmt: skip
+    fine = torch.float64 if max(electrons.shape[-2:]) <= PRECISE else at_least_single(electrons)
+    doubts = sum(len(other) for other in nearby or ())
+    count, frame, one = len(electrons), tuple(electrons.shape), (len(electrons), 1, 1)
+    kernels = (count, *psf.intensity.shape[-2:])
+    patterns = [(number, *frame) for number in (len(glare or ()) + len(ghosts or ()), doubts)]
+    shapes = (frame, frame, kernels, *patterns, frame, frame, one, one)
+    return WienerProblem._make(blank(*shape, dtype=fine) for shape in shapes)
+
+
+@wiener_problem.work
+def _(result: WienerProblem, *inputs: Any, **params: Any) -> tuple[float, float]:
+    work: tuple[float, float] = wiener.hooks.work(result.picture, *inputs)  # type: ignore[misc]
+    return work
+
+
+@unrolled.work
+def _(
+    result: Tensor, electrons: Tensor, psf: Psf, *others: Any, width: int = 16, steps: int = 2, **params: Any
+) -> tuple[float, float]:
+    memory, operations = wiener.hooks.work(result, electrons, psf, *others)  # type: ignore[misc]
+    of_layers, layers = _layers(result, width=width)
+    return memory + of_layers, (1 + steps) * operations + steps * layers
 
 
 @white_level.shape

@@ -1,9 +1,9 @@
-"""Repeated commands, with and without its stored answer: processor and wall seconds, as a table in RESULTS.md.
+"""Repeated commands, with and without the stored answer of each: processor and wall seconds, as a table in RESULTS.md.
 
     python tests/benchmarks/bench_repeated_command.py [--times 9]
 
 Each command is a process of its own with one thread. Without the answer: the folder of answers is removed first, so
-that the command reads the recipe, takes an estimate from the store and keeps its answer. The two take turns in one
+that the command reads the recipe, takes results from the store and keeps its answer. The two take turns in one
 run, beside `neusee --help` and a bare `import torch`, and the load of the machine is recorded.
 """
 
@@ -19,16 +19,27 @@ from pathlib import Path
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
 HEAD = "## A repeated command (`bench_repeated_command.py`)"
-COLUMNS = "| command | processor, s: least (median) | wall, s: least (median) |\n|---|---|---|\n"
+COLUMNS = "| command | processor, s | wall, s | times `import torch` |\n|---|---|---|---|\n"
 RECIPE = ["-m", "neusee", "safety", "safety_pointer", "--quiet"]
 VALIDATE = ["-m", "neusee", "validate", "first_light"]
+RUN, PLAN = ["-m", "neusee", "run", "first_light"], ["-m", "neusee", "plan", "first_light"]
+WHY = ["-m", "neusee", "why", "restored", "first_light"]
+TORCH = "`import torch` alone"
 COMMANDS = {
     "`neusee safety safety_pointer`, repeated, no stored answer": RECIPE,
     "`neusee safety safety_pointer`, repeated": RECIPE,
     "`neusee validate first_light`, repeated, no stored answer": VALIDATE,
     "`neusee validate first_light`, repeated": VALIDATE,
+    "`neusee run first_light`, from the cache, no stored answer": RUN,
+    "`neusee run first_light`, repeated": RUN,
+    "`neusee plan first_light`, from the cache, no stored answer": PLAN,
+    "`neusee plan first_light`, repeated": PLAN,
+    "`neusee why restored first_light`, no stored answer": WHY,
+    "`neusee why restored first_light`, repeated": WHY,
+    "`neusee report latest`": ["-m", "neusee", "report", "latest"],
+    "`neusee cache ls`": ["-m", "neusee", "cache", "ls"],
     "`neusee --help`": ["-m", "neusee", "--help"],
-    "`import torch` alone": ["-c", "import torch"],
+    TORCH: ["-c", "import torch"],
 }
 
 
@@ -48,6 +59,12 @@ def shown(seconds: list[float]) -> str:
     return f"{min(seconds):.2f} ({statistics.median(seconds):.2f})"
 
 
+def line(name: str, rows: list[tuple[float, float]], alone: float) -> str:
+    """Return the row of a command in the table; ``alone``: processor seconds of an import of torch, the median."""
+    processor, wall = map(list, zip(*rows, strict=True))
+    return f"| {name} | {shown(processor)} | {shown(wall)} | {statistics.median(processor) / alone:.2f} |\n"
+
+
 def write(lines: list[str], about: str) -> None:
     """Write the section of this script in RESULTS.md anew."""
     before, _, rest = RESULTS.read_text(encoding="utf-8").partition(HEAD)
@@ -65,18 +82,18 @@ def main() -> None:
     loads = [os.getloadavg()[0]]
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        measured(RECIPE, place)  # the estimate itself
+        for words in (RECIPE, RUN):  # the estimate and the run themselves
+            measured(words, place)
         for _ in range(times):
             for name, words in COMMANDS.items():
                 if name.endswith("no stored answer"):
                     shutil.rmtree(place / "cache" / "answers", ignore_errors=True)
                 found[name].append(measured(words, place))
             loads.append(os.getloadavg()[0])
-    lines = [
-        f"| {name} | {' | '.join(map(shown, map(list, zip(*rows, strict=True))))} |\n" for name, rows in found.items()
-    ]
+    alone = statistics.median(processor for processor, _ in found[TORCH])
+    lines = [line(name, rows, alone) for name, rows in found.items()]
     load = f"load of the machine {min(loads):.1f} to {max(loads):.1f} with {os.cpu_count()} cores"
-    write(lines, f"Whole processes of one thread, {times} of each in turns; {load}.")
+    write(lines, f"Whole processes of one thread, {times} of each in turns: least (median); {load}.")
     print("".join(lines), load)
 
 

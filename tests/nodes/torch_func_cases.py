@@ -13,6 +13,7 @@ from neusee.nodes.restore._networks._fft_mamba import FFTMamba
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
 from neusee.nodes.restore._networks._unet import UNet
+from neusee.nodes.restore._networks._unrolled import Unrolled
 from neusee.nodes.values import Channels, Dirt, FoundLasers, LowRankCube, MeasuredPsf, Psf, Pupil
 
 HERE = Path(__file__).parent
@@ -129,6 +130,11 @@ def _networks(folder):
             {"weights": saved(folder, "own", partial(UNet, 4)), "architecture": UNet, "parameters": {"width": 4}},
         ),
         "restore.unet": Case("0", (single,), {"weights": saved(folder, "unet", partial(UNet, 4)), "width": 4}),
+        "restore.unrolled": Case(
+            "0",
+            (WIDE_RAW, PSF, LIGHT, RESPONSES, BANDS, torch.zeros(3, 48, 48, dtype=torch.bool)),
+            {"weights": saved(folder, "unrolled", partial(Unrolled, 2)), "width": 2, "read_noise": 5.0},
+        ),
         "spectra.lift_mst_plus_plus": Case(
             "0",
             (rand(3, 16, 16, dtype=torch.float32), spectra.bands(start=400e-9, stop=700e-9, count=31)),
@@ -235,6 +241,12 @@ CASES = {
     "restore.white_level": Case(
         "0", (RAW, torch.zeros(RAW.shape, dtype=torch.bool), PSF, BANDS, LIGHT, RESPONSES), WELL
     ),
+    "restore.wiener_problem": Case(
+        "0",
+        (WIDE_RAW, PSF, LIGHT, RESPONSES, BANDS, torch.zeros(3, 48, 48, dtype=torch.bool)),
+        {"read_noise": 5.0},
+        to=1e-3,
+    ),
     "restore.spread_by_field": Case(
         "3",
         (WIDE_RAW, MEASURED, torch.zeros(3, 48, 48, dtype=torch.bool), rand(3, 3)),
@@ -316,6 +328,7 @@ NOTHING_TO_FOLLOW = {
     "doe.unet": "draws a network that is to be trained",
     "doe.vortex": "has a whole charge alone",
     "optics.stop": "states the pupil grid, which other nodes read as plain numbers",
+    "restore.shading": "reads files",
     "restore.measured_psf": "reads files",
     "scene.exr": "reads a file",
     "sensor.frame": "reads a file",

@@ -20,7 +20,8 @@ from neusee.workflows.answers.answer_upkeep import make_room
 from neusee.workflows.answers.installed_program import ROOT, SITES, SOURCES, program_state, standard_library
 from neusee.workflows.answers.opened_files import Folders, Opened
 from neusee.workflows.answers.results_folder import kept_files, printed, write_again
-from neusee.workflows.answers.stored_answer import Answer, read_answer, used, write_answer
+from neusee.workflows.answers.stored_answer import RUN, Answer, read_answer, used, write_answer
+from neusee.workflows.answers.stored_results import note_use, still_there, taken_from
 from neusee.workflows.answers.typed_command import command_name
 from neusee.workflows.answers.witnesses import Unsettled, Witnesses, hold, witnesses_of
 from neusee.workflows.report.run_folder import writable_folder
@@ -28,8 +29,10 @@ from neusee.workflows.store.environment import budget_bytes, default_root
 from neusee.workflows.store.shared_folder import Disk
 
 if TYPE_CHECKING:
+    from neusee.workflows.answers.repeated_run import RunResults
     from neusee.workflows.graph.recipe_graph import Recipe
     from neusee.workflows.report.study_folder import StudyReport
+    from neusee.workflows.store.result_store import Store
 
 running: list[Command] = []  #: the command of this process, if its answer may be kept
 _SYSTEM = ("/proc", "/sys", "/dev")
@@ -37,6 +40,9 @@ _OUT = "runs"  #: folder of results where the command names none
 _RECIPES = (".yaml", ".yml")
 #: files that are made of others: bytecode, compiled modules, and the list of fonts that matplotlib keeps
 _DERIVED = re.compile(r"\.pyc$|\.so$|/fontlist-v[^/]*$")
+#: files of a cache that decide what a forecast or an explanation says, beside the results themselves
+_OF_CACHE = re.compile(r"journal\.jsonl|speeds\.json|code/.*")
+_SHARE = 0.9  #: of the free memory, which a run may use
 _PART = re.compile(r"/\.[^/]*\.part(/|$)")  #: in the path of a folder of results that is not complete
 _TICK = 20_000_000  #: ns, longer than a tick of the clock of a file system
 _IMPORTED = 2_000_000_000  #: ns before the command began in which its modules may have been imported
@@ -58,12 +64,28 @@ def begin(words: Sequence[str], terminal: Sequence[object]) -> Command | None:
         return None
 
 
+class Said(NamedTuple):
+    """What a command that writes nothing has taken from a store."""
+
+    store: Store
+    memory: float = 0.0  #: bytes that must be free
+    out: None = None  #: no folder of results
+
+    def fields(self) -> dict[str, Any]:
+        """Return the fields of the answer that say on what it rests."""
+        return {"files": {}, "stored": taken_from(self.store, {}), "memory": int(self.memory)}
+
+
 class Results(NamedTuple):
     """The folder of results of a command."""
 
     folder: Path  #: complete
     out: Path  #: the folder that has it
     report: StudyReport  #: that was written there
+
+    def fields(self) -> dict[str, Any]:
+        """Return the fields of the answer that say what the folder holds."""
+        return {"files": kept_files(self.folder, self.report)}
 
 
 class Command:
@@ -82,35 +104,60 @@ class Command:
         Raises `OSError` if the folder of results cannot be written.
         """
         answer = read_answer(self._disk, self.name)
-        if answer and answer.state == self._state.digest and self._fits(answer) and hold(answer.witnesses):
+        if answer and self._holds(answer):
             with suppress(ValueError, KeyError, TypeError, AttributeError):  # a document that is none
-                folder = write_again(answer, time.perf_counter() - self._began) if answer.key else None
+                text = self._given_again(answer)
                 used(self._disk, self.name)
-                return printed(answer, folder / "report.html") if folder else answer.text
+                return text
         running[:] = [self]
         self._opened.listen()
         return None
+
+    def _holds(self, answer: Answer) -> bool:
+        """Return True if everything that decided an answer is as it was."""
+        return (
+            answer.state == self._state.digest
+            and self._fits(answer)
+            and hold(answer.witnesses)
+            and still_there(self._disk, answer.stored)
+            and _are_free(answer.memory)
+        )
+
+    def _given_again(self, answer: Answer) -> str:
+        """Write the folder of an answer again, if it has one, and return the text to print."""
+        if not answer.key:
+            return answer.text
+        if answer.kind != RUN:
+            return printed(answer, write_again(answer, time.perf_counter() - self._began) / "report.html")
+        from neusee.workflows.answers.repeated_run import said_again, write_run_again
+
+        folder, document = write_run_again(answer, self._disk, time.perf_counter() - self._began)
+        note_use(self._disk, answer.stored)
+        return said_again(answer, folder, document)
 
     def doubt(self) -> None:
         """Keep no answer: the command has said something that its text does not hold, such as a warning."""
         self._doubtful = True
 
-    def keep(self, text: str, as_json: bool, recipe: Recipe, results: Results | None = None) -> None:
+    def keep(
+        self, text: str, as_json: bool, recipe: Recipe, results: Results | RunResults | Said | None = None
+    ) -> None:
         """Keep the answer of a command that has ended well; do so only if nothing that it rests on is in doubt.
 
         Args: text: of the terminal, with `results_folder.PAGE` for the path of the page. recipe: that of the command.
-        results: None for a command that writes nothing; such a command makes no cache either.
+        results: what the command has written, or what it has taken from a store. A command that writes nothing makes no
+        cache either.
         """
         self._opened.end()
         with suppress(OSError, ValueError, KeyError, TypeError):
-            witnesses = self._witnesses(results.out if results else None, _input_files(recipe))
-            if self._is_doubtful() or not (results or os.path.isdir(self._disk.folder)):
+            inputs = [*_input_files(recipe), *(self._of_cache() if isinstance(results, Said) else ())]
+            witnesses = self._witnesses(results.out if results else None, inputs)
+            written = results if results and results.out else None
+            if self._is_doubtful() or not (written or os.path.isdir(self._disk.folder)):
                 return
-            of_folder: tuple[str, str, str, dict[str, bytes]] = "", "", "", {}
-            if results:
-                files = kept_files(results.folder, results.report)
-                of_folder = (str(results.out), *_parts(results.folder.name), files)
-            answer = Answer(self._state.digest, witnesses, text, as_json, *of_folder)
+            place = (str(written.out), *_parts(written.folder.name)) if written else ("", "", "")
+            fields = results.fields() if results else {"files": {}}
+            answer = Answer(self._state.digest, witnesses, text, as_json, *place, **fields)
             if write_answer(self._disk, self.name, answer):
                 make_room(self._disk, budget_bytes(None))
 
@@ -152,6 +199,23 @@ class Command:
         folders = [path for path in self._opened.folders if path not in ignored and not _PART.search(path)]
         listed = {path: self._opened.folders[path] for path in folders if path != written}
         return witnesses_of([*files, *inputs], recipes, listed, self._started - _TICK, written)
+
+    def _of_cache(self) -> list[str]:
+        """Return the files of the cache that were read and decide what a forecast or an explanation says."""
+        return [path for path in self._opened.files if _OF_CACHE.fullmatch(_inside(path, self._disk.folder))]
+
+
+def _are_free(memory: int) -> bool:
+    """Return True if a run may use so many bytes of memory now."""
+    if not memory:
+        return True
+    from neusee.workflows.engine.memory_use import free_memory
+
+    return _SHARE * free_memory() >= memory
+
+
+def _inside(path: str, folder: str) -> str:
+    return os.path.relpath(os.path.realpath(path), os.path.realpath(folder))
 
 
 def _parts(folder: str) -> tuple[str, str]:

@@ -14,11 +14,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
+from neusee.workflows.answers.stored_results import NOTHING, StoredResults, checked
 from neusee.workflows.answers.witnesses import Witnesses
 from neusee.workflows.keys.seal import NotRead, seal_file, unseal_file
 from neusee.workflows.store.shared_folder import Disk, read_file
 
 FOLDER, SUFFIX = "answers", ".answer"
+AS_KEPT, RUN = "as kept", "run"  #: kinds of answers: with the files of a folder, and with what a run shows
 MOST = 32 << 20  #: bytes of the largest answer that is kept
 _LABEL = re.compile(r"\w[\w.-]*")
 _FILE = re.compile(r"\w[\w.-]*(/\w[\w.-]*)*")
@@ -36,6 +38,9 @@ class Answer:
     label: str  #: recipe and kind in the name of this folder
     key: str  #: of the result, in the name of this folder; empty for a command that writes no folder
     files: Mapping[str, bytes]  #: of this folder by name, with marks in place of date and seconds
+    stored: StoredResults = NOTHING  #: what of the cache the answer rests on
+    kind: str = AS_KEPT  #: how the folder is written again
+    memory: int = 0  #: bytes that must be free
 
 
 def answer_path(disk: Disk, name: str) -> str:
@@ -82,9 +87,10 @@ def used(disk: Disk, name: str) -> None:
 
 def packed(name: str, answer: Answer) -> bytes:
     """Return the content of the file of an answer."""
-    fields = {key: value for key, value in vars(answer).items() if key not in ("files", "witnesses")}
+    fields = {key: value for key, value in vars(answer).items() if key not in ("files", "witnesses", "stored")}
     sizes = [[file, len(content)] for file, content in answer.files.items()]
-    head = json.dumps({**fields, "witnesses": answer.witnesses._asdict(), "files": sizes}).encode()
+    rests = {"witnesses": answer.witnesses._asdict(), "stored": answer.stored._asdict()}
+    head = json.dumps({**fields, **rests, "files": sizes}).encode()
     content = b"".join([head, b"\n", *answer.files.values()])
     return seal_file(f"{FOLDER}/{name}", content) + b"\n" + content
 
@@ -105,7 +111,10 @@ def unpacked(name: str, raw: bytes) -> Answer:
     if at != len(rest):
         raise ValueError("the files of the answer are not as long as it says")
     witnesses = Witnesses(**fields.pop("witnesses"))
-    answer = Answer(**fields, witnesses=witnesses, files=files)
+    stored = checked(fields.pop("stored"))
+    for file in stored.taken:
+        _checked(_FILE, file)
+    answer = Answer(**fields, witnesses=witnesses, files=files, stored=stored)
     if answer.key or answer.label:
         _checked(_LABEL, answer.label)
         _checked(_LABEL, answer.key)
@@ -116,9 +125,11 @@ def unpacked(name: str, raw: bytes) -> Answer:
 def _refuse_other_types(answer: Answer) -> None:
     """Raise ValueError if a field of an answer is not of its type."""
     files, absent, recipes, listed = answer.witnesses
-    texts = [answer.state, answer.text, answer.out, answer.label, answer.key]
+    texts = [answer.state, answer.text, answer.out, answer.label, answer.key, answer.kind]
     for mapping in (files, recipes, listed):
         texts += [*mapping, *mapping.values()]
+    if type(answer.memory) is not int:
+        raise ValueError("a field of the answer is not of its type")
     if not isinstance(absent, list) or not all(isinstance(text, str) for text in [*texts, *absent]):
         raise ValueError("a field of the answer is not of its type")
 

@@ -34,11 +34,11 @@ def command_name(words: Sequence[str], terminal: Sequence[object]) -> str:
     """Return the name of the answer to a command; ``terminal`` says how wide the terminal is and what it shows.
 
     The name depends on the words, the working folder, all variables of the environment but `IGNORED`, the terminal,
-    Python with its options and search path, and the machine.
+    Python with its options and search path, and the machine. Answers of another form have other names.
     """
     python = [sys.version, sys.executable, list(sys.flags), list(sys.warnoptions), dict(sys._xoptions), sys.path]
-    place = [os.getcwd(), sorted(_decisive(os.environ).items()), list(os.uname())]
-    return digest("answer", list(words), list(terminal), python, place)
+    place = [os.getcwd(), sorted(_decisive(os.environ).items()), list(os.uname()), os.cpu_count()]
+    return digest("answer 2", list(words), list(terminal), python, place)
 
 
 def _decisive(variables: Mapping[str, str]) -> dict[str, str]:

@@ -82,7 +82,7 @@ def why(key: Key) -> None:
 
     Also print the differences from the nearest earlier result.
     """
-    from neusee.workflows.explain.why_rerun import why_key_lines
+    from neusee.workflows.explain.stored_origin import why_key_lines
 
     with failing(LookupError):
         say(why_key_lines(the_store(), key))

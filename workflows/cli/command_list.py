@@ -43,7 +43,7 @@ COMMANDS = {
     "study": ("study_commands", "Study how accurate, stable and certain a recipe's numbers are."),
     "cache": ("cache_commands", "List, check, remove and keep stored results."),
 }
-REPEATED = frozenset({"config", "safety", "validate"})  #: commands whose answer is stored
+REPEATED = frozenset({"config", "plan", "run", "safety", "validate", "why"})  #: commands whose answer is stored
 _OPTIONS = {
     "--version": "Show the version and exit.",
     "--no-code": "Refuse recipes that name code; also after a command.",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import shlex
 import sys
 from collections.abc import Callable, Iterator
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.cli.command_frame import fail, say
 from neusee.workflows.cli.command_list import FAILED, INTERRUPTED, TYPED
+from neusee.workflows.report.json_output import json_line
 
 if TYPE_CHECKING:
     from neusee.workflows.store.result_store import Store
@@ -63,19 +63,6 @@ def kept_training(out: Path, recipe: str) -> str:
 def say_json(document: dict[str, Any]) -> None:
     """Print the result of a command as one JSON object on one line of stdout; a number that is not finite is null."""
     say([json_line(document)])
-
-
-def json_line(document: dict[str, Any]) -> str:
-    """Return the result of a command as one JSON object on one line; a number that is not finite is null."""
-    return json.dumps(_finite(document), ensure_ascii=False, default=str, allow_nan=False)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def say_folder(folder: Path, as_json: bool, *more: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,8 +24,9 @@ from neusee.workflows.cli.command_options import (
     executor_of,
     memory_limit,
 )
-from neusee.workflows.cli.interruption import json_line, kept_in, print_warning, resumable, say_json
-from neusee.workflows.cli.repetition import say_and_keep
+from neusee.workflows.cli.interruption import kept_in, print_warning, resumable, say_json
+from neusee.workflows.cli.repetition import keep_run, say_and_keep
+from neusee.workflows.report.json_output import json_line
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -60,8 +61,9 @@ def run(
 
     check_device(device)
     limit, silent = memory_limit(memory), as_json or quiet
+    before = [] if silent else console.opening(recipe, shlex.join(command[1:]))
     if not silent:
-        say(console.opening(recipe, shlex.join(command[1:])))
+        say(before)
     store = the_store()
     predicted = _predicted(recipe, store, device, limit, executor == "local", silent)
     cheaper = with_substitutions(recipe, contents.wanted(recipe))
@@ -72,13 +74,29 @@ def run(
         table,
     ):
         done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit)
+    hints = [] if silent else console.next_commands(recipe, command[2 : -1 if exact else None], _loads)
     if silent:
         _say_briefly(done, as_json)
     else:
-        hints = console.next_commands(recipe, command[2 : -1 if exact else None], _loads)
         say(console.closing(done.document, str(done.page), hints))
     if done.document["missed"]:
         raise typer.Exit(MISSED)
+    if executor == "local":
+        keep_run(_text([*before, *table.printed()], done, hints), as_json, out, done, recipe, store)
+
+
+def _text(before: Sequence[str], done: Simulation, hints: Sequence[str]) -> Callable[[str, str], str]:
+    """Return a function from the folder and the seconds of a run to all that the run has printed.
+
+    Without ``hints`` that is the path of the page alone.
+    """
+    from neusee.workflows.report.console import closing
+
+    def text(folder: str, took: str) -> str:
+        page = f"{folder}/report.html"
+        return "\n".join([*before, *closing(done.document, page, hints, took)]) if hints else page
+
+    return text
 
 
 def _say_briefly(done: Simulation, as_json: bool) -> None:
@@ -163,15 +181,17 @@ def plan(
     from neusee.workflows.explain import run_forecast
 
     check_device(device)
+    store = the_store()
     if devices:
         with refusing():
-            found = run_forecast.Forecast(run_forecast.simulated_lines(recipe, the_store(), devices), [], {}, False)
+            found = run_forecast.Forecast(run_forecast.simulated_lines(recipe, store, devices), [], {}, False)
     else:
-        found = run_forecast.forecast(recipe, the_store(), device, memory_limit(memory))
-    if as_json:
-        say_json({"command": shlex.join(command), **asdict(found)})
+        found = run_forecast.forecast(recipe, store, device, memory_limit(memory))
+    text = json_line({"command": shlex.join(command), **asdict(found)}) if as_json else "\n".join(found.lines)
+    if found.totals.get("steps") == 0 and not found.refused:
+        say_and_keep(text, recipe, store, found.totals["memory_of_report"] or 0.0)
     else:
-        say(found.lines)
+        say([text])
     if found.refused:
         raise typer.Exit(FAILED)
 
@@ -190,8 +210,10 @@ def why(
     recipe, _ = load(words, before=1)
     from neusee.workflows.explain.why_rerun import why_lines
 
+    store = the_store()
     with failing(ValueError):
-        say(why_lines(recipe, the_store(), step, device))
+        lines = why_lines(recipe, store, step, device)
+    say_and_keep("\n".join(lines), recipe, store)
 
 
 def config(words: Words = None, debug: Debug = False) -> None:
@@ -212,7 +234,7 @@ def report(
 ) -> None:
     """Write the page of a run again from stored results."""
     from neusee.workflows.report.run_folder import find_run
-    from neusee.workflows.report.run_page import rebuild
+    from neusee.workflows.report.run_html import rebuild
 
     with failing(FileNotFoundError):
         say([str(rebuild(find_run(folder, out)))])

@@ -9,10 +9,13 @@ from shutil import get_terminal_size
 from typing import TYPE_CHECKING
 
 from neusee.workflows.answers import repeated_command
+from neusee.workflows.answers.repeated_command import Said
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
     from neusee.workflows.report.study_folder import StudyReport
+    from neusee.workflows.simulation.simulate_recipe import Simulation
+    from neusee.workflows.store.result_store import Store
 
 _COMPUTED = {"-h", "--help", "--debug"}  #: words of a command that no stored answer answers
 
@@ -30,11 +33,14 @@ def say_stored_answer(words: Sequence[str]) -> bool:
     return True
 
 
-def say_and_keep(text: str, recipe: Recipe) -> None:
-    """Print the text of a command that writes nothing, and keep this text as the answer of the command."""
+def say_and_keep(text: str, recipe: Recipe, store: Store | None = None, memory: float = 0.0) -> None:
+    """Print the text of a command that writes nothing, and keep this text as the answer of the command.
+
+    ``store``: the store on which the answer rests. ``memory``: bytes that must be free, without which it would differ.
+    """
     print(text, flush=True)
     for command in repeated_command.running:
-        command.keep(text, False, recipe)
+        command.keep(text, False, recipe, Said(store, memory) if store else None)
 
 
 def keep_answer(
@@ -48,6 +54,20 @@ def keep_answer(
 
     for command in repeated_command.running:
         command.keep(text(PAGE), as_json, recipe, repeated_command.Results(folder, out, report))
+
+
+def keep_run(
+    text: Callable[[str, str], str], as_json: bool, out: Path, done: Simulation, recipe: Recipe, store: Store
+) -> None:
+    """Keep what a run has printed and written, if all its results came from the cache.
+
+    ``text`` returns the text of the command for the path of the folder of the run and the seconds that it took.
+    """
+    from neusee.workflows.answers.repeated_run import FOLDER, TOOK, RunResults
+
+    for command in repeated_command.running:
+        results = RunResults(done.folder, out, done.document, done.taken, store)
+        command.keep(text(FOLDER, TOOK), as_json, recipe, results)
 
 
 def doubt_answer() -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 from neusee.workflows.cli.command_frame import failing, load, refusing, say, the_store
 from neusee.workflows.cli.command_list import FAILED
 from neusee.workflows.cli.command_options import AsJson, Debug, Out, Quiet, Words
-from neusee.workflows.cli.interruption import json_line
 from neusee.workflows.cli.repetition import keep_answer
+from neusee.workflows.report.json_output import json_line
 
 
 def safety(

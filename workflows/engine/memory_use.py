@@ -9,8 +9,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
-import torch
-
 _CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _USED = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in_bytes")
 _highest = 0  # peak memory of this process before the last reset of the counter of the system
@@ -32,6 +30,8 @@ class PeakMemory:
         if not self.watched:
             return self
         if self.device.startswith("cuda"):
+            import torch  # here, because a command that computes nothing asks for the free memory alone
+
             torch.cuda.reset_peak_memory_stats(self.device)
             self._before = torch.cuda.memory_allocated(self.device)
         elif self.device.startswith("cpu"):
@@ -41,10 +41,15 @@ class PeakMemory:
     def __exit__(self, *error: object) -> None:
         if self._before is None:
             return
-        on_cpu = self.device.startswith("cpu")
-        highest = _resident("VmHWM:") if on_cpu else torch.cuda.max_memory_allocated(self.device)
+        highest = _resident("VmHWM:") if self.device.startswith("cpu") else _highest_on(self.device)
         if highest is not None:
             self.bytes = max(0, highest - self._before)
+
+
+def _highest_on(device: str) -> int:
+    import torch
+
+    return int(torch.cuda.max_memory_allocated(device))
 
 
 def pool_of(device: str) -> str:
@@ -111,6 +116,8 @@ def _reclaimable(group: Path) -> int:
 def there_is(device: str) -> int:
     """Return the memory of a GPU in bytes, or for the CPU the memory that this process may use."""
     if device.startswith("cuda"):
+        import torch
+
         return int(torch.cuda.get_device_properties(device).total_memory)
     found = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     for path in _CGROUPS:

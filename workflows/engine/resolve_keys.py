@@ -2,41 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterable
 
 from neusee.nodes import TensorStats
 from neusee.workflows.engine.finished_step import facts_in
 from neusee.workflows.engine.node_call import place
+from neusee.workflows.engine.resolved_keys import Resolved
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.keys.cache_key import Key, key_of
+from neusee.workflows.keys.cache_key import key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.error_budget import ErrorBudget
-from neusee.workflows.tolerance.skip_decision import SkipDecision
-
-
-@dataclass(frozen=True, slots=True)
-class Resolved:
-    """Cache keys of steps, the parts of each key, and the decisions on the steps that may be left out."""
-
-    keys: dict[str, Key] = field(default_factory=dict)
-    origins: dict[Key, Mapping[str, Any]] = field(default_factory=dict)
-    makers: dict[Key, str] = field(default_factory=dict)  #: the first step of each key that is not left out
-    verdicts: dict[str, SkipDecision | None] = field(default_factory=dict)  #: None where statistics are missing
-
-    def left_out(self, name: str) -> bool | None:
-        """Return True if a step is left out, False if it runs, and None if only the values of its inputs can decide."""
-        verdict = self.verdicts.get(name)
-        return None if verdict is None and name in self.verdicts else verdict is not None and verdict.left_out
-
-    def stands_for(self, name: str) -> str:
-        """Return ``name``, or if the step ``name`` is left out, the name of the upstream step that is used instead."""
-        while (verdict := self.verdicts.get(name)) is not None and verdict.left_out:
-            name = verdict.instead
-        return name
 
 
 def resolve(

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from neusee.workflows.engine.resolve_keys import Resolved
+from neusee.workflows.engine.resolved_keys import Resolved
 from neusee.workflows.explain.change_wording import Wording
 from neusee.workflows.explain.code_changes import edits
 from neusee.workflows.graph.recipe_graph import Recipe

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from neusee.workflows.keys.code_memo import read_parts
 from neusee.workflows.keys.module_origin import source_file
-from neusee.workflows.keys.process_settings import USUAL
+from neusee.workflows.keys.usual_settings import USUAL
 
 _STATE, _SETTINGS = "state of ", "settings"
 _PROGRAM = "neusee.workflows"

@@ -166,11 +166,11 @@ def _sums(plan: Plan, lanes: Mapping[str, Lane], totals: Mapping[str, Any]) -> l
     read, new = format_size(sum(plan.loaded.values())), format_size(int(totals["bytes"]))
     would = f"{totals['steps']} of {len(plan.order)} steps would run{guessed if totals['guesses'] else ''}"
     lines += _wrapped(f"{would}: {took}, {new} new, {read} to load")
-    if plan.schedule:
+    if plan.schedule and plan.expected:
         for name, lane in lanes.items():
             peak = format_size(plan.schedule.peak.get(name, 0.0))
             lines.append(f"memory  {name}: {peak} at most, of {format_size(max(lane.memory, 0.0))}")
-    if plan.running:
+    if plan.running and plan.expected:
         held = format_size(max(lane.held for lane in lanes.values()))
         lines += _wrapped(
             f"memory  process: {format_size(plan.running)} while the steps run, of which the program itself holds "

@@ -13,17 +13,8 @@ from pathlib import Path
 import torch
 
 from neusee.nodes.exact_convolution import tf32_setting
+from neusee.workflows.keys.usual_settings import USUAL
 
-#: settings of a new process
-USUAL = {
-    "default dtype": "torch.float32",
-    "default device": "cpu",
-    "matmul precision": "highest",
-    "TF32": "True",
-    "autocast": "off",
-    "numbers below 1e-308": "kept",
-    "assert statements": "run",
-}
 _KINDS, _is_cast = ("cpu", "cuda"), torch.is_autocast_enabled
 _HALF = float("0.5")
 _SMALLEST = sys.float_info.min  #: its half is 0 where a process flushes small numbers to 0

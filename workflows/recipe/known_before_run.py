@@ -5,15 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
-
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step, Wire, in_order
 from neusee.workflows.recipe.parameters import Checker
 from neusee.workflows.recipe.step_shapes import Form, bytes_of, form_of, inputs_of, tensors_of
 from neusee.workflows.recipe.text.yaml_values import Value
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _CHEAPER = ("channel_sum_form", "low_rank_form", "accepts_channel_sums", "accepts_low_rank")
 _GB = 1e9
@@ -112,15 +113,21 @@ def _too_large(step: Step, inputs: Mapping[str, Any], result: Any, memory: float
     needed = bytes_of(result) + max(map(bytes_of, single), default=0.0)
     if needed <= memory:
         return ""
-    sizes = " x ".join(map(str, max(tensors_of(result), key=Tensor.numel).shape))
+    sizes = " x ".join(map(str, max(tensors_of(result), key=_numbers_of).shape))
     return (
         f"the step {step.name.partition('[')[0]} needs {needed / _GB:.4g} GB for a result of {sizes} values and one "
         f"input, and this machine has {memory / _GB:.3g} GB: choose a smaller shape, or fewer bands or samples"
     )
 
 
+def _numbers_of(tensor: Tensor) -> int:
+    return tensor.numel()
+
+
 def _wrong_index(expected: Expectation, known: Any) -> str:
     """Return a message if the indices ``at`` of an expected number do not select one number of a result."""
+    from torch import Tensor
+
     found, axis = known, 0
     for part in expected.at:
         if found is None:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
-
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from neusee.nodes import Node
 from neusee.workflows.graph.recipe_graph import Recipe, Step
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Form = Any  #: a tensor, a named tuple of tensors, or None where the shape is not known
 
@@ -64,6 +65,8 @@ def complete(node: Node, inputs: Sequence[Form]) -> bool:
 
 def without_values(value: Any) -> Form:
     """Return the form of a value: tensors of many numbers become tensors on the device ``meta``."""
+    from torch import Tensor
+
     if isinstance(value, Tensor):
         return value if value.numel() <= _FEW else value.detach().to("meta")
     if hasattr(value, "_make"):
@@ -81,6 +84,8 @@ def bytes_of(form: Form) -> float:
 
 def tensors_of(form: Form) -> list[Tensor]:
     """Return the tensors of a result, or of a list of results."""
+    from torch import Tensor
+
     if isinstance(form, Tensor):
         return [form]
     return [tensor for item in form for tensor in tensors_of(item)] if isinstance(form, tuple | list) else []

@@ -13,6 +13,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
@@ -84,6 +85,7 @@ class ProgressTable(ABC):
 
     def __init__(self, mode: Mode) -> None:
         self.mode = mode
+        self._lines: list[str] = []  #: that were printed
 
     @abstractmethod
     def live_rows(self) -> Iterable[tuple[Sequence[str], str]]:
@@ -112,7 +114,21 @@ class ProgressTable(ABC):
             return
         columns = zip(self.header, cells, self.widths, strict=True)
         padded = [f"{cell:{'>' if name in self.numbers else '<'}{width}}" for name, cell, width in columns]
-        print("  " + "  ".join(padded).rstrip(), flush=True)
+        self._print("  " + "  ".join(padded).rstrip())
+
+    def _print(self, line: str) -> None:
+        self._lines.append(line)
+        print(line, flush=True)
+
+    def printed(self) -> list[str]:
+        """Return the lines of the finished table as they stand on the screen."""
+        if self.mode != "live":
+            return self._lines
+        from rich.console import Console
+
+        text, seen = StringIO(), self._live.console
+        Console(file=text, force_terminal=True, width=seen.width, height=seen.height).print(self)
+        return text.getvalue().removesuffix("\n").split("\n")
 
     def show_error(self, plain: Iterable[str], live: str) -> None:
         """Print an error: the lines ``plain`` to a file or pipe, or the text ``live`` above a table on a terminal."""
@@ -150,7 +166,7 @@ class RunTable(ProgressTable):
     def __exit__(self, *error: object) -> None:
         super().__exit__(*error)
         if self.mode == "plain" and self.caption():
-            print(f"  {self.caption()}")
+            self._print(f"  {self.caption()}")
 
     def watch(self, event: Event) -> None:
         """Update the table of steps with the start or the end of a step."""
@@ -229,8 +245,12 @@ def forecast_line(seconds: float, steps: int, unknown: int) -> str:
     return f"time     about {lasts(seconds)}, as earlier runs took{rest}"
 
 
-def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str]:
-    """Return the lines to print after a run: steps left out, result table, gain by the mask, verdict, next commands."""
+def closing(doc: Mapping[str, Any], path: str, again: Sequence[str], took: str = "") -> list[str]:
+    """Return the lines to print after a run: steps left out, result table, gain by the mask, verdict, next commands.
+
+    ``took`` stands in place of the seconds of the document.
+    """
+    took = took or f"{doc['seconds']:.2f}"
     lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
     lines += [left_out_line(doc)] if doc["left_out"] else []
     lines += [doc["spectral"]["said"]] if doc.get("spectral") else []
@@ -238,7 +258,7 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str]) -> list[str
     lines += ["", *indented([["", *doc["table"]["columns"]], *rows])] if rows else []
     lines += [line for text in doc["table"]["legend"] for line in wrapped(text)]
     lines += story_lines(doc)
-    lines += ["", f"{doc['verdict']}  ({doc['counts']}, {doc['seconds']:.2f} s)"]
+    lines += ["", f"{doc['verdict']}  ({doc['counts']}, {took} s)"]
     lines += [
         f"  missed: {e['name']} = {e['found']:.5g}, expected {e['wanted']:.5g} ± {100 * e['rtol']:.2g} %"
         for e in doc["expected"]

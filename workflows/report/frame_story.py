@@ -7,14 +7,17 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from neusee.nodes.values import Shading
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report.figures.frame_and_interval import BRIGHT, half_width, unexplained
+from neusee.workflows.report.figures.shading_field import NORMAL
 from neusee.workflows.report.result_numbers import Value
 
 _NEEDS = ("restored", "restored_spread", "raw[mask]", "clipped[mask]")
 _FRAME = "sensor.frame"
 _WIENER = ("restore.wiener", "restore.wiener_by_field")  #: filters of which the interval is
 _MEASURED = "restore.spread_by_field"
+_SHADING = "shading"
 
 
 def said_of_frame(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, str]:
@@ -27,7 +30,10 @@ def said_of_frame(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict
     invented = clipped.any(0)
     half = half_width(spread, recipe.steps["restored_spread"].params["draws"])
     name = recipe.steps["raw[mask]"].params["file"].name
-    parts = [_invented(name, invented), _interval(half, invented), _doubtful(restored, half, invented), _limits(recipe)]
+    parts = [_invented(name, invented), _interval(half, invented), _doubtful(restored, half, invented)]
+    if _SHADING in recipe.steps and _SHADING in keys:
+        parts.append(_shading(value(_SHADING)))
+    parts.append(_limits(recipe))
     return {"frame": " ".join(part for part in parts if part)}
 
 
@@ -66,6 +72,27 @@ def _doubtful(restored: Tensor, half: Tensor, invented: Tensor) -> str:
         "this interval (red in the figure): no scene explains them, and the model does not hold there. Either "
         "light of a laser or a lamp was taken for scene, or white is set too low (frame.white). Do not trust them or "
         "their surroundings; restore=search finds lasers and removes them."
+    )
+
+
+def _shading(found: Shading) -> str:
+    """Return what the frames tell of dirt, as a smooth transmission."""
+    count = int(found.frames)
+    frames = "one frame tells" if count == 1 else f"{count} frames tell"
+    told = f"{frames} {float(found.told):.0%} of the variance of the shading"
+    width = f"±{NORMAL * float(found.deviation.median()):.2g}"
+    if not bool(found.identifiable):
+        return (
+            f"Dirt is not identifiable: {told}, and the probability that there is none is {float(found.clean):.0%}. "
+            "At least 8 different scenes, half of the variance and at most 5% are needed. "
+            f"The frame is left as it is. The logarithm of a transmission stays unknown to {width} in half of the "
+            "field; the interval of the picture includes this."
+        )
+    low, high = (float(end) for end in found.transmission.aminmax())
+    return (
+        f"The frame was divided by a transmission of {low:.2f} to {high:.2f} relative to its geometric mean, whose "
+        f"logarithm is known to {width} in half of the field: {told}. What all scenes have in common cannot be told "
+        "from dirt, nor a constant factor. Light that dirt scatters into the picture is not removed."
     )
 
 

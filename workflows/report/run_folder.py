@@ -30,6 +30,7 @@ class RunFolder:
 
     path: Path
     said: dict[str, Any] = field(default_factory=dict)  #: for the crate: command, recipe, inputs, versions, seconds
+    taken: dict[str, Path] = field(default_factory=dict)  #: by name: the stored file that was added to the folder
 
     def write(self, name: str, content: str | bytes) -> Path:
         """Write a file into the folder of a run, and return the path of the file."""
@@ -49,6 +50,7 @@ class RunFolder:
         """Add a stored file to the folder of a run as a hard link, or as a copy if the file system refuses the link."""
         path = self.path / name
         path.parent.mkdir(parents=True, exist_ok=True)
+        self.taken[name] = source
         try:
             os.link(source, path)
         except OSError:

@@ -1,13 +1,11 @@
-"""The report of a run as JSON document and as HTML page: numbers, steps, pictures and provenance.
+"""The report of a run as JSON document: numbers, steps, pictures and provenance.
 
 `document` returns JSON values, which a run stores beside the pictures as ``provenance.json``.
-`page` needs this document and the pictures only, so that `rebuild` can write the page again.
+`run_html.page` needs this document and the pictures only.
 """
 
 from __future__ import annotations
 
-import base64
-import json
 import math
 import os
 import platform
@@ -16,7 +14,6 @@ import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +29,9 @@ from neusee.workflows.report.contents import FIGURES, compared
 from neusee.workflows.report.frame_story import said_of_frame
 from neusee.workflows.report.mask_story import story
 from neusee.workflows.report.result_numbers import expected, metrics, table
-from neusee.workflows.report.run_crate import remove_crate, restore_crate
+from neusee.workflows.report.run_html import present_time
 from neusee.workflows.report.run_timing import said_of, timing
 from neusee.workflows.report.spectral_sampling import spectral_error
-from neusee.workflows.report.study_page import filled
 from neusee.workflows.report.tolerance_spent import spent
 from neusee.workflows.store.byte_sizes import format_size
 
@@ -71,7 +67,7 @@ def document(
         "title": recipe.title,
         "version": version_of("neusee"),
         "command": shlex.join(command),
-        "started": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %Z"),
+        "started": present_time(),
         "device": result.device,
         "seconds": result.seconds,
         "tolerance": recipe.tolerance,
@@ -119,27 +115,6 @@ def _comparisons(
         "expected": found,
         "unchecked": unchecked,
     }
-
-
-def page(doc: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
-    """Return the report of a run, from its document and pictures, as one HTML page that loads no other file."""
-    inline = {name: base64.b64encode(content).decode() for name, content in pictures.items()}
-    shown = {**doc, "figures": [f for f in doc["figures"] if f["name"] in inline]}
-    return filled("run_page.html.j2", doc=shown, pictures=inline)
-
-
-def rebuild(folder: Path) -> Path:
-    """Write ``report.html`` of a run again, from the document and the pictures in ``folder``, and return its path."""
-    doc = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
-    pictures = {p.stem: p.read_bytes() for p in sorted((folder / "figures").glob("*.png"))}
-    target = folder / "report.html"
-    part = folder / ".report.html.part"
-    part.write_text(page(doc, pictures), encoding="utf-8")
-    crate = remove_crate(folder)
-    part.replace(target)
-    if crate is not None:
-        restore_crate(folder, crate)
-    return target
 
 
 def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked: int = 0) -> str:

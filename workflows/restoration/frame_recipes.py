@@ -21,6 +21,7 @@ OUTPUTS = ("raw[mask]", "developed[mask]", "clipped[mask]", "restored", "restore
 PLAIN_CAMERA = "first_light"  #: recipe around a sensor file, with a plain lens
 _SCENE = ("scene", "cube")  #: steps of the groups `scene` and `lift`, which a frame does not need
 _DROPPED = ("rival", "damage", "safety")  #: groups that compare or judge a simulated laser
+_SHADING = "shading=estimated"  #: an option of which all frames together tell
 _STEM = re.compile(r"[^\w-]+")
 
 
@@ -36,7 +37,10 @@ def recipes_of(
     """
     name, base, words = _camera(camera, folder)
     words += _mask(mask, folder) + _psf(psf, changes, folder, first)
-    found, problems = list[Recipe](), dict[Diagnostic, None]()
+    frames, found, problems = list(frames), list[Recipe](), dict[Diagnostic, None]()
+    if any(change.lstrip("+") == _SHADING for change in changes):
+        quoted = ", ".join(map(_quoted, frames))
+        words = [*words, _said("frames", f"shading.frames=[{quoted}]", folder, shown_as=f"{len(frames)} frames")]
     for frame in frames:
         try:
             found.append(_one(frame, (name, base, words), changes, folder, first))

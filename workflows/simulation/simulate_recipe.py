@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from neusee.workflows.explain.why_rerun import explained
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.report import run_page, run_timing
+from neusee.workflows.report import run_html, run_page, run_timing
 from neusee.workflows.report.contents import wanted
 from neusee.workflows.report.data_exports import exports
 from neusee.workflows.report.run_code import code_text
@@ -32,10 +31,11 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 @dataclass(frozen=True)
 class Simulation:
-    """A finished run: the path of its folder, and the content of its file ``provenance.json``."""
+    """A finished run: the path of its folder, the content of its file ``provenance.json``, and its stored files."""
 
     folder: Path
     document: dict[str, Any]
+    taken: Mapping[str, Path]  #: by name in the folder: the file of the store that was added
 
     @property
     def page(self) -> Path:
@@ -72,7 +72,7 @@ def simulate(
         with limited(memory_limit(memory)), _watched(), new_run(runs, recipe.name, key) as folder:
             folder.said = {"began": began}
             doc = _write(result, folder, command, caught)
-    return Simulation(folder.path, doc)
+    return Simulation(folder.path, doc, folder.taken)
 
 
 @contextmanager
@@ -107,8 +107,8 @@ def _write(
     folder.write("recipe.yaml", recipe_text(result.recipe))
     folder.write_rows("metrics.csv", ("step", "field", "index", "value"), doc["metrics"])
     folder.write_rows("timing.csv", run_timing.COLUMNS, run_timing.rows(doc["steps"]))
-    folder.write("provenance.json", json.dumps(doc, indent=1, ensure_ascii=False, allow_nan=True))
-    folder.write("report.html", run_page.page(doc, shown))
+    folder.write("provenance.json", run_html.document_text(doc))
+    folder.write("report.html", run_html.page(doc, shown))
     return doc
 
 

@@ -11,14 +11,15 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
 import xxhash
-from torch import Tensor
 
 from neusee.workflows.keys.seal import secrets
 from neusee.workflows.store.result_store import Store
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _SHA256 = 32  #: bytes of this digest
 _FAST = xxhash.xxh3_128
@@ -34,6 +35,8 @@ class DerivedFiles:
 
     def find(self, key: str, suffix: str) -> Path | None:
         """Return the path of the derived file ``key``, or None if the file is missing or has a wrong checksum."""
+        from torch import Tensor
+
         path = self._path(key, suffix)
         with suppress(KeyError, OSError):
             if path.is_file() and self.store.has(key) and _is_right(path, self.store.get(key, Tensor)):
@@ -77,11 +80,15 @@ class DerivedFiles:
 
 def _is_right(path: Path, kept: Tensor) -> bool:
     """Return True if a file has the digest that was stored: SHA-256, or the faster xxh3 where nothing is signed."""
+    import torch
+
     signed = len(kept) == _SHA256
     return (signed or not secrets()) and torch.equal(kept, _digest(path, "sha256" if signed else _FAST))
 
 
 def _digest(path: Path, how: Any) -> Tensor:
     """Return a digest of a file as bytes."""
+    import torch
+
     with path.open("rb") as file:
         return torch.tensor(list(hashlib.file_digest(file, how).digest()), dtype=torch.uint8)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any, TypeGuard
@@ -15,6 +16,7 @@ from neusee.workflows.store.shared_folder import Disk, entries, read_file
 Metadata = dict[str, Any]
 INLINE = 4096  #: bytes of tensors up to which a result is stored inside its JSON
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, ArithmeticError, MemoryError)
+_USED = 3600.0  #: smallest time in s between two records of the use of a value
 _TOP = re.compile("[0-9a-f]{2}")
 _OF_THE_VALUE = ("layout", "payload", "tensors", "bands")
 
@@ -89,6 +91,14 @@ def has_value(disk: Disk, key: str) -> bool:
         return False
     except UNREADABLE:
         return os.path.exists(disk.path(key, "json"))
+
+
+def record_use(disk: Disk, key: str) -> None:
+    """Record the use of a value as the modification time of its JSON file, at most once an hour."""
+    path = disk.path(key, "json")
+    with suppress(OSError):
+        if abs(time.time() - os.stat(path).st_mtime) > _USED:
+            os.utime(path)
 
 
 def is_kept(about: Metadata | None) -> TypeGuard[Metadata]:

@@ -27,7 +27,7 @@ from neusee.workflows.store.environment import Verify, budget_bytes, default_roo
 from neusee.workflows.store.journal import Journal
 from neusee.workflows.store.lease import Lease, Leases
 from neusee.workflows.store.maintenance import Maintained
-from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept
+from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept, record_use
 from neusee.workflows.store.shared_folder import Disk
 from neusee.workflows.store.small_results import SmallResults
 from neusee.workflows.store.store_warnings import Warned
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from neusee.workflows.store.band_files import Blobs
-
-_USED = 3600.0  #: smallest time in s between two records of the use of a value
 
 
 class Store(Warned, Maintained):
@@ -68,6 +66,7 @@ class Store(Warned, Maintained):
         self._known: dict[str, Metadata] = {}
         self._lost: set[str] = set()  # damaged results that the user may have no permission to move
         self._used: set[str] = set()
+        self._missed: set[str] = set()
 
     def __reduce__(self) -> tuple[Any, ...]:  # another process receives the path and opens the store
         return partial(type(self), self.root, verify=self.verify, budget=self.budget), ()
@@ -100,7 +99,17 @@ class Store(Warned, Maintained):
                 self._put_aside(key, error)
         if about is not None:
             self._known[key] = about
+        else:
+            self._missed.add(key)
         return about
+
+    def asked(self) -> dict[str, Metadata | None]:
+        """Return the metadata of each result that this process asked for so far; None for one that is missing."""
+        return {**dict.fromkeys(self._missed | self._lost), **self._known}
+
+    def loaded(self) -> set[str]:
+        """Return the keys of the values that this process has loaded so far."""
+        return set(self._used)
 
     def get(self, key: str, kind: Any = Any) -> Any:
         """Return the value of ``key``; raise `KeyError` if no undamaged value is stored.
@@ -191,10 +200,7 @@ class Store(Warned, Maintained):
         """Record the use of a value as the modification time of its JSON file, at most once an hour."""
         if key not in self._used:
             self._used.add(key)
-            path = self.disk.path(key, "json")
-            with suppress(OSError):
-                if abs(time.time() - os.stat(path).st_mtime) > _USED:
-                    os.utime(path)
+            record_use(self.disk, key)
 
     def _try(self, write: Callable[..., bool], key: str, *arguments: Any) -> bool:
         """Return the result of ``write``, called again if a folder was removed; on failure, return False and warn."""

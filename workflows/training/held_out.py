@@ -133,7 +133,7 @@ class Validation:
         for i, sample in self._pictures(samples, shared, fixed):
             picture = sample.picture.to(self.device)
             truth = sample.truth.to(self.device)
-            for who, estimate in (("held_out", net(picture)), ("input", picture)):
+            for who, estimate in (("held_out", net(picture, *sample.given)), ("input", picture)):
                 found |= {f"{i} {who}_{name}": x for name, x in _quality(estimate, truth).items()}
         net.train(trains)
         names = [f"{i} {who}_{n}" for i in range(len(self.photographs)) for who in ("held_out", "input")

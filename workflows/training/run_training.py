@@ -218,7 +218,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         sample = self.seen[0]
         self.learner.net.eval()
         with torch.no_grad():
-            restored = self.learner.net(sample.picture[:1])[0].float()
+            restored = self.learner.net(sample.picture[:1], *sample.given)[0].float()
         self.learner.net.train()
         shown = strip([sample.picture[0].detach(), restored, sample.truth[0]])
         if self.board:

@@ -20,6 +20,7 @@ from neusee.nodes.restore import (
     OwnNetwork,
     Restorer,
     UNet,
+    Unrolled,
     critic_slopes,
     critics,
     own_network,
@@ -194,7 +195,7 @@ class Learner:
         low = torch.autocast(device_kind(self.device), torch.bfloat16, self.settings.precision == "bfloat16")
         picture = sample.picture if self.learns else sample.picture.detach()
         with low, self._seeded(sample):
-            coarse, fine = self.net.pyramid(picture)
+            coarse, fine = self.net.pyramid(picture, *sample.given)
         estimate = Scales(coarse.to(self.settings.dtype), fine.to(self.settings.dtype))
         y, x = sample.truth.shape[-2:]
         truth = Scales(resize(sample.truth.detach(), -(-y // 2), -(-x // 2)), sample.truth.detach())
@@ -265,4 +266,6 @@ def _backward(terms: Sequence[Tensor]) -> None:
 def _network_of(network: Network) -> Restorer:
     if network.kind == "fft_mamba":
         return FFTMamba(network.width, **network.options)
+    if network.kind == "unrolled":
+        return Unrolled(network.width, network.steps)
     return UNet(network.width) if network.kind == "unet" else NAFNet(network.width)

@@ -30,6 +30,7 @@ from neusee.workflows.training.parallel.band_shards import Shards
 from neusee.workflows.training.parallel.picture_rounds import Pictures
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
+from neusee.workflows.training.posed_pictures import Given, PosedPictures, given_of, tensors_of
 from neusee.workflows.training.stored_pool import StoredPool
 from neusee.workflows.training.training_recipe import frame_of, in_precision, require_steps
 
@@ -46,11 +47,17 @@ class Sample:
     truth: Tensor  #: (n, 3, y, x), the true picture
     light: Tensor  #: (band,), the fraction of the light of the scene that the mask keeps; empty where no loss reads it
     drawn: Mapping[str, Any]  #: the values that were sampled for the picture
+    given: Given = ()  #: what the network needs beside the picture
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """Return picture, true picture and light by name."""
-        return {"picture": self.picture, "truth": self.truth, "light": self.light}
+        """Return picture, true picture, light, and what the network needs beside the picture, by name."""
+        return {"picture": self.picture, "truth": self.truth, "light": self.light, **tensors_of(self.given)}
+
+    @classmethod
+    def of(cls, tensors: Mapping[str, Tensor], drawn: Mapping[str, Any]) -> Sample:
+        """Return the training picture whose tensors `tensors` named."""
+        return cls(tensors["picture"], tensors["truth"], tensors["light"], drawn, given_of(tensors))
 
 
 _NOTHING = Sample(torch.zeros(0), torch.zeros(0), torch.zeros(0), {})  #: of a process without a picture in a round
@@ -76,16 +83,20 @@ class TrainingStream:
         self._pool = settings.pool if frozen else None
         self._kept: dict[tuple[int, int], Sample] = {}
         self._rounds: dict[tuple[int, ...], Sample] = {}  #: by stage and numbers, of processes that divide the bands
-        outputs = (settings.picture, settings.truth, settings.light, settings.psf)
+        outputs: tuple[str, ...] = (settings.picture, settings.truth, settings.light, settings.psf)
         require_steps(recipe, "train", (*outputs, settings.scene, *([learn] if learn else [])))
         self._inputs = Inputs.of(recipe, outputs) if recipe.uncertain and recipe.uncertain.names else None
         self._mismatch = CameraMismatch.of(recipe, settings)
         self.shape = frame_of(recipe, settings.scene)
         believed = in_precision(frozen or recipe, settings.dtype)
+        self._posed = PosedPictures.of(recipe, settings)
+        if self._posed:
+            believed = self._posed.within(believed)
         stage = settings.stages.get(2 if frozen else 1)
         light = (settings.light,) if stage is not None and stage.bsr else ()  # else no loss reads it
-        recipe, self.psf = self._mismatch.camera(believed, (settings.picture, settings.truth, *light), settings.psf)
-        self._made = (settings.picture, settings.truth, *light)
+        seen = self._posed.steps if self._posed else (settings.picture,)
+        self._made = (*seen, settings.truth, *light)
+        recipe, self.psf = self._mismatch.camera(believed, self._made, settings.psf)
         outputs = (*self._made, self.psf)
         recipe = with_substitutions(recipe, outputs, {learn} if learn else ())
         order = needed(recipe, outputs)
@@ -212,8 +223,8 @@ class TrainingStream:
         if self._stored is None or stage == HELD_OUT:
             return simulated()
         given = {name: theta[name] for name in self._readers}
-        return Sample(**self._stored.picture(theta[self.settings.scene], given, noise, lambda: simulated().tensors),
-                      drawn=drawn)  # fmt: skip
+        kept = self._stored.picture(theta[self.settings.scene], given, noise, lambda: simulated().tensors)
+        return Sample.of(kept, drawn)
 
     def _drawn(self, stage: int, number: int) -> tuple[dict[str, Any], int, dict[str, Any]]:
         """Sample the random inputs of a training picture; return the inputs, the noise seed, and all values by name."""
@@ -240,11 +251,14 @@ class TrainingStream:
         Antialiased `kornia.geometry.transform.resize` lets stripes alias: at 2/3 of the size the finest stripes keep a
         contrast of 0.69 with kornia, and of 0.09 with `resize`.
         """
-        both = [values[name].to(self.settings.dtype) for name in (self.settings.picture, self.settings.truth)]
+        light = values.get(self.settings.light, torch.zeros(0))
+        dtype = self.settings.dtype
+        picture, given = self._posed.read(values, dtype) if self._posed else (values[self.settings.picture], ())
+        both = [x.to(dtype) for x in (picture, values[self.settings.truth])]
         if self.settings.size is not None:
             both = [resize(picture, *self.settings.size) for picture in both]
         picture, truth = self._patches(torch.stack(both), drawn["noise"])
-        return Sample(picture, truth, values.get(self.settings.light, torch.zeros(0)), drawn)
+        return Sample(picture, truth, light, drawn, given)
 
     def _patches(self, both: Tensor, seed: int) -> Tensor:
         """Cut patches from a training picture and the true picture at the same positions, as a tensor (2, n, 3, y, x).

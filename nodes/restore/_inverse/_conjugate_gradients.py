@@ -7,21 +7,22 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from neusee.nodes.restore._inverse._lowest_frequencies import Lowest
+from neusee.nodes.restore._inverse._lowest_frequencies import MODES, Lowest
 from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, inverse_colour, mixed, weighing
 
 LOWEST = 512  #: pixels a side, up to which each step solves the lowest frequencies exactly
 _PIECE = 2**18  #: numbers of a spectrum worked on at a time, which fit in the cache
 
 
-def descend(seen: Blurred, x: Tensor, steps: int, enough: float) -> Tensor:
+def descend(seen: Blurred, x: Tensor, steps: int, enough: float, inverse: Preconditioner | None = None) -> Tensor:
     """Improve the half spectrum `x` of a picture in place by at most `steps` conjugate-gradient steps, and return `x`.
 
     The steps end early when the squared distance from the solution, in units of the posterior, is about `enough`.
+    `inverse` is the preconditioner of the problem, where the caller has it: it depends on no pixel of the picture.
     """
     if steps < 1:
         return x
-    normal, inverse = _Normal(seen), _Inverse(seen)
+    normal, inverse = _Normal(seen), inverse or Preconditioner(seen)
     left, way, change = normal.slope(x), torch.empty_like(x), torch.empty_like(x)
     size = inverse(left, way)
     enough = max(enough, 1e-20 * float(size))
@@ -71,6 +72,7 @@ class _Normal:
         """Write the product of the normal matrix and x to `result`, and return the inner product of x and `result`."""
         self._gather(self.weigh(self._blurred(x, result)), result)
         self._finish(x, result, 1.0)
+        self._hold(x, result, 1.0)
         return inner(x, result, self.seen.torus)
 
     def slope(self, x: Tensor) -> Tensor:
@@ -78,6 +80,7 @@ class _Normal:
         result = torch.empty_like(x)
         self._gather(self.weigh(self._blurred(x, result).neg_().add_(self.seen.picture)), result)
         self._finish(x, result, -1.0)
+        self._hold(x, result, -1.0)
         return result if self.seen.pull is None else result.add_(self.seen.pull)
 
     def _blurred(self, x: Tensor, room: Tensor) -> Tensor:
@@ -93,6 +96,16 @@ class _Normal:
             self.plane[:rows, :columns] = picture
             torch.fft.rfft2(self.plane, out=result[channel])
 
+    def _hold(self, x: Tensor, result: Tensor, sign: float) -> None:
+        """Add `sign` times the precision of the further prior in the frame, times x, to `result`."""
+        if self.seen.held is None:
+            return
+        rows, columns = self.pixels.shape[-2:]
+        for channel, held in enumerate(self.seen.held):
+            corner(x[channel], self.seen.torus, self.pixels[channel])
+            self.plane[:rows, :columns] = self.pixels[channel].mul_(held)
+            result[channel].add_(torch.fft.rfft2(self.plane), alpha=sign)
+
     def _finish(self, x: Tensor, result: Tensor, sign: float) -> None:
         """Multiply `result` by the adjoint of the blur, and add `sign` times the inverse prior covariance times x."""
         own, shared = inverse_colour(len(x), self.seen.grey)
@@ -101,22 +114,24 @@ class _Normal:
             result[:, rows].mul_(self.seen.transfer[:, rows].conj()).add_(prior, alpha=sign)
 
 
-class _Inverse:
-    """The preconditioner: the inverse normal matrix of a picture without edges, exact at the lowest frequencies."""
+class Preconditioner:
+    """The inverse normal matrix of a picture without edges, made exact at the lowest frequencies."""
 
-    def __init__(self, seen: Blurred) -> None:
+    def __init__(self, seen: Blurred, modes: int = MODES) -> None:
         own, shared = inverse_colour(len(seen.picture), seen.grey)
         known = (seen.weight > 0).sum((-2, -1)).clamp_min(1)
         mean = (seen.weight.sum((-2, -1)) / known)[:, None, None]
+        held = torch.zeros_like(mean) if seen.held is None else seen.held.mean((-2, -1), keepdim=True)
         self.torus = seen.torus
         self.gain = torch.empty(seen.transfer.shape, dtype=seen.power.dtype, device=seen.power.device)
         self.shared = torch.empty_like(seen.power)
         for rows in pieces(self.gain):
             inverse = 1.0 / seen.power[rows].clamp_min(1e-30)
             through = seen.transfer[:, rows]
-            self.gain[:, rows] = 1.0 / (own * inverse + mean * (through.real.square() + through.imag.square()))
+            told = mean * (through.real.square() + through.imag.square())
+            self.gain[:, rows] = 1.0 / (own * inverse + told + held)
             self.shared[rows] = shared * inverse / (1.0 - shared * inverse * self.gain[:, rows].sum(0))
-        self.lowest = Lowest(seen, self.gain) if max(seen.picture.shape[-2:]) <= LOWEST else None
+        self.lowest = Lowest(seen, self.gain, modes) if max(seen.picture.shape[-2:]) <= LOWEST else None
 
     def __call__(self, slope: Tensor, result: Tensor) -> Tensor:
         """Write the preconditioner times the gradient to `result`, and return the inner product of the gradient and

@@ -37,7 +37,7 @@ def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH, coars
     """
     tensors = (seen.picture, seen.weight, seen.transfer, *seen.glare)
     with torch.no_grad():
-        alone = _fixed(seen)
+        alone = fixed(seen)
         lower = seen.picture.new_empty(0) if halvings(_size(seen)) else _factor(alone)
         enough = enough * float((seen.weight > 0).sum())
         if coarser or lower.numel():
@@ -49,16 +49,17 @@ def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH, coars
         return x
     rest = torch.fft.irfft2(seen.slope(x), s=seen.torus)
     frame = _Frame(seen.torus, seen.grey, steps, seen.bounded)
-    fixed = (lower, *map(Tensor.detach, (seen.weight, seen.transfer, seen.power, *seen.glare)))
-    pixels: Tensor = _Followed.apply(torch.fft.irfft2(x, s=seen.torus), rest, frame, *fixed)  # type: ignore[no-untyped-call]
+    others = (lower, *map(Tensor.detach, (seen.weight, seen.transfer, seen.power, *seen.glare)))
+    pixels: Tensor = _Followed.apply(torch.fft.irfft2(x, s=seen.torus), rest, frame, *others)  # type: ignore[no-untyped-call]
     spectrum: Tensor = torch.fft.rfft2(pixels)
     return spectrum
 
 
-def _fixed(seen: Blurred) -> Blurred:
+def fixed(seen: Blurred) -> Blurred:
     """Return the problem without gradients and tangents."""
     parts = {name: getattr(seen, name).detach() for name in ("picture", "weight", "transfer", "power")}
-    return replace(seen, **parts, glare=tuple(pattern.detach() for pattern in seen.glare))
+    held = None if seen.held is None else seen.held.detach()
+    return replace(seen, **parts, glare=tuple(pattern.detach() for pattern in seen.glare), held=held)
 
 
 class _Frame(NamedTuple):

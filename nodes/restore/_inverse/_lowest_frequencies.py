@@ -24,10 +24,10 @@ SHARE = 24  #: grid points for each unknown, at least, on a small torus
 class Lowest:
     """The inverse of the normal matrix of a blurred picture at the lowest frequencies, including the mean."""
 
-    def __init__(self, seen: Blurred, gain: Tensor) -> None:
+    def __init__(self, seen: Blurred, gain: Tensor, modes: int = MODES) -> None:
         """Build the inverse; `gain` (channel, fy, fx), an approximate inverse's diagonal, scales the normal matrix."""
         self.torus = seen.torus
-        count = min(MODES, 3 * MODES // len(seen.picture), int(math.prod(seen.torus) / SHARE))
+        count = min(modes, 3 * modes // len(seen.picture), int(math.prod(seen.torus) / SHARE))
         self.fy, self.fx = (f.to(gain.device) for f in _lowest(seen.torus, max(1, count // 2)))
         root = gain[:, self.fy, self.fx].double().sqrt()
         root[:, 0] *= 0.5**0.5  # the mean is its own mirror image
@@ -70,6 +70,9 @@ class Lowest:
         for channel, through in enumerate(transfer):
             weight = torch.fft.rfft2(seen.weight[channel].double(), s=seen.torus)
             matrix[channel, :, channel] += self._noise(weight, through)
+            if seen.held is not None:
+                held = torch.fft.rfft2(seen.held[channel].double(), s=seen.torus)
+                matrix[channel, :, channel] += self._noise(held, torch.ones_like(through))
         size = len(transfer) * len(inverse)
         return self._without_glare(matrix.view(size, size), seen, transfer)
 

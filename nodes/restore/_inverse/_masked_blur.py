@@ -31,11 +31,18 @@ class Blurred:
     glare: tuple[Tensor, ...] = ()  #: (channel, y, x) patterns of unknown strength that are added to the picture
     pull: Tensor | None = None  #: (channel, fy, fx), a further term of the log posterior's gradient
     bounded: int = 0  #: how many patterns, the last ones, have strengths of mean 0 and variance 1, not any strength
+    held: Tensor | None = None  #: (channel, y, x), precision of a further prior of x in the frame, of mean 0
 
     def blur(self, spectrum: Tensor) -> Tensor:
         """Return the blurred picture, given half the spectrum of x."""
         y, x = self.picture.shape[-2:]
         return blurred(self.transfer, spectrum, self.torus, (y, x))
+
+    def first(self, spectrum: Tensor) -> Tensor:
+        """Return the pixels of x in the frame of the picture, given half the spectrum of x."""
+        y, x = self.picture.shape[-2:]
+        parts = [torch.fft.irfft2(s, s=self.torus)[:y, :x] for s in spectrum]  # one batch takes twice as long
+        return torch.stack(parts)
 
     def gathered(self, pixels: Tensor) -> Tensor:
         """Return half the spectrum that results from the adjoint of `blur`, applied to a picture."""
@@ -46,6 +53,8 @@ class Blurred:
         own, shared = inverse_colour(len(x), self.grey)
         prior = mixed(x, own, -shared) / self.power.clamp_min(1e-30)
         rise = self.gathered(weighing(self)(self.picture - self.blur(x))) - prior
+        if self.held is not None:
+            rise = rise - torch.fft.rfft2(self.held * self.first(x), s=self.torus)
         return rise if self.pull is None else rise + self.pull
 
 

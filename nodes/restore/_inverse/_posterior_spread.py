@@ -14,7 +14,7 @@ from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred, blurred, mixed
 from neusee.nodes.restore._inverse._wiener import Doubt, Scaled, effective_psf, known_and_light, posed, wrapped
 from neusee.nodes.units import Electrons
-from neusee.nodes.values import Bands, Psf
+from neusee.nodes.values import Bands, Psf, Shading
 
 Draws = Annotated[int, Field(ge=2, le=4096)]
 
@@ -31,6 +31,8 @@ def wiener_spread(
     glare: list[Tensor] | None = None,
     nearby: list[Tensor] | None = None,
     ghosts: list[Tensor] | None = None,
+    restored: Tensor | None = None,
+    shading: Shading | None = None,
     *,
     balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     doubt: Doubt = 0.0,
@@ -46,6 +48,9 @@ def wiener_spread(
     that the errors are draws from the posterior; with `law` frame the law A / f^b of the highest Whittle likelihood for
     this frame, because a scene that is rougher than the prior is restored worse than the prior says. Clipped pixels and
     pixels beyond the edge are as unknown as in `restore.wiener`.
+
+    With ``restored``, the picture in colour, and ``shading``, by which the frame was divided, what is not known of the
+    shading counts too: its relative deviation times the picture.
 
     Shapes: as `restore.wiener`, matrix (colour, channel) -> (colour, y, x).
     Units:  those of `restore.colour`; with the unit matrix e-.
@@ -66,7 +71,14 @@ def wiener_spread(
         power = scaled.problem.power
         if law == "frame":
             power = fitted_power(scaled.problem, wrapped(kernels / scaled.share, (fine.shape[-2], fine.shape[-1])))
-    return drawn_deviation(scaled, power, matrix, draws, rng).to(single(electrons))
+    return with_shading(drawn_deviation(scaled, power, matrix, draws, rng).to(single(electrons)), restored, shading)
+
+
+def with_shading(deviation: Tensor, restored: Tensor | None, shading: Shading | None) -> Tensor:
+    """Return the deviation of a picture (colour, y, x) that includes what is not known of its shading."""
+    if restored is None or shading is None:
+        return deviation
+    return torch.hypot(deviation, (restored * shading.spread).to(deviation).abs())
 
 
 def drawn_deviation(

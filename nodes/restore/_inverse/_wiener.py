@@ -22,10 +22,8 @@ from neusee.nodes.values import Bands, Psf
 
 _FALL = 3.0  #: the power spectrum of pictures falls with frequency to this power, like that of edges
 _NO_LIGHT = 1e-12  #: share of the light below which a PSF counts as one without light
-_GREY = 0.95  #: correlation between the channels of pictures
-_PRECISE = (
-    256  #: pixels a side, up to which all is computed in float64: the dense float64 algebra takes most time there
-)
+GREY = 0.95  #: correlation between the channels of pictures
+PRECISE = 256  #: pixels a side, up to which all is computed in float64: the dense float64 algebra takes most time there
 _LIGHT = 0.999  #: share of the light that the unknown border around the picture is wide enough for
 
 
@@ -84,10 +82,9 @@ def wiener(
     Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; as least squares with a
             prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.
     """
-    pictures = single(electrons), clipped, glare, nearby, ghosts
-    fine, known, light = known_and_light(psf, responses, *pictures)
-    kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
-    return _restored(fine, known, kernels, light, (balance, read_noise, doubt), coarser_grids).to(pictures[0])
+    electrons, light = single(electrons), (glare, nearby, ghosts)
+    scaled = pose(electrons, psf, illuminant, responses, bands, clipped, *light, (balance, read_noise, doubt))
+    return (scaled.pixels(most_likely(scaled.problem, coarser=coarser_grids)) + scaled.mean).to(electrons)
 
 
 def known_and_light(
@@ -106,7 +103,7 @@ def known_and_light(
     refuse_other_pictures(electrons, psf, responses, clipped, [*(glare or ()), *(nearby or ()), *(ghosts or ())])
     _refuse_other_glare(glare or [], nearby)
     size = (electrons.shape[-2], electrons.shape[-1])
-    fine = electrons.double() if max(size) <= _PRECISE else electrons
+    fine = electrons.double() if max(size) <= PRECISE else electrons
     patterns, others, ghostly = ([crop(x.to(fine), shape=size) for x in g or ()] for g in (glare, nearby, ghosts))
     known = (~clipped).to(fine)
     return (
@@ -186,25 +183,29 @@ class Scaled(NamedTuple):
     scale: Tensor  #: (channel, 1, 1)
     mean: Tensor  #: (channel, 1, 1), of the scene
     share: Tensor  #: (channel, 1, 1), powers of two by which the PSF was divided
+    kernels: Tensor  #: (channel, any, any), the PSF of each channel, divided by ``share``
 
     def pixels(self, spectrum: Tensor) -> Tensor:
         """Return the contrast of a scene in e-, given its spectrum."""
-        y, x = self.problem.picture.shape[-2:]
-        parts = [torch.fft.irfft2(s, s=self.problem.torus)[:y, :x] for s in spectrum]  # one batch takes twice as long
-        return torch.stack(parts) * self.scale / self.share
+        return self.problem.first(spectrum) * self.scale / self.share
 
 
-def _restored(
+def pose(
     electrons: Tensor,
-    known: Tensor,
-    kernels: Tensor,
-    glare: Glare,
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    clipped: Tensor,
+    glare: list[Tensor] | None,
+    nearby: list[Tensor] | None,
+    ghosts: list[Tensor] | None,
     settings: Settings,
-    coarser: bool,
-) -> Tensor:
-    """Deconvolve a picture: scale the scene to mean 0 and variance 1, solve this problem, and scale the result back."""
-    scaled = posed(electrons, known, kernels, glare, settings)
-    return scaled.pixels(most_likely(scaled.problem, coarser=coarser)) + scaled.mean
+) -> Scaled:
+    """Return the inputs of `wiener` as a linear problem, unsolved; ``settings`` are balance, read noise and doubt."""
+    fine, known, light = known_and_light(psf, responses, electrons, clipped, glare, nearby, ghosts)
+    kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
+    return posed(fine, known, kernels, light, settings)
 
 
 def posed(electrons: Tensor, known: Tensor, kernels: Tensor, glare: Glare, settings: Settings) -> Scaled:
@@ -233,8 +234,8 @@ def posed(electrons: Tensor, known: Tensor, kernels: Tensor, glare: Glare, setti
     weight = known * (scale / noise.sqrt()).square()
     scaled = tuple(pattern / scale for pattern in (*glare.patterns, *light.modes))
     centred = (picture - mean) / scale
-    problem = Blurred(centred, weight, transfer, power, size, _GREY, scaled, bounded=len(light.modes))
-    return Scaled(problem, scale, mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None] / share, share)
+    problem = Blurred(centred, weight, transfer, power, size, GREY, scaled, bounded=len(light.modes))
+    return Scaled(problem, scale, mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None] / share, share, kernels)
 
 
 def _power_of_two(x: Tensor) -> Tensor:

@@ -9,12 +9,12 @@ from torch.nn import functional as F
 from neusee.nodes import node
 from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.restore._networks._mamba_blocks import Block, Directions, Form
-from neusee.nodes.restore._networks._restorer import Restorer, Tile, fitting, restored, restorer_checks
+from neusee.nodes.restore._networks._restorer import PictureRestorer, Tile, fitting, restored, restorer_checks
 from neusee.nodes.restore._networks._scan_layer import Kind
 from neusee.nodes.units import Count, DataFile
 
 
-class FFTMamba(Restorer):
+class FFTMamba(PictureRestorer):
     """The FFT-Mamba network, whose blocks scan rows and columns in turn, with the same weights at half and full size.
 
     The first pass computes a coarse estimate, from which the second pass computes a fine estimate. With ``directions``

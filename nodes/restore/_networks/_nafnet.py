@@ -34,11 +34,13 @@ class NAFBlock(nn.Module):
 class NAFNet(Flat):
     """A network whose encoder levels halve the size and double the channels, with skips to a mirrored decoder."""
 
-    def __init__(self, width: int = 16, levels: Sequence[int] = (1, 1, 2, 4), middle: int = 2) -> None:
+    def __init__(
+        self, width: int = 16, levels: Sequence[int] = (1, 1, 2, 4), middle: int = 2, inputs: int = 3, outputs: int = 3
+    ) -> None:
         super().__init__()
         self.multiple = 2 ** len(levels)
         widths = [width * 2**i for i in range(len(levels))]
-        self.enter, self.last = nn.Conv2d(3, width, 3, padding=1), nn.Conv2d(width, 3, 3, padding=1)
+        self.enter, self.last = nn.Conv2d(inputs, width, 3, padding=1), nn.Conv2d(width, outputs, 3, padding=1)
         self.down = nn.ModuleList(_blocks(c, n) for c, n in zip(widths, levels, strict=True))
         self.shrink = nn.ModuleList(nn.Conv2d(c, 2 * c, 2, 2) for c in widths)
         self.middle = _blocks(2 * widths[-1], middle)

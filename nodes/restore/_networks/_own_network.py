@@ -18,7 +18,7 @@ from neusee.nodes._mirror_padding import mirrored
 from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.exact_convolution import exact_convolutions
 from neusee.nodes.network_classes import Architecture
-from neusee.nodes.restore._networks._restorer import Restorer
+from neusee.nodes.restore._networks._restorer import PictureRestorer
 
 _DRAWING = threading.Lock()  #: one thread at a time seeds the random numbers of the process
 _LEAST = 32  #: pixels of the smaller side of the picture on which a network is tried, at least
@@ -33,7 +33,7 @@ class Trial(NamedTuple):
     memory: float  #: bytes of all inner results for each pixel
 
 
-class OwnNetwork(Restorer):
+class OwnNetwork(PictureRestorer):
     """A network of a user as a restorer: sides are padded to a multiple, and wrong results raise a named error."""
 
     def __init__(self, inner: nn.Module, name: str, multiple: int, options: Mapping[str, Any]) -> None:
@@ -52,7 +52,7 @@ class OwnNetwork(Restorer):
         y, x = fine.shape[-2:]
         return resize(fine, -(-y // 2), -(-x // 2)), fine
 
-    def forward(self, picture: Tensor) -> Tensor:
+    def forward(self, picture: Tensor, *given: Any) -> Tensor:
         y, x = picture.shape[-2:]
         return self.called(mirrored(picture, -y % self.multiple, -x % self.multiple))[..., :y, :x]
 

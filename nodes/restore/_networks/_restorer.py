@@ -29,23 +29,23 @@ LAYERS = (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)
 
 
 class Restorer(nn.Module, ABC):
-    """A network that restores pictures (n, 3, y, x) of any size at two scales, a coarse and a fine scale."""
+    """A network that restores pictures (n, 3, y, x) of any size at two scales, a coarse and a fine scale.
+
+    ``given`` is what a network needs of a picture beside its pixels; most networks need nothing.
+    """
 
     multiple: int  #: divisor of the height and width inside the network
-    last: nn.Conv2d  #: layer that computes the change that is added to the picture
 
     @abstractmethod
-    def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the restored picture at half and full size, for a picture whose sides are multiples of `multiple`."""
-
-    def pyramid(self, picture: Tensor) -> tuple[Tensor, Tensor]:
+    def pyramid(self, picture: Tensor, *given: Any) -> tuple[Tensor, Tensor]:
         """Return the restored picture at half the size, rounded up, and at the full size."""
-        y, x = picture.shape[-2:]
-        coarse, fine = self.scales(mirrored(picture, -y % self.multiple, -x % self.multiple))
-        return coarse[..., : -(-y // 2), : -(-x // 2)], fine[..., :y, :x]
 
-    def forward(self, picture: Tensor) -> Tensor:
-        return self.pyramid(picture)[1]
+    def forward(self, picture: Tensor, *given: Any) -> Tensor:
+        return self.pyramid(picture, *given)[1]
+
+    @abstractmethod
+    def begin(self) -> None:
+        """Change the drawn weights so that the network at first returns almost the same picture."""
 
     @property
     def stored(self) -> nn.Module:
@@ -53,7 +53,25 @@ class Restorer(nn.Module, ABC):
         return self
 
 
-class Flat(Restorer):
+class PictureRestorer(Restorer):
+    """A restoring network that sees nothing but the picture."""
+
+    last: nn.Conv2d  #: layer that computes the change that is added to the picture
+
+    @abstractmethod
+    def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the restored picture at half and full size, for a picture whose sides are multiples of `multiple`."""
+
+    def pyramid(self, picture: Tensor, *given: Any) -> tuple[Tensor, Tensor]:
+        y, x = picture.shape[-2:]
+        coarse, fine = self.scales(mirrored(picture, -y % self.multiple, -x % self.multiple))
+        return coarse[..., : -(-y // 2), : -(-x // 2)], fine[..., :y, :x]
+
+    def begin(self) -> None:
+        self.last.weight.mul_(0.1)
+
+
+class Flat(PictureRestorer):
     """A restoring network that works at full size only; its coarse estimate is the reduced fine estimate."""
 
     @abstractmethod
@@ -90,8 +108,8 @@ def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
     """Return a network with initial values: random orthogonal weights and zero biases of linear and convolution layers.
 
     Norms, decays and factors have rules of their own. The weights of a network with leaky layers are multiplied by its
-    `gain`, which keeps the power from layer to layer. The change to a picture is multiplied by a tenth, so that the
-    network at first returns almost the same picture.
+    `gain`, which keeps the power from layer to layer. `Restorer.begin` makes the change to a picture small, so that
+    the network at first returns almost the same picture.
     """
     net = empty(make).to_empty(device=rng.device)
     gain = getattr(net, "gain", 1.0)
@@ -106,7 +124,7 @@ def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
             elif callable(start := getattr(part, "start", None)):
                 start(rng)
         if isinstance(net, Restorer):
-            net.last.weight.mul_(0.1)
+            net.begin()
     return net
 
 

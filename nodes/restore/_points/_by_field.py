@@ -13,11 +13,11 @@ from torch import Generator, Tensor
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.restore._inverse._frame_spectrum import fitted_power
-from neusee.nodes.restore._inverse._posterior_spread import Draws, drawn_deviation
+from neusee.nodes.restore._inverse._posterior_spread import Draws, drawn_deviation, with_shading
 from neusee.nodes.restore._inverse._wiener import edge, known_and_light, posed, wiener, wrapped
 from neusee.nodes.restore._points._point_model import hats
 from neusee.nodes.units import Electrons
-from neusee.nodes.values import Bands, MeasuredPsf, Psf
+from neusee.nodes.values import Bands, MeasuredPsf, Psf, Shading
 
 Balance = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -52,13 +52,14 @@ def wiener_by_field(
 
 @node()
 def spread_by_field(
-    electrons: Tensor, measured: MeasuredPsf, clipped: Tensor, matrix: Tensor, *, balance: Balance = 1.0,
-    draws: Draws = 8, read_noise: Electrons, rng: Generator,
+    electrons: Tensor, measured: MeasuredPsf, clipped: Tensor, matrix: Tensor, restored: Tensor | None = None,
+    shading: Shading | None = None, *, balance: Balance = 1.0, draws: Draws = 8, read_noise: Electrons, rng: Generator,
 ) -> Tensor:  # fmt: skip
     """Compute the standard deviation of each pixel of `restore.wiener_by_field`, the error of the PSF included.
 
     As `restore.wiener_spread` with the law `frame`, around each node. Each drawn scene is blurred with a PSF drawn from
     the measurement, and restored with the mean PSF: noise, the lost detail and the error of the PSF enter together.
+    ``restored`` and ``shading`` count as in `restore.wiener_spread`.
 
     Shapes: as `restore.wiener_by_field`, matrix (colour, channel) -> (colour, y, x).
     Units:  those of `restore.colour`.
@@ -81,7 +82,7 @@ def spread_by_field(
             power = fitted_power(scaled.problem, wrapped(kernels / scaled.share, size))
         found = drawn_deviation(scaled, power, matrix, draws, rng, part.draws)
         total[:, part.rows, part.columns] += part.weight.to(total) * found.to(total)
-    return total
+    return with_shading(total, restored, shading)
 
 
 @wiener_by_field.check

@@ -1,4 +1,4 @@
-"""`neusee safety` in processes of its own: the repeated command imports no torch, and says and writes the same."""
+"""Commands in processes of their own: the repeated command imports no torch, and says and writes the same."""
 
 import json
 import os
@@ -15,7 +15,7 @@ import sys
 
 class Refuse:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in ("torch", "numpy", "pydantic", "ruamel", "typer", "jinja2", "rich"):
+        if name.partition(".")[0] in ("torch", "numpy", "pydantic", "ruamel", "typer", "rich"):
             raise RuntimeError(f"{name} is imported")
 
 sys.meta_path.insert(0, Refuse())
@@ -47,6 +47,16 @@ class Terminal:
 @pytest.fixture
 def neusee(tmp_path):
     return Terminal(tmp_path)
+
+
+RUN = """# A frame that a user took.
+steps:
+  frame:
+    node: scene.photograph
+    with: {file: frame.png, shape: "${size.shape}"}
+size: {shape: [16, 16]}
+outputs: [frame]
+"""
 
 
 def refuses(done):
@@ -100,3 +110,99 @@ def test_a_recipe_with_a_mistake_or_code_of_its_own_has_no_stored_answer(neusee)
     (neusee.folder / "sensor").mkdir()
     (neusee.folder / "sensor" / "neusee.yaml").write_text((ROOT / "recipes/sensor/neusee.yaml").read_text())
     assert refuses(neusee("config", "first_light", light=True))
+
+
+def picture(neusee, level):
+    from PIL import Image
+
+    Image.new("RGB", (24, 20), (level, 90, 30)).save(neusee.folder / "frame.png")
+
+
+@pytest.mark.slow
+def test_a_run_from_the_cache_is_given_again_until_anything_changes(neusee):
+    (neusee.folder / "mine.yaml").write_text(f"{RUN}defaults: [size: small]\n".replace("size: {shape: [16, 16]}\n", ""))
+    (neusee.folder / "size").mkdir()
+    (neusee.folder / "size" / "small.yaml").write_text("size: {shape: [16, 16]}\n")
+    picture(neusee, 200)
+    words = ("run", "mine.yaml")
+
+    def kept(*words):
+        """Return the answer without torch, after the runs that compute, load and keep."""
+        done = [neusee(*words) for _ in range(2)]
+        assert [each[0] for each in done] == [0, 0], done
+        again = neusee(*words, light=True)
+        assert again[0] == 0, again
+        assert again[2] == ""
+        seconds = re.compile(r"[0-9.]+ s\)")
+        assert seconds.sub("", plain(again[1])) == seconds.sub("", plain(done[1][1]))
+        return json.loads((neusee.folder / "runs/latest/provenance.json").read_text())
+
+    assert refuses(neusee(*words, light=True)), "nothing is computed yet"
+    assert neusee(*words)[0] == 0
+    assert refuses(neusee(*words, light=True)), "the first run has computed its step"
+    first = kept(*words)
+    assert first["counts"] == "1 cached"
+    assert refuses(neusee(*words, "--json", light=True))
+    assert refuses(neusee(*words, "size.shape=[8, 8]", light=True))
+    other = kept(*words, "size.shape=[8, 8]")
+    assert other["steps"][0]["key"] != first["steps"][0]["key"]
+    changes = {
+        "a frame": lambda: picture(neusee, 201),
+        "an option": lambda: (neusee.folder / "size/small.yaml").write_text("size: {shape: [16, 14]}\n"),
+        "the recipe": lambda: (neusee.folder / "mine.yaml").write_text(
+            f"{RUN}seed: 3\n".replace("16, 16", "16, 12"),
+        ),
+        "the environment": lambda: neusee.env.update(NEUSEE_CACHE_VERIFY="sampled"),
+        "a module that hides a package": lambda: (neusee.folder / "scipy.py").write_text("x = 1\n"),
+    }
+    seen = {first["steps"][0]["key"]}
+    for name, change in changes.items():
+        change()
+        assert refuses(neusee(*words, light=True)), name
+        if name == "a module that hides a package":
+            break
+        seen.add(kept(*words)["steps"][0]["key"])
+    assert len(seen) == 4, "frame, option and recipe each give another result; the environment does not"
+
+
+@pytest.mark.slow
+def test_a_run_with_a_node_of_the_user_is_never_given_again(neusee):
+    (neusee.folder / "helper.py").write_text("factor = 2\n")
+    (neusee.folder / "mine.py").write_text(
+        "import torch\nfrom neusee.nodes import node\nfrom helper import factor\n\n"
+        "@node()\ndef made(*, x: float) -> torch.Tensor:\n    return torch.tensor(x * factor)\n"
+    )
+    (neusee.folder / "mine.yaml").write_text(
+        "steps:\n  made: {node: mine.made, with: {x: 3.0}}\noutputs: [made]\nnodes: [mine.py]\n"
+    )
+    for _ in range(2):
+        done = neusee("run", "mine.yaml")
+        assert done[0] == 0, done
+    assert refuses(neusee("run", "mine.yaml", light=True))
+    assert not (neusee.cache / "answers").exists()
+
+
+@pytest.mark.slow
+def test_plan_and_why_are_given_again_until_the_cache_says_something_else(neusee):
+    (neusee.folder / "mine.yaml").write_text(RUN.replace("16, 16", "48, 48"))  # large enough for a file of its own
+    picture(neusee, 200)
+    plan, why = ("plan", "mine.yaml"), ("why", "frame", "mine.yaml")
+    assert neusee(*plan)[0] == 0
+    assert refuses(neusee(*plan, light=True)), "a step would run, and its time and the free memory count"
+    assert neusee("run", "mine.yaml")[0] == 0
+    for words in (plan, why, (*plan, "--json")):
+        first = neusee(*words)
+        assert first[0] == 0, first
+        assert neusee(*words, light=True) == first
+    assert "0 of 1 steps would run" in neusee(*plan, light=True)[1]
+    assert neusee("run", "mine.yaml", "size.shape=[8, 8]")[0] == 0
+    assert refuses(neusee(*why, light=True)), "the journal has one more result, with which this one is compared"
+    for words in (plan, why):
+        assert neusee(*words)[0] == 0
+    key = json.loads((neusee.folder / "runs/latest/provenance.json").read_text())["steps"][0]["key"]
+    (neusee.cache / key[:2] / f"{key}.json").unlink()
+    assert neusee(*plan, light=True)[0] == 0, "another result is gone"
+    for each in neusee.cache.glob("??/*.safetensors"):
+        each.unlink()
+    for words in (plan, why):
+        assert refuses(neusee(*words, light=True)), "the value is gone"

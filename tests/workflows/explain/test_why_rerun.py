@@ -10,10 +10,11 @@ import pytest
 import neusee.nodes
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.runner import run
-from neusee.workflows.explain import change_causes, why_rerun
+from neusee.workflows.explain import change_causes, stored_origin, why_rerun
 from neusee.workflows.explain.change_causes import Comparison, Pair
 from neusee.workflows.explain.code_changes import edits
-from neusee.workflows.explain.why_rerun import explained, why_key_lines, why_lines
+from neusee.workflows.explain.stored_origin import why_key_lines
+from neusee.workflows.explain.why_rerun import explained, why_lines
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.keys.code_digest import Code
@@ -448,7 +449,7 @@ def test_a_run_tells_every_step_s_own_cause(trial):
 
 def test_a_cached_run_looks_nothing_up(trial, monkeypatch):
     trial.run()
-    monkeypatch.setattr(why_rerun, "_rows", lambda *a: pytest.fail("looked at earlier results"))
+    monkeypatch.setattr(why_rerun, "rows_of", lambda *a: pytest.fail("looked at earlier results"))
     assert trial.told() == {}
 
 
@@ -553,7 +554,7 @@ def test_a_chain_of_ten_thousand_steps_is_walked_without_recursion(tmp_path, toy
     assert list(roots.found) == ["amount 1 -> 2 (default of toy.add)"]
     names = roots.chain("amount 1 -> 2 (default of toy.add)")
     assert (len(names), names[0], names[-1]) == (length, last, "s0")
-    assert why_rerun._chain(names) == f"{last} <- s9998 <- s9997 <- s9996 <- (9995 more) <- s0"
+    assert stored_origin._chain(names) == f"{last} <- s9998 <- s9997 <- s9996 <- (9995 more) <- s0"
 
 
 def test_results_that_are_gone_are_said_to_be(tmp_path, toy):
@@ -597,4 +598,4 @@ def test_a_packaged_recipe_s_changes_are_told_in_its_own_words(tmp_path, change)
     shelf.abouts = {key: {"step": before.makers[key], "origin": origin} for key, origin in before.origins.items()}
     after = resolve(other, needed(other, [step]), shelf)
     roots = Comparison(shelf, other, after).roots(Pair(step, after.keys[step], before.keys[step]))
-    assert [f"{why_rerun._chain(roots.chain(text))}: {text}" for text in roots.found] == [said]
+    assert [f"{stored_origin._chain(roots.chain(text))}: {text}" for text in roots.found] == [said]

@@ -10,7 +10,7 @@ import torch
 
 from neusee.nodes.values import Bands
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.report import console, mask_story, run_page
+from neusee.workflows.report import console, mask_story, run_html
 from neusee.workflows.report.contents import wanted
 from neusee.workflows.report.mask_story import sentences
 
@@ -235,14 +235,14 @@ def test_the_terminal_ends_with_the_story_no_wider_than_it_is(document, monkeypa
 
 def test_the_page_leads_with_the_pictures_and_the_story(document):
     document["figures"] = [{"name": "overview", "title": "What the camera sees", "caption": "Pictures."}]
-    page = run_page.page(document, {"overview": b"png"})
+    page = run_html.page(document, {"overview": b"png"})
     places = [
         page.index(text) for text in (*document["story"].values(), 'alt="What the camera', "Right.", 'id="notes"')
     ]
     assert places == sorted(places)
-    wrong = run_page.page(document | {"failed": ["a check"]}, {"overview": b"png"})
+    wrong = run_html.page(document | {"failed": ["a check"]}, {"overview": b"png"})
     assert wrong.index("Right.") < wrong.index(document["story"]["buys"])
-    assert "What the camera sees" not in run_page.page(document | {"story": {}}, {})
+    assert "What the camera sees" not in run_html.page(document | {"story": {}}, {})
 
 
 def test_the_rival_of_a_mask_is_the_grey_filter_of_its_least_suppressed_laser():

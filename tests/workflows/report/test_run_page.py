@@ -15,7 +15,7 @@ from neusee.nodes import Check, node
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
-from neusee.workflows.report import result_numbers, run_folder, run_page, run_pictures, run_timing
+from neusee.workflows.report import result_numbers, run_folder, run_html, run_page, run_pictures, run_timing
 from neusee.workflows.report.figures import gantt
 from neusee.workflows.report.run_folder import find_run, new_run
 from neusee.workflows.simulation.simulate_recipe import simulate
@@ -179,7 +179,7 @@ def test_every_table_scrolls_within_its_box(done):
 def test_sentences_have_room_beside_wide_columns_and_show_no_backticks(done):
     doc = {**done.document, "readings": [{"name": "a", "value": "b", "state": "c", "matter": "of `d`", "number": "C1",
                                           "reason": "`e` < f"}]}  # fmt: skip
-    text = run_page.page(doc, {})
+    text = run_html.page(doc, {})
     assert '<th class="why">contradiction in the paper</th><th class="why">why</th>' in text
     assert re.search(r"\.why \{ min-width: \d+rem; \}", text)
     assert "<td>of <code>d</code> (C1)</td><td><code>e</code> &lt; f</td>" in text
@@ -198,14 +198,14 @@ def test_a_section_without_a_figure_is_left_out_and_its_reason_is_a_note(done):
 def test_a_reason_and_a_check_share_a_column_that_wraps(done):
     step = {**done.document["steps"][0], "state": "left out", "why": "changes at most 0", "checks": [{"text": "a < b",
             "ok": True}]}  # fmt: skip
-    text = run_page.page({**done.document, "steps": [step]}, {})
+    text = run_html.page({**done.document, "steps": [step]}, {})
     assert '<td class="check"><span class="soft">changes at most 0</span>; <span>a &lt; b</span></td>' in text
     assert "nowrap" not in re.search(r"td\.check \{(.*?)\}", text)[1]
 
 
 def test_a_short_time_is_not_shown_as_none(done):
     steps = [{**done.document["steps"][0], "made_in": seconds} for seconds in (0.0004, 0.0006, 0.0)]
-    text = run_page.page({**done.document, "steps": steps}, {})
+    text = run_html.page({**done.document, "steps": steps}, {})
     cells = re.findall(r"</td><td class=\"n\">(&lt; 0.001|[\d.]+)(?:<br>.*?)?</td><td>2 DN", text)
     assert cells == ["&lt; 0.001", "0.001", "0.000"]
 
@@ -284,7 +284,7 @@ def test_a_missed_number_and_a_failed_check_stand_first(tmp_path):
 def test_the_page_can_be_written_again_from_what_is_stored(done):
     before = done.page.read_bytes()
     done.page.unlink()
-    assert run_page.rebuild(done.folder).read_bytes() == before
+    assert run_html.rebuild(done.folder).read_bytes() == before
 
 
 def test_a_second_run_reads_the_same_numbers_and_says_where_they_come_from(done, tmp_path):
@@ -388,7 +388,7 @@ def test_a_page_of_before_there_was_an_account_of_time_is_still_written(done):
     del doc["timing"]
     doc["steps"] = [{k: v for k, v in s.items() if k != "predicted"} for s in doc["steps"]]
     path.write_text(json.dumps(doc))
-    page = run_page.rebuild(done.folder)
+    page = run_html.rebuild(done.folder)
     assert "Time" in page.read_text()
     (entry,) = [e for e in json.loads((done.folder / "ro-crate-metadata.json").read_text())["@graph"]
                 if e["@id"] == "report.html"]  # fmt: skip
@@ -400,7 +400,7 @@ def test_the_page_shows_what_each_step_was_expected_to_take(done):
     assert text.count(" expected</span>") == sum(s["predicted"] is not None for s in done.document["steps"])
     doc = dict(done.document)
     doc["steps"] = [{**s, "predicted": 1.25} for s in doc["steps"]]
-    assert run_page.page(doc, {}).count("1.250 expected</span>") == 2
+    assert run_html.page(doc, {}).count("1.250 expected</span>") == 2
 
 
 def test_every_row_of_the_page_has_a_cell_for_each_column(done):

@@ -4,7 +4,7 @@ import pytest
 
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.report import contents, run_page
+from neusee.workflows.report import contents, run_html, run_page
 from neusee.workflows.report.console import closing
 from neusee.workflows.report.spectral_sampling import spectral_error
 from neusee.workflows.store.result_store import Store
@@ -33,7 +33,7 @@ def test_an_error_larger_than_the_tolerance_is_a_warning(store):
     line = next(line for line in closing(doc, "report.html", []) if line.startswith("bands"))
     assert f"LOOK: error by the number of bands: {errors['of the PSF of a white point']:.1e} of the PSF" in line
     assert "larger than the tolerance 0.001, which is relative to the bands of the recipe" in line
-    assert "This error is larger than the tolerance of 0.001" in run_page.page(doc, {})
+    assert "This error is larger than the tolerance of 0.001" in run_html.page(doc, {})
     rows = {(step, index): number for step, _, index, number in doc["metrics"]}
     assert max(rows["spectral", i] for i in range(3)) == errors["of the PSF of a white point"]
     assert rows["outside[mask]", 0] > rows["outside[plain]", 0] > 0
@@ -48,7 +48,7 @@ def test_a_smaller_error_is_a_number_beside_the_tolerance(store):
     line = next(line for line in closing(doc, "report.html", []) if line.startswith("bands"))
     assert "LOOK" not in line
     assert "tolerance 5, which is relative to the bands" in line
-    assert "larger than the tolerance" not in run_page.page(doc, {})
+    assert "larger than the tolerance" not in run_html.page(doc, {})
 
 
 def test_a_recipe_without_these_steps_says_nothing():

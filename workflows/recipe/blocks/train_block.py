@@ -33,12 +33,13 @@ _OF_CLASS = ("architecture", "parameters", "multiple")  #: settings of a network
 class Network(SettingsBlock):
     """Settings of the restoration network: its kind, width and options."""
 
-    kind: Literal["fft_mamba", "unet", "nafnet"] = "fft_mamba"
+    kind: Literal["fft_mamba", "unet", "nafnet", "unrolled"] = "fft_mamba"
     width: Annotated[int, Field(ge=2)] = 64
     shuffle: Annotated[int, Field(ge=1, le=8)] = 2  #: of fft_mamba: pixels along an axis that are scanned as one
     directions: Literal[2, 4] = 2  #: of fft_mamba, like the next two
     pyramid: bool = False
     frequency: Literal["complex", "amp_phase"] = "complex"
+    steps: Annotated[int, Field(ge=1, le=16)] = 2  #: of unrolled: steps of filter and network
     architecture: NetworkClass | None = None  #: a class of the user, in place of a kind and its options
     parameters: dict[str, Any] | None = None  #: arguments of this class
     multiple: Annotated[int, Field(ge=1, le=1024)] | None = None  #: of this class: divisor of the sides of a picture
@@ -50,8 +51,11 @@ class Network(SettingsBlock):
 
     @model_validator(mode="after")
     def _fits(self) -> Network:
-        if self.architecture is None and self.options and self.kind != "fft_mamba":
-            raise ValueError(f"{', '.join(self.options)}: only the network fft_mamba has such options, not {self.kind}")
+        owners = {name: "unrolled" if name == "steps" else "fft_mamba" for name in self.options}
+        wrong = {name: owner for name, owner in owners.items() if owner != self.kind}
+        if self.architecture is None and wrong:
+            owner = next(iter(wrong.values()))
+            raise ValueError(f"{', '.join(wrong)}: only the network {owner} has such options, not {self.kind}")
         return self
 
 
@@ -150,6 +154,21 @@ class Training(SettingsBlock):
         if self.export and self.network.architecture is None and self.network.kind == "fft_mamba":
             text = "export: the scan of fft_mamba is in no graph of torch.export or ONNX"
             raise ValueError(f"{text}: train network.kind: nafnet or unet, or a class of your own")
+        return self
+
+    @model_validator(mode="after")
+    def _unrolls(self) -> Training:
+        if self.network.architecture is not None or self.network.kind != "unrolled":
+            return self
+        if self.export:
+            raise ValueError("export: the filter within the network unrolled is in no graph of torch.export or ONNX")
+        given = {"learn": self.learn, "size": self.size, "patch": self.patch}
+        if self.augment.pooled != "none":
+            given["augment.pooled"] = "none"
+        wrong = next((name for name, value in given.items() if value is not None), None)
+        if wrong:
+            text = "the network unrolled restores a whole picture behind a fixed mask"
+            raise ValueError(f"{wrong}: {text}: write {wrong}: {given[wrong] if wrong == 'augment.pooled' else 'null'}")
         return self
 
     @model_validator(mode="after")

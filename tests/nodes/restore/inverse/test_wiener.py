@@ -140,7 +140,7 @@ def test_of_measured_colours_no_other_correlation_of_channels_tells_more_of_a_hi
     errors, tried = {}, [0.0, 0.3, 0.6, 0.8, 0.99]
     for grey in ["as shipped", *tried]:
         if grey in tried:
-            monkeypatch.setattr(_wiener, "_GREY", grey)
+            monkeypatch.setattr(_wiener, "GREY", grey)
         apart = []
         for n, picture in enumerate(photographs(6)):
             hidden = torch.zeros(picture.shape, dtype=torch.bool)

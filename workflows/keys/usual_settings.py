@@ -1,0 +1,14 @@
+"""Settings of a new process, from which `process_settings.settings` tells the differences; torch is not needed."""
+
+from __future__ import annotations
+
+#: settings of a new process
+USUAL = {
+    "default dtype": "torch.float32",
+    "default device": "cpu",
+    "matmul precision": "highest",
+    "TF32": "True",
+    "autocast": "off",
+    "numbers below 1e-308": "kept",
+    "assert statements": "run",
+}
