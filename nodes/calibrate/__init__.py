@@ -2,7 +2,7 @@
 
 from neusee.nodes.calibrate import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
-from neusee.nodes.calibrate._frames._emva_descriptor import descriptor
+from neusee.nodes.calibrate._frames._emva_descriptor import descriptor, descriptor_frames
 from neusee.nodes.calibrate._frames._frame_statistics import levels, reduce
 from neusee.nodes.calibrate._frames._level_frames import frames
 from neusee.nodes.calibrate._frames._moment_table import table
@@ -18,6 +18,9 @@ from neusee.nodes.calibrate._prior._sensor_prior import NAMES, Coordinates, prio
 from neusee.nodes.calibrate._scatter._point_source import Rings, point_source
 from neusee.nodes.calibrate._scatter._scatter_likelihood import guess_scatter, stray_light
 from neusee.nodes.calibrate._scatter._scatter_prior import SCATTER_NAMES, ScatterCoordinates, stray_prior
+from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Stack
+from neusee.nodes.calibrate._validity._inspection import inspect_frames
+from neusee.nodes.calibrate._validity._number_tests import coarse
 
 __all__ = [
     "CAMERA_NAMES",
@@ -25,22 +28,27 @@ __all__ = [
     "SCATTER_NAMES",
     "CameraCoordinates",
     "Coordinates",
+    "FrameTest",
     "LeastSquares",
     "Likelihood",
     "Prior",
     "Ridge",
     "Rings",
     "ScatterCoordinates",
+    "Stack",
     "Sufficient",
     "camera",
     "camera_prior",
+    "coarse",
     "density",
     "descriptor",
+    "descriptor_frames",
     "expose",
     "frames",
     "guess",
     "guess_camera",
     "guess_scatter",
+    "inspect_frames",
     "least_squares",
     "levels",
     "point_source",

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from neusee.nodes.calibrate import Rings, Sufficient
+from neusee.nodes.calibrate import FrameTest, Rings, Sufficient
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration import calibration_figures as figures
+from neusee.workflows.calibration.frame_validity import frame_section
 from neusee.workflows.calibration.identifiability import KINDS, Identifiability
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import IntervalEstimate, ModelSpread
@@ -89,6 +90,7 @@ class CalibrationResult:
     chains: Chains
     checks: Sequence[Check]
     models: Sequence[ModelSpread] = ()  #: of a camera of unknown response
+    frames: Sequence[FrameTest] = ()  #: the tests of the frames
 
     @property
     def params(self) -> Mapping[str, Any]:
@@ -133,8 +135,7 @@ def banner(result: CalibrationResult) -> str:
 def lead(result: CalibrationResult) -> str:
     """Return the opening of a calibration's page: estimates, values to report, and undetermined parameters."""
     values = [f"{_words(row.name)} {row.text}" for row in result.rows()]
-    estimated = [m for m in result.models if result.identifiability.kinds[m.name] == "estimate"]
-    stated = [f"{_words(m.name)} {_between(m.stated)}" for m in estimated]
+    stated = [f"{_words(m.name)} {_between(m.stated)}" for m in estimated_models(result)]
     return "\n\n".join(
         f"{opening}{'; '.join(parts)}."
         for opening, parts in (
@@ -146,6 +147,11 @@ def lead(result: CalibrationResult) -> str:
     )
 
 
+def estimated_models(result: CalibrationResult) -> list[ModelSpread]:
+    """Return the models of the response for each parameter that the frames determine; others have no value."""
+    return [model for model in result.models if result.identifiability.kinds[model.name] == "estimate"]
+
+
 def _words(name: str) -> str:
     return name.replace("_", " ")
 
@@ -153,7 +159,13 @@ def _words(name: str) -> str:
 def sections(result: CalibrationResult) -> list[Section]:
     """Return the sections of a calibration's page: parameters, checks, identifiability and pictures."""
     models = (_models,) if result.models else ()
-    return [part(result) for part in (_parameters, *models, _checks, _not_determined, _curve, _corner, _chains)]
+    frames = (_frames,) if result.frames else ()
+    parts = (_parameters, *models, _checks, *frames, _not_determined, _curve, _corner, _chains)
+    return [part(result) for part in parts]
+
+
+def _frames(result: CalibrationResult) -> Section:
+    return frame_section(result.frames)
 
 
 def _parameters(result: CalibrationResult) -> Section:
@@ -182,7 +194,8 @@ def _models(result: CalibrationResult) -> Section:
         single model is too narrow."""
     columns = ("parameter", *(f"{n} terms" for n in range(len(result.models[0].models))), "stated", "unit")
     rows = [
-        (_words(m.name), *map(_between, (*m.models, m.stated)), unit_of(m.name, result.params)) for m in result.models
+        (_words(m.name), *map(_between, (*m.models, m.stated)), unit_of(m.name, result.params))
+        for m in estimated_models(result)
     ]
     return Section("How models of the response differ", text, columns, rows)
 

@@ -12,6 +12,7 @@ import numpy as np
 from neusee.nodes.calibrate import Likelihood, Rings
 from neusee.workflows.calibration.identifiability import Identifiability
 from neusee.workflows.calibration.importance_sampling import Guide, draw_guide, draw_samples, weights
+from neusee.workflows.calibration.level_misfit import is_camera, misfits
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
@@ -173,6 +174,9 @@ def _of_data(
         fit = goodness_of_fit(look, len(identifiability.estimated))
         text = f"deviance {fit.deviance:.1f} of {fit.freedom:.0f} degrees of freedom, p = {fit.p:.2g}"
         yield Check("the model of the sensor fits the levels", text, f"a p-value above {MISFIT}", _mark(fit.good))
+    if is_camera(problem):
+        for found in misfits(problem, law.samples, law.weights, mode.theta):
+            yield Check(found.name, found.found, found.bar, _mark(found.good))
     if law.guide and isinstance(problem.levels, Rings):
         yield from _of_rings(problem, law, law.guide)
     count = len(identifiability.directions)

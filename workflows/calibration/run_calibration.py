@@ -12,9 +12,25 @@ from typing import Any
 
 import numpy as np
 
-from neusee.nodes.calibrate import Rings
+from neusee.nodes.calibrate import FrameTest, Rings
 from neusee.nodes.values import Levels
-from neusee.workflows.calibration.calibration_page import NOT_TOLD, CalibrationResult, banner, lead, sections
+from neusee.workflows.calibration.calibration_page import (
+    NOT_TOLD,
+    CalibrationResult,
+    banner,
+    estimated_models,
+    lead,
+    sections,
+)
+from neusee.workflows.calibration.frame_validity import (
+    as_rows,
+    frame_checks,
+    frame_section,
+    inspect_recipe,
+    lines,
+    widened,
+    widened_models,
+)
 from neusee.workflows.calibration.identifiability import identify, identify_from_draws
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import compare_models
@@ -33,6 +49,14 @@ class CalibrationRefused(ValueError):
     """Error raised if the levels constrain the sensor too little for a useful posterior."""
 
 
+class FramesRefused(CalibrationRefused):
+    """Error raised if the frames are not such as any likelihood describes; ``tests`` has the tests of the frames."""
+
+    def __init__(self, tests: Sequence[FrameTest]) -> None:
+        self.tests = tests
+        super().__init__("; ".join(f"{t.name}: {t.sentence}" for t in tests if t.verdict == "refused"))
+
+
 def calibrate(
     recipe: Recipe,
     store: Store,
@@ -46,11 +70,18 @@ def calibrate(
 ) -> Path:
     """Draw from the posterior of the sensor of ``recipe``, and return the folder with the results.
 
-    A second call continues an interrupted calibration and does not repeat draws. Raises: `CalibrationRefused` before
-    any sampling if the levels constrain the sensor too little, `ValueError` for a recipe without a likelihood.
+    A second call continues an interrupted calibration and does not repeat draws. Where the frames are refused, nothing
+    is drawn, and the page and the document have the tests of the frames and no parameter. Raises: `CalibrationRefused`
+    before any sampling if the levels constrain the sensor too little, `ValueError` for a recipe without a likelihood.
     """
     study_run = StudyRun("calibrate", recipe, command)
-    result = find_posterior(recipe, store, progress, walkers=walkers, move=move, draws=draws)
+    try:
+        result = find_posterior(recipe, store, progress, walkers=walkers, move=move, draws=draws)
+    except FramesRefused as refused:
+        document = study_run.document(_refused_document(refused))
+        return study_run.write(
+            runs, digest(document["frames"]), document, _refused_report(recipe, document, refused), "posterior"
+        )
     document = study_run.document(_document(result))
     return study_run.write(runs, digest(document["parameters"]), document, _report(result, document), "posterior")
 
@@ -63,6 +94,11 @@ def find_posterior(
 
     emcee_sampler.move(move)  # raises for a wrong name before anything is computed
     arviz()
+    tests = inspect_recipe(recipe, store)
+    for line in lines(tests):
+        progress(line)
+    if any(test.verdict == "refused" for test in tests):
+        raise FramesRefused(tests)
     problem = SensorPosterior.of(recipe, store)
     mode = find_mode(problem, initial_theta(problem))
     identifiability = identify(problem, mode)
@@ -87,8 +123,32 @@ def find_posterior(
         guide=law.guide,
     )
     models = compare_models(recipe, store, recipe.seed) if isinstance(problem.levels, Levels) else []
-    tested = checks(problem, mode, identifiability, chains, law)
-    return CalibrationResult(problem, mode, identifiability, chains, tested, models)
+    tested = [
+        *frame_checks(tests, not isinstance(problem.levels, Rings)),
+        *checks(problem, mode, identifiability, chains, law),
+    ]
+    chains, models = widened(problem, chains, tests, recipe.seed), widened_models(models, tests)
+    return CalibrationResult(problem, mode, identifiability, chains, tested, models, tests)
+
+
+def _refused_document(refused: FramesRefused) -> dict[str, Any]:
+    """Return the document of a calibration whose frames are refused, without a value of any parameter."""
+    found = frame_checks(refused.tests)
+    return {
+        "failed": count_failures(found),
+        "parameters": {},
+        "frames": as_rows(refused.tests),
+        "checks": [asdict(check) for check in found],
+    }
+
+
+def _refused_report(recipe: Recipe, document: Mapping[str, Any], refused: FramesRefused) -> StudyReport:
+    lead = "The frames are refused, and nothing was drawn: no likelihood describes them, so no parameter is stated."
+    files: dict[str, Content] = {"posterior.json": as_json(document)}
+    wrong = f"Not fit for use: {document['failed']} tests of the frames fail. {refused}."
+    return StudyReport(
+        f"{recipe.name}: frames refused", lead, [frame_section(refused.tests)], files=files, banner=wrong
+    )
 
 
 def _document(result: CalibrationResult) -> dict[str, Any]:
@@ -102,7 +162,8 @@ def _document(result: CalibrationResult) -> dict[str, Any]:
             "mean": flat.mean(0).tolist(),
             "covariance": np.cov(flat.T).reshape(len(problem.names), -1).tolist(),
         },
-        "stated": {model.name: asdict(model.stated) for model in result.models},
+        "stated": {model.name: asdict(model.stated) for model in estimated_models(result)},
+        "frames": as_rows(result.frames),
         "not told": list(result.identifiability.directions),
         "checks": [asdict(check) for check in result.checks],
     }

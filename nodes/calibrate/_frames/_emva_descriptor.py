@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import torch
 from pydantic import BeforeValidator
+from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.calibrate._frames._frame_statistics import Temporal, levels, reduce
@@ -84,6 +85,16 @@ def _(result: Levels, **params: Any) -> list[Check]:
             f"{len(result.mean)} levels ({dark} dark), exposures up to {float(result.exposure.max()):.3g} s", dark > 0
         )
     ]
+
+
+def descriptor_frames(files: Sequence[Path]) -> Iterator[tuple[str, float, float, Tensor]]:
+    """Yield name, photons, exposure (s) and frames (frame, y, x) of each light level of a descriptor.
+
+    ``files`` is the value of the parameter `file` of `descriptor`, whose first path is the descriptor.
+    """
+    for level in _parsed(files[0]).levels:
+        frames = torch.from_numpy(stack([image for _, image in level.images]))
+        yield f"line {level.line}", level.photons, level.exposure, frames
 
 
 def _reduced(name: str, measurement: _Measurement, level: _Level, scatter: Temporal) -> Levels:

@@ -1,0 +1,148 @@
+"""Tests of the difference of two frames of the same light: its noise must be white, Gaussian and without a trend."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.calibrate._validity._block_test import blocks, products
+from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Level, outcome, strongest, studentised
+
+_NEAR = ((0, 1), (1, 0))  #: lags in pixels (y, x)
+_BOTH = ((1, 1), (1, -1))
+_FAR = ((0, 2), (2, 0))
+_QUIET = 0.24  #: DN2, least variance of EMVA 1288
+_CORE = 1.5  #: standard deviations of the middle of a distribution that gives its robust width
+
+
+def noise_tests(levels: Sequence[Level]) -> list[FrameTest]:
+    """Test the noise of pairs of frames for correlation, block compression, lines, rare jumps and drift.
+
+    The differences of two frames of the same light hold no fixed pattern. Sums of products of neighbouring differences
+    are divided by the root of the sum of their squares, so that they are standard normal for independent pixels of any
+    variance; sums of squares of line means have a chi-square distribution.
+
+    Shapes: a list of levels -> a list of tests.
+    Units:  numbers and limits in standard deviations of chance.
+    Error:  each test fails by chance with a probability of 1e-3, for large frames.
+    Source: EMVA Standard 1288, release 4.0 Linear, sections 2.4 (white noise) and 6.6; Bonferroni; Wilson and
+            Hilferty, PNAS 17, 684 (1931); Anscombe and Glynn, Biometrika 70, 227 (1983).
+    """
+    paired = [level for level in levels if level.paired and not level.high and not level.low]
+    if not paired:
+        return []
+    white = [_without_lines(level.apart) for level in paired]
+    lines = [_lines(name, axis, paired, white) for name, axis in (("row", 2), ("column", 1))]
+    return [_whiteness(white), blocks(paired, white), *lines, *_telegraph(paired), _drift(paired)]
+
+
+def _without_lines(apart: Tensor) -> Tensor:
+    return apart - apart.mean(2, keepdim=True) - apart.mean(1, keepdim=True)
+
+
+def _correlation(levels: Sequence[Tensor], lag: tuple[int, int]) -> float:
+    """Return the correlation at a lag, of all levels with equal weight."""
+    return sum(float(products(x, lag).mean() / x.square().mean().clamp_min(1e-12)) for x in levels) / len(levels)
+
+
+def _whiteness(white: Sequence[Tensor]) -> FrameTest:
+    near, far = (
+        [sum(studentised(products(x, lag)) for lag in lags) / math.sqrt(2) for x in white] for lags in (_NEAR, _FAR)
+    )
+    evidence = strongest([near, far], sides=2)
+    at = [_correlation(white, lag) for lag in (*_NEAR, *_BOTH, *_FAR)]
+    missing = 2 * sum(at)
+    gain = abs(math.log(max(1 + missing, 1e-3)))
+    sentence = (
+        f"the noise of neighbouring pixels correlates by {at[0]:.2g} along rows and {at[1]:.2g} along columns, as in "
+        "frames that are mixed, denoised, interpolated or compressed"
+    )
+    passed = f"the noise of neighbouring pixels correlates by {at[0]:.2g} along rows and {at[1]:.2g} along columns"
+    return outcome("white noise", evidence, sentence, {"gain": gain, "noise": gain / 2}, passed)
+
+
+def _lines(name: str, axis: int, levels: Sequence[Level], white: Sequence[Tensor]) -> FrameTest:
+    """Test if the means of rows (axis 2) or columns (axis 1) scatter more than white noise lets them."""
+    lag = _NEAR[0] if axis == 2 else _NEAR[1]
+    z, shares = [], []
+    for level, x in zip(levels, white, strict=True):
+        means = level.apart.mean(axis)
+        freedom = means.numel() - len(means)
+        pixel = float(x.square().mean()) * x.numel() / max(1, x.numel() - len(x) * (x.shape[1] + x.shape[2] - 1))
+        together = 1 + 2 * max(0.0, _correlation([x], lag)) + 2 * max(0.0, _correlation([x], (2 * lag[0], 2 * lag[1])))
+        ratio = float((means - means.mean(1, keepdim=True)).square().sum()) * level.apart.shape[axis] / (pixel + 1e-12)
+        z.append(_hilferty(ratio / together, freedom))
+        shares.append((ratio / together / freedom - 1) / level.apart.shape[axis])
+    darks = [x for x, level in zip(z, levels, strict=True) if level.dark]
+    evidence = strongest([z], more=[sum(darks) / math.sqrt(len(darks))] if darks else [])
+    dark = [s for s, level in zip(shares, levels, strict=True) if level.dark] or shares
+    noise, gain = (abs(sum(s) / len(s)) / 2 for s in (dark, shares))
+    sentence = f"whole {name}s vary together from frame to frame by {math.sqrt(2 * noise):.2g} of the noise of a pixel"
+    passed = f"whole {name}s do not vary together from frame to frame"
+    return outcome(f"no {name} noise", evidence, sentence, {"noise": noise, "gain": 2 * gain}, passed)
+
+
+def _hilferty(chi: float, freedom: float) -> float:
+    """Return a chi-square number as a standard normal number."""
+    third = 2 / (9 * freedom)
+    return float((max(chi, 0.0) / freedom) ** (1 / 3) - (1 - third)) / math.sqrt(third)
+
+
+def _telegraph(levels: Sequence[Level]) -> list[FrameTest]:
+    """Test if the noise of dark frames has more large differences than a normal distribution."""
+    darks = [level for level in levels if level.dark and level.variance >= _QUIET]
+    if not darks:
+        return []
+    z, wider = [], []
+    for level in darks:
+        x = level.apart
+        square = float(x.square().mean())
+        fourth = float(x.pow(4).mean()) / square**2 - 3 + 1 / 60 / square**2  # rounding takes 1/60 of the cumulant
+        z.append(_glynn(fourth + 3, x.numel()))
+        wider.append(math.sqrt(square) / _core(x + level.drift[:, None, None]) - 1)
+    evidence = strongest([z])
+    error = abs(sum(wider) / len(wider))
+    sentence = f"the dark noise has rare large jumps, and is {error:.1%} wider than its middle, as of telegraph pixels"
+    passed = "the dark noise is normal: no telegraph pixels"
+    return [outcome("no telegraph noise", evidence, sentence, {"noise": error}, passed)]
+
+
+def _glynn(kurtosis: float, n: int) -> float:
+    """Return the kurtosis of a sample of n normal numbers as a standard normal number (Anscombe and Glynn 1983)."""
+    variance = 24 * n * (n - 2) * (n - 3) / ((n + 1) ** 2 * (n + 3) * (n + 5))
+    away = (kurtosis - 3 * (n - 1) / (n + 1)) / math.sqrt(variance)
+    skew = 6 * (n * n - 5 * n + 2) / ((n + 7) * (n + 9)) * math.sqrt(6 * (n + 3) * (n + 5) / (n * (n - 2) * (n - 3)))
+    freedom = 6 + 8 / skew * (2 / skew + math.sqrt(1 + 4 / skew**2))
+    ratio = (1 - 2 / freedom) / (1 + away * math.sqrt(2 / (freedom - 4)))
+    root = math.copysign(abs(ratio) ** (1 / 3), ratio)
+    return (1 - 2 / (9 * freedom) - root) / math.sqrt(2 / (9 * freedom))
+
+
+def _core(x: Tensor) -> float:
+    """Return the standard deviation of the normal distribution with the same share of small whole numbers."""
+    end = round(_CORE * float(x.std()))
+    share = float((x.abs() <= end + 0.5).double().mean())
+    width = (end + 0.5) / -float(torch.special.ndtri(torch.tensor((1 - share) / 2, dtype=torch.float64)))
+    return math.sqrt(width**2 + 1 / 12)
+
+
+def _drift(levels: Sequence[Level]) -> FrameTest:
+    """Test if the mean moves between the frames of a pair."""
+    z, shares = [], []
+    for level in levels:
+        error = math.sqrt(2 * level.variance / level.apart[0].numel() + 1e-12)
+        z += (level.drift / error).tolist()
+        shares.append(float(level.drift.square().mean()) / 2 / (level.variance + 1e-12))
+    evidence = strongest([[x] for x in z], sides=2)
+    dark = [s for s, level in zip(shares, levels, strict=True) if level.dark] or [0.0]
+    lit = [s for s, level in zip(shares, levels, strict=True) if not level.dark] or [0.0]
+    steady = all(level.stack.scatter == "steady" for level in levels)
+    shifts = {} if steady else {"gain": max(lit), "noise": max(dark) / 2}
+    moved = max((float(level.drift.abs().max()) for level in levels), default=0.0)
+    passed = "the mean keeps from frame to frame"
+    modelled = "`scatter: steady` removes it from the variance" if steady else ""
+    sentence = f"the mean moves by up to {moved:.3g} DN between two frames of a level, as under a drifting lamp"
+    return outcome("no drift within a level", evidence, sentence, shifts, passed, modelled)
