@@ -205,7 +205,7 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        "workflows/training/training_pictures.py",
+        "workflows/training/training_recipe.py",
         '"precision": "double"',
         '"precision": "single"',
         within("workflows/training", "training_precision.py::test_the_loss_in_float64_has_no_step_of_single_precision"),

@@ -99,7 +99,7 @@ def frame_section(tests: Sequence[FrameTest]) -> Section:
     text = """Each test asks if the frames are such as the likelihood describes. Modelled: the likelihood describes it.
         Widened: the intervals include the error that may follow. Refused: the error may exceed 2 %, or is unknown.
         Numbers and limits of noise and patterns are in standard deviations of chance; all tests together fail for
-        frames without fault in less than 2 % of all measurements."""
+        frames without fault in about 1 % of all measurements (2 of 200)."""
     if len(tests) < 2:
         text = "Only moments are given, so that noise, patterns and numbers of the frames are not tested."
     rows = [(t.name, abs(t.number), abs(t.limit), t.verdict, t.sentence) for t in tests]

@@ -94,11 +94,7 @@ def find_posterior(
 
     emcee_sampler.move(move)  # raises for a wrong name before anything is computed
     arviz()
-    tests = inspect_recipe(recipe, store)
-    for line in lines(tests):
-        progress(line)
-    if any(test.verdict == "refused" for test in tests):
-        raise FramesRefused(tests)
+    tests = _accepted_frames(recipe, store, progress)
     problem = SensorPosterior.of(recipe, store)
     mode = find_mode(problem, initial_theta(problem))
     identifiability = identify(problem, mode)
@@ -129,6 +125,16 @@ def find_posterior(
     ]
     chains, models = widened(problem, chains, tests, recipe.seed), widened_models(models, tests)
     return CalibrationResult(problem, mode, identifiability, chains, tested, models, tests)
+
+
+def _accepted_frames(recipe: Recipe, store: Store, progress: Progress) -> Sequence[FrameTest]:
+    """Return the tests of the frames of a calibration; raises `FramesRefused` where no likelihood describes them."""
+    tests = inspect_recipe(recipe, store)
+    for line in lines(tests):
+        progress(line)
+    if any(test.verdict == "refused" for test in tests):
+        raise FramesRefused(tests)
+    return tests
 
 
 def _refused_document(refused: FramesRefused) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from neusee.workflows.cli.command_options import (
 from neusee.workflows.cli.interruption import kept_in, print_warning, resumable, say_json
 from neusee.workflows.cli.repetition import keep_run, say_and_keep
 from neusee.workflows.report.json_output import json_line
+from neusee.workflows.report.next_commands import commands_to_try
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -74,7 +75,7 @@ def run(
         table,
     ):
         done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit)
-    hints = [] if silent else console.next_commands(recipe, command[2 : -1 if exact else None], _loads)
+    hints = [] if silent else commands_to_try(recipe, command[2 : -1 if exact else None], _loads)
     if silent:
         _say_briefly(done, as_json)
     else:

@@ -6,12 +6,10 @@ step had to load share one line.
 
 from __future__ import annotations
 
-import re
-import shlex
 import sys
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from io import StringIO
 from pathlib import Path
@@ -21,7 +19,7 @@ from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.recipe.paper_readings import consequences
 from neusee.workflows.report.mask_story import SENTENCES
 from neusee.workflows.report.run_page import shape_of, unchecked_lines, unit_of
-from neusee.workflows.report.text_table import by_family, columns, indented, lasts, wrapped
+from neusee.workflows.report.text_table import by_family, indented, lasts, wrapped
 from neusee.workflows.report.tolerance_spent import said_of_economies
 
 if TYPE_CHECKING:
@@ -285,35 +283,3 @@ def left_out_line(doc: Mapping[str, Any]) -> str:
         named[short] = max(named.get(short, 0.0), row["bound"] or 0.0)
     each = ", ".join(f"{name} (at most {bound:.1e})" for name, bound in named.items())
     return f"left out {each}; tolerance {doc['tolerance']:g}"
-
-
-def next_commands(recipe: Recipe, words: Sequence[str], works: Callable[[Sequence[str]], bool]) -> list[str]:
-    """Return three commands to try after a run, each with a comment, quoted for a shell.
-
-    ``words`` are the name and the changes of the recipe, as the user wrote them. ``works`` tells whether a recipe with
-    its changes can be loaded.
-    """
-    noise = "sensor.read_noise"
-    changed = {
-        "only what follows is run": _with(words, f"{noise}=20 e-") if noise in recipe.config.settings else [],
-        "another mask": _with(words, f"doe={_another_mask(recipe)}") if "height" in recipe.steps else [],
-    }
-    tried = {what: again for what, again in changed.items() if again and works(again)}
-    shown = [[shlex.join(["neusee", "run", *again]), f"# {what}"] for what, again in tried.items()]
-    shown += [
-        [shlex.join(["neusee", "plan", *words]), "# what would run, how long"],
-        ["neusee nodes optics.psf", "# what a step computes, and its source"],
-        ["neusee recipes", "# what else there is"],
-    ]
-    return columns(shown[:3], gap="   ")
-
-
-def _another_mask(recipe: Recipe) -> str:
-    return "axicon" if recipe.steps["height"].node.path == "doe.vortex" else "vortex"
-
-
-def _with(words: Sequence[str], change: str) -> list[str]:
-    """Return the words of a recipe with one more change, in place of changes of the same value or of a part of it."""
-    path = change.partition("=")[0]
-    same = re.compile(rf"[~+]?{re.escape(path)}([.=]|$)")
-    return [*(word for word in words if not same.match(word)), change]

@@ -90,32 +90,41 @@ class TrainingStream:
         self.shape = frame_of(recipe, settings.scene)
         believed = in_precision(frozen or recipe, settings.dtype)
         self._posed = PosedPictures.of(recipe, settings)
-        if self._posed:
-            believed = self._posed.within(believed)
-        stage = settings.stages.get(2 if frozen else 1)
-        light = (settings.light,) if stage is not None and stage.bsr else ()  # else no loss reads it
-        seen = self._posed.steps if self._posed else (settings.picture,)
-        self._made = (*seen, settings.truth, *light)
+        believed = self._posed.within(believed) if self._posed else believed
+        self._made = self._outputs(2 if frozen else 1)
         recipe, self.psf = self._mismatch.camera(believed, self._made, settings.psf)
         outputs = (*self._made, self.psf)
         recipe = with_substitutions(recipe, outputs, {learn} if learn else ())
         order = needed(recipe, outputs)
-        self._stored = (
-            StoredPool(recipe, settings, self._made, store, device) if self._pool and settings.keep_pool else None
-        )
+        keeps = self._pool and settings.keep_pool
+        self._stored = StoredPool(recipe, settings, self._made, store, device) if keeps else None
         self._lasers = [f"{n}.{_LASER[1]}" for n in order if recipe.steps[n].node.path == _LASER[0]]
         self._readers = self._read(believed, order)
-        readers = self._readers
-        fixed = set(needed(recipe, [self.psf]))  # random effects in the PSF, such as dirt, are constant
-        noise = {name for name in order if recipe.steps[name].node.random and name not in fixed}
-        drawn = dependents(recipe, noise | {settings.scene, *(name.rpartition(".")[0] for name in readers)}, order)
+        noise, drawn = self._changing(recipe, order)
         learnt = dependents(recipe, {learn} if learn else (), order)
-        if self.psf in drawn:
-            raise ValueError(f"train.psf: {settings.psf} changes with each picture: name a step with a constant PSF")
         self.shards = Shards.of(recipe, self.psf, outputs, drawn | learnt, store, mesh)
         drawn |= self.shards.behind
         read = _sources(recipe, drawn) | {self.psf}
         self._divide(recipe, learn, [n for n in order if n in (learnt - drawn) & read], drawn, noise, store)
+
+    def _changing(self, recipe: Recipe, order: Sequence[str]) -> tuple[set[str], set[str]]:
+        """Return the steps that draw noise for each picture, and all steps that change with each picture."""
+        fixed = set(needed(recipe, [self.psf]))  # random effects in the PSF, such as dirt, are constant
+        noise = {name for name in order if recipe.steps[name].node.random and name not in fixed}
+        read = {self.settings.scene, *(name.rpartition(".")[0] for name in self._readers)}
+        drawn = dependents(recipe, noise | read, order)
+        if self.psf in drawn:
+            raise ValueError(
+                f"train.psf: {self.settings.psf} changes with each picture: name a step with a constant PSF"
+            )
+        return noise, drawn
+
+    def _outputs(self, number: int) -> tuple[str, ...]:
+        """Return the steps that make a picture of a stage: what the network sees, the truth, light if a loss reads it."""
+        stage = self.settings.stages.get(number)
+        light = (self.settings.light,) if stage is not None and stage.bsr else ()
+        seen = self._posed.steps if self._posed else (self.settings.picture,)
+        return (*seen, self.settings.truth, *light)
 
     def _read(self, believed: Recipe, order: Sequence[str]) -> dict[str, Any]:
         """Return the parameters that change with each picture, with the values that the recipe states.

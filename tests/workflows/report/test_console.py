@@ -13,6 +13,7 @@ from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.report import console as console_room
+from neusee.workflows.report.next_commands import commands_to_try
 
 
 @node()
@@ -62,7 +63,7 @@ def test_the_mask_to_try_next_is_not_the_mask_of_the_run(there, suggested):
     made = SimpleNamespace(
         config=SimpleNamespace(settings={}), steps={"height": SimpleNamespace(node=SimpleNamespace(path=there))}
     )
-    first = console_room.next_commands(made, ["first_light", "doe=x"], lambda words: True)[0]
+    first = commands_to_try(made, ["first_light", "doe=x"], lambda words: True)[0]
     assert first.split("#")[0].split() == ["neusee", "run", "first_light", f"doe={suggested}"]
 
 
