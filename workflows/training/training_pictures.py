@@ -120,7 +120,7 @@ class TrainingStream:
         return noise, drawn
 
     def _outputs(self, number: int) -> tuple[str, ...]:
-        """Return the steps that make a picture of a stage: what the network sees, the truth, light if a loss reads it."""
+        """Return the steps that make a picture of a stage: what a network sees, the truth, light if a loss reads it."""
         stage = self.settings.stages.get(number)
         light = (self.settings.light,) if stage is not None and stage.bsr else ()
         seen = self._posed.steps if self._posed else (self.settings.picture,)
