@@ -153,7 +153,7 @@ def _(
 
 
 @spread_by_field.shape
-def _(electrons: Tensor, measured: Any, clipped: Any, matrix: Tensor, **params: Any) -> Tensor:
+def _(electrons: Tensor, measured: Any, clipped: Any, matrix: Tensor, *others: Any, **params: Any) -> Tensor:
     return blank(len(matrix), *electrons.shape[-2:], dtype=at_least_single(electrons))
 
 

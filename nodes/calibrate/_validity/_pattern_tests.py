@@ -60,7 +60,10 @@ def _pattern(levels: Sequence[Level]) -> FrameTest:
     if all(level.stack.scatter != "all" for level in levels):
         modelled = "the temporal variance leaves these differences out"
         return outcome("total against temporal variance", evidence, sentence, {"gain": prnu**2}, passed, modelled)
-    shares = [(abs(c) / (c + level.variance), level.dark) for c, level in zip(common, levels, strict=True)]
+    shares = [
+        (abs(c) / (c + level.variance) if c + level.variance else 0.0, level.dark)
+        for c, level in zip(common, levels, strict=True)
+    ]
     shifts = {"noise": max((s / 2 for s, dark in shares if dark), default=0.0)}
     shifts["gain"] = max((s for s, dark in shares if not dark), default=0.0)
     sentence += ", which `scatter: all` counts as noise; use calibrate.camera with `scatter: steady`"
