@@ -111,9 +111,10 @@ def unrolled(
 
     Each of the ``steps`` asks a small NAFNet of its own what the picture is, c, and how precisely it knows this (one
     precision R for each channel), and gives the most likely picture under the frame, the prior of the filter and a
-    Gaussian prior of mean c and precision R in the frame. Beyond the frame the precision is 0. The network sees the picture
-    of the step before, the residual y - B x over its noise, how certain each pixel is, which pixels are not clipped,
-    and the glare. Without ``weights`` the restorer is the filter, and so it is where the network's precision is 0.
+    Gaussian prior of mean c and precision R in the frame. Beyond the frame the precision is 0. The network sees the
+    picture of the step before, the residual y - B x over its noise, how certain each pixel is, which pixels are not
+    clipped, and the glare. Without ``weights`` the restorer is the filter, and so it is where the network's precision
+    is 0.
 
     Shapes: as `restore.wiener`, of three channels -> (channel, y, x).
     Units:  as `restore.wiener`.
