@@ -276,6 +276,8 @@ class Store(Warned, Maintained):
 
     def _put_aside(self, key: str, error: Exception) -> None:
         self.put_aside(key, error)
+        if isinstance(error, OSError) and not isinstance(error, FileNotFoundError | PermissionError):
+            return self.report_failure(error, "read")  # the device fails, of which one warning is enough
         warnings.warn(f"the stored result {key} is damaged ({error}) and counts as missing", stacklevel=5)
 
     def put_aside(self, key: str, error: Exception) -> None:

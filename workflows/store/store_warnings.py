@@ -1,4 +1,4 @@
-"""Warnings of a store, each issued once: a folder that cannot be written, and results that are not read."""
+"""Warnings of a store, each issued once: a folder that cannot be used, and results that are not read."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class Warned:
     failure = ""  #: the warning after the first write that failed
     _told = False
 
-    def report_failure(self, error: Exception) -> None:
-        """Warn that the folder cannot be written, once for each store; `failure` keeps the text for reports."""
+    def report_failure(self, error: Exception, use: str = "written") -> None:
+        """Warn that the folder cannot be written or read, once for each store; `failure` keeps the text for reports."""
         if not self.failure:
-            self.failure = f"the cache {self.root} cannot be written ({error}): {_CONSEQUENCE}"
+            self.failure = f"the cache {self.root} cannot be {use} ({error}): {_CONSEQUENCE}"
             self.failures.append(self.failure)
             warnings.warn(self.failure, stacklevel=5)
 

@@ -667,3 +667,17 @@ def test_a_description_is_json_that_says_what_it_is(tmp_path):
     assert about["step"] == "s"
     assert about["layout"] == {"tensor": 0}
     assert about["payload"]["size"] == payload(tmp_path).stat().st_size
+
+
+@pytest.mark.parametrize("written_first", [True, False])
+def test_a_device_that_fails_is_told_once_whether_it_fails_to_write_or_to_read_first(written_first, tmp_path):
+    store = Store(tmp_path / "cache")
+    error = OSError(5, "Input/output error")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        if written_first:
+            store.report_failure(error)
+        store._put_aside("ab" * 16, error)
+        store.report_failure(error)
+    assert len(told) == 1, [str(one.message) for one in told]
+    assert ("cannot be written" if written_first else "cannot be read") in str(told[0].message)
