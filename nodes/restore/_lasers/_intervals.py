@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from neusee.nodes.restore._lasers._components import NANOMETRE, Laser
-from neusee.nodes.restore._lasers._joint_fit import Fit, solved
+from neusee.nodes.restore._lasers._joint_fit import Fit, products, solved
 
 NORMAL = 1.6448536269514722  #: standard deviations on each side of a 90 % interval
 _BLOCK = 8  #: pixels a side of blocks whose residuals count as independent of one another
@@ -31,7 +31,7 @@ def covariances(fit: Fit, seen: Tensor) -> list[Tensor]:
     scores = pictures.sum(1)
     y, x = (-n % _BLOCK for n in seen.shape[-2:])
     blocks = pad(scores, (0, x, 0, y)).unfold(1, _BLOCK, _BLOCK).unfold(2, _BLOCK, _BLOCK).sum((-2, -1)).flatten(1)
-    prior = fit.normal - (fit.columns @ fit.columns.T).double()
+    prior = fit.normal - products(fit.columns)
     scattered = inverse @ (blocks @ blocks.T + prior) @ inverse
     growth = (scattered.diagonal() / inverse.diagonal().clamp_min(1e-300)).clamp_min(1.0).sqrt()
     whole = growth[:, None] * inverse * growth

@@ -14,8 +14,7 @@ from neusee.nodes.restore._lasers._whitening import Filter, Weights
 
 Parts = tuple[Laser | Lamp, ...]
 _DAMPED = (0.0, 1e-3, 1e-1, 10.0)  #: factors of the diagonal, tried in this order until a step lowers the misfit
-
-
+_PIECE = 1 << 16  #: numbers at a time whose float64 copies fit in the cache
 _ENOUGH = 0.02  #: log likelihood, a smaller gain of which ends the steps
 
 
@@ -93,7 +92,19 @@ def _columns(data: Data, parts: Parts, left: Tensor) -> Tensor:
 
 
 def _normal(parts: Parts, columns: Tensor) -> Tensor:
-    return (columns @ columns.T + torch.cat([part.precision for part in parts]).diag()).double()
+    return products(columns) + torch.cat([part.precision for part in parts]).double().diag()
+
+
+def products(columns: Tensor) -> Tensor:
+    """Return the products (value, value) of columns (value, number), summed in float64, a piece at a time.
+
+    Of a million numbers float32 loses 1e-4 of a product, and what tells strength from responses is smaller than that.
+    """
+    total = torch.zeros(len(columns), len(columns), dtype=torch.float64, device=columns.device)
+    for first in range(0, columns.shape[1], _PIECE):
+        piece = columns[:, first : first + _PIECE].double()
+        total += piece @ piece.T
+    return total
 
 
 def solved(normal: Tensor, right: Tensor) -> Tensor:
