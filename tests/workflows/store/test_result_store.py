@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -335,34 +336,78 @@ def test_what_killed_processes_left_is_swept_after_an_hour(tmp_path):
     assert {f.name for f in folder.iterdir()} == {"young", ".lock"}
 
 
-WRITER = """
-import sys
+WRITERS = """
+import os, signal, sys
 from pathlib import Path
 import torch
 from neusee.workflows.store.result_store import Store
 torch.set_num_threads(1)
-for i in range(10_000):
-    if i == 2:
-        print("ready", flush=True)
-    key = f"{i % 40:02x}" + "5" * 30
-    store = Store(Path(sys.argv[1]))
-    if not store.has(key):
-        store.put(key, torch.full((200_000,), float(i % 40)), {"step": "s"})
-    elif i % 3 == 0:
-        (Path(sys.argv[1]) / key[:2] / f"{key}.json").unlink(missing_ok=True)
+
+def write(root):
+    for i in range(10_000):
+        if i == 2:
+            os.write(1, b"ready %d\\n" % os.getpid())
+        key = f"{i % 40:02x}" + "5" * 30
+        store = Store(root)
+        if not store.has(key):
+            store.put(key, torch.full((200_000,), float(i % 40)), {"step": "s"})
+        elif i % 3 == 0:
+            (root / key[:2] / f"{key}.json").unlink(missing_ok=True)
+
+signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+for root in sys.stdin:
+    if (pid := os.fork()) == 0:
+        write(Path(root.rstrip()))
+        os._exit(0)
+    os.write(1, b"started %d\\n" % pid)
 """
 
 
-def killed_writers(root: Path, count: int, delays: list[float]) -> None:
-    """Processes that write the same keys over and over, each killed in the midst of it, none before its second."""
-    command = [sys.executable, "-c", WRITER, str(root)]
-    writers = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) for _ in range(count)]
-    for writer, delay in zip(writers, delays, strict=True):
-        assert writer.stdout.readline() == b"ready\n"
+class Writers:
+    """Processes that write the same keys over and over, forked from one that has torch at hand."""
+
+    def __init__(self) -> None:
+        command = [sys.executable, "-c", WRITERS]
+        self.server = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.said: list[list[str]] = []
+
+    def heard(self, word: str, pid: str = "") -> str:
+        """Wait until a process says the word, and give its number."""
+        while True:
+            for line in self.said:
+                if line[0] == word and pid in ("", line[1]):
+                    self.said.remove(line)
+                    return line[1]
+            self.said.append(self.server.stdout.readline().split())
+
+    def start(self, root: Path) -> str:
+        self.server.stdin.write(f"{root}\n")
+        self.server.stdin.flush()
+        return self.heard("started")
+
+    def kill(self, pid: str) -> None:
+        """Kill a process, and wait until it has ended."""
+        os.kill(int(pid), signal.SIGKILL)
+        with suppress(ProcessLookupError):
+            while True:
+                os.kill(int(pid), 0)
+                time.sleep(0.001)
+
+
+@pytest.fixture(scope="module")
+def writers():
+    found = Writers()
+    yield found
+    found.server.communicate()
+
+
+def killed_writers(writers: Writers, root: Path, delays: list[float]) -> None:
+    """Three processes that write the same keys, each killed in the midst of it, none before its second."""
+    started = [writers.start(root) for _ in delays]
+    for pid, delay in zip(started, delays, strict=True):
+        writers.heard("ready", pid)
         time.sleep(delay)
-        writer.kill()
-        writer.wait()
-        writer.stdout.close()
+        writers.kill(pid)
 
 
 def check_kept(root: Path) -> int:
@@ -375,15 +420,15 @@ def check_kept(root: Path) -> int:
 
 
 @pytest.mark.slow
-def test_killed_writers_leave_no_wrong_entry(tmp_path):
-    killed_writers(tmp_path, 3, [0.03, 0.05, 0.08])
+def test_killed_writers_leave_no_wrong_entry(tmp_path, writers):
+    killed_writers(writers, tmp_path, [0.03, 0.05, 0.08])
     assert check_kept(tmp_path) > 0
 
 
 @pytest.mark.slow
-def test_many_killed_writers_leave_no_wrong_entry(tmp_path):
+def test_many_killed_writers_leave_no_wrong_entry(tmp_path, writers):
     for i in range(17):
-        killed_writers(tmp_path, 3, [0.01 + 0.003 * i, 0.01 * (i % 3), 0.007 * (i % 5)])
+        killed_writers(writers, tmp_path, [0.01 + 0.003 * i, 0.01 * (i % 3), 0.007 * (i % 5)])
         assert check_kept(tmp_path) > 0
 
 
