@@ -97,13 +97,13 @@ def scored(restored, truth):
     return 10 * np.log10(truth.max() ** 2 / (rest**2).mean()), rest.reshape(restored[inner].shape)
 
 
-def taken(folder, nodes, signals, seed):
+def taken(folder, nodes, signals, seed, draws):
     rng = np.random.default_rng(seed)
     for number, signal in enumerate(signals):
         places = [tuple(c + rng.uniform(-0.5, 0.5) for c in p) for p in nodes]
         np.save(folder / f"p{number}.npy", points(rng, (100, 100), places, [signal] * 4, **STRONG))
     files = tuple(sorted(folder.iterdir()))
-    return measured_psf(torch.ones(3, 3), files=files, window=(25, 25), zones=(2, 2), draws=24, shape=(100, 100),
+    return measured_psf(torch.ones(3, 3), files=files, window=(25, 25), zones=(2, 2), draws=draws, shape=(100, 100),
                         rng=torch.Generator().manual_seed(1), **CAMERA)  # fmt: skip
 
 
@@ -111,7 +111,7 @@ def taken(folder, nodes, signals, seed):
 def test_restoring_with_the_measured_psf_comes_near_restoring_with_the_true_one(seen, tmp_path):
     electrons, truth, nodes, kernels = seen
     clipped = torch.zeros(electrons.shape, dtype=torch.bool)
-    found = taken(tmp_path, nodes, [6e4, 6e4, 6e5, 6e5], 3)
+    found = taken(tmp_path, nodes, [6e4, 6e4, 6e5, 6e5], 3, draws=4)  # of which the filter uses none
     middle = known(kernels.mean((0, 1), keepdims=True))
     measured, told, mean = (
         scored(wiener_by_field(electrons, psf, clipped, read_noise=READ).numpy(), truth)[0]
@@ -129,7 +129,7 @@ def test_the_interval_holds_the_scene_when_the_psf_is_poorly_known(seen, tmp_pat
     """Two faint frames: without the draws of the PSF the interval is far too narrow."""
     electrons, truth, nodes, _ = seen
     clipped = torch.zeros(electrons.shape, dtype=torch.bool)
-    found = taken(tmp_path, nodes, [2e3, 2e3], 5)
+    found = taken(tmp_path, nodes, [2e3, 2e3], 5, draws=8)  # as many as there are drawn scenes below
     _, wrong = scored(wiener_by_field(electrons, found, clipped, read_noise=READ).numpy(), truth)
     inside = []
     for psf in (found, known(found.kernels)):
