@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from neusee.nodes.restore._inverse._conjugate_gradients import descend, inner, pieces
+from neusee.nodes.restore._inverse._conjugate_gradients import LOWEST, Preconditioner, descend, inner, pieces
 from neusee.nodes.restore._inverse._fft_grid import halvings
 from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, mixed, narrowed, variance, widened
 from neusee.nodes.torch_func import transformed
@@ -30,18 +30,47 @@ _ONCE = "the deconvolution has no second derivative: differentiate without creat
 CAREFUL = 8.0  #: factor by which the tolerance falls with each coarser grid, whose steps are cheap
 
 
-def most_likely(seen: Blurred, steps: int = STEPS, enough: float = ENOUGH, coarser: bool = True) -> Tensor:
+class Inverses:
+    """What solves the grids of a deconvolution and depends on no pixel of the picture: for several pictures of it.
+
+    The preconditioners of grids beyond `LOWEST` pixels a side are large and cheap to make, and are not kept.
+    """
+
+    def __init__(self) -> None:
+        self._factors: dict[Size, Tensor] = {}
+        self._preconditioners: dict[Size, Preconditioner] = {}
+
+    def factor(self, seen: Blurred) -> Tensor:
+        """Return the Cholesky factor of the matrix of a small problem."""
+        if seen.torus not in self._factors:
+            self._factors[seen.torus] = _factor(seen)
+        return self._factors[seen.torus]
+
+    def preconditioner(self, seen: Blurred) -> Preconditioner:
+        """Return the preconditioner of a problem."""
+        if max(_size(seen)) > LOWEST:
+            return Preconditioner(seen)
+        if seen.torus not in self._preconditioners:
+            self._preconditioners[seen.torus] = Preconditioner(seen)
+        return self._preconditioners[seen.torus]
+
+
+def most_likely(
+    seen: Blurred, steps: int = STEPS, enough: float = ENOUGH, coarser: bool = True, inverses: Inverses | None = None
+) -> Tensor:
     """Return half the spectrum of the most likely picture before the blur, given the seen pixels and the prior.
 
     Without ``coarser`` grids the steps start from a picture without contrast, which suits a narrow PSF alone.
+    ``inverses`` are those of a problem that differs in the picture alone; missing ones are made and added.
     """
+    inverses = inverses or Inverses()
     tensors = (seen.picture, seen.weight, seen.transfer, *seen.glare)
     with torch.no_grad():
         alone = fixed(seen)
-        lower = seen.picture.new_empty(0) if halvings(_size(seen)) else _factor(alone)
+        lower = seen.picture.new_empty(0) if halvings(_size(seen)) else inverses.factor(alone)
         enough = enough * float((seen.weight > 0).sum())
         if coarser or lower.numel():
-            x = _solved(alone, lower, steps, enough)
+            x = _solved(alone, lower, steps, enough, inverses)
         else:
             x = descend(alone, torch.zeros_like(alone.transfer), MOST, enough)
     followed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
@@ -103,7 +132,7 @@ class _Solved(torch.autograd.Function):
         pull, nothing = torch.fft.rfft2(right), torch.zeros_like(weight)
         seen = Blurred(nothing, weight, transfer, power, frame.torus, frame.grey, tuple(glare), pull, frame.bounded)
         enough = 1e-10 * float(inner(pull, _spread(seen, pull), seen.torus))
-        solution: Tensor = torch.fft.irfft2(_solved(seen, lower, frame.steps, enough), s=seen.torus)
+        solution: Tensor = torch.fft.irfft2(_solved(seen, lower, frame.steps, enough, Inverses()), s=seen.torus)
         return solution
 
     @staticmethod
@@ -119,17 +148,17 @@ class _Solved(torch.autograd.Function):
         raise RuntimeError(_ONCE)
 
 
-def _solved(seen: Blurred, lower: Tensor, steps: int, enough: float) -> Tensor:
+def _solved(seen: Blurred, lower: Tensor, steps: int, enough: float, inverses: Inverses) -> Tensor:
     """Solve a small problem exactly with the Cholesky factor `lower` of its matrix, and a larger problem by steps."""
-    return _by_factor(seen, lower) if lower.numel() else _nested(seen, steps, enough)
+    return _by_factor(seen, lower) if lower.numel() else _nested(seen, steps, enough, inverses)
 
 
-def _nested(seen: Blurred, steps: int, enough: float) -> Tensor:
+def _nested(seen: Blurred, steps: int, enough: float, inverses: Inverses) -> Tensor:
     if not halvings(_size(seen)):
-        return _by_factor(seen, _factor(seen))
+        return _by_factor(seen, inverses.factor(seen))
     coarse = halved(seen)
-    start = widened(_nested(coarse, min(4 * steps, MOST), enough / CAREFUL), coarse.torus, seen.torus)
-    return descend(seen, start, steps, enough)
+    start = widened(_nested(coarse, min(4 * steps, MOST), enough / CAREFUL, inverses), coarse.torus, seen.torus)
+    return descend(seen, start, steps, enough, inverses.preconditioner(seen))
 
 
 def _size(seen: Blurred) -> Size:

@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.restore._inverse._frame_spectrum import fitted_power
-from neusee.nodes.restore._inverse._hidden_pixels import most_likely
+from neusee.nodes.restore._inverse._hidden_pixels import Inverses, most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred, blurred, mixed
 from neusee.nodes.restore._inverse._wiener import Doubt, Scaled, effective_psf, known_and_light, posed, wrapped
 from neusee.nodes.units import Electrons
@@ -89,6 +89,7 @@ def drawn_deviation(
     ``kernels`` (any, channel, y, x) are PSFs that blur these scenes in turn, in place of the PSF of the filter.
     """
     total = scaled.problem.picture.new_zeros(len(matrix), *scaled.problem.picture.shape[-2:])
+    inverses = Inverses()
     for number in range(draws):
         with torch.no_grad():
             true = scaled.problem.transfer
@@ -96,7 +97,7 @@ def drawn_deviation(
                 other = kernels[number % len(kernels)].to(scaled.share) / scaled.share
                 true = torch.fft.rfft2(wrapped(other, scaled.problem.torus))
             spectrum, problem = _drawn(scaled.problem, power, rng, true)
-            error = scaled.pixels(spectrum - most_likely(problem))
+            error = scaled.pixels(spectrum - most_likely(problem, inverses=inverses))
         total = total + torch.tensordot(matrix.to(error), error, 1).square()
     return (total / draws).sqrt()
 
