@@ -87,12 +87,12 @@ def check_gradient(call: Call) -> Iterator[Finding]:
         yield Finding("gradient", None, f"not compared: {stated[0]}")
         return
     inputs = [_double(value) for value in call.inputs]
+    scales = [_largest(y) for y in _floating(call.result(inputs))]
     followed = []
     for i, name in enumerate(call.node.inputs):
         for j, x in enumerate(tensors_in([inputs[i]])):
             if not x.is_floating_point() or x.numel() == 0:
                 continue
-            scales = [_largest(y) for y in _floating(call.result(inputs))]
             function = partial(_scaled, call, inputs, i, j, scales)
             zero = torch.zeros_like(x, requires_grad=True)
             with warnings.catch_warnings():
