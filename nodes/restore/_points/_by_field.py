@@ -77,7 +77,7 @@ def spread_by_field(
             psf, _, responses, _ = _channelwise(part.kernels)
             fine, known, light = known_and_light(psf, responses, seen, ends, None, None, None)
             kernels = part.kernels.to(fine)
-            scaled = posed(fine, known, kernels, light, (balance, read_noise, 0.0))
+            scaled = posed(fine, known, kernels, light, (balance, read_noise, 0.0, 0.0))
             size = (fine.shape[-2], fine.shape[-1])
             power = fitted_power(scaled.problem, wrapped(kernels / scaled.share, size))
         found = drawn_deviation(scaled, power, matrix, draws, rng, part.draws)
