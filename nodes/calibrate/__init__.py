@@ -2,7 +2,12 @@
 
 from neusee.nodes.calibrate import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
-from neusee.nodes.calibrate._frames._emva_descriptor import descriptor, descriptor_frames, descriptor_series
+from neusee.nodes.calibrate._frames._emva_descriptor import (
+    descriptor,
+    descriptor_frames,
+    descriptor_series,
+    refuse_descriptor,
+)
 from neusee.nodes.calibrate._frames._frame_statistics import levels, reduce
 from neusee.nodes.calibrate._frames._level_frames import frames
 from neusee.nodes.calibrate._frames._moment_table import table
@@ -77,6 +82,7 @@ __all__ = [
     "prior",
     "profiles",
     "reduce",
+    "refuse_descriptor",
     "spatial_series",
     "spectrogram",
     "stray_light",

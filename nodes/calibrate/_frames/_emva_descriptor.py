@@ -121,6 +121,11 @@ def descriptor_series(files: Sequence[Path]) -> Iterator[tuple[float, float, Ite
         yield level.photons, level.exposure, (f for _, image in level.images for f in torch.from_numpy(stack([image])))
 
 
+def refuse_descriptor(file: Path) -> None:
+    """Raise ValueError with the line of the mistake if a descriptor or an image that it names cannot be read."""
+    refuse_unreadable("file", _with_images(file)[1:])
+
+
 def _reduced(name: str, measurement: _Measurement, level: _Level, scatter: Temporal) -> Levels:
     numbers = stack([image for _, image in level.images])
     if measurement.shape and numbers.shape[1:] != measurement.shape:

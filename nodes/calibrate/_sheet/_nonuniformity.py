@@ -15,6 +15,7 @@ from torch import Tensor
 from neusee.nodes.calibrate._sheet._quantity import Quantity
 
 FloatArray = NDArray[np.float64]
+_SURE = 2.0  #: standard errors of a variance below which only a limit follows
 _LEAST = 8  #: pixels, side of the smallest frame
 PARTS = ("total", "row", "column", "pixel")
 
@@ -79,15 +80,14 @@ def spatial_variances(series: SpatialSeries) -> SpatialVariances:
 
     Shapes: -> scalars.
     Units:  DN2.
-    Error:  the rest of the noise in time is subtracted, so that a part that is smaller may come out negative.
+    Error:  the rest of the noise in time is subtracted, so that a part that is smaller may come out negative; see
+            `chance_of_variances`.
     Source: EMVA Standard 1288, release 4.0 Linear, section 8.2 (rows, columns and pixels that add up to the total).
     """
-    image = series.average
-    rows, columns = image.shape
+    rows, columns = series.total.shape
     left = series.temporal / series.count
-    total = float(image.var(ddof=1)) - left
-    by_column = float(image.mean(0).var()) - left / rows
-    by_row = float(image.mean(1).var()) - left / columns
+    found = _measured(series)
+    total, by_row, by_column = found.total - left, found.row - left / columns, found.column - left / rows
     pixels = rows * columns
     rest = pixels - rows - columns
     return SpatialVariances(
@@ -96,6 +96,24 @@ def spatial_variances(series: SpatialSeries) -> SpatialVariances:
         ((pixels - rows) * by_column - columns * (total - by_row)) / rest,
         pixels * (total - by_column - by_row) / rest,
     )
+
+
+def chance_of_variances(series: SpatialSeries) -> SpatialVariances:
+    """Return the standard errors of `spatial_variances`, DN2, for normal noise and a normal nonuniformity."""
+    rows, columns = series.total.shape
+    found = _measured(series)
+    noise = series.temporal / series.count * math.sqrt(2 / (rows * columns * (series.count - 1)))
+    pixel = math.hypot(found.total * math.sqrt(2 / (rows * columns)), noise)
+    row, column = found.row * math.sqrt(2 / rows), found.column * math.sqrt(2 / columns)
+    return SpatialVariances(math.hypot(pixel, row, column), math.hypot(row, pixel / columns),
+                            math.hypot(column, pixel / rows), pixel)  # fmt: skip
+
+
+def _measured(series: SpatialSeries) -> SpatialVariances:
+    """Return the variances of the averaged frame, of the means of its rows and of the means of its columns."""
+    image = series.average
+    rows, columns = float(image.mean(1).var()), float(image.mean(0).var())
+    return SpatialVariances(float(image.var(ddof=1)), rows, columns, math.nan)
 
 
 def nonuniformity(found: Nonuniformity, gain: float | None) -> list[Quantity]:
@@ -110,21 +128,20 @@ def nonuniformity(found: Nonuniformity, gain: float | None) -> list[Quantity]:
 
 def _dark(series: SpatialSeries | None, gain: float | None) -> list[Quantity]:
     quantities: list[Quantity] = []
-    parts = None if series is None else spatial_variances(series)
     for i, part in enumerate(PARTS):
         names = _names("DSNU", part, "dark signal nonuniformity")
         in_numbers = Quantity(f"{names[0]}_DN", f"{names[1]}.DN", names[2], "DN")
         in_electrons = Quantity(names[0], names[1], names[2], "e-")
-        if parts is None:
+        if series is None:
             why = "no series of dark frames is given, only pairs"
             quantities += [in_numbers.untold(why), in_electrons.untold(why)]
             continue
-        numbers = _root(in_numbers, parts[i])
+        numbers = _root(in_numbers, spatial_variances(series)[i], chance_of_variances(series)[i])
         quantities.append(numbers)
         if numbers.value is None or gain is None:
             quantities.append(in_electrons.untold(numbers.reason or "K is not told, so that no value in electrons is"))
         else:
-            quantities.append(in_electrons.told(numbers.value / gain))
+            quantities.append(in_electrons.told(numbers.value / gain, numbers.bound, numbers.reason))
     return quantities
 
 
@@ -136,8 +153,11 @@ def _lit(found: Nonuniformity) -> list[Quantity]:
     signal = float(found.lit.average.mean() - found.dark.average.mean())
     if not signal > 0:
         return [blank.untold("the lit series is no brighter than the dark one") for blank in blanks]
-    both = zip(blanks, spatial_variances(found.lit), spatial_variances(found.dark), strict=True)
-    return [_root(blank, (lit - dark) * (100 / signal) ** 2) for blank, lit, dark in both]
+    scale = (100 / signal) ** 2
+    each = zip(spatial_variances(found.lit), spatial_variances(found.dark), strict=True)
+    chance = zip(chance_of_variances(found.lit), chance_of_variances(found.dark), strict=True)
+    both = zip(blanks, each, chance, strict=True)
+    return [_root(blank, (lit - dark) * scale, math.hypot(*errors) * scale) for blank, (lit, dark), errors in both]
 
 
 def _names(kind: str, part: str, name: str) -> tuple[str, str, str]:
@@ -146,7 +166,9 @@ def _names(kind: str, part: str, name: str) -> tuple[str, str, str]:
     return f"{kind}1288_{part}", f"{kind}1288.{part}", f"{name}, {part}s"
 
 
-def _root(blank: Quantity, variance: float) -> Quantity:
-    if variance < 0:
-        return blank.untold("smaller than what noise in time leaves in the averaged frames")
-    return blank.told(math.sqrt(variance))
+def _root(blank: Quantity, variance: float, error: float) -> Quantity:
+    """Return the root of a variance, or a limit if the variance is less than two of its standard errors."""
+    if variance >= _SURE * error and variance > 0:
+        return blank.told(math.sqrt(variance))
+    limit = math.sqrt(max(variance, 0.0) + _SURE * error)
+    return blank.told(limit, "<", "no more than what noise in time leaves in the averaged frames")

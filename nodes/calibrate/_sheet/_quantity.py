@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 Bound = Literal["", "<", ">"]
+_WHOLE = (1e3, 1e7)  #: values that are shown as whole numbers
 
 
 @dataclass(frozen=True)
@@ -27,10 +28,11 @@ class Quantity:
 
     @property
     def text(self) -> str:
-        """Value and unit with four digits, such as ``< 1.4 e-``, or ``not measured``."""
+        """Value and unit with four digits or as a whole number, such as ``< 1.4 e-``, or ``not measured``."""
         if self.value is None:
             return "not measured"
-        return f"{self.bound} {self.value:.4g} {self.unit}".strip()
+        number = f"{self.value:.0f}" if _WHOLE[0] <= abs(self.value) < _WHOLE[1] else f"{self.value:.4g}"
+        return f"{self.bound} {number} {self.unit}".strip()
 
     def told(self, value: float, bound: Bound = "", reason: str = "") -> Quantity:
         """Return the quantity with a value; a value that is not finite counts as none, and needs a reason."""

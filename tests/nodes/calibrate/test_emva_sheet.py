@@ -19,7 +19,7 @@ from neusee.nodes.calibrate import (
     without_trend,
 )
 from neusee.nodes.calibrate import levels as joined
-from neusee.nodes.calibrate._sheet._nonuniformity import spatial_variances
+from neusee.nodes.calibrate._sheet._nonuniformity import nonuniformity, spatial_variances
 from neusee.nodes.calibrate._sheet._photon_transfer import saturation_point
 from neusee.nodes.values import Levels
 
@@ -266,3 +266,26 @@ def test_uneven_light_is_no_defect():
     slope[10, 20] += 50
     assert without_trend(slope).shape == (26, 36)
     assert np.unique(without_trend(slope)).tolist() == [-50, 0, 24 * 50]
+
+
+def test_a_nonuniformity_within_chance_is_a_limit():
+    rng = np.random.default_rng(11)
+    stated, most = 0, 0.0
+    for _ in range(60):
+        frames = torch.from_numpy(np.round(100 + 10 * rng.standard_normal((3, 24, 32))).astype(np.int64))
+        found = [q for q in nonuniformity(Nonuniformity(spatial_series(0.0, 1.0, frames), None), 1.0) if q.unit == "DN"]
+        stated += sum(q.bound == "" for q in found)
+        most = max(most, *(q.value for q in found))
+    assert stated <= 0.1 * 4 * 60  # two standard errors of a variance from few rows
+    assert most < 10 / 3**0.5  # of a single averaged pixel
+
+
+def test_a_nonuniformity_beyond_chance_is_stated():
+    rng = np.random.default_rng(12)
+    image = 100 + 5 * rng.standard_normal((24, 32))
+    frames = torch.from_numpy(np.round(image + 4 * rng.standard_normal((9, 24, 32))).astype(np.int64))
+    total, _, _, pixel = (
+        q for q in nonuniformity(Nonuniformity(spatial_series(0.0, 1.0, frames), None), 1.0) if q.unit == "DN"
+    )
+    assert (total.bound, pixel.bound) == ("", "")
+    assert (total.value, pixel.value) == (pytest.approx(5, rel=0.1), pytest.approx(5, rel=0.1))
