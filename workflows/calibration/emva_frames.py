@@ -69,7 +69,7 @@ def descriptor_recipe(file: Path, changes: Sequence[str] = ()) -> Recipe:
         return load(path, changes)
 
 
-def emva_frames(recipe: Recipe, store: Store, release: Release = "4") -> EmvaFrames:
+def frames_of_recipe(recipe: Recipe, store: Store, release: Release = "4") -> EmvaFrames:
     """Return levels with the variance in time, and the dark and the lit series, of a recipe that reads frames.
 
     In release 4 the variance of a level excludes the difference of the means of its frames; in 3 it includes it.

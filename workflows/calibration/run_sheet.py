@@ -9,7 +9,7 @@ from typing import Any
 
 from neusee.nodes.calibrate import EmvaSheet, emva_sheet
 from neusee.workflows.calibration import emva_figures
-from neusee.workflows.calibration.emva_frames import OPERATING_POINT, EmvaFrames, Release, emva_frames
+from neusee.workflows.calibration.emva_frames import OPERATING_POINT, EmvaFrames, Release, frames_of_recipe
 from neusee.workflows.calibration.emva_page import banner, group_of, lead, operating_point, requirements, sections
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
@@ -38,7 +38,7 @@ def write_sheet(
     statement.
     """
     study_run, told = StudyRun("sheet", recipe, command), operating_point(state)
-    frames = emva_frames(recipe, store, release)
+    frames = frames_of_recipe(recipe, store, release)
     sheet = emva_sheet(frames.levels, frames.spatial, photons_told=not relative)
     document = study_run.document(_document(sheet, frames, told, release))
     report = _report(recipe, sheet, frames, told, release, document)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,6 +13,9 @@ from neusee.workflows.cli.command_frame import fail, failing, load, refusing, sa
 from neusee.workflows.cli.command_list import FAILED, MISSED
 from neusee.workflows.cli.command_options import AsJson, Debug, Out, Quiet, Words, option_words
 from neusee.workflows.cli.interruption import say_folder
+
+if TYPE_CHECKING:
+    from neusee.workflows.graph.recipe_graph import Recipe
 
 
 class StandardRelease(StrEnum):
@@ -48,17 +51,10 @@ def sheet(
     and CSV have every quantity with the symbol of the standard, or the reason why the frames do not tell it. Where
     rounding hides the dark noise, the page has a red banner and the exit code is 3.
     """
-    from neusee.workflows.calibration.emva_frames import descriptor_recipe
     from neusee.workflows.calibration.run_sheet import write_sheet
     from neusee.workflows.graph.run_error import RunError
 
-    name, changes, _ = split(words)
-    if Path(name).suffix.lower() == ".txt":
-        with failing(ValueError, before="nothing was computed: "), refusing():
-            recipe = descriptor_recipe(Path(name), changes)
-        command = ["neusee", "sheet", name, *changes]
-    else:
-        recipe, command = load(words, "sheet")
+    recipe, command = _loaded(words)
     said = [word for fact in state or () for word in ("--state", fact)]
     command += [*option_words({"release": release.value, "relative": relative}), *said]
     with failing(RunError, code=FAILED), failing(ValueError):
@@ -71,6 +67,17 @@ def sheet(
     say_folder(folder, as_json)
     if document["fails"]:
         fail(f"{document['fails']} See {folder / 'report.html'}", MISSED)
+
+
+def _loaded(words: list[str] | None) -> tuple[Recipe, list[str]]:
+    """Return the recipe of a descriptor or the named recipe, and the command line."""
+    name, changes, _ = split(words)
+    if Path(name).suffix.lower() != ".txt":
+        return load(words, "sheet")
+    from neusee.workflows.calibration.emva_frames import descriptor_recipe
+
+    with failing(ValueError, before="nothing was computed: "), refusing():
+        return descriptor_recipe(Path(name), changes), ["neusee", "sheet", name, *changes]
 
 
 def _line(quantity: dict[str, object]) -> str:

@@ -12,7 +12,7 @@ import torch
 
 from neusee.nodes.calibrate import Nonuniformity, emva_sheet, levels, reduce, spatial_series
 from neusee.workflows.calibration import emva_figures
-from neusee.workflows.calibration.emva_frames import EmvaFrames, descriptor_recipe, emva_frames
+from neusee.workflows.calibration.emva_frames import EmvaFrames, descriptor_recipe, frames_of_recipe
 from neusee.workflows.calibration.emva_page import operating_point, requirements, sections
 from neusee.workflows.cli import app
 from neusee.workflows.store.result_store import Store
@@ -111,7 +111,7 @@ def test_a_descriptor_gives_page_tables_and_document(neusee, archive, tmp_path):
 
 def test_release_3_keeps_the_drift_of_a_pair(archive, tmp_path):
     recipe = descriptor_recipe(archive / "EMVA1288_Data.txt")
-    of = {release: emva_frames(recipe, Store(tmp_path), release).levels for release in ("3", "4")}
+    of = {release: frames_of_recipe(recipe, Store(tmp_path), release).levels for release in ("3", "4")}
     for i, photons in enumerate(GRID):
         one, two = (np.load(archive / f"{photons:.0f}_10_2_{k}.npy").astype(float) for k in (0, 1))
         apart, count = one - two, one.size
