@@ -208,7 +208,7 @@ STAND_INS = {
         constants={"studies.calibration.calibration_study:PIXELS": 32,
                    "studies.calibration.calibration_study:walk_draws": without_walk}),
     **{f"sheet {words}": StandIn("seconds for each plot", constants=ONE_PLOT) for words in (
-        'set/EMVA1288_descriptor.txt --state "wavelength=525 nm" --state "temperature=25 °C"',
+        'my/set/EMVA1288_descriptor.txt --state "wavelength=525 nm" --state "temperature=25 °C"',
         "my/frames.yaml --relative")},
     "calibrate calibrate": StandIn("minutes", more=("flats.shape=[32,32]", *FEW_DRAWS), constants=CUT, code=3),
     "calibrate calibrate_camera table.file=my.csv": StandIn("minutes", more=FEW_DRAWS, constants=CUT, code=3),

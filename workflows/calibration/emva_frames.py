@@ -10,10 +10,15 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from neusee.nodes.calibrate import (
+    FrameTest,
     Nonuniformity,
     SpatialSeries,
+    Stack,
+    coarse,
     descriptor,
+    descriptor_frames,
     descriptor_series,
+    inspect_frames,
     levels,
     reduce,
     refuse_descriptor,
@@ -52,6 +57,7 @@ class EmvaFrames(NamedTuple):
     levels: Levels
     spatial: Nonuniformity
     frames: int  #: least number of frames of a level
+    tests: Sequence[FrameTest] = ()  #: of the frames themselves
 
 
 def descriptor_recipe(file: Path, changes: Sequence[str] = ()) -> Recipe:
@@ -83,7 +89,9 @@ def frames_of_recipe(recipe: Recipe, store: Store, release: Release = "4") -> Em
         return _reduced(recipe, store, reduced, scatter)
     if tables := steps["calibrate.table"]:
         found = run(recipe, store, (tables[0].name,)).values[tables[0].name]
-        return EmvaFrames(found, Nonuniformity(None, None), 2)
+        dark = found.variance[found.photons == 0]
+        tests = [coarse(float(dark.min()), exact=False)] if len(dark) else []
+        return EmvaFrames(found, Nonuniformity(None, None), 2, tests)
     raise ValueError(f"{recipe.name} has no step of the nodes {', '.join(_READERS)}, so that it has no frames of a "
                      "sheet of EMVA 1288: give a descriptor, or a recipe as in `neusee run calibrate`")  # fmt: skip
 
@@ -95,7 +103,8 @@ def _described(step: Step, scatter: Any) -> EmvaFrames:
     files = step.params["file"]
     found = descriptor(file=files, scatter=scatter)
     series = [spatial_series(*each) for each in descriptor_series(files)]
-    return EmvaFrames(found, _nearest_half(series, found), 2)
+    stacks = (Stack(name, light, time, scatter, frames) for name, light, time, frames in descriptor_frames(files))
+    return EmvaFrames(found, _nearest_half(series, found), 2, inspect_frames(stacks, exact=False))
 
 
 def _reduced(recipe: Recipe, store: Store, steps: Sequence[Step], scatter: Any) -> EmvaFrames:
@@ -110,7 +119,8 @@ def _reduced(recipe: Recipe, store: Store, steps: Sequence[Step], scatter: Any) 
     chosen = [step for step, count in zip(steps, counts, strict=True) if count == most]
     pair = _dark_and_half([_of(step) for step in chosen], found)
     series = (spatial_series(*_of(chosen[i]), _frames(recipe, store, chosen[i])) for i in pair)
-    return EmvaFrames(found, _pair(series), min(counts))
+    stacks = (Stack(step.name, *_of(step), scatter, _frames(recipe, store, step)) for step in steps)
+    return EmvaFrames(found, _pair(series), min(counts), inspect_frames(stacks, exact=False))
 
 
 def _of(step: Step) -> tuple[float, float]:

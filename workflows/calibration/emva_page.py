@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neusee.nodes.calibrate import EmvaSheet, Quantity, SpatialSeries
+from neusee.nodes.calibrate import EmvaSheet, FrameTest, Quantity, SpatialSeries
 from neusee.workflows.calibration.emva_frames import OPERATING_POINT, EmvaFrames, Release
+from neusee.workflows.calibration.frame_validity import frame_section
 from neusee.workflows.report.study_page import Mark, Section
 
 _LEVELS, _EXPOSURES, _SERIES = (
@@ -16,6 +17,9 @@ _LEVELS, _EXPOSURES, _SERIES = (
     6,
     16,
 )  #: lit levels, exposures of darks, frames of a series that the standard asks for
+_ROUNDING = "the dark noise exceeds rounding"  #: name of the test of frames that says the same as `_COARSE`
+_COARSE = """the temporal dark noise is below 0.49 DN; the standard asks for more, because rounding hides the noise: \
+dark noise, thresholds and dynamic range are limits only, and K is doubtful"""
 _HALF = (0.45, 0.55)  #: shares of saturation that count as 50 %
 _TABLES = {
     "Quantities": ("eta", "DR_bit"),
@@ -65,14 +69,13 @@ class Requirement(NamedTuple):
     mark: Mark
 
 
-def banner(sheet: EmvaSheet) -> str:
+def banner(sheet: EmvaSheet, tests: Sequence[FrameTest] = ()) -> str:
     """Return why the linear model of the standard does not hold for these frames, or an empty text."""
-    if sheet["sigma_y_dark"].bound:
-        return (
-            "Not fit for use: the temporal dark noise is below 0.49 DN. The standard asks for more, because rounding "
-            "hides the noise: dark noise, thresholds and dynamic range are limits only, and K is doubtful."
-        )
-    return f"Not fit for use: K is not told: {sheet['K'].reason}." if sheet["K"].value is None else ""
+    coarse = sheet["sigma_y_dark"].bound != ""
+    reasons = [_COARSE] if coarse else [f"K is not told: {sheet['K'].reason}"] if sheet["K"].value is None else []
+    wrong = (test for test in tests if test.verdict == "refused" and not (coarse and test.name == _ROUNDING))
+    reasons += [f"{test.name}: {test.sentence}" for test in wrong]
+    return f"Not fit for use: {'; '.join(reasons)}." if reasons else ""
 
 
 def lead(sheet: EmvaSheet, release: Release) -> str:
@@ -93,7 +96,8 @@ def sections(
 ) -> list[Section]:
     """Return the sections of the page in the order of the standard, without plots that the frames do not allow."""
     found = (_section(sheet, heading, text, pictures.get(name)) for heading, name, text in _SECTIONS)
-    return [*(s for s in found if s.rows or s.picture), _compliance(sheet, frames, told)]
+    kept = (s for s in found if s.rows or s.picture)
+    return [*kept, frame_section(frames.tests), _compliance(sheet, frames, told)]
 
 
 def requirements(sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any]) -> list[Requirement]:

@@ -11,6 +11,7 @@ from neusee.nodes.calibrate import EmvaSheet, emva_sheet
 from neusee.workflows.calibration import emva_figures
 from neusee.workflows.calibration.emva_frames import OPERATING_POINT, EmvaFrames, Release, frames_of_recipe
 from neusee.workflows.calibration.emva_page import banner, group_of, lead, operating_point, requirements, sections
+from neusee.workflows.calibration.frame_validity import as_rows
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.study_folder import StudyReport, StudyRun, as_json
@@ -50,9 +51,10 @@ def _document(sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any], rel
     return {
         "standard": "EMVA 1288, release 4.0 Linear",
         "temporal variance": "release 4: without the difference of means" if release == "4" else "release 3.0",
-        "fails": banner(sheet),
+        "fails": banner(sheet, frames.tests),
         "quantities": {q.key: {"section": group_of(q, sheet), **asdict(q)} for q in sheet.quantities},
         "operating point": dict(told),
+        "frames": as_rows(frames.tests),
         "demands": [each._asdict() for each in requirements(sheet, frames, told)],
         "deviation": None if sheet.linearity is None else sheet.linearity.deviation.tolist(),
     }
@@ -78,7 +80,7 @@ def _report(
             "emva1288.json": as_json(document),
             "emva1288.pdf": emva_figures.pdf(sheet, title, [*summary, document["fails"]]),
         },
-        banner=banner(sheet),
+        banner=document["fails"],
     )
 
 

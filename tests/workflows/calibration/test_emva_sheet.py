@@ -151,22 +151,40 @@ def test_mistakes_are_refused(neusee, words, message):
     assert message in err
 
 
-def test_dark_noise_below_rounding_ends_with_exit_code_3(neusee, archive, tmp_path):
-    rng = np.random.default_rng(1)
-    text = (archive / "EMVA1288_Data.txt").read_text().splitlines()
+def planted(archive, folder, change):
+    """Write the archive again with changed frames, and return the name of its descriptor."""
+    text = (archive / "EMVA1288_Data.txt").read_text()
     photons = 0.0
-    for line in text:
+    for line in text.splitlines():
         kind, _, rest = line.partition(" ")
         if kind in "bd":
             photons = float(rest.split()[1]) if kind == "b" else 0.0
         if kind == "i":
-            np.save(tmp_path / rest, exposed(rng, photons, 1, noise=0.3, exposure=0.0)[0])
-    (tmp_path / "quiet.txt").write_text("\n".join(text))
-    code, out, err = neusee("quiet.txt")
+            np.save(folder / rest, change(photons, np.load(archive / rest)))
+    (folder / "planted.txt").write_text(text)
+    return "planted.txt"
+
+
+def test_dark_noise_below_rounding_ends_with_exit_code_3(neusee, archive, tmp_path):
+    rng = np.random.default_rng(1)
+    quiet = planted(archive, tmp_path, lambda photons, _: exposed(rng, photons, 1, noise=0.3, exposure=0.0)[0])
+    code, out, err = neusee(quiet)
     assert code == 3
-    assert "below 0.49 DN" in err
+    assert err.count("0.49 DN") == 1
     assert "< 0.4899 DN" in out
     assert "Not fit for use" in (results(out, tmp_path) / "report.html").read_text()
+
+
+def test_mixed_pixels_end_with_exit_code_3(neusee, archive, tmp_path):
+    def mixed(_, frame):
+        sides = sum(np.roll(frame, shift, axis).astype(float) for shift, axis in ((1, 0), (-1, 0), (1, 1), (-1, 1)))
+        return np.round(0.7 * frame + 0.3 * sides / 4).astype(np.uint16)
+
+    code, out, err = neusee(planted(archive, tmp_path, mixed))
+    assert (code, "Not fit for use: white noise: " in err) == (3, True)
+    document = json.loads((results(out, tmp_path) / "emva1288.json").read_text())
+    assert document["quantities"]["K"]["value"] < 0.8 * GAIN  # which nobody could see in the number
+    assert {t["name"]: t["verdict"] for t in document["frames"]}["white noise"] == "refused"
 
 
 def test_every_demand_is_met_or_says_what_is_missing(sheet):
@@ -185,11 +203,12 @@ def test_sections_stand_in_the_order_of_the_standard_and_none_is_empty(sheet):
     shown = sections(sheet, EmvaFrames(None, sheet.spatial, 2), operating_point([]), dict.fromkeys(names, b"png"))
     assert [s.heading for s in shown] == [
         "Quantities", "Photon transfer", "Response", "Signal-to-noise ratio", "Linearity", "Dark current",
-        "Spatial nonuniformity", "Spectrograms", "Profiles", "Defect pixels", "Compliance: what was measured and told",
+        "Spatial nonuniformity", "Spectrograms", "Profiles", "Defect pixels", "The frames",
+        "Compliance: what was measured and told",
     ]  # fmt: skip
-    assert sum(len(s.rows) for s in shown[:-1]) == len(sheet.quantities)
+    assert sum(len(s.rows) for s in shown[:-2]) == len(sheet.quantities)
     bare = sections(sheet, EmvaFrames(None, sheet.spatial, 2), operating_point([]), {})
-    assert [s.heading for s in bare if not s.rows] == []
+    assert [s.heading for s in bare if not s.rows] == ["The frames"]
 
 
 @pytest.mark.parametrize("name", [n for n in emva_figures.PICTURES if n != "dark_current"])
