@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import textwrap
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -173,8 +174,9 @@ def defect_pixels(sheet: EmvaSheet) -> Any:
     if dark is not None:
         found["DSNU", "DN"] = defects(dark.total, 1 / dark.count)
     if dark is not None and lit is not None and (signal := _signal(dark, lit)) > 0:
-        trendless = without_trend(lit.total * dark.count - dark.total * lit.count)
-        found["PRNU", "%"] = defects(trendless, 100 / (25 * dark.count * lit.count * signal))
+        parts = math.gcd(dark.count, lit.count)
+        trendless = without_trend((lit.total * dark.count - dark.total * lit.count) // parts)
+        found["PRNU", "%"] = defects(trendless, 100 * parts / (25 * dark.count * lit.count * signal))
     if not found:
         return None
     figure, axes = canvas(_WIDTH, 3.4 * len(found), len(found), 2)

@@ -16,8 +16,9 @@ from neusee.workflows.calibration.emva_frames import EmvaFrames, descriptor_reci
 from neusee.workflows.calibration.emva_page import operating_point, requirements, sections
 from neusee.workflows.cli import app
 from neusee.workflows.store.result_store import Store
+from tests.nodes.calibrate.numpy_emva import quantities
 
-GAIN, SHAPE, SERIES = 0.4, (24, 32), 16
+GAIN, SHAPE, SERIES = 0.4, (40, 48), 16
 GRID = [0, *np.linspace(500, 20000, 14).tolist()]
 
 
@@ -86,7 +87,7 @@ def test_a_descriptor_gives_page_tables_and_document(neusee, archive, tmp_path):
     folder = results(out, tmp_path)
     document = json.loads((folder / "emva1288.json").read_text())
     found = document["quantities"]
-    assert found["K"]["value"] == pytest.approx(GAIN, rel=0.05)  # 768 pixels
+    assert found["K"]["value"] == pytest.approx(GAIN, rel=0.05)  # 1920 pixels
     assert found["eta"]["value"] == pytest.approx(50, rel=0.05)
     assert (found["mu_I_mean"]["value"], found["mu_I_mean"]["unit"]) == (pytest.approx(900, rel=0.05), "e-/s")
     assert document["operating point"]["temperature"] == "25 °C"
@@ -107,6 +108,21 @@ def test_a_descriptor_gives_page_tables_and_document(neusee, archive, tmp_path):
     assert demands["series of 16 or more lit frames for spatial quantities"] == ("16 frames", "pass")
     assert demands["both series at one exposure"][1] == "pass"
     assert re.search(r"^σ_d +1[0-4]\.\d+ e- ", out, re.MULTILINE)
+
+
+def test_every_quantity_is_that_of_numpy_alone(archive, tmp_path):
+    def frames(photons, exposure, count):
+        return np.stack([np.load(archive / f"{photons:.0f}_{exposure}_{count}_{i}.npy") for i in range(count)])
+
+    light = [*((p, 10) for p in GRID), (0, 200), (0, 400)]
+    pairs = [(p, 1e-3 * t, frames(p, t, 2)) for p, t in light]
+    found = frames_of_recipe(descriptor_recipe(archive / "EMVA1288_Data.txt"), Store(tmp_path))
+    sheet = emva_sheet(found.levels, found.spatial)
+    truth = quantities(pairs, [frames(p, 10, SERIES) for p in (0, GRID[7])])
+    assert set(truth) == {q.key for q in sheet.quantities}
+    stated = {q.key: q.value for q in sheet.quantities if not q.reason}
+    assert len(stated) > 20
+    assert stated == pytest.approx({key: truth[key] for key in stated}, rel=1e-3, abs=0)
 
 
 def test_release_3_keeps_the_drift_of_a_pair(archive, tmp_path):
