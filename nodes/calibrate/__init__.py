@@ -23,6 +23,7 @@ from neusee.nodes.calibrate._prior._sensor_prior import NAMES, Coordinates, prio
 from neusee.nodes.calibrate._scatter._point_source import Rings, point_source
 from neusee.nodes.calibrate._scatter._scatter_likelihood import guess_scatter, stray_light
 from neusee.nodes.calibrate._scatter._scatter_prior import SCATTER_NAMES, ScatterCoordinates, stray_prior
+from neusee.nodes.calibrate._sheet._general_model import general_model
 from neusee.nodes.calibrate._sheet._nonuniformity import Nonuniformity, SpatialSeries, spatial_series
 from neusee.nodes.calibrate._sheet._patterns import (
     DefectHistogram,
@@ -72,6 +73,7 @@ __all__ = [
     "emva_sheet",
     "expose",
     "frames",
+    "general_model",
     "guess",
     "guess_camera",
     "guess_scatter",

@@ -1,24 +1,28 @@
-"""The pictures of the EMVA 1288 sheet, in the order of the standard, and the PDF with all of them."""
+"""The pictures of the EMVA 1288 sheet, in the order of the standard."""
 
 from __future__ import annotations
 
-import io
 import math
-import textwrap
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from neusee.nodes.calibrate import EmvaSheet, SpatialSeries, defects, profiles, spectrogram, without_trend
+from neusee.nodes.calibrate import (
+    EmvaSheet,
+    SpatialSeries,
+    defects,
+    general_model,
+    profiles,
+    spectrogram,
+    without_trend,
+)
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, styled
 
 Draw = Callable[[EmvaSheet], Any]
 _DOTS = {"linestyle": "", "marker": "o", "color": BLACK, "markersize": 3.5}
 _WIDTH, _HEIGHT = 9.0, 4.2  #: inches
 _BINS = 200  #: points of a curve
-_LINE = 105  #: characters of a line of the summary
-_A4 = (8.27, 11.69)  #: inches
 
 
 def photon_transfer(sheet: EmvaSheet) -> Any:
@@ -78,6 +82,23 @@ def signal_to_noise(sheet: EmvaSheet) -> Any:
     return figure
 
 
+def general(sheet: EmvaSheet) -> Any:
+    """Draw the local slope of the response and the signal-to-noise ratio of the light; None with too few levels."""
+    found = general_model(sheet.transfer)
+    if found is None:
+        return None
+    figure, axes = canvas(_WIDTH, _HEIGHT, 1, 2)
+    left, right = axes[0]
+    left.plot(found.photons, found.slope[1:], **_DOTS)
+    left.set(xlabel=_light(sheet), ylabel="slope (DN per photon)", title="Slope of the response")
+    left.set_ylim(0, 1.15 * float(found.slope.max()))
+    left.locator_params(axis="x", nbins=5)
+    right.plot(found.photons, found.ratio, **_DOTS)
+    right.set(xscale="log", yscale="log", xlabel=_light(sheet), ylabel="SNR of the light", title="SNR, no linear model")
+    right.xaxis.set_minor_formatter("")
+    return figure
+
+
 def linearity(sheet: EmvaSheet) -> Any:
     """Draw the response with its line, and the relative deviation from the line, from 5 to 95 % of saturation."""
     figure, axes = canvas(_WIDTH, 6.0, 2, 1, sharex=True, height_ratios=(1.4, 1.0))
@@ -92,10 +113,10 @@ def linearity(sheet: EmvaSheet) -> Any:
         for key in ("LE_min", "LE_max"):
             below.axhline(sheet[key].value, color=VERMILION, linestyle=":")
             text = f"{sheet[key].symbol} = {sheet[key].text}"
-            below.annotate(
-                text, (1, sheet[key].value), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=9
-            )
-        below.margins(y=0.25)
+            side = "top" if key == "LE_min" else "bottom"
+            at = (1, sheet[key].value)
+            below.annotate(text, at, xycoords=("axes fraction", "data"), ha="right", va=side, fontsize=9)
+        below.margins(y=0.3)
     else:
         below.text(0.5, 0.5, sheet["LE_min"].reason, transform=below.transAxes, ha="center")
     below.axhline(0, color=BLUE, linewidth=1)
@@ -198,6 +219,7 @@ PICTURES: Mapping[str, Draw] = {
     "photon_transfer": photon_transfer,
     "sensitivity": sensitivity,
     "snr": signal_to_noise,
+    "general_model": general,
     "linearity": linearity,
     "dark_current": dark_current,
     "spectrograms": spectrograms,
@@ -215,39 +237,6 @@ def pictures(sheet: EmvaSheet) -> dict[str, bytes]:
         return None if figure is None else drawn(lambda: figure)()
 
     return {name: png for name, draw in PICTURES.items() if (png := kept(draw)) is not None}
-
-
-def pdf(sheet: EmvaSheet, title: str, lines: list[str]) -> bytes:
-    """Return a PDF: the summary of the sheet on its first page, and the pictures on the pages after it."""
-    from matplotlib.backends.backend_pdf import PdfPages
-
-    out = io.BytesIO()
-    with styled(), PdfPages(out, metadata={"Title": title, "Creator": "neusee"}) as pages:
-        pages.savefig(_summary(sheet, title, lines))
-        for draw in PICTURES.values():
-            if (figure := draw(sheet)) is not None:
-                pages.savefig(figure, bbox_inches="tight", pad_inches=0.3)
-    return out.getvalue()
-
-
-def _summary(sheet: EmvaSheet, title: str, lines: list[str]) -> Any:
-    """Return a page of A4 with title, what is told of the camera, and the table of all quantities."""
-    figure, axes = canvas(*_A4, 2, 1, height_ratios=(0.25, 1.0))
-    figure.get_layout_engine().set(rect=(0.07, 0.04, 0.86, 0.92))
-    for ax in axes[:, 0]:
-        ax.set_axis_off()
-    axes[0, 0].text(0, 1, title, fontsize=14, fontweight="bold", va="top", transform=axes[0, 0].transAxes)
-    shown = "\n".join(part for text in lines for part in textwrap.wrap(text, _LINE))
-    axes[0, 0].text(0, 0.86, shown, fontsize=9, va="top", linespacing=1.4, transform=axes[0, 0].transAxes)
-    rows = [(q.symbol, q.name, q.text) for q in sheet.quantities]
-    table = axes[1, 0].table(
-        rows, colLabels=("symbol", "quantity", "value"), colWidths=(0.2, 0.52, 0.28), cellLoc="left", loc="upper center"
-    )
-    table.auto_set_font_size(False)
-    table.set_fontsize(9)
-    for cell in table.get_celld().values():
-        cell.set_linewidth(0.3)
-    return figure
 
 
 def _saturation(ax: Any, sheet: EmvaSheet, at: float) -> None:

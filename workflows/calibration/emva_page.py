@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,9 +21,14 @@ _LEVELS, _EXPOSURES, _SERIES = (
 _ROUNDING = "the dark noise exceeds rounding"  #: name of the test of frames that says the same as `_COARSE`
 _COARSE = """the temporal dark noise is below 0.49 DN; the standard asks for more, because rounding hides the noise: \
 dark noise, thresholds and dynamic range are limits only, and K is doubtful"""
+_TESTED = """Each test asks if the frames are such as the model of the standard describes. Modelled: the quantities allow
+for it. Widened: it is found, and the error of K or of the noise that may follow is small. Refused: this error may exceed
+2 %, or is unknown. Numbers and limits of noise and patterns are in standard deviations of chance."""
+_MOMENTS = "Only moments are given, so that noise, patterns and numbers of the frames are not tested."
 _HALF = (0.45, 0.55)  #: shares of saturation that count as 50 %
 _TABLES = {
     "Quantities": ("eta", "DR_bit"),
+    "General model": ("mu_p_min_general", "DR_general"),
     "Linearity": ("LE_min", "LE_max"),
     "Dark current": ("mu_I_mean", "mu_I_var"),
     "Spatial nonuniformity": ("DSNU1288_DN", "PRNU1288_pixel"),
@@ -41,6 +47,9 @@ _SECTIONS = (
     ("Signal-to-noise ratio", "snr",
         """Measured in time at each level, and of the linear model with the quantities above. The total SNR has the
         spatial nonuniformity in its noise too. At μ_p.min the model is 1."""),
+    ("General model", "general_model",
+        """As release 4.0 General, which needs no linear camera and no K: the slope of the response at each level refers
+        the noise in time to the light. For a linear camera it agrees with the linear model."""),
     ("Linearity", "linearity",
         """The line has the least squares of relative deviations from 5 to 95 % of saturation; its greatest
         deviations are the linearity errors."""),
@@ -97,7 +106,8 @@ def sections(
     """Return the sections of the page in the order of the standard, without plots that the frames do not allow."""
     found = (_section(sheet, heading, text, pictures.get(name)) for heading, name, text in _SECTIONS)
     kept = (s for s in found if s.rows or s.picture)
-    return [*kept, frame_section(frames.tests), _compliance(sheet, frames, told)]
+    tested = replace(frame_section(frames.tests), text=_TESTED if len(frames.tests) > 1 else _MOMENTS)
+    return [*kept, tested, _compliance(sheet, frames, told)]
 
 
 def requirements(sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any]) -> list[Requirement]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neusee.nodes.calibrate import EmvaSheet, emva_sheet
-from neusee.workflows.calibration import emva_figures
+from neusee.workflows.calibration import emva_figures, emva_pdf
 from neusee.workflows.calibration.emva_frames import OPERATING_POINT, EmvaFrames, Release, frames_of_recipe
 from neusee.workflows.calibration.emva_page import banner, group_of, lead, operating_point, requirements, sections
 from neusee.workflows.calibration.frame_validity import as_rows
@@ -78,7 +78,7 @@ def _report(
         tables={"emva1288.csv": (_COLUMNS, _rows(sheet)), "transfer.csv": (_TRANSFER, _levels(sheet))},
         files={
             "emva1288.json": as_json(document),
-            "emva1288.pdf": emva_figures.pdf(sheet, title, [*summary, document["fails"]]),
+            "emva1288.pdf": emva_pdf.pdf(sheet, title, [*summary, document["fails"]]),
         },
         banner=document["fails"],
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from neusee.nodes.calibrate._sheet._general_model import general_quantities
 from neusee.nodes.calibrate._sheet._nonuniformity import Nonuniformity, nonuniformity
 from neusee.nodes.calibrate._sheet._photon_transfer import PhotonTransfer, photon_transfer
 from neusee.nodes.calibrate._sheet._quantity import Quantity
@@ -45,6 +46,7 @@ def emva_sheet(levels: Levels, spatial: Nonuniformity | None = None, *, photons_
     transfer, patterns = photon_transfer(levels), spatial or Nonuniformity(None, None)
     found = [
         *sensitivity(transfer, photons_told),
+        *general_quantities(transfer, photons_told),
         *linearity_errors(transfer),
         *dark_current(transfer),
         *nonuniformity(patterns, gain(transfer).value),

@@ -11,6 +11,7 @@ from neusee.nodes.calibrate import (
     Nonuniformity,
     defects,
     emva_sheet,
+    general_model,
     profiles,
     reduce,
     spatial_series,
@@ -20,7 +21,7 @@ from neusee.nodes.calibrate import (
 )
 from neusee.nodes.calibrate import levels as joined
 from neusee.nodes.calibrate._sheet._nonuniformity import nonuniformity, spatial_variances
-from neusee.nodes.calibrate._sheet._photon_transfer import saturation_point
+from neusee.nodes.calibrate._sheet._photon_transfer import photon_transfer, saturation_point
 from neusee.nodes.values import Levels
 
 DATA = Path(os.environ.get("NEUSEE_EMVA1288", Path(__file__).parents[3] / "../shared/data/emva1288"))
@@ -168,6 +169,7 @@ def test_without_a_gain_nothing_is_told_in_electrons():
     series = spatial_series(0.0, EXPOSURE, torch.arange(100).reshape(1, 10, 10).expand(4, 10, 10))
     found = emva_sheet(levels._replace(variance=torch.full((41,), 5.0)), Nonuniformity(series, None))
     in_electrons = [q for q in found.quantities if "e-" in q.unit or q.key.startswith(("SNR", "DR", "K", "eta"))]
+    in_electrons = [q for q in in_electrons if not q.key.endswith("general")]
     assert len(in_electrons) == 19
     assert {(q.value, q.text, q.reason != "") for q in in_electrons} == {(None, "not measured", True)}
     assert found["DSNU1288_DN"].value > 0
@@ -289,3 +291,32 @@ def test_a_nonuniformity_beyond_chance_is_stated():
     )
     assert (total.bound, pixel.bound) == ("", "")
     assert (total.value, pixel.value) == (pytest.approx(5, rel=0.1), pytest.approx(5, rel=0.1))
+
+
+def test_the_general_model_of_a_linear_camera_is_the_linear_one():
+    found = emva_sheet(ideal(np.linspace(0, 20000, 41)))
+    noise = NOISE**2 + 1 / 12 / GAIN**2
+    least = (0.5 + np.sqrt(0.25 + noise)) / EFFICIENCY
+    most = EFFICIENCY * found["mu_p_sat"].value
+    assert found["mu_p_min_general"].value == pytest.approx(least, rel=1e-9)
+    assert found["SNR_max_general"].value == pytest.approx(20 * np.log10(most / np.sqrt(most + noise)), rel=1e-9)
+    assert found["DR_general"].value == pytest.approx(20 * np.log10(most / EFFICIENCY / least), rel=1e-9)
+
+
+def test_the_general_model_of_a_bent_camera_has_the_slope_at_each_level():
+    photons = np.linspace(0, 17000, 41)
+    levels = ideal(photons)
+    bend = 0.4 / 17000  # the signal is lower by 40 % of the line at the end
+    found = general_model(
+        photon_transfer(levels._replace(mean=OFFSET + (levels.mean - OFFSET) * (1 - bend * levels.photons)))
+    )
+    slope = GAIN * EFFICIENCY * (1 - 2 * bend * photons)
+    assert found.slope == pytest.approx(slope, rel=1e-9)
+    assert found.ratio == pytest.approx((photons * slope / np.sqrt(levels.variance.numpy()))[1:], rel=1e-9)
+
+
+def test_the_general_model_needs_levels():
+    found = emva_sheet(ideal([0, 1000, 20000]))
+    assert {found[key].value for key in ("mu_p_min_general", "SNR_max_general", "DR_general")} == {None}
+    dim = emva_sheet(ideal(np.linspace(0, 9000, 10), noise=0.4), photons_told=False)
+    assert (dim["mu_p_min_general"].value, dim["DR_general"].bound, dim["SNR_max_general"].bound) == (None, ">", ">")
