@@ -113,10 +113,10 @@ def linearity(sheet: EmvaSheet) -> Any:
         for key in ("LE_min", "LE_max"):
             below.axhline(sheet[key].value, color=VERMILION, linestyle=":")
             text = f"{sheet[key].symbol} = {sheet[key].text}"
-            side = "top" if key == "LE_min" else "bottom"
-            at = (1, sheet[key].value)
-            below.annotate(text, at, xycoords=("axes fraction", "data"), ha="right", va=side, fontsize=9)
-        below.margins(y=0.3)
+            side, up = ("top", -4) if key == "LE_min" else ("bottom", 4)
+            at: Any = {"xy": (1, sheet[key].value), "xycoords": ("axes fraction", "data"), "xytext": (0, up)}
+            below.annotate(text, **at, textcoords="offset points", ha="right", va=side, fontsize=9)
+        below.margins(y=0.35)
     else:
         below.text(0.5, 0.5, sheet["LE_min"].reason, transform=below.transAxes, ha="center")
     below.axhline(0, color=BLUE, linewidth=1)

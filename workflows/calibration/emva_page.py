@@ -21,9 +21,9 @@ _LEVELS, _EXPOSURES, _SERIES = (
 _ROUNDING = "the dark noise exceeds rounding"  #: name of the test of frames that says the same as `_COARSE`
 _COARSE = """the temporal dark noise is below 0.49 DN; the standard asks for more, because rounding hides the noise: \
 dark noise, thresholds and dynamic range are limits only, and K is doubtful"""
-_TESTED = """Each test asks if the frames are such as the model of the standard describes. Modelled: the quantities allow
-for it. Widened: it is found, and the error of K or of the noise that may follow is small. Refused: this error may exceed
-2 %, or is unknown. Numbers and limits of noise and patterns are in standard deviations of chance."""
+_TESTED = """Each test asks if the frames are such as the model of the standard describes. Modelled: the quantities
+allow for it. Widened: it is found, and the error of K or of the noise that may follow is small. Refused: this error may
+exceed 2 %, or is unknown. Numbers and limits of noise and patterns are in standard deviations of chance."""
 _MOMENTS = "Only moments are given, so that noise, patterns and numbers of the frames are not tested."
 _HALF = (0.45, 0.55)  #: shares of saturation that count as 50 %
 _TABLES = {
@@ -150,9 +150,10 @@ def _section(sheet: EmvaSheet, heading: str, text: str, picture: bytes | None) -
 
 
 def _compliance(sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any]) -> Section:
-    rows = requirements(sheet, frames, told)
-    marks: dict[tuple[int, int], Mark] = {(i, 2): row.mark for i, row in enumerate(rows)}
-    open_ones = sum(row.mark != "pass" for row in rows)
+    found = requirements(sheet, frames, told)
+    marks: dict[tuple[int, int], Mark] = {(i, 2): row.mark for i, row in enumerate(found)}
+    rows = [(row.demand, row.found, "yes" if row.mark == "pass" else "no") for row in found]
+    open_ones = sum(row.mark != "pass" for row in found)
     text = f"""The quantities are computed as EMVA 1288, release 4.0 Linear, says. This is a computation from frames and
         no certificate: geometry, homogeneity and calibration of the light are the laboratory's part, and frames do
         not show them.
