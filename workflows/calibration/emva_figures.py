@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from neusee.nodes.calibrate import (
-    EmvaSheet,
-    SpatialSeries,
-    defects,
-    general_model,
-    profiles,
-    spectrogram,
-    without_trend,
-)
+from neusee.nodes.calibrate import EmvaSheet, general_model
+from neusee.workflows.calibration import emva_patterns
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, styled
 
 Draw = Callable[[EmvaSheet], Any]
@@ -144,22 +136,20 @@ def dark_current(sheet: EmvaSheet) -> Any:
 
 def spectrograms(sheet: EmvaSheet) -> Any:
     """Draw the spectrograms of DSNU and PRNU along rows and columns; None without a series."""
-    images = _spatial(sheet)
+    images = emva_patterns.spectrograms(sheet)
     if not images:
         return None
     figure, axes = canvas(_WIDTH, 3.4 * len(images), len(images), 2)
-    for row, (name, (image, unit)) in zip(axes, images.items(), strict=True):
-        for ax, vertical in zip(row, (False, True), strict=True):
-            found = spectrogram(image, vertical)
+    for row, ((name, unit), directions) in zip(axes, images.items(), strict=True):
+        quantity = sheet[f"{name}1288_DN" if name == "DSNU" else f"{name}1288"]
+        one, average = emva_patterns.noise_in_time(sheet, name)
+        for ax, (direction, found) in zip(row, directions.items(), strict=True):
             ax.plot(found.frequency[1:], found.amplitude[1:].clip(1e-12), color=BLACK, linewidth=0.8)
-            quantity = sheet[f"{name}1288_DN" if name == "DSNU" else f"{name}1288"]
             if quantity.value is not None:
                 ax.axhline(quantity.value, color=VERMILION, linestyle="--", label=f"{quantity.symbol}: {quantity.text}")
-            one, average = _temporal(sheet, name)
             ax.axhline(one, color=GREEN, linestyle="-.", label="noise in time of one frame")
             ax.axhline(average, color=BLUE, linestyle=":", label="noise in time of the average")
-            which = "vertical" if vertical else "horizontal"
-            ax.set(yscale="log", xlabel="cycles per pixel", ylabel=f"amplitude ({unit})", title=f"{name}, {which}")
+            ax.set(yscale="log", xlabel="cycles per pixel", ylabel=f"amplitude ({unit})", title=f"{name}, {direction}")
             ax.set_ylim(top=12 * ax.get_ylim()[1])
             ax.legend(loc="upper right")
     return figure
@@ -167,37 +157,23 @@ def spectrograms(sheet: EmvaSheet) -> Any:
 
 def line_profiles(sheet: EmvaSheet) -> Any:
     """Draw the horizontal and vertical profiles of the averaged dark and lit frames; None without a series."""
-    images = {}
-    if sheet.spatial.dark is not None:
-        images["dark"] = sheet.spatial.dark.average
-    if sheet.spatial.lit is not None:
-        below = 0.0 if sheet.spatial.dark is None else sheet.spatial.dark.average
-        images["lit, less the dark" if sheet.spatial.dark is not None else "lit"] = sheet.spatial.lit.average - below
+    images = emva_patterns.line_profiles(sheet)
     if not images:
         return None
     figure, axes = canvas(_WIDTH, 3.4 * len(images), len(images), 2)
-    for row, (name, image) in zip(axes, images.items(), strict=True):
-        for ax, vertical in zip(row, (False, True), strict=True):
-            found = profiles(image, vertical)
-            lines = zip(found, ("middle", "mean", "least", "greatest"), (GREEN, BLACK, BLUE, ORANGE), strict=True)
-            for values, label, colour in lines:
+    for row, (name, directions) in zip(axes, images.items(), strict=True):
+        for ax, (direction, found) in zip(row, directions.items(), strict=True):
+            for values, label, colour in zip(found, found._fields, (GREEN, BLACK, BLUE, ORANGE), strict=True):
                 ax.plot(values, color=colour, linewidth=0.8, label=label)
-            which = "vertical" if vertical else "horizontal"
-            ax.set(xlabel="row" if vertical else "column", ylabel="DN", title=f"{which} profile, {name}")
-    axes[0, 0].figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+            pixel = "row" if direction == "vertical" else "column"
+            ax.set(xlabel=pixel, ylabel="DN", title=f"{direction} profile, {name}")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
 
 
 def defect_pixels(sheet: EmvaSheet) -> Any:
     """Draw the logarithmic and the accumulated histograms of DSNU and PRNU; None without a series."""
-    found = {}
-    dark, lit = sheet.spatial
-    if dark is not None:
-        found["DSNU", "DN"] = defects(dark.total, 1 / dark.count)
-    if dark is not None and lit is not None and (signal := _signal(dark, lit)) > 0:
-        parts = math.gcd(dark.count, lit.count)
-        trendless = without_trend((lit.total * dark.count - dark.total * lit.count) // parts)
-        found["PRNU", "%"] = defects(trendless, 100 * parts / (25 * dark.count * lit.count * signal))
+    found = emva_patterns.defect_histograms(sheet)
     if not found:
         return None
     figure, axes = canvas(_WIDTH, 3.4 * len(found), len(found), 2)
@@ -250,29 +226,3 @@ def _light(sheet: EmvaSheet) -> str:
 
 def _straight(x: Any, y: Any) -> Any:
     return np.polyval(np.polyfit(x, y, 1), x)
-
-
-def _signal(dark: SpatialSeries, lit: SpatialSeries) -> float:
-    return float(lit.average.mean() - dark.average.mean())
-
-
-def _spatial(sheet: EmvaSheet) -> dict[str, tuple[Any, str]]:
-    """Return the frames of DSNU in DN and of PRNU in percent, with their unit, as far as there are series."""
-    dark, lit = sheet.spatial
-    images: dict[str, tuple[Any, str]] = {}
-    if dark is not None:
-        images["DSNU"] = dark.average, "DN"
-    if dark is not None and lit is not None and (signal := _signal(dark, lit)) > 0:
-        images["PRNU"] = (lit.average - dark.average) * (100 / signal), "%"
-    return images
-
-
-def _temporal(sheet: EmvaSheet, name: str) -> tuple[float, float]:
-    """Return the standard deviations in time of a frame and of the average, in the unit of the spectrogram."""
-    dark, lit = sheet.spatial
-    assert dark is not None
-    if name == "DSNU" or lit is None:
-        return float(np.sqrt(dark.temporal)), float(np.sqrt(dark.temporal / dark.count))
-    share = 100 / _signal(dark, lit)
-    both = lit.temporal / lit.count + dark.temporal / dark.count
-    return float(share * np.sqrt(lit.temporal)), float(share * np.sqrt(both))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -43,6 +44,7 @@ OPERATING_POINT = {
     "temperature": "temperature",
     "laboratory": "laboratory and date",
 }
+_LEVEL = re.compile(r"^[bd]\s+[\d.,]+(\s|$)", re.MULTILINE)  #: a line of a descriptor that begins a light level
 _HALF = 0.5  #: share of saturation at which the lit series is taken
 _TEXT = """# EMVA 1288: the sheet of the measurement {name}.
 steps:
@@ -73,6 +75,20 @@ def descriptor_recipe(file: Path, changes: Sequence[str] = ()) -> Recipe:
         path = Path(folder) / f"{name}.yaml"
         path.write_text(text, encoding="utf-8")
         return load(path, changes)
+
+
+def descriptor_of(path: Path) -> Path:
+    """Return the descriptor file that a path is, or the only one in the folder that a path is.
+
+    Raises: ValueError for a folder without a descriptor, or with several.
+    """
+    if not path.is_dir():
+        return path
+    found = [file for file in sorted(path.glob("*.txt")) if _LEVEL.search(file.read_text("utf-8-sig", "replace"))]
+    if len(found) == 1:
+        return found[0]
+    has = f"has {len(found)} descriptors" if found else "has no descriptor, a .txt with levels in lines b and d"
+    raise ValueError(f"{path} {has}: name one file")
 
 
 def frames_of_recipe(recipe: Recipe, store: Store, release: Release = "4") -> EmvaFrames:

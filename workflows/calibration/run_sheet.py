@@ -11,6 +11,7 @@ from neusee.nodes.calibrate import EmvaSheet, emva_sheet
 from neusee.workflows.calibration import emva_figures, emva_pdf
 from neusee.workflows.calibration.emva_frames import OPERATING_POINT, EmvaFrames, Release, frames_of_recipe
 from neusee.workflows.calibration.emva_page import banner, group_of, lead, operating_point, requirements, sections
+from neusee.workflows.calibration.emva_patterns import pattern_tables
 from neusee.workflows.calibration.frame_validity import as_rows
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
@@ -75,7 +76,11 @@ def _report(
         lead(sheet, release),
         sections(sheet, frames, told, pictures),
         pictures,
-        tables={"emva1288.csv": (_COLUMNS, _rows(sheet)), "transfer.csv": (_TRANSFER, _levels(sheet))},
+        tables={
+            "emva1288.csv": (_COLUMNS, _rows(sheet)),
+            "transfer.csv": (_TRANSFER, _levels(sheet)),
+            **pattern_tables(sheet),
+        },
         files={
             "emva1288.json": as_json(document),
             "emva1288.pdf": emva_pdf.pdf(sheet, title, [*summary, document["fails"]]),

@@ -47,7 +47,7 @@ def sheet(
 ) -> None:
     """Write the EMVA 1288 sheet of a camera from frames.
 
-    In place of a recipe, name the descriptor of a measurement: neusee sheet set/EMVA1288_Data.txt. Page, PDF, JSON
+    In place of a recipe, name the descriptor of a measurement, or its folder: neusee sheet set. Page, PDF, JSON
     and CSV have every quantity with the symbol of the standard, or the reason why the frames do not tell it. Where
     rounding hides the dark noise, the page has a red banner and the exit code is 3.
     """
@@ -72,12 +72,12 @@ def sheet(
 def _loaded(words: list[str] | None) -> tuple[Recipe, list[str]]:
     """Return the recipe of a descriptor or the named recipe, and the command line."""
     name, changes, _ = split(words)
-    if Path(name).suffix.lower() != ".txt":
+    if Path(name).suffix.lower() != ".txt" and not Path(name).is_dir():
         return load(words, "sheet")
-    from neusee.workflows.calibration.emva_frames import descriptor_recipe
+    from neusee.workflows.calibration.emva_frames import descriptor_of, descriptor_recipe
 
     with failing(ValueError, before="nothing was computed: "), refusing():
-        return descriptor_recipe(Path(name), changes), ["neusee", "sheet", name, *changes]
+        return descriptor_recipe(descriptor_of(Path(name)), changes), ["neusee", "sheet", name, *changes]
 
 
 def _line(quantity: dict[str, object]) -> str:

@@ -12,7 +12,7 @@ import torch
 
 from neusee.nodes.calibrate import Nonuniformity, emva_sheet, levels, reduce, spatial_series
 from neusee.workflows.calibration import emva_figures, emva_pdf
-from neusee.workflows.calibration.emva_frames import EmvaFrames, descriptor_recipe, frames_of_recipe
+from neusee.workflows.calibration.emva_frames import EmvaFrames, descriptor_of, descriptor_recipe, frames_of_recipe
 from neusee.workflows.calibration.emva_page import operating_point, requirements, sections
 from neusee.workflows.cli import app
 from neusee.workflows.store.result_store import Store
@@ -81,8 +81,16 @@ def results(out, tmp_path):
     return tmp_path / out.splitlines()[-1].removesuffix("/report.html")
 
 
+def curves(folder, name):
+    """The number of rows of a table of curves, all of them finite."""
+    with (folder / f"{name}.csv").open(newline="") as file:
+        _, *rows = csv.reader(file)
+    assert all(np.isfinite(float(row[-1])) for row in rows)
+    return len(rows)
+
+
 def test_a_descriptor_gives_page_tables_and_document(neusee, archive, tmp_path):
-    code, out, _ = neusee(str(archive / "EMVA1288_Data.txt"), "--state", "temperature=25 °C")
+    code, out, _ = neusee(str(archive), "--state", "temperature=25 °C")
     assert code == 0
     folder = results(out, tmp_path)
     document = json.loads((folder / "emva1288.json").read_text())
@@ -98,6 +106,9 @@ def test_a_descriptor_gives_page_tables_and_document(neusee, archive, tmp_path):
         key: each["value"] for key, each in found.items()
     }
     assert len((folder / "transfer.csv").read_text().splitlines()) == len(GRID)
+    assert curves(folder, "spectrograms") == 2 * (SHAPE[1] // 2 + 1 + SHAPE[0] // 2 + 1)
+    assert curves(folder, "profiles") == 2 * sum(SHAPE)
+    assert curves(folder, "defects") > 100
     page = (folder / "report.html").read_text().replace("<wbr>", "")
     assert "stated: temperature" in page
     assert all(each["symbol"] in page for each in found.values())
@@ -144,12 +155,24 @@ def test_relative_light_and_tables_without_frames(neusee, tmp_path):
     assert {found[key]["value"] for key in ("eta", "R", "mu_p_min", "mu_p_sat", "DSNU1288", "PRNU1288")} == {None}
 
 
+@pytest.mark.slow
 def test_frames_of_a_recipe_give_the_variance_in_time(neusee, tmp_path):
     code, out, _ = neusee("calibrate", "flats.shape=[32,32]")
     assert code == 0
     found = json.loads((results(out, tmp_path) / "emva1288.json").read_text())["quantities"]
     assert found["K"]["value"] == pytest.approx(2.7027, rel=0.06)
     assert found["DSNU1288_DN"]["bound"] == "<"  # of two frames, of a sensor without DSNU
+
+
+def test_a_folder_has_one_descriptor(archive, tmp_path):
+    assert descriptor_of(archive) == archive / "EMVA1288_Data.txt"
+    (tmp_path / "readme.txt").write_text("d, as in dark, and b 12 as in bright")
+    with pytest.raises(ValueError, match="has no descriptor"):
+        descriptor_of(tmp_path)
+    for name in ("one.txt", "two.txt"):
+        (tmp_path / name).write_text("v 3.0\nd 000.00\ni x.png\n")
+    with pytest.raises(ValueError, match="has 2 descriptors: name one file"):
+        descriptor_of(tmp_path)
 
 
 @pytest.mark.parametrize(
