@@ -81,9 +81,9 @@ def general(sheet: EmvaSheet) -> Any:
         return None
     figure, axes = canvas(_WIDTH, _HEIGHT, 1, 2)
     left, right = axes[0]
-    left.plot(found.photons, found.slope[1:], **_DOTS)
+    left.errorbar(found.photons, found.slope[1:], found.slope[1:] * found.error[1:], ecolor="#777777", **_DOTS)
     left.set(xlabel=_light(sheet), ylabel="slope (DN per photon)", title="Slope of the response")
-    left.set_ylim(0, 1.15 * float(found.slope.max()))
+    left.set_ylim(0, 1.15 * float((found.slope * (1 + found.error)).max()))
     left.locator_params(axis="x", nbins=5)
     right.plot(found.photons, found.ratio, **_DOTS)
     right.set(xscale="log", yscale="log", xlabel=_light(sheet), ylabel="SNR of the light", title="SNR, no linear model")

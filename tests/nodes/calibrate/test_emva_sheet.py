@@ -320,3 +320,14 @@ def test_the_general_model_needs_levels():
     assert {found[key].value for key in ("mu_p_min_general", "SNR_max_general", "DR_general")} == {None}
     dim = emva_sheet(ideal(np.linspace(0, 9000, 10), noise=0.4), photons_told=False)
     assert (dim["mu_p_min_general"].value, dim["DR_general"].bound, dim["SNR_max_general"].bound) == (None, ">", ">")
+
+
+def test_light_that_scatters_tells_no_slope_of_a_few_levels():
+    rng = np.random.default_rng(7)
+    levels = ideal(np.linspace(0, 20000, 31))
+    truth = emva_sheet(levels)["SNR_max_general"].value
+    for scatter, told in ((1e-4, True), (0.02, False)):
+        light = OFFSET + (levels.mean - OFFSET) * (1 + scatter * torch.from_numpy(rng.standard_normal(31)))
+        found = emva_sheet(levels._replace(mean=light.clamp(max=4000.0)))["SNR_max_general"]
+        assert (found.value is not None) == told
+        assert found.value == pytest.approx(truth, abs=0.05) if told else "the light scatters" in found.reason
