@@ -58,7 +58,7 @@ def spatial_series(photons: float, exposure: float, frames: Iterable[Tensor]) ->
     Shapes: each frame (y, x).
     Units:  DN; exposure s.
     Raises: ValueError for fewer than two frames, for frames of fewer than 8 x 8 pixels or of different sizes.
-    Source: EMVA Standard 1288, release 4.0 Linear, section 8.1.
+    Source: EMVA Standard 1288, release 4.0 Linear
     """
     total, squares, count = torch.zeros(0), torch.zeros(0), 0
     for frame in frames:
@@ -82,7 +82,7 @@ def spatial_variances(series: SpatialSeries) -> SpatialVariances:
     Units:  DN2.
     Error:  the rest of the noise in time is subtracted, so that a part that is smaller may come out negative; see
             `chance_of_variances`.
-    Source: EMVA Standard 1288, release 4.0 Linear, section 8.2 (rows, columns and pixels that add up to the total).
+    Source: EMVA Standard 1288, release 4.0 Linear (rows, columns and pixels that add up to the total).
     """
     rows, columns = series.total.shape
     left = series.temporal / series.count
@@ -121,7 +121,7 @@ def nonuniformity(found: Nonuniformity, gain: float | None) -> list[Quantity]:
 
     Shapes: scalars.
     Units:  as in each `Quantity`.
-    Source: EMVA Standard 1288, release 4.0 Linear, sections 4 and 8.2.
+    Source: EMVA Standard 1288, release 4.0 Linear
     """
     return [*_dark(found.dark, gain), *_lit(found)]
 

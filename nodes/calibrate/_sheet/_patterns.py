@@ -45,7 +45,7 @@ def spectrogram(image: FloatArray, vertical: bool = False) -> Spectrogram:
 
     White noise of standard deviation s has the amplitude s at every frequency.
 
-    Source: EMVA Standard 1288, release 4.0 Linear, section 8.4.
+    Source: EMVA Standard 1288, release 4.0 Linear
     """
     lines = (image - image.mean()).T if vertical else image - image.mean()
     power = np.abs(np.fft.rfft(lines, axis=1)) ** 2 / lines.shape[1]
@@ -55,7 +55,7 @@ def spectrogram(image: FloatArray, vertical: bool = False) -> Spectrogram:
 def profiles(image: FloatArray, vertical: bool = False) -> Profiles:
     """Return the middle row of a frame (y, x), and mean, least and greatest number of each column; or the transposed.
 
-    Source: EMVA Standard 1288, release 4.0 Linear, section 8.5.
+    Source: EMVA Standard 1288, release 4.0 Linear
     """
     lines = image.T if vertical else image
     return Profiles(lines[len(lines) // 2], lines.mean(0), lines.min(0), lines.max(0))
@@ -64,7 +64,7 @@ def profiles(image: FloatArray, vertical: bool = False) -> Profiles:
 def without_trend(total: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return 25 times a frame less the mean of 5 x 5 pixels, without a rim of two pixels; whole numbers stay exact.
 
-    Source: EMVA Standard 1288, release 4.0 Linear, section 8.6 (highpass filtering of the lit frame).
+    Source: EMVA Standard 1288, release 4.0 Linear (highpass filtering of the lit frame).
     """
     rim = _BOX // 2
     windows = np.lib.stride_tricks.sliding_window_view(total, (_BOX, _BOX))
@@ -75,7 +75,7 @@ def defects(total: NDArray[np.int64], unit: float) -> DefectHistogram:
     """Return the histogram of the numbers (y, x) of a frame about their mean; ``unit`` is the value of the number 1.
 
     Shapes: -> (class,), at most 256 classes of equal whole width.
-    Source: EMVA Standard 1288, release 4.0 Linear, section 8.6 (logarithmic and accumulated histograms).
+    Source: EMVA Standard 1288, release 4.0 Linear (logarithmic and accumulated histograms).
     """
     low, high = int(total.min()), int(total.max())
     width = 1 if high - low < _MOST else (high - low) // _MOST + 1
