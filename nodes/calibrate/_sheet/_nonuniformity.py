@@ -58,7 +58,7 @@ def spatial_series(photons: float, exposure: float, frames: Iterable[Tensor]) ->
     Shapes: each frame (y, x).
     Units:  DN; exposure s.
     Raises: ValueError for fewer than two frames, for frames of fewer than 8 x 8 pixels or of different sizes.
-    Source: EMVA Standard 1288, release 4.0 Linear
+    Source: EMVA Standard 1288, release 4.0 Linear.
     """
     total, squares, count = torch.zeros(0), torch.zeros(0), 0
     for frame in frames:
@@ -121,7 +121,7 @@ def nonuniformity(found: Nonuniformity, gain: float | None) -> list[Quantity]:
 
     Shapes: scalars.
     Units:  as in each `Quantity`.
-    Source: EMVA Standard 1288, release 4.0 Linear
+    Source: EMVA Standard 1288, release 4.0 Linear.
     """
     return [*_dark(found.dark, gain), *_lit(found)]
 

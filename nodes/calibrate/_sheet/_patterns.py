@@ -45,7 +45,7 @@ def spectrogram(image: FloatArray, vertical: bool = False) -> Spectrogram:
 
     White noise of standard deviation s has the amplitude s at every frequency.
 
-    Source: EMVA Standard 1288, release 4.0 Linear
+    Source: EMVA Standard 1288, release 4.0 Linear.
     """
     lines = (image - image.mean()).T if vertical else image - image.mean()
     power = np.abs(np.fft.rfft(lines, axis=1)) ** 2 / lines.shape[1]
@@ -55,7 +55,7 @@ def spectrogram(image: FloatArray, vertical: bool = False) -> Spectrogram:
 def profiles(image: FloatArray, vertical: bool = False) -> Profiles:
     """Return the middle row of a frame (y, x), and mean, least and greatest number of each column; or the transposed.
 
-    Source: EMVA Standard 1288, release 4.0 Linear
+    Source: EMVA Standard 1288, release 4.0 Linear.
     """
     lines = image.T if vertical else image
     return Profiles(lines[len(lines) // 2], lines.mean(0), lines.min(0), lines.max(0))

@@ -60,7 +60,7 @@ def photon_transfer(levels: Levels) -> PhotonTransfer:
     Shapes: levels (level,).
     Units:  as in `PhotonTransfer`.
     Raises: ValueError without a dark level or without two lit levels.
-    Source: EMVA Standard 1288, release 4.0 Linear
+    Source: EMVA Standard 1288, release 4.0 Linear.
     """
     photons, exposure, mean, variance = (
         np.asarray(x, dtype=np.float64) for x in (levels.photons, levels.exposure, levels.mean, levels.variance)

@@ -48,7 +48,7 @@ def sensitivity(transfer: PhotonTransfer, photons_told: bool = True) -> list[Qua
 
     Shapes: scalars.
     Units:  as in each `Quantity`.
-    Source: EMVA Standard 1288, release 4.0 Linear
+    Source: EMVA Standard 1288, release 4.0 Linear.
     """
     k = gain(transfer)
     response = _responsivity(transfer, k, photons_told)
@@ -101,7 +101,7 @@ def linearity_errors(transfer: PhotonTransfer) -> list[Quantity]:
 def dark_current(transfer: PhotonTransfer) -> list[Quantity]:
     """Return mu_I from the means and from the variances of dark frames, e-/s.
 
-    Source: EMVA Standard 1288, release 4.0 Linear
+    Source: EMVA Standard 1288, release 4.0 Linear.
     """
     of_mean = Quantity("mu_I_mean", "μ_I.mean", "dark current, from the means", "e-/s")
     of_variance = Quantity("mu_I_var", "μ_I.var", "dark current, from the variances", "e-/s")
