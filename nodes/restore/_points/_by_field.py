@@ -135,7 +135,11 @@ def _parts(electrons: Tensor, measured: MeasuredPsf) -> Iterator[_Part]:
 
 
 def _glare(
-    electrons: Tensor, measured: MeasuredPsf, clipped: Tensor, lights: tuple[list[Tensor] | None, ...], doubt: float | None
+    electrons: Tensor,
+    measured: MeasuredPsf,
+    clipped: Tensor,
+    lights: tuple[list[Tensor] | None, list[Tensor] | None],
+    doubt: float | None,
 ) -> Glare:
     """Return the glare of the whole frame, with the light around each pixel of it where a doubt needs that."""
     kernel = _channelwise(measured.kernels[0, 0])
@@ -151,10 +155,13 @@ def _problem(
     fine = single(electrons)[inside]
     fine = fine.double() if max(fine.shape[-2:]) <= PRECISE else fine
     known, kernels = (~clipped[inside]).to(fine), part.kernels.to(fine)
-    cut = ([None if x is None else x[..., part.rows, part.columns].to(fine) for x in each] for each in light[:2])
-    around = light.around and [x[inside].to(fine) for x in light.around]
-    patterns, nearby = cut
-    return posed(fine, known, kernels, Glare(patterns, nearby, around), settings), kernels
+
+    def cut(pictures: list[Tensor]) -> list[Tensor]:
+        return [x[..., part.rows, part.columns].to(fine) for x in pictures]
+
+    nearby = [None if x is None else cut([x])[0] for x in light.nearby]
+    here = Glare(cut(light.patterns), nearby, None if light.around is None else cut(light.around))
+    return posed(fine, known, kernels, here, settings), kernels
 
 
 def _around(weight: Tensor, reach: int) -> slice:

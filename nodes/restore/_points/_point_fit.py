@@ -24,6 +24,8 @@ _SURE = 4.0  #: standard deviations below saturation from which a pixel counts
 _CALM = 1e-9  #: share of the largest curvature that is added to each, in a step alone
 _ITERATIONS = 300  #: of conjugate gradients
 _RESIDUAL = 1e-8  #: squared residual over the first, at which they end
+_CORE = 2  #: pixels around the middle of a PSF, in which points are counted
+_ALONE = 1e-9  #: least eigenvalue of the products of weights, below which nodes are not told apart
 _LOCAL = 5  #: pixels a side over which chi-square is averaged
 
 
@@ -34,6 +36,8 @@ class Fit(NamedTuple):
     draws: Tensor  #: (draw, node, channel, y, x)
     state: State
     chi: Tensor  #: (channel,)
+    support: Tensor  #: (node,)
+    inflation: Tensor  #: (node,)
 
 
 def fitted(seen: Seen, shape: tuple[int, int], zones: tuple[int, int], window: tuple[int, int], count: int,
@@ -63,7 +67,7 @@ def fitted(seen: Seen, shape: tuple[int, int], zones: tuple[int, int], window: t
         slope = slope._replace(background=slope.background + _normal(seen.doubt, rng) / seen.doubt.sqrt())
         other = gauged(state.plus(_solved(near, weight, slope)).kernels)
         draws.append((kernels + local * (other - kernels)).float())
-    return Fit(kernels, torch.stack(draws), state, _chi(weight, residual, near))
+    return Fit(kernels, torch.stack(draws), state, _chi(weight, residual, near), *_support(near, weight))
 
 
 def gauged(kernels: Tensor) -> Tensor:
@@ -225,6 +229,23 @@ def _misfit(near: Linear, weight: Tensor, residual: Tensor) -> Tensor:
 def _chi(weight: Tensor, residual: Tensor, near: Linear) -> Tensor:
     free = 1.0 - _unknowns(near) / float((weight > 0).sum())
     return (weight * residual.square()).sum(1) / ((weight > 0).sum(1) * free).clamp_min(1.0)
+
+
+def _support(near: Linear, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return how many points at each node would tell its PSF as well, and the inflation of its variance.
+
+    The worst of the pixels in the middle. With A the bilinear weights of the points that show a pixel, the number is
+    1 over the diagonal of the inverse of A^T A, and the inflation the product of this diagonal and that of A^T A
+    (Kutner et al., Applied Linear Statistical Models, 5th ed., 2005, sec. 10.5): 1 for points in the middles of zones.
+    """
+    shown = near.stamps_of(weight) > 0
+    y, x = (n // 2 for n in shown.shape[-2:])
+    core = shown[..., y - _CORE : y + _CORE + 1, x - _CORE : x + _CORE + 1].flatten(1).double()
+    patterns = torch.unique(core, dim=1).T
+    normal = near.share.T @ (patterns[:, :, None] * near.share)
+    sizes, ways = torch.linalg.eigh(normal)
+    inverse = (ways.square() / sizes.clamp_min(_ALONE)[:, None]).sum(-1)
+    return (1.0 / inverse).amin(0), (inverse * normal.diagonal(dim1=-2, dim2=-1)).amax(0)
 
 
 def _unknowns(near: Linear) -> float:
