@@ -3,7 +3,7 @@
     python tests/benchmarks/bench_measured_psf.py --waves 0.4 --seeds 10 3
 
 The camera is that of `bench_restored_frames.py` behind a plain lens, with grains of dirt, half a pixel of tilt and
-``waves`` of defocus at the rim, of which the recipe knows nothing. Its PSF comes from six frames of a white point, three
+``waves`` of defocus at the rim, of which the recipe knows nothing. Its PSF comes from six frames of a white point, half
 of them thirty times as long, and four dark ones. Each frame is restored by the filter that knows of no laser and by
 the search, each with the PSF of the recipe and with the measured one. The score is that of `bench_restored_frames.py`.
 """
