@@ -20,7 +20,7 @@ from neusee.nodes.units import DataFiles, Electrons, Gain, Shape
 from neusee.nodes.values import MeasuredPsf
 
 _GOOD = 1.5  #: chi-square per pixel above which the model is said not to fit
-_INFLATED = 1.15  #: inflation of a variance above which the deviation was seen to be half of the error, or less
+_INFLATED = 4.0  #: inflation of a variance above which the deviation was seen to be smaller than the error
 
 
 def _odd(window: tuple[int, int]) -> tuple[int, int]:
@@ -65,9 +65,9 @@ def measured_psf(
             faster from the rim, which light bent by the edge of a pupil does.
     Error:  `deviation`, from draws of the noise of photons, converter, background and centring: a relative standard
             deviation of 1 / sqrt(2 draws). Where the frames fit worse than their noise, the deviation grows by the root
-            of chi-square in 5 x 5 pixels. It is right for points near the middles of the zones, or spread evenly over
-            many places. Points that tell the PSFs of several nodes at once inflate the variance: where all of them lie
-            at the same such places, the error was 1.5 to 4 times the deviation, for an ``inflation`` of 1.15 to 1.6.
+            of chi-square in 5 x 5 pixels. Points far from the middles of the zones tell the PSFs of several nodes at once
+            and inflate the variance. Up to an ``inflation`` of 3 the deviation was right; at 7 the error was up to 1.7
+            times the deviation.
             Points between pixels are interpolated: 1e-4 for an image with up to 0.4 periods in a pixel; a sharper image
             shows as chi-square. The background beyond the windows counts as free of the light of points; pixels beyond
             windows twice as wide give it where there are enough.
@@ -126,7 +126,7 @@ def _counted(result: MeasuredPsf) -> Check:
         return Check(text)
     why = (
         f" in zone ({row + 1}, {column + 1}), more than {_INFLATED:g}: its points lie far from the middle of the zone "
-        "and tell several PSFs at once, so that the deviation may be far too small; take frames with points near the "
+        "and tell several PSFs at once, so that the deviation may be too small; take frames with points near the "
         "middles of the zones, or choose fewer zones"
     )
     return Check(text + why, False)
