@@ -19,6 +19,7 @@ from neusee.nodes.restore._inverse._posterior_spread import Draws, drawn_deviati
 from neusee.nodes.restore._inverse._wiener import (
     PRECISE,
     Doubt,
+    LeastDoubt,
     Scaled,
     Settings,
     edge,
@@ -36,15 +37,16 @@ Balance = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 @node(rtol=1e-5, additive_inputs=[("glare", "nearby")])
 def wiener_by_field(
     electrons: Tensor, measured: MeasuredPsf, clipped: Tensor, glare: list[Tensor] | None = None,
-    nearby: list[Tensor] | None = None, *, balance: Balance = 1.0, doubt: Doubt = 0.0, read_noise: Electrons,
+    nearby: list[Tensor] | None = None, *, balance: Balance = 1.0, doubt: Doubt = 0.0,
+    least_doubt: LeastDoubt = 0.0, read_noise: Electrons,
 ) -> Tensor:  # fmt: skip
     """Deconvolve a picture with a PSF that was measured by field: `restore.wiener` around each node, blended.
 
     The picture around each node of the grid is deconvolved with the PSF of the node, up to where its bilinear weight is
     0 and by the radius that holds 99.9 % of the PSF beyond. The results are added with these weights, whose sum is 1.
-    The patterns of ``glare`` are removed, with ``nearby`` and ``doubt`` as in `restore.wiener`. They come from a model
-    of the lens, because a PSF that white points gave does not tell the pattern of one wavelength. Their strengths are
-    fitted around each node.
+    The patterns of ``glare`` are removed, with ``nearby``, ``doubt`` and ``least_doubt`` as in `restore.wiener`. They
+    come from a model of the lens, because a PSF that white points gave does not tell the pattern of one wavelength.
+    Their strengths, and a doubt that is found, are those around each node.
 
     Shapes: electrons and clipped (channel, y, x), measured.kernels (row, column, channel, any, any), each glare
             (channel, y, x), each nearby (pattern, channel, y, x) -> (channel, y, x).
@@ -60,7 +62,7 @@ def wiener_by_field(
     total = torch.zeros_like(single(electrons))
     light = _glare(electrons, measured, clipped, (glare, nearby), doubt)
     for part in _parts(electrons, measured):
-        scaled, _ = _problem(electrons, clipped, part, light, (balance, read_noise, doubt))
+        scaled, _ = _problem(electrons, clipped, part, light, (balance, read_noise, doubt, least_doubt))
         found = scaled.pixels(most_likely(scaled.problem, coarser=True)) + scaled.mean
         total[:, part.rows, part.columns] += (part.weight.to(found) * found).to(total)
     return total
@@ -70,7 +72,8 @@ def wiener_by_field(
 def spread_by_field(
     electrons: Tensor, measured: MeasuredPsf, clipped: Tensor, matrix: Tensor, glare: list[Tensor] | None = None,
     nearby: list[Tensor] | None = None, restored: Tensor | None = None, shading: Shading | None = None, *,
-    balance: Balance = 1.0, doubt: Doubt = 0.0, draws: Draws = 8, read_noise: Electrons, rng: Generator,
+    balance: Balance = 1.0, doubt: Doubt = 0.0, least_doubt: LeastDoubt = 0.0, draws: Draws = 8, read_noise: Electrons,
+    rng: Generator,
 ) -> Tensor:  # fmt: skip
     """Compute the standard deviation of each pixel of `restore.wiener_by_field`, the error of the PSF included.
 
@@ -92,7 +95,7 @@ def spread_by_field(
         light = _glare(electrons, measured, clipped, (glare, nearby), doubt)
     for part in _parts(electrons, measured):
         with torch.no_grad():
-            scaled, kernels = _problem(electrons, clipped, part, light, (balance, read_noise, doubt))
+            scaled, kernels = _problem(electrons, clipped, part, light, (balance, read_noise, doubt, least_doubt))
             size = (scaled.problem.picture.shape[-2], scaled.problem.picture.shape[-1])
             power = fitted_power(scaled.problem, wrapped(kernels / scaled.share, size))
         found = drawn_deviation(scaled, power, matrix, draws, rng, part.draws)

@@ -65,9 +65,9 @@ def measured_psf(
             faster from the rim, which light bent by the edge of a pupil does.
     Error:  `deviation`, from draws of the noise of photons, converter, background and centring: a relative standard
             deviation of 1 / sqrt(2 draws). Where the frames fit worse than their noise, the deviation grows by the root
-            of chi-square in 5 x 5 pixels. Points far from the middles of the zones tell the PSFs of several nodes at once
-            and inflate the variance. Up to an ``inflation`` of 3 the deviation was right; at 7 the error was up to 1.7
-            times the deviation.
+            of chi-square in 5 x 5 pixels. Points far from the middles of the zones tell the PSFs of several nodes at
+            once and inflate the variance. Up to an ``inflation`` of 3 the deviation was right; at 7 the error was up to
+            1.7 times the deviation.
             Points between pixels are interpolated: 1e-4 for an image with up to 0.4 periods in a pixel; a sharper image
             shows as chi-square. The background beyond the windows counts as free of the light of points; pixels beyond
             windows twice as wide give it where there are enough.
