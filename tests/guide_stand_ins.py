@@ -146,6 +146,10 @@ STAND_INS = {
     ),
     "restore runs/latest/data/raw_mask.png --camera plain_lens --psf points points.window=[33,33]": StandIn(
         "a frame of 24 x 24", instead={"points.window=[33,33]": "points.window=[5,5]"}),
+    "restore runs/latest/data/raw_mask.png --camera plain_lens --psf points points.window=[33,33] "
+    "restore=search": StandIn(
+        "a frame of 24 x 24", instead={"points.window=[33,33]": "points.window=[5,5]"},
+        more=("restore.most=1", "restore.lamps=0")),
     "run six_lasers": StandIn("two of the six lasers", more=TWO_LASERS),
     "run six_lasers --executor dask:2": StandIn(
         "two lasers, other noise, and one process", more=(*TWO_LASERS, "seed=8"), instead={"dask:2": "dask:1"}),

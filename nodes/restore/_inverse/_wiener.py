@@ -223,7 +223,7 @@ def posed(electrons: Tensor, known: Tensor, kernels: Tensor, glare: Glare, setti
     def own_noise(mean: Tensor) -> Tensor:
         return _noise(electrons, mean, read)
 
-    if doubt != 0:
+    if doubt != 0 and glare.around is None:
         glare = with_light_around(glare)
     doubt = likeliest_doubt(electrons, known, glare, own_noise, least) if doubt is None else doubt
     trusted, light, wrong = doubted(electrons, known, glare, doubt, own_noise)
