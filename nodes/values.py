@@ -188,6 +188,10 @@ class MeasuredPsf(NamedTuple):
     places: Tensor  #: (point, 4) float64: file from 0, y and x of each point in pixels, and its signal in e-
     fit: Tensor  #: (channel,) float64, chi-square of the frames per seen pixel, 1 for a model as good as the noise
     outside: Tensor  #: (channel,) float64, bound of the light beyond the window, as a share of the light within
+    support: Tensor  #: (row, column) float64, number of points at the node that would tell its PSF as well
+    inflation: (
+        Tensor  #: (row, column) float64, of the variance of the PSF, because points tell several at once; 1 is best
+    )
 
 
 #: for each class, the fields with one entry per band

@@ -2,7 +2,12 @@
 
 from neusee.nodes.calibrate import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
-from neusee.nodes.calibrate._frames._emva_descriptor import descriptor, descriptor_frames
+from neusee.nodes.calibrate._frames._emva_descriptor import (
+    descriptor,
+    descriptor_frames,
+    descriptor_series,
+    refuse_descriptor,
+)
 from neusee.nodes.calibrate._frames._frame_statistics import levels, reduce
 from neusee.nodes.calibrate._frames._level_frames import frames
 from neusee.nodes.calibrate._frames._moment_table import table
@@ -18,6 +23,19 @@ from neusee.nodes.calibrate._prior._sensor_prior import NAMES, Coordinates, prio
 from neusee.nodes.calibrate._scatter._point_source import Rings, point_source
 from neusee.nodes.calibrate._scatter._scatter_likelihood import guess_scatter, stray_light
 from neusee.nodes.calibrate._scatter._scatter_prior import SCATTER_NAMES, ScatterCoordinates, stray_prior
+from neusee.nodes.calibrate._sheet._general_model import general_model
+from neusee.nodes.calibrate._sheet._nonuniformity import Nonuniformity, SpatialSeries, spatial_series
+from neusee.nodes.calibrate._sheet._patterns import (
+    DefectHistogram,
+    Profiles,
+    Spectrogram,
+    defects,
+    profiles,
+    spectrogram,
+    without_trend,
+)
+from neusee.nodes.calibrate._sheet._quantity import Quantity
+from neusee.nodes.calibrate._sheet._sheet import EmvaSheet, emva_sheet
 from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Stack
 from neusee.nodes.calibrate._validity._inspection import inspect_frames
 from neusee.nodes.calibrate._validity._number_tests import coarse
@@ -28,23 +46,34 @@ __all__ = [
     "SCATTER_NAMES",
     "CameraCoordinates",
     "Coordinates",
+    "DefectHistogram",
+    "EmvaSheet",
     "FrameTest",
     "LeastSquares",
     "Likelihood",
+    "Nonuniformity",
     "Prior",
+    "Profiles",
+    "Quantity",
     "Ridge",
     "Rings",
     "ScatterCoordinates",
+    "SpatialSeries",
+    "Spectrogram",
     "Stack",
     "Sufficient",
     "camera",
     "camera_prior",
     "coarse",
+    "defects",
     "density",
     "descriptor",
     "descriptor_frames",
+    "descriptor_series",
+    "emva_sheet",
     "expose",
     "frames",
+    "general_model",
     "guess",
     "guess_camera",
     "guess_scatter",
@@ -53,9 +82,14 @@ __all__ = [
     "levels",
     "point_source",
     "prior",
+    "profiles",
     "reduce",
+    "refuse_descriptor",
+    "spatial_series",
+    "spectrogram",
     "stray_light",
     "stray_prior",
     "sufficient",
     "table",
+    "without_trend",
 ]

@@ -71,7 +71,7 @@ _KERNELS = rand(4, 1, 2, 3, 9, 9)
 _KERNELS = _KERNELS / _KERNELS.sum((-2, -1), keepdim=True)
 MEASURED = MeasuredPsf(
     _KERNELS.mean(0), _KERNELS.std(0), _KERNELS.float(), torch.zeros(1, 4, dtype=torch.float64),
-    torch.ones(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64),
+    torch.ones(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), *torch.ones(2, 1, 2, dtype=torch.float64),
 )  # fmt: skip
 
 STOP = optics.stop(samples=16, pitch=5e-4, diameter=8e-3)

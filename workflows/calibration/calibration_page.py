@@ -17,6 +17,7 @@ from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import IntervalEstimate, ModelSpread
 from neusee.workflows.calibration.posterior_checks import Check, count_failures
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
+from neusee.workflows.calibration.standard_fit import least_squares_section
 from neusee.workflows.report.study_page import Mark, Section, with_uncertainty
 
 if TYPE_CHECKING:
@@ -160,8 +161,14 @@ def sections(result: CalibrationResult) -> list[Section]:
     """Return the sections of a calibration's page: parameters, checks, identifiability and pictures."""
     models = (_models,) if result.models else ()
     frames = (_frames,) if result.frames else ()
-    parts = (_parameters, *models, _checks, *frames, _not_determined, _curve, _corner, _chains)
+    standard = (_standard,) if result.problem.measured is not None else ()
+    parts = (_parameters, *standard, *models, _checks, *frames, _not_determined, _curve, _corner, _chains)
     return [part(result) for part in parts]
+
+
+def _standard(result: CalibrationResult) -> Section:
+    assert result.problem.measured is not None
+    return least_squares_section(result.problem.measured, result.rows())
 
 
 def _frames(result: CalibrationResult) -> Section:

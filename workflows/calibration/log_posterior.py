@@ -44,6 +44,7 @@ class SensorPosterior:
     levels: Sufficient | Levels | Rings  #: the data that the likelihood describes
     weigh: _Function
     weigh_in_full: _Function  #: also returns deviances and derivatives
+    measured: Levels | None = None  #: the statistics of all frames, from which `levels` follow; None for a lens
 
     @classmethod
     def of(cls, recipe: Recipe, store: Store) -> SensorPosterior:
@@ -52,7 +53,12 @@ class SensorPosterior:
         prior_node, kind = _KINDS[density.node.path]
         prior = only_step(recipe, prior_node)
         source = str(density.wires[density.node.inputs[0]])
-        done = run(recipe, store, (density.name, prior.name, source))
+        whole = (
+            str(recipe.steps[source].wires["levels"])
+            if recipe.steps[source].node.path == "calibrate.sufficient"
+            else source
+        )
+        done = run(recipe, store, (density.name, prior.name, source, whole))
         coordinates = kind.of(done[prior.name], density.params)
         if isinstance(coordinates, ScatterCoordinates):
             coordinates = coordinates.seen_by(done[source], density.params)
@@ -64,7 +70,8 @@ class SensorPosterior:
             return as_function(changed, *free, outputs=[step.name], store=store)
 
         key = digest(*(done.keys[step.name] for step in (density, prior)))
-        return cls(recipe, density.name, key, coordinates, done[source], function(quick), function(density))
+        measured = done[whole] if isinstance(done[whole], Levels) else None
+        return cls(recipe, density.name, key, coordinates, done[source], function(quick), function(density), measured)
 
     @property
     def names(self) -> tuple[str, ...]:

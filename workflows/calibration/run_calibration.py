@@ -36,6 +36,7 @@ from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import compare_models
 from neusee.workflows.calibration.posterior_checks import arviz, checks, count_failures, importance_samples
 from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
+from neusee.workflows.calibration.standard_fit import compared
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.engine_digest import engine
@@ -169,6 +170,7 @@ def _document(result: CalibrationResult) -> dict[str, Any]:
             "covariance": np.cov(flat.T).reshape(len(problem.names), -1).tolist(),
         },
         "stated": {model.name: asdict(model.stated) for model in estimated_models(result)},
+        "least_squares": compared(problem.measured, result.rows()) if problem.measured is not None else {},
         "frames": as_rows(result.frames),
         "not told": list(result.identifiability.directions),
         "checks": [asdict(check) for check in result.checks],

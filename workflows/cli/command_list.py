@@ -32,6 +32,7 @@ COMMANDS = {
     "sweep": ("sweep_command", "Run a recipe at several values of its parameters."),
     "train": ("train_command", "Train the mask of a recipe and its restoring network."),
     "calibrate": ("calibrate_command", "Find the posterior of a sensor from calibration frames."),
+    "sheet": ("sheet_command", "Write the EMVA 1288 sheet of a camera from frames."),
     "evaluate": ("evaluate_command", "Compare masks and restorers on the same scenes and lasers."),
     "recipes": ("catalogue", "List the recipes and the groups of options."),
     "nodes": ("catalogue", "List the nodes, or explain one node."),

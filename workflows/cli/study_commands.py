@@ -135,6 +135,10 @@ def uncertainty(
     points: Annotated[
         Points, typer.Option("--points", help="Independent draws, or a Sobol sequence, which needs fewer.")
     ] = Points.DRAWS,
+    until: Annotated[
+        list[str] | None,
+        typer.Option("--until", metavar="NAME", help="Output or quantity that decides when to stop; may be repeated."),
+    ] = None,
     workers: Annotated[
         int, typer.Option("--workers", min=0, help="Number of draws computed at the same time; 0: one for each core.")
     ] = 0,
@@ -147,11 +151,12 @@ def uncertainty(
     """Propagate uncertain values to the outputs.
 
     Uncertain are values given as distributions, such as "normal(1 e-, 0.1 e-)", and those of a `posterior`. Draws
-    go on until each standard deviation is known to --error; the page says which input causes the scatter. Run the
-    same command again to continue. Needs: pip install -e ".[uncertainty]".
+    go on until each standard deviation, or each that --until names, is known to --error; the page says which input
+    causes the scatter. Run the same command again to continue. Needs: pip install -e ".[uncertainty]".
     """
     check_device(device)
-    how = {"error": error, "most": most, "points": points.value, "workers": workers, "device": device}
+    how: dict[str, Any] = {"error": error, "most": most, "points": points.value, "workers": workers, "device": device}
+    how["until"] = tuple(until or ())
     _run("uncertainty", words, quiet, as_json, out, **how)
 
 

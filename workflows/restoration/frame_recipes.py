@@ -22,6 +22,7 @@ PLAIN_CAMERA = "first_light"  #: recipe around a sensor file, with a plain lens
 _SCENE = ("scene", "cube")  #: steps of the groups `scene` and `lift`, which a frame does not need
 _DROPPED = ("rival", "damage", "safety")  #: groups that compare or judge a simulated laser
 _SHADING = "shading=estimated"  #: an option of which all frames together tell
+_WITH_PSF = {"restore=measured": "measured", "restore=search": "measured_search"}  #: restorers for a measured PSF
 _STEM = re.compile(r"[^\w-]+")
 
 
@@ -41,9 +42,10 @@ def recipes_of(
     if any(change.lstrip("+") == _SHADING for change in changes):
         quoted = ", ".join(map(_quoted, frames))
         words = [*words, _said("frames", f"shading.frames=[{quoted}]", folder, shown_as=f"{len(frames)} frames")]
+    own = [(n, text) for n, text in enumerate(changes, first) if not psf or text not in _WITH_PSF]
     for frame in frames:
         try:
-            found.append(_one(frame, (name, base, words), changes, folder, first))
+            found.append(_one(frame, (name, base, words), own, folder))
         except RecipeError as error:
             problems |= dict.fromkeys(error.diagnostics)
     if problems:
@@ -52,10 +54,10 @@ def recipes_of(
 
 
 def _one(
-    frame: Path, camera: tuple[str, Path, Sequence[Override]], changes: Sequence[str], folder: Path, first: int
+    frame: Path, camera: tuple[str, Path, Sequence[Override]], changes: Sequence[tuple[int, str]], folder: Path
 ) -> Recipe:
     name, base, words = camera
-    own = [read_override(text, Location(f"argument {n}", folder=str(folder))) for n, text in enumerate(changes, first)]
+    own = [read_override(text, Location(f"argument {n}", folder=str(folder))) for n, text in changes]
     file = _said("frame", f"frame.file={_quoted(frame)}", folder, shown_as=str(_near(frame, folder)))
     recipe = load(name, [*_prepared(name, base, own), *words, file, *own], base)
     title = f"The frame {frame.name}, restored with the camera {name}"
@@ -97,16 +99,19 @@ def _psf(psf: str, changes: Sequence[str], folder: Path, first: int) -> list[Ove
     """Return the words that measure the PSF from the frames of a folder, in place of the PSF of the recipe."""
     if not psf:
         return []
+    restorer = "measured"
     for number, text in enumerate(changes, first):
         if text.startswith("restore="):
-            message = "a measured PSF has a filter of its own: leave out --psf, or this restorer"
+            restorer = _WITH_PSF.get(text, "")
+        if not restorer:
+            message = "a measured PSF has a filter of its own, or restore=search: leave out --psf, or this restorer"
             raise RecipeError([Diagnostic(Location(f"argument {number}"), text, message)])
     try:
         files = named_frames([psf], folder)
     except RecipeError as error:
         raise RecipeError([replace(each, mark=Location("--psf")) for each in error.diagnostics]) from None
     listed = "points.files=[" + ", ".join(map(_quoted, files)) + "]"
-    words = [("restore=measured", ""), ("steps.level.from.psf=measured", ""), (listed, psf)]
+    words = [(f"restore={restorer}", ""), ("steps.level.from.psf=measured", ""), (listed, psf)]
     return [_said("--psf", word, folder, shown_as) for word, shown_as in words]
 
 

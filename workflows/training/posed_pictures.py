@@ -21,7 +21,7 @@ from neusee.workflows.recipe.blocks.train_block import KEY, Training
 
 Given = tuple[()] | tuple[WienerProblem, Tensor]  #: nothing, or the problem of the filter and the colour matrix
 _FILTERS = ("restore.wiener", "restore.unrolled")
-_PARAMETERS = ("balance", "doubt", "read_noise")
+_PARAMETERS = ("balance", "doubt", "least_doubt", "read_noise")
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from neusee.nodes.calibrate._frames._level_frames import refuse_unreadable, stac
 from neusee.nodes.units import IsFile
 from neusee.nodes.values import Levels
 
+_PAIR = 2  #: images of a level of the photon transfer
 _WORDS = {"b": "b EXPOSURE_NS PHOTONS", "d": "d EXPOSURE_NS [0]", "n": "n BITS WIDTH HEIGHT", "v": "v RELEASE"}
 
 
@@ -35,6 +36,17 @@ class _Measurement:
     bits: int = 24
     shape: tuple[int, int] | None = None
     levels: list[_Level] = field(default_factory=list)
+
+    @property
+    def transfer(self) -> list[_Level]:
+        """The levels of the photon transfer: the pairs of images, or all levels if there is no pair."""
+        pairs = [level for level in self.levels if len(level.images) == _PAIR]
+        return pairs or self.levels
+
+    @property
+    def series(self) -> list[_Level]:
+        """The levels of more images than a pair, for spatial quantities."""
+        return [level for level in self.levels if len(level.images) > _PAIR]
 
 
 def _with_images(file: Any) -> tuple[Path, ...]:
@@ -58,8 +70,11 @@ DescriptorFile = Annotated[tuple[Path, ...], BeforeValidator(_with_images, json_
 def descriptor(*, file: DescriptorFile, scatter: Temporal = "temporal") -> Levels:
     """Read the images that an EMVA 1288 descriptor names, and reduce each level to mean and variance as `reduce` does.
 
+    In a descriptor with pairs of images, a level of more images is a series for spatial quantities. It is no level of
+    the photon transfer, and `descriptor_series` reads it.
+
     Shapes: -> (level,), in the order of the descriptor.
-    Units:  in the descriptor exposures ns, photons per pixel and exposure; mean DN; variance DN2.
+    Units:  in the descriptor exposures ns, 0 for the shortest, photons per pixel and exposure; mean DN; variance DN2.
     Error:  counted in whole numbers, as in `reduce`. The difference of the means of a pair counts as variance, except
             with `steady`.
     Raises: ValueError, before the run, where the descriptor or an image is missing or cannot be read, and for a level
@@ -68,7 +83,7 @@ def descriptor(*, file: DescriptorFile, scatter: Temporal = "temporal") -> Level
     """
     files = _with_images(file)
     measurement = _parsed(files[0])
-    joined: Levels = levels([_reduced(files[0].name, measurement, level, scatter) for level in measurement.levels])
+    joined: Levels = levels([_reduced(files[0].name, measurement, level, scatter) for level in measurement.transfer])
     return joined
 
 
@@ -88,13 +103,27 @@ def _(result: Levels, **params: Any) -> list[Check]:
 
 
 def descriptor_frames(files: Sequence[Path]) -> Iterator[tuple[str, float, float, Tensor]]:
-    """Yield name, photons, exposure (s) and frames (frame, y, x) of each light level of a descriptor.
+    """Yield name, photons, exposure (s) and frames (frame, y, x) of each level of a descriptor's photon transfer.
 
     ``files`` is the value of the parameter `file` of `descriptor`, whose first path is the descriptor.
     """
-    for level in _parsed(files[0]).levels:
+    for level in _parsed(files[0]).transfer:
         frames = torch.from_numpy(stack([image for _, image in level.images]))
         yield f"line {level.line}", level.photons, level.exposure, frames
+
+
+def descriptor_series(files: Sequence[Path]) -> Iterator[tuple[float, float, Iterator[Tensor]]]:
+    """Yield photons, exposure (s) and an iterator of frames (y, x) of each spatial series of a descriptor.
+
+    ``files`` is as in `descriptor_frames`. Each image is read when its turn comes.
+    """
+    for level in _parsed(files[0]).series:
+        yield level.photons, level.exposure, (f for _, image in level.images for f in torch.from_numpy(stack([image])))
+
+
+def refuse_descriptor(file: Path) -> None:
+    """Raise ValueError with the line of the mistake if a descriptor or an image that it names cannot be read."""
+    refuse_unreadable("file", _with_images(file)[1:])
 
 
 def _reduced(name: str, measurement: _Measurement, level: _Level, scatter: Temporal) -> Levels:
@@ -148,7 +177,7 @@ def _take(measurement: _Measurement, kind: str, rest: str, folder: Path, line: i
         raise ValueError(f"cannot read {kind!r}: begin the line with v, n, b, d, i or #")
     words = rest.split()
     try:
-        numbers = [float(word) for word in words]
+        numbers = [float(word.replace(",", ".")) for word in words]  # some laboratories write decimal commas
         if kind == "n":
             measurement.bits, measurement.shape = int(words[0]), (int(words[2]), int(words[1]))
         elif kind != "v":
@@ -160,6 +189,6 @@ def _take(measurement: _Measurement, kind: str, rest: str, folder: Path, line: i
 def _level(line: int, kind: str, numbers: list[float]) -> _Level:
     """Return the light level of a descriptor line; raise ValueError for an invalid exposure or number of photons."""
     exposure, photons = (*numbers, 0.0)[:2] if kind == "d" else numbers
-    if not 0 < exposure < float("inf") or not (0 < photons < float("inf") if kind == "b" else photons == 0):
+    if not 0 <= exposure < float("inf") or not (0 < photons < float("inf") if kind == "b" else photons == 0):
         raise ValueError
     return _Level(line, photons, exposure * 1e-9)

@@ -15,8 +15,10 @@ _STEPS = 30  #: variances of the scene that are tried for each doubt, each half 
 _SAMPLE = 1 << 16  #: pixels of a channel from which the variance of the scene is chosen; all decide on the doubt
 
 
-def likeliest_doubt(electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]) -> float:
-    """Return the doubt of highest likelihood for a picture of which ``known`` pixels count; 0 without glare.
+def likeliest_doubt(
+    electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor], least: float = 0.0
+) -> float:
+    """Return the doubt of highest likelihood, at least ``least``, for a picture of which ``known`` pixels count.
 
     Likelihood: what is left of the picture without glare, less the mean of the 3 x 3 pixels around, is Gaussian in each
     pixel by itself, with the variance of the noise, of the doubted glare and of a scene that is the same in all pixels
@@ -36,7 +38,7 @@ def likeliest_doubt(electrons: Tensor, known: Tensor, glare: Glare, noise: Calla
         return sum(_profile(errors[use].square(), own[use]) for errors, own, use in channels if use.any())
 
     with torch.no_grad():
-        return max(DOUBTS, key=likelihood)
+        return max((least, *(doubt for doubt in DOUBTS if doubt > least)), key=likelihood)
 
 
 def _profile(squares: Tensor, variance: Tensor) -> float:

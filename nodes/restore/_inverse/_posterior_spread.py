@@ -12,7 +12,15 @@ from neusee.nodes._half_precision import single
 from neusee.nodes.restore._inverse._frame_spectrum import fitted_power
 from neusee.nodes.restore._inverse._hidden_pixels import Inverses, most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred, blurred, mixed
-from neusee.nodes.restore._inverse._wiener import Doubt, Scaled, effective_psf, known_and_light, posed, wrapped
+from neusee.nodes.restore._inverse._wiener import (
+    Doubt,
+    LeastDoubt,
+    Scaled,
+    effective_psf,
+    known_and_light,
+    posed,
+    wrapped,
+)
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf, Shading
 
@@ -36,6 +44,7 @@ def wiener_spread(
     *,
     balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     doubt: Doubt = 0.0,
+    least_doubt: LeastDoubt = 0.0,
     draws: Draws = 8,
     law: Literal["filter", "frame"] = "frame",
     read_noise: Electrons,
@@ -67,7 +76,7 @@ def wiener_spread(
     with torch.no_grad():
         fine, known, light = known_and_light(psf, responses, single(electrons), clipped, glare, nearby, ghosts)
         kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
-        scaled = posed(fine, known, kernels, light, (balance, read_noise, doubt))
+        scaled = posed(fine, known, kernels, light, (balance, read_noise, doubt, least_doubt))
         power = scaled.problem.power
         if law == "frame":
             power = fitted_power(scaled.problem, wrapped(kernels / scaled.share, (fine.shape[-2], fine.shape[-1])))

@@ -29,7 +29,8 @@ _LIGHT = 0.999  #: share of the light that the unknown border around the picture
 
 #: standard deviation of a glare pattern in each pixel over its light around there; None: the likeliest for the picture
 Doubt = Annotated[float, Field(ge=0, le=10)] | None
-Settings = tuple[float, float, float | None]  #: balance, read noise and doubt
+LeastDoubt = Annotated[float, Field(ge=0, le=10)]  #: of a doubt that is found
+Settings = tuple[float, float, float | None, float]  #: balance, read noise, doubt and least doubt
 
 
 @node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])
@@ -46,6 +47,7 @@ def wiener(
     *,
     balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     doubt: Doubt = 0.0,
+    least_doubt: LeastDoubt = 0.0,
     coarser_grids: bool = True,
     read_noise: Electrons,
 ) -> Tensor:
@@ -58,11 +60,11 @@ def wiener(
     wide as the scene, are removed, each with its own unknown strength. By default their shapes count as known exactly.
     `doubt` is the standard deviation of a pattern in each pixel over the light of the pattern around this pixel, which
     falls as 1 / distance^3 from each point of it: the variance of the noise grows by (doubt x this light)^2. Without a
-    number (null) it is the likeliest of 0, 0.01, 0.03, 0.1, 0.3, 1 and 3 for this picture. `nearby` has other possible
-    patterns of each glare, as `restore.nearby_glare` computes them: their differences from the glare, averaged over the
-    patterns, are its covariance. The glare in a variance is a least-squares estimate, in which uncertain pixels count
-    less. The iteration starts from the answer on `coarser_grids`; without these it starts from a picture without
-    contrast: faster, and right for a plain lens alone.
+    number (null) it is the likeliest of 0, 0.01, 0.03, 0.1, 0.3, 1 and 3 for this picture that is not below
+    `least_doubt`. `nearby` has other possible patterns of each glare, as `restore.nearby_glare` computes them: their
+    differences from the glare, averaged over the patterns, are its covariance. The glare in a variance is a
+    least-squares estimate, in which uncertain pixels count less. The iteration starts from the answer on
+    `coarser_grids`; without these it starts from a picture without contrast: faster, and right for a plain lens alone.
 
     Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses (channel, band),
             each glare and ghost (channel, at least y, at least x), cropped to the centre, each nearby
@@ -83,7 +85,9 @@ def wiener(
             prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.
     """
     electrons, light = single(electrons), (glare, nearby, ghosts)
-    scaled = pose(electrons, psf, illuminant, responses, bands, clipped, *light, (balance, read_noise, doubt))
+    scaled = pose(
+        electrons, psf, illuminant, responses, bands, clipped, *light, (balance, read_noise, doubt, least_doubt)
+    )
     return (scaled.pixels(most_likely(scaled.problem, coarser=coarser_grids)) + scaled.mean).to(electrons)
 
 
@@ -202,16 +206,16 @@ def pose(
     ghosts: list[Tensor] | None,
     settings: Settings,
 ) -> Scaled:
-    """Return the inputs of `wiener` as a linear problem, unsolved; ``settings`` are balance, read noise and doubt."""
+    """Return the inputs of `wiener` as a linear problem, unsolved; ``settings`` as `Settings` says."""
     fine, known, light = known_and_light(psf, responses, electrons, clipped, glare, nearby, ghosts)
     kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
     return posed(fine, known, kernels, light, settings)
 
 
 def posed(electrons: Tensor, known: Tensor, kernels: Tensor, glare: Glare, settings: Settings) -> Scaled:
-    """Return the deconvolution of a picture as a linear problem; ``settings`` are balance, read noise and doubt."""
+    """Return the deconvolution of a picture as a linear problem; ``settings`` as `Settings` says."""
     y, x = electrons.shape[-2:]
-    balance, read, doubt = settings
+    balance, read, doubt, least = settings
     known = torch.where(known.amax((-2, -1), keepdim=True) > 0, known, 1.0)
     share = _power_of_two(kernels.sum((-2, -1), keepdim=True).detach())
     kernels = kernels / share  # the same bits, and the floors below concern the shape of the PSF, not a grey filter
@@ -219,9 +223,9 @@ def posed(electrons: Tensor, known: Tensor, kernels: Tensor, glare: Glare, setti
     def own_noise(mean: Tensor) -> Tensor:
         return _noise(electrons, mean, read)
 
-    if doubt != 0:
+    if doubt != 0 and glare.around is None:
         glare = with_light_around(glare)
-    doubt = likeliest_doubt(electrons, known, glare, own_noise) if doubt is None else doubt
+    doubt = likeliest_doubt(electrons, known, glare, own_noise, least) if doubt is None else doubt
     trusted, light, wrong = doubted(electrons, known, glare, doubt, own_noise)
     picture = electrons - light.sum
     mean = average(picture, trusted)

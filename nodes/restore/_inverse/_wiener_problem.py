@@ -11,7 +11,7 @@ from neusee.nodes._half_precision import single
 from neusee.nodes.restore._inverse._fft_grid import torus
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred
-from neusee.nodes.restore._inverse._wiener import GREY, Doubt, Scaled, edge, fall, pose, wrapped
+from neusee.nodes.restore._inverse._wiener import GREY, Doubt, LeastDoubt, Scaled, edge, fall, pose, wrapped
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf, WienerProblem
 
@@ -30,6 +30,7 @@ def wiener_problem(
     *,
     balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     doubt: Doubt = 0.0,
+    least_doubt: LeastDoubt = 0.0,
     read_noise: Electrons,
 ) -> WienerProblem:
     """Pose the deconvolution of `restore.wiener` as a linear problem, and solve it: the answer is that of the filter.
@@ -43,7 +44,9 @@ def wiener_problem(
     Source: as `restore.wiener`.
     """
     electrons, light = single(electrons), (glare, nearby, ghosts)
-    return packed(pose(electrons, psf, illuminant, responses, bands, clipped, *light, (balance, read_noise, doubt)))
+    return packed(
+        pose(electrons, psf, illuminant, responses, bands, clipped, *light, (balance, read_noise, doubt, least_doubt))
+    )
 
 
 @wiener_problem.check

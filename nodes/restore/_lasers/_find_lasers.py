@@ -21,10 +21,10 @@ from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
 
 _WIDEST = (0.5, 10.0)  #: pixels and nm; half of a wider interval does not identify
 _RIVAL = 5.0  #: log likelihood by which the fit exceeds one at another place or wavelength, to identify
-_CHANNELS, _SMALLEST = 3, 20
+_CHANNELS, _SMALLEST = (1, 3), 20
 _COLOURS = (
-    "lasers are found in a frame of 3 colour channels (3, y, x) alone, because the ratio of the channels tells a laser "
-    "from a lamp: give a camera of 3 channels, or restore without a search, as `restore=wiener_blind` does"
+    "lasers are found in a frame of 3 colour channels (3, y, x), or of one: give such a camera, or restore without a "
+    "search, as `restore=wiener_blind` does"
 )
 _PRECISE = 256  #: pixels a side, up to which all is computed in float64
 
@@ -63,14 +63,17 @@ def find_lasers(
     fitted at once, and the search goes on in the rest. Intervals (90 %) come from the second derivatives and the
     scatter of the residual.
 
-    Shapes: electrons and clipped (3, y, x), psf.intensity (band, any, any), pupil, illuminant (band,),
-            responses (3, band), bands -> FoundLasers of ``most`` rows.
+    In a frame of one channel nothing but the scale of a pattern tells its wavelength, and nothing but its sharpness
+    tells a laser from a lamp.
+
+    Shapes: electrons and clipped (channel, y, x) of 1 or 3 channels, psf.intensity (band, any, any), pupil,
+            illuminant (band,), responses (channel, band), bands -> FoundLasers of ``most`` rows.
     Units:  electrons e-; direction rad; wavelength and widths m; strength e-; gain none.
     Error:  in frames of more than 256 pixels a side float32 rounds the fit. A light that is narrow but no laser, such
             as a light-emitting diode, may be taken for one. A laser that changes no pixel that is seen is not found.
             Two lasers within 2 pixels and 25 nm count as one. The responses are linear between the bands.
             `recipes/guide/found_lasers.md` has measured rates and coverage.
-    Raises: ValueError for a number of channels other than 3, frames of fewer than 20 pixels a side, inputs of different
+    Raises: ValueError for other numbers of channels, frames of fewer than 20 pixels a side, inputs of different
             channels, bands or pixels, and values that are not finite.
     Gradient: none, because a search chooses between candidates.
     Source: matched filter as in Kay, Fundamentals of Statistical Signal Processing II, 1998, ch. 4; covariance of a
@@ -98,7 +101,7 @@ def find_lasers(
 @find_lasers.preflight
 def _(*, responses: Any = None, **_: Any) -> list[str]:
     """Refuse a camera of another number of channels, where its responses are known before the run."""
-    if responses is not None and len(responses) != _CHANNELS:
+    if responses is not None and len(responses) not in _CHANNELS:
         raise ParameterError("responses.camera", f"the camera has {_told(len(responses))}: {_COLOURS}")
     return []
 
@@ -118,11 +121,12 @@ def _(
         texts.append(
             f"{y:+.2f}, {x:+.2f} px, {float(result.wavelength[n]) / NANOMETRE:.1f} nm ({low:.1f} to {high:.1f}){known}"
         )
-    return [Check(f"{count} laser{'s' * (count > 1)} found: {'; '.join(texts)}")]
+    alone = "" if len(electrons) > 1 else "; with one channel, wavelengths come from the scale of the patterns alone"
+    return [Check(f"{count} laser{'s' * (count > 1)} found: {'; '.join(texts)}{alone}")]
 
 
 def _refuse(electrons: Tensor, clipped: Tensor, psf: Psf, pupil: Pupil, responses: Tensor, bands: Bands) -> None:
-    if electrons.ndim != 3 or len(electrons) != _CHANNELS:
+    if electrons.ndim != 3 or len(electrons) not in _CHANNELS:
         raise ValueError(f"electrons {tuple(electrons.shape)}: {_COLOURS}")
     refuse_other_pictures(electrons, psf, responses, clipped, None)
     if min(electrons.shape[-2:]) < _SMALLEST:

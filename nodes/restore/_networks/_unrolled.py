@@ -17,7 +17,7 @@ from neusee.nodes.network_weights import loaded, same_layout
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred
 from neusee.nodes.restore._inverse._pulled_answer import STEPS, pulled
-from neusee.nodes.restore._inverse._wiener import Doubt, pose
+from neusee.nodes.restore._inverse._wiener import Doubt, LeastDoubt, pose
 from neusee.nodes.restore._inverse._wiener_problem import unpacked
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import Restorer
@@ -105,6 +105,7 @@ def unrolled(
     steps: Steps = 2,
     balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     doubt: Doubt = 0.0,
+    least_doubt: LeastDoubt = 0.0,
     read_noise: Electrons,
 ) -> Tensor:
     """Deconvolve a picture by `restore.wiener` with a learned prior: the filter and a network take turns.
@@ -130,7 +131,9 @@ def unrolled(
     electrons, light = single(electrons), (glare, nearby, ghosts)
     if len(electrons) != 3:
         raise ValueError(f"electrons {tuple(electrons.shape)} have {len(electrons)} channels, and the network needs 3")
-    scaled = pose(electrons, psf, illuminant, responses, bands, clipped, *light, (balance, read_noise, doubt))
+    scaled = pose(
+        electrons, psf, illuminant, responses, bands, clipped, *light, (balance, read_noise, doubt, least_doubt)
+    )
     problem, spectrum = scaled.problem, most_likely(scaled.problem)
     result = scaled.pixels(spectrum)
     if weights is not None:

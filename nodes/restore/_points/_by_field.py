@@ -13,8 +13,20 @@ from torch import Generator, Tensor
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.restore._inverse._frame_spectrum import fitted_power
+from neusee.nodes.restore._inverse._glare import Glare, with_light_around
+from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._posterior_spread import Draws, drawn_deviation, with_shading
-from neusee.nodes.restore._inverse._wiener import edge, known_and_light, posed, wiener, wrapped
+from neusee.nodes.restore._inverse._wiener import (
+    PRECISE,
+    Doubt,
+    LeastDoubt,
+    Scaled,
+    Settings,
+    edge,
+    known_and_light,
+    posed,
+    wrapped,
+)
 from neusee.nodes.restore._points._point_model import hats
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, MeasuredPsf, Psf, Shading
@@ -22,44 +34,52 @@ from neusee.nodes.values import Bands, MeasuredPsf, Psf, Shading
 Balance = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
-@node(rtol=1e-5)
+@node(rtol=1e-5, additive_inputs=[("glare", "nearby")])
 def wiener_by_field(
-    electrons: Tensor, measured: MeasuredPsf, clipped: Tensor, *, balance: Balance = 1.0, read_noise: Electrons
-) -> Tensor:
+    electrons: Tensor, measured: MeasuredPsf, clipped: Tensor, glare: list[Tensor] | None = None,
+    nearby: list[Tensor] | None = None, *, balance: Balance = 1.0, doubt: Doubt = 0.0,
+    least_doubt: LeastDoubt = 0.0, read_noise: Electrons,
+) -> Tensor:  # fmt: skip
     """Deconvolve a picture with a PSF that was measured by field: `restore.wiener` around each node, blended.
 
     The picture around each node of the grid is deconvolved with the PSF of the node, up to where its bilinear weight is
     0 and by the radius that holds 99.9 % of the PSF beyond. The results are added with these weights, whose sum is 1.
+    The patterns of ``glare`` are removed, with ``nearby``, ``doubt`` and ``least_doubt`` as in `restore.wiener`. They
+    come from a model of the lens, because a PSF that white points gave does not tell the pattern of one wavelength.
+    Their strengths, and a doubt that is found, are those around each node.
 
-    Shapes: electrons and clipped (channel, y, x), measured.kernels (row, column, channel, any, any) -> (channel, y, x).
-    Units:  e-; the result as behind a perfect lens that loses the same light.
+    Shapes: electrons and clipped (channel, y, x), measured.kernels (row, column, channel, any, any), each glare
+            (channel, y, x), each nearby (pattern, channel, y, x) -> (channel, y, x).
+    Units:  e-, glare and nearby any; the result as behind a perfect lens that loses the same light; doubt none.
     Error:  that of `restore.wiener`, of the PSF (`restore.spread_by_field` includes it), and of taking the PSF as
             constant over each part: the blend of two restored pictures is not the restoration with the blended PSF.
-            Variance and mean of the prior are those of each part. Lasers are taken for scene.
+            Variance and mean of the prior are those of each part. Without `glare` lasers are taken for scene.
     Raises: ValueError where channels or pixels differ.
     Source: overlap-add with a PSF that varies in space, Nagy and O'Leary, SIAM J. Sci. Comput. 19, 1063 (1998), applied
             to the restored pictures.
     """
     _refuse_other(electrons, measured)
     total = torch.zeros_like(single(electrons))
+    light = _glare(electrons, measured, clipped, (glare, nearby), doubt)
     for part in _parts(electrons, measured):
-        seen = electrons[:, part.rows, part.columns]
-        found = wiener(seen, *_channelwise(part.kernels), clipped[:, part.rows, part.columns], balance=balance,
-                       read_noise=read_noise)  # fmt: skip
-        total[:, part.rows, part.columns] += part.weight.to(total) * found
+        scaled, _ = _problem(electrons, clipped, part, light, (balance, read_noise, doubt, least_doubt))
+        found = scaled.pixels(most_likely(scaled.problem, coarser=True)) + scaled.mean
+        total[:, part.rows, part.columns] += (part.weight.to(found) * found).to(total)
     return total
 
 
 @node()
 def spread_by_field(
-    electrons: Tensor, measured: MeasuredPsf, clipped: Tensor, matrix: Tensor, restored: Tensor | None = None,
-    shading: Shading | None = None, *, balance: Balance = 1.0, draws: Draws = 8, read_noise: Electrons, rng: Generator,
+    electrons: Tensor, measured: MeasuredPsf, clipped: Tensor, matrix: Tensor, glare: list[Tensor] | None = None,
+    nearby: list[Tensor] | None = None, restored: Tensor | None = None, shading: Shading | None = None, *,
+    balance: Balance = 1.0, doubt: Doubt = 0.0, least_doubt: LeastDoubt = 0.0, draws: Draws = 8, read_noise: Electrons,
+    rng: Generator,
 ) -> Tensor:  # fmt: skip
     """Compute the standard deviation of each pixel of `restore.wiener_by_field`, the error of the PSF included.
 
     As `restore.wiener_spread` with the law `frame`, around each node. Each drawn scene is blurred with a PSF drawn from
     the measurement, and restored with the mean PSF: noise, the lost detail and the error of the PSF enter together.
-    ``restored`` and ``shading`` count as in `restore.wiener_spread`.
+    ``glare``, ``nearby``, ``restored`` and ``shading`` count as in `restore.wiener_spread`.
 
     Shapes: as `restore.wiener_by_field`, matrix (colour, channel) -> (colour, y, x).
     Units:  those of `restore.colour`.
@@ -71,14 +91,12 @@ def spread_by_field(
     """
     _refuse_other(electrons, measured)
     total = torch.zeros(len(matrix), *electrons.shape[-2:], dtype=single(electrons).dtype, device=electrons.device)
+    with torch.no_grad():
+        light = _glare(electrons, measured, clipped, (glare, nearby), doubt)
     for part in _parts(electrons, measured):
         with torch.no_grad():
-            seen, ends = (x[:, part.rows, part.columns] for x in (single(electrons), clipped))
-            psf, _, responses, _ = _channelwise(part.kernels)
-            fine, known, light = known_and_light(psf, responses, seen, ends, None, None, None)
-            kernels = part.kernels.to(fine)
-            scaled = posed(fine, known, kernels, light, (balance, read_noise, 0.0))
-            size = (fine.shape[-2], fine.shape[-1])
+            scaled, kernels = _problem(electrons, clipped, part, light, (balance, read_noise, doubt, least_doubt))
+            size = (scaled.problem.picture.shape[-2], scaled.problem.picture.shape[-1])
             power = fitted_power(scaled.problem, wrapped(kernels / scaled.share, size))
         found = drawn_deviation(scaled, power, matrix, draws, rng, part.draws)
         total[:, part.rows, part.columns] += part.weight.to(total) * found.to(total)
@@ -117,6 +135,36 @@ def _parts(electrons: Tensor, measured: MeasuredPsf) -> Iterator[_Part]:
             rows, columns = _around(down[:, i], reach[0]), _around(right[:, j], reach[1])
             weight = down[rows, i, None] * right[columns, j]
             yield _Part(rows, columns, weight, kernels, measured.draws[:, i, j])
+
+
+def _glare(
+    electrons: Tensor,
+    measured: MeasuredPsf,
+    clipped: Tensor,
+    lights: tuple[list[Tensor] | None, list[Tensor] | None],
+    doubt: float | None,
+) -> Glare:
+    """Return the glare of the whole frame, with the light around each pixel of it where a doubt needs that."""
+    kernel = _channelwise(measured.kernels[0, 0])
+    light = known_and_light(kernel[0], kernel[2], single(electrons), clipped, *lights, None)[2]
+    return light if doubt == 0 else with_light_around(light)
+
+
+def _problem(
+    electrons: Tensor, clipped: Tensor, part: _Part, light: Glare, settings: Settings
+) -> tuple[Scaled, Tensor]:
+    """Return the deconvolution of a part of a frame, and its PSFs."""
+    inside = (slice(None), part.rows, part.columns)
+    fine = single(electrons)[inside]
+    fine = fine.double() if max(fine.shape[-2:]) <= PRECISE else fine
+    known, kernels = (~clipped[inside]).to(fine), part.kernels.to(fine)
+
+    def cut(pictures: list[Tensor]) -> list[Tensor]:
+        return [x[..., part.rows, part.columns].to(fine) for x in pictures]
+
+    nearby = [None if x is None else cut([x])[0] for x in light.nearby]
+    here = Glare(cut(light.patterns), nearby, None if light.around is None else cut(light.around))
+    return posed(fine, known, kernels, here, settings), kernels
 
 
 def _around(weight: Tensor, reach: int) -> slice:

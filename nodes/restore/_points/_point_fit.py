@@ -24,6 +24,9 @@ _SURE = 4.0  #: standard deviations below saturation from which a pixel counts
 _CALM = 1e-9  #: share of the largest curvature that is added to each, in a step alone
 _ITERATIONS = 300  #: of conjugate gradients
 _RESIDUAL = 1e-8  #: squared residual over the first, at which they end
+_SHARED = 1.02  #: inflation of a variance from which points tell several PSFs
+_CORE = 2  #: pixels around the middle of a PSF, in which points are counted
+_ALONE = 1e-9  #: least eigenvalue of the products of weights, below which nodes are not told apart
 _LOCAL = 5  #: pixels a side over which chi-square is averaged
 
 
@@ -34,6 +37,8 @@ class Fit(NamedTuple):
     draws: Tensor  #: (draw, node, channel, y, x)
     state: State
     chi: Tensor  #: (channel,)
+    support: Tensor  #: (node,)
+    inflation: Tensor  #: (node,)
 
 
 def fitted(seen: Seen, shape: tuple[int, int], zones: tuple[int, int], window: tuple[int, int], count: int,
@@ -41,11 +46,12 @@ def fitted(seen: Seen, shape: tuple[int, int], zones: tuple[int, int], window: t
     """Return the PSFs at the nodes and draws of them; raise ValueError where no pixel tells of a part of a PSF."""
     share = node_weights(seen.middle, shape, zones)
     state, weight = _start(seen, share, window)
+    hold = _hold(linear(seen, state, share), state.kernels, weight)
     _refuse_unseen(linear(seen, state, share), weight)
     for _ in range(_STEPS):
         near = linear(seen, state, share)
         residual = seen.light - near.model(state.background)
-        step = _solved(near, weight, _slope(near, state, weight, residual))
+        step = _solved(near, hold, weight, _slope(near, state, weight, residual))
         before = state.offset
         state = _ahead(seen, state, share, weight, step._replace(offset=step.offset.clamp(-_MOST, _MOST)))
         weight = _weight(seen, linear(seen, state, share).model(state.background))
@@ -61,9 +67,9 @@ def fitted(seen: Seen, shape: tuple[int, int], zones: tuple[int, int], window: t
         noise = _normal(weight, rng) * weight.sqrt()
         slope = near.slope(noise)
         slope = slope._replace(background=slope.background + _normal(seen.doubt, rng) / seen.doubt.sqrt())
-        other = gauged(state.plus(_solved(near, weight, slope)).kernels)
+        other = gauged(state.plus(_solved(near, hold, weight, slope)).kernels)
         draws.append((kernels + local * (other - kernels)).float())
-    return Fit(kernels, torch.stack(draws), state, _chi(weight, residual, near))
+    return Fit(kernels, torch.stack(draws), state, _chi(weight, residual, near), *_support(near, weight))
 
 
 def gauged(kernels: Tensor) -> Tensor:
@@ -166,19 +172,17 @@ def _curvature(near: Linear, weight: Tensor) -> State:
     return State(*(x + 1e-3 * x.amax() * (x <= 0) + _CALM * x.amax() for x in found))
 
 
-def _solved(near: Linear, weight: Tensor, right: State) -> State:
+def _solved(near: Linear, hold: Hold, weight: Tensor, right: State) -> State:
     """Return the step for a slope, by conjugate gradients that the curvature of each entry speeds up.
 
-    A shift of all points is a shift of the PSFs: the points move only as no shift of the PSFs at the nodes can. A
-    factor of a PSF is one of the signals: the sum of each PSF stays as it is.
+    A shift of all points is a shift of the PSFs, and a factor of a PSF is one of the signals: ``hold`` decides.
     """
     diagonal = _curvature(near, weight)
     inverse = State(*(1.0 / x for x in diagonal))
     calm = State(*(_CALM * x.amax() * torch.ones_like(x) for x in diagonal))
     x = State(*(torch.zeros_like(part) for part in right))
-    bound = near.share @ torch.linalg.pinv(near.share)
-    rest = _free(right, bound)
-    way = _free(rest.times(inverse), bound)
+    rest = _free(right, hold)
+    way = _free(rest.times(inverse), hold)
     size = rest.dot(way)
     first = size
     for _ in range(_ITERATIONS):
@@ -186,19 +190,50 @@ def _solved(near: Linear, weight: Tensor, right: State) -> State:
             break
         image = near.slope(weight * near.change(way)).plus(way.times(calm))
         image = image._replace(background=image.background + way.background / near.seen.doubt)
-        image = _free(image, bound)
+        image = _free(image, hold)
         step = size / way.dot(image)
         x, rest = x.plus(way, step), rest.plus(image, -step)
-        turned = _free(rest.times(inverse), bound)
+        turned = _free(rest.times(inverse), hold)
         size, before = rest.dot(turned), size
         way = turned.plus(way, size / before)
     return x
 
 
-def _free(change: State, bound: Tensor) -> State:
-    """Return a change without the part that does not change the frames; ``bound`` (point, point) projects on it."""
+class Hold(NamedTuple):
+    """What stays where it is, because a shift of all points is a shift of the PSFs."""
+
+    points: Tensor  #: (point, point), projects on the moves of the points that are left to the PSFs
+    ways: Tensor | None  #: (way, node, channel, y, x), changes of the PSFs that are left to the points
+
+
+def _hold(near: Linear, kernels: Tensor, weight: Tensor) -> Hold:
+    """Return what stays where it is at the nodes.
+
+    Where each point tells one PSF, the points stay, so that a PSF need not be known between pixels. Where points tell
+    several, the PSFs stay in the middle: those that lie beside one another would add to a wider one.
+    """
+    if float(_support(near, weight)[1].max()) > _SHARED:
+        return Hold(torch.zeros_like(near.share @ near.share.T), _ways(kernels))
+    return Hold(near.share @ torch.linalg.pinv(near.share), None)
+
+
+def _free(change: State, hold: Hold) -> State:
+    """Return a change without the part that does not change the frames, which would have no end."""
     kernels = change.kernels - change.kernels.mean((-2, -1), keepdim=True)
-    return change._replace(kernels=kernels, offset=change.offset - bound @ change.offset)
+    for way in () if hold.ways is None else hold.ways:
+        kernels = kernels - (way * kernels).sum((-3, -2, -1), keepdim=True) * way
+    return change._replace(kernels=kernels, offset=change.offset - hold.points @ change.offset)
+
+
+def _ways(kernels: Tensor) -> Tensor:
+    """Return two changes (2, node, channel, y, x) of each PSF, of unit length, that move it down and to the right."""
+    found = list[Tensor]()
+    for way in torch.gradient(kernels, dim=(-2, -1)):
+        way = way - way.mean((-2, -1), keepdim=True)
+        for other in found:
+            way = way - (way * other).sum((-3, -2, -1), keepdim=True) * other
+        found.append(way / way.square().sum((-3, -2, -1), keepdim=True).sqrt().clamp_min(1e-30))
+    return torch.stack(found)
 
 
 def _refuse_unseen(near: Linear, weight: Tensor) -> None:
@@ -225,6 +260,23 @@ def _misfit(near: Linear, weight: Tensor, residual: Tensor) -> Tensor:
 def _chi(weight: Tensor, residual: Tensor, near: Linear) -> Tensor:
     free = 1.0 - _unknowns(near) / float((weight > 0).sum())
     return (weight * residual.square()).sum(1) / ((weight > 0).sum(1) * free).clamp_min(1.0)
+
+
+def _support(near: Linear, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return how many points at each node would tell its PSF as well, and the inflation of its variance.
+
+    The worst of the pixels in the middle. With A the bilinear weights of the points that show a pixel, the number is
+    1 over the diagonal of the inverse of A^T A, and the inflation the product of this diagonal and that of A^T A
+    (Kutner et al., Applied Linear Statistical Models, 5th ed., 2005, sec. 10.5): 1 for points in the middles of zones.
+    """
+    shown = near.stamps_of(weight) > 0
+    y, x = (n // 2 for n in shown.shape[-2:])
+    core = shown[..., y - _CORE : y + _CORE + 1, x - _CORE : x + _CORE + 1].flatten(1).double()
+    patterns = torch.unique(core, dim=1).T
+    normal = near.share.T @ (patterns[:, :, None] * near.share)
+    sizes, ways = torch.linalg.eigh(normal)
+    inverse = (ways.square() / sizes.clamp_min(_ALONE)[:, None]).sum(-1)
+    return (1.0 / inverse).amin(0), (inverse * normal.diagonal(dim1=-2, dim2=-1)).amax(0)
 
 
 def _unknowns(near: Linear) -> float:

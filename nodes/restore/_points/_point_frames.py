@@ -70,6 +70,11 @@ def refuse_bad_frames(
         raise ParameterError("zones", _without_point(empty, zones))
 
 
+def points_in(files: Sequence[Path], window: tuple[int, int], camera: Camera) -> int:
+    """Return the number of points in the frames that are not dark."""
+    return sum(len(_found(file, window, camera)) for file in lit_and_dark(files)[0])
+
+
 def read_points(files: Sequence[Path], window: tuple[int, int], camera: Camera) -> Seen:
     """Read all frames and keep the pixels in the windows of their points; subtract the mean of the dark frames."""
     gain, offset, full_well, bits, read_noise = camera

@@ -235,6 +235,9 @@ def test_the_whole_command_finds_the_sensor_and_draws_nothing_twice(here, capsys
     for name, row in document["parameters"].items():
         low, high = np.quantile(draws[name], [0.005, 0.995])
         assert low <= row["nominal"] <= high, name
+    gain = document["parameters"]["gain"]
+    assert abs(document["least_squares"]["gain"]["value"] - gain["mean"]) < 0.1 * gain["mean"]
+    assert "Beside the least squares of EMVA 1288" in (here / "runs" / "latest" / "report.html").read_text()
     data = importlib.import_module("arviz").from_netcdf(here / "runs" / "latest" / "posterior.nc")
     assert set(data.posterior) == set(document["parameters"])
     monkeypatch.setattr(emcee.moves.DEMove, "get_proposal", None)  # nothing is drawn again

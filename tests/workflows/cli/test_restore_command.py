@@ -167,6 +167,16 @@ def test_a_folder_of_point_sources_gives_the_psf_and_its_error(neusee, tmp_path)
     assert not [name for name in steps if name.startswith("psf[")]  # the PSF of the recipe is not computed
     page = (tmp_path / document["report"]).read_text(encoding="utf-8")
     assert "3 points; chi-square per pixel" in page
+    small += ["restore.most=1", "restore.lamps=0"]
+    code, out, err = neusee(
+        "shot.npy", "--camera", "plain_lens", "--psf", "points", "restore=search", *small, "--json", small=False
+    )
+    assert (code, err) == (0, "")
+    document = json.loads(out)
+    steps = {step["step"]: step for step in document["steps"]}
+    assert steps["search"]["node"] == "restore.find_lasers"
+    assert steps["deconvolved"]["node"] == "restore.wiener_by_field"
+    assert steps["measured"]["state"] == "cached"
 
 
 GOOD = "shot.npy"

@@ -12,7 +12,7 @@ from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
 from neusee.nodes.scene import grey
 from neusee.nodes.scene._spectral_exr import exr_parts
-from neusee.workflows import RecipeError, Store, load
+from neusee.workflows import Store, load
 
 #: quantum efficiency in percent by wavelength in nm, as a data sheet draws it
 QE = [(350, 20), (400, 45), (450, 60), (525, 69), (600, 62), (700, 45), (850, 19), (950, 7), (1050, 1.2), (1100, 0.2)]
@@ -144,8 +144,9 @@ def test_the_page_of_a_run_shows_the_mono_camera(tmp_path, mono, monkeypatch):
         np.testing.assert_array_equal(opened.channels()["Y"].pixels, raw)
 
 
-def test_a_search_for_lasers_with_one_channel_is_a_mistake_of_the_camera_before_work(mono):
-    with pytest.raises(RecipeError, match="1 channel") as error:
-        mono("restored", "restore=search")
-    assert "mine.yaml:4" in str(error.value)
-    assert "restore=wiener_blind" in str(error.value)
+@pytest.mark.slow
+def test_a_search_for_lasers_runs_with_one_channel(mono):
+    _, result = mono("restored, search", "restore=search", "restore.most=1", "restore.lamps=0")
+    assert result["search"].strength.shape == (1, 1)
+    assert result["restored"].shape == (3, 48, 48)
+    assert bool(torch.isfinite(result["restored"]).all())

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, ParamSpec
 
 import torch
@@ -49,12 +50,19 @@ def drawn(draw: Callable[P, Any]) -> Callable[P, bytes]:
 
     @functools.wraps(draw)
     def inner(*args: P.args, **kwargs: P.kwargs) -> bytes:
-        import matplotlib
-
-        with matplotlib.rc_context(dict(_RC)):
+        with styled():
             return png_of(draw(*args, **kwargs))
 
     return inner
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Use the common style for the figures that are made in the ``with`` block."""
+    import matplotlib
+
+    with matplotlib.rc_context(dict(_RC)):
+        yield
 
 
 def png_of(figure: Any) -> bytes:

@@ -38,16 +38,17 @@ class UncertaintyResult:
     is_constant: tuple[str, ...]  #: outputs that depend on no input
     wanted: float  #: the requested relative error
     sequences: int  #: number of Sobol sequences; 0 for independent draws
-
-    @property
-    def error(self) -> float:
-        """Return the largest relative error of the standard deviations of all quantities."""
-        return worst_known(self.scatter)[1]
+    deciding: tuple[str, ...]  #: quantities whose standard deviations decided when to stop
 
     @property
     def worst(self) -> str:
-        """Return the name of the quantity whose standard deviation has the largest relative error."""
-        return worst_known(self.scatter)[0]
+        """Return the name of the deciding quantity whose standard deviation has the largest relative error."""
+        return worst_known({name: self.scatter[name] for name in self.deciding})
+
+    @property
+    def error(self) -> float:
+        """Return the largest relative error of the standard deviations that decided when to stop."""
+        return self.scatter[self.worst].error
 
     @property
     def strange(self) -> list[str]:
@@ -62,11 +63,11 @@ class UncertaintyResult:
     @property
     def input_rows(self) -> list[dict[str, Any]]:
         """Return the name, label, distribution, mean and standard deviation of each uncertain input."""
-        rows = []
-        for name, label, x in zip(self.inputs.names, self.inputs.labels, self.points.values.T, strict=True):
-            row = {"name": name, "label": label, "law": self.inputs.uncertain.said(name)}
-            rows.append({**row, "mean": float(x.mean()), "sd": float(x.std(ddof=1))})
-        return rows
+        said, columns = self.inputs.uncertain.said, self.points.values.T
+        return [
+            {"name": name, "label": label, "law": said(name), "mean": float(x.mean()), "sd": float(x.std(ddof=1))}
+            for name, label, x in zip(self.inputs.names, self.inputs.labels, columns, strict=True)
+        ]
 
     @property
     def numbers(self) -> list[str]:
@@ -120,17 +121,22 @@ def _wavelengths_nm(result: UncertaintyResult) -> FloatArray:
 
 def _node_of(result: UncertaintyResult, quantity: str) -> str:
     steps = result.inputs.recipe.steps
-    name = quantity if quantity in steps else quantity.rpartition(".")[0]
-    return steps[name].node.path if name in steps else ""
+    step = steps.get(quantity) or steps.get(quantity.rpartition(".")[0])
+    return step.node.path if step else ""
 
 
 def lead(result: UncertaintyResult) -> str:
     """Return the summary of the uncertainty study in a few sentences."""
     count, kind = len(result.points.z), "Sobol points" if result.sequences else "independent draws"
-    known = f"every standard deviation is known to {result.error:.1%}"
+    every = len(result.deciding) == len(result.scatter)
+    which = "every standard deviation" if every else f"the standard deviation of {', '.join(result.deciding)}"
+    known = f"{which} is known to {result.error:.1%}"
     if result.error > result.wanted:
         known = f"the standard deviation of {result.worst} is known to {result.error:.1%} only"
         known += f"; {result.wanted:.1%} was requested"
+    if not every:
+        other = worst_known(result.scatter)
+        known += f"; others did not decide, the least known is {other} to {result.scatter[other].error:.1%}"
     numbers = {name: result.scatter[name] for name in result.numbers[:_MOST]}
     values = [f"{name} {with_uncertainty(float(s.mean[0]), float(s.sd[0]))}" for name, s in numbers.items()]
     strange = f" NaN or infinite in some draw: {', '.join(result.strange)}." if result.strange else ""
@@ -142,8 +148,7 @@ def sections(result: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Sect
     parts = [_inputs(result), *_posterior(result), _numbers(result, shown.get("numbers"))]
     parts += _moves(result, shown.get("tornado"))
     if "bands" in shown:
-        text = "The middle 90 % of the draws, element by element."
-        parts.append(Section("Curves", text, picture=shown["bands"]))
+        parts.append(Section("Curves", "The middle 90 % of the draws, element by element.", picture=shown["bands"]))
     if "transfer" in shown:
         text = """The curves that a laboratory would measure with the drawn sensors, simulated by the recipe's steps.
             The prediction has no noise. Flat fields have the noise of their pixels, because each draw has its own

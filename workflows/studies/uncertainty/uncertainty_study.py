@@ -25,6 +25,7 @@ from neusee.workflows.studies.uncertainty.uncertainty_page import UncertaintyRes
 LEAST = 64  #: draws before the first decision to stop
 _ROUND = 16  #: independent draws in each further round
 PICTURED = 32  #: draws for the mean and standard deviation of pictures; the deviation is known to 13 %
+_KEPT = ("mean", "sd")  #: of each picture
 _COLUMNS = ("quantity", "element", "at the medians", "mean", "sd", "5 %", "95 %")
 
 
@@ -39,18 +40,21 @@ def study(
     points: str = "draws",
     workers: int = 0,
     device: str = "cpu",
+    until: Sequence[str] = (),
 ) -> Path:
     """Sample inputs, up to ``most`` times, until all output standard deviations are known to the relative ``error``.
 
-    On the CPU, ``workers`` draws are computed at once; 0 means one for each core. Returns the folder with the results.
+    With ``until``, names of outputs or of single quantities, only their deviations decide. On the CPU, ``workers``
+    draws are computed at once; 0 means one for each core. Returns the folder with the results.
     """
     study_run = StudyRun("uncertainty", recipe, command)
     require_salib()
     inputs = Inputs.of(recipe)
+    _chosen([name.partition(".")[0] for name in until], inputs.recipe.outputs)
     at = _points(inputs, recipe.seed, most, points)
     inputs.checked(np.concatenate([at.values, _ends(inputs)]))
     draws = OutputDraws(inputs, store, device, workers)
-    result = _measure(inputs, draws, at, progress, error, SCRAMBLES if points == "sobol" else 0)
+    result = _measure(inputs, draws, at, progress, (error, SCRAMBLES if points == "sobol" else 0, until))
     document = study_run.document(_document(result, draws))
     return study_run.write(runs, digest(document["quantities"]), document, _report(result))
 
@@ -64,19 +68,29 @@ def _points(inputs: Inputs, seed: int, most: int, points: str) -> InputDraws:
 def _ends(inputs: Inputs) -> FloatArray:
     """Return the input values of each run: all at their medians, then one input at its 5 % and at its 95 % quantile."""
     count = len(inputs.names)
-    z = np.concatenate([np.zeros((1, count)), *(np.stack([-Z_90 * e, Z_90 * e]) for e in np.eye(count))])
-    return inputs.at(z)
+    return inputs.at(np.concatenate([np.zeros((1, count)), *(np.stack([-Z_90 * e, Z_90 * e]) for e in np.eye(count))]))
+
+
+def _chosen(until: Sequence[str], there: Sequence[str]) -> tuple[str, ...]:
+    """Return the names ``there`` that ``until`` means, or all; raise ValueError for a name that means none of them."""
+    found = {name: [x for x in there if x == name or x.startswith((f"{name}.", f"{name}["))] for name in until}
+    for name in (name for name, those in found.items() if not those):
+        raise ValueError(f"--until {name}: no output with numbers has this name; there are {', '.join(there)}")
+    return tuple(name for name in there if not until or any(name in those for those in found.values()))
 
 
 def _measure(
-    inputs: Inputs, draws: OutputDraws, at: InputDraws, progress: Progress, wanted: float, sequences: int
+    inputs: Inputs, draws: OutputDraws, at: InputDraws, progress: Progress, how: tuple[float, int, Sequence[str]]
 ) -> UncertaintyResult:
+    wanted, sequences, until = how
     progress(f"{len(inputs.names)} inputs: {', '.join(inputs.names)}; {len(draws.outputs)} outputs depend on them")
     progress(f"steps that depend on no input: {draws.ready():.1f} s")
     pictures = draws.pictures(at.values[:PICTURED])
     ends = draws.numbers(_ends(inputs))
     if not ends[0]:
         raise ValueError("the outputs are pictures only: add an output with numbers, such as restored_quality")
+    deciding = _chosen(until, list(ends[0]))
+    what = f"standard deviations of {', '.join(until)}" if until else "every standard deviation"
     numbers: list[Numbers] = []
     used = 0
     while used < len(at.values):
@@ -85,15 +99,16 @@ def _measure(
         numbers += draws.numbers(at.values[len(numbers) : used])
         values = {name: np.array([n[name] for n in numbers]) for name in ends[0]}
         scattered = {name: scatter(x, sequences) for name, x in values.items()}
-        worst, error = worst_known(scattered)
+        worst = worst_known({name: scattered[name] for name in deciding})
+        error = scattered[worst].error
         needed = used if error <= wanted else min(len(at.values), int(used * (error / wanted) ** 2))
-        progress(f"{used} draws of about {needed}: every standard deviation to {error:.1%} ({worst})")
+        progress(f"{used} draws of about {needed}: {what} to {error:.1%} ({worst})")
         if error <= wanted:
             break
     middle, swings = ends[0], _swings(inputs, ends, values, scattered)
     z = at.z[:used]
     shares = {n: indices(inputs.labels, z, values[n][:, 0], inputs.recipe.seed) for n in swings}
-    rest = (pictures, draws.is_constant, wanted, sequences)
+    rest = (pictures, draws.is_constant, wanted, sequences, deciding)
     return UncertaintyResult(inputs, InputDraws(z, at.values[:used]), values, scattered, middle, swings, shares, *rest)
 
 
@@ -104,9 +119,8 @@ def _swings(
     found: dict[str, list[tuple[str, float, float]]] = {}
     for name, x in values.items():
         known = np.isfinite(x).all() and np.isfinite([end[name] for end in ends]).all()
-        if x.shape[1] > 1 or scattered[name].is_constant or not known:
-            continue
-        if not any(_proportional(x[:, 0], values[other][:, 0]) for other in found):
+        varies = known and x.shape[1] == 1 and not scattered[name].is_constant
+        if varies and not any(_proportional(x[:, 0], values[other][:, 0]) for other in found):
             each = zip(inputs.labels, ends[1::2], ends[2::2], strict=True)
             found[name] = [(label, low[name][0], high[name][0]) for label, low, high in each]
     return found
@@ -115,9 +129,6 @@ def _swings(
 def _proportional(x: FloatArray, y: FloatArray) -> bool:
     at = int(np.abs(y).argmax())
     return y[at] != 0 and bool(np.allclose(x * y[at], y * x[at], rtol=1e-9, atol=0.0))
-
-
-# --- the folder -------------------------------------------------------------------------------------------------------
 
 
 def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
@@ -129,6 +140,7 @@ def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
         "failed": result.failed,
         "error": result.error,
         "wanted": result.wanted,
+        "decided by": list(result.deciding),
         "inputs": result.input_rows,
         "posterior": told(result.inputs.uncertain.standings),
         "idle": list(result.inputs.idle),
@@ -140,19 +152,19 @@ def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
 
 def _plain(result: UncertaintyResult, name: str) -> dict[str, Any]:
     s = result.scatter[name]
-    arrays = {"mean": s.mean, "sd": s.sd, "low": s.low, "high": s.high}
-    return {"error": s.error, "middle": list(result.middle[name]), **{k: x.tolist() for k, x in arrays.items()}}
+    arrays = {what: getattr(s, what).tolist() for what in ("mean", "sd", "low", "high")}
+    return {"error": s.error, "middle": list(result.middle[name]), **arrays}
 
 
 def _report(result: UncertaintyResult) -> StudyReport:
     pictures = draw_pictures(result)
     draws = zip(result.inputs.names, result.points.values.T, strict=True)
     files: dict[str, Content] = {"draws.npz": _npz({**dict(draws), **result.values})}
-    arrays: dict[str, Any] = {}
-    for name, (mean, sd) in result.pictures.items():
-        arrays |= {f"{name} mean": mean.numpy(), f"{name} sd": sd.numpy()}
-    if arrays:
-        files["pictures.npz"] = _npz(arrays)
+    if result.pictures:
+        named = (
+            (f"{name} {what}", x) for name, both in result.pictures.items() for what, x in zip(_KEPT, both, strict=True)
+        )
+        files["pictures.npz"] = _npz({name: x.numpy() for name, x in named})
     return StudyReport(
         f"{result.inputs.recipe.name}: uncertainty",
         lead(result),

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 from pydantic import ValidationError
 
-from neusee.nodes.calibrate import descriptor, reduce
+from neusee.nodes.calibrate import descriptor, descriptor_frames, descriptor_series, reduce
 from neusee.nodes.calibrate._frames._emva_descriptor import _parsed
 from neusee.workflows.keys.cache_key import plain
 
@@ -52,17 +52,37 @@ def pixels(folder, *names):
     return np.stack([np.asarray(Image.open(folder / "images" / f"{n}.png")) for n in names]).astype(np.float64)
 
 
-def test_levels_are_those_of_the_images(folder):
+def test_levels_are_those_of_the_pairs(folder):
     found = descriptor(file=given(folder))
-    sets = [NAMES[:2], NAMES[2:4], NAMES[4:]]
+    sets = [NAMES[:2], NAMES[2:4]]
     for i, names in enumerate(sets):
         stack = pixels(folder, *names)
         assert float(found.mean[i]) == pytest.approx(stack.mean(), rel=1e-13)
         assert float(found.variance[i]) == pytest.approx(stack.var(0, ddof=1).mean(), rel=1e-13)
-    assert found.photons.tolist() == [120.0, 0.0, 0.0]
-    assert found.exposure.tolist() == pytest.approx([4e-5, 4e-5, 1e-3], rel=1e-13)
-    assert found.pixels.tolist() == [48.0, 48.0, 72.0]
-    assert found.degrees_of_freedom.tolist() == [24.0, 24.0, 48.0]
+    assert found.photons.tolist() == [120.0, 0.0]
+    assert found.exposure.tolist() == pytest.approx([4e-5, 4e-5], rel=1e-13)
+    assert found.pixels.tolist() == [48.0, 48.0]
+    assert found.degrees_of_freedom.tolist() == [24.0, 24.0]
+
+
+def test_more_images_than_a_pair_are_a_spatial_series_and_no_level(folder):
+    ((photons, exposure, frames),) = descriptor_series(given(folder))
+    assert (photons, exposure) == (0.0, pytest.approx(1e-3, rel=1e-13))
+    assert np.array_equal(torch.stack(list(frames)).numpy(), pixels(folder, *NAMES[4:]))
+    assert [name for name, *_ in descriptor_frames(given(folder))] == ["line 4", "line 9"]
+
+
+def test_without_pairs_every_level_counts(folder):
+    (folder / "set.txt").write_text(
+        TEXT.replace("b_1.png", "b_1.png\ni images/b_0.png").replace("d_1.png", "d_1.png\ni images/d_2.png")
+    )
+    assert descriptor(file=given(folder)).pixels.tolist() == [72.0, 72.0, 72.0]
+
+
+def test_exposure_0_and_decimal_commas_are_read(folder):
+    (folder / "set.txt").write_text(TEXT.replace("b 40000.0 120.0", "b 000.00 000,35").replace("d 40000.0", "d 0"))
+    found = descriptor(file=given(folder))
+    assert (found.photons.tolist(), found.exposure.tolist()) == ([0.35, 0.0], [0.0, 0.0])
 
 
 def test_a_path_will_do_where_no_recipe_is_read(folder):
@@ -123,7 +143,7 @@ def test_images_are_held_to_what_the_descriptor_says(folder, old, new, message):
 
 def test_the_check_wants_a_dark(folder):
     found = descriptor(file=given(folder))
-    assert descriptor.hooks.check(found)[0].text == "3 levels (2 dark), exposures up to 0.001 s"
+    assert descriptor.hooks.check(found)[0].text == "2 levels (1 dark), exposures up to 4e-05 s"
     lit = reduce(np_stack(folder), photons=1.0, exposure=0.1)
     assert not descriptor.hooks.check(lit)[0].ok
 
@@ -144,6 +164,8 @@ def test_descriptors_of_the_working_group_are_understood(name, levels, dark, ima
     assert (said.bits, said.shape) == (12, (480, 640))
     assert (len(said.levels), sum(level.photons == 0 for level in said.levels)) == (levels, dark)
     assert sorted(len(level.images) for level in said.levels) == images
+    assert [level.photons > 0 for level in said.series] == [True, False]
+    assert len(said.transfer) == levels - 2
     assert max(level.exposure for level in said.levels) == pytest.approx(longest, rel=1e-12)
     with pytest.raises(ValidationError, match=r"descriptor\.txt:\d+: no such image: "):
         descriptor.params.model_validate({"file": str(file)})

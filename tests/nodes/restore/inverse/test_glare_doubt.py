@@ -45,11 +45,11 @@ def lens(rng=None):
     return 3e6 * light[part, part] / light.sum()
 
 
-def restored(seen, told, doubt):
+def restored(seen, told, doubt, least=0.0):
     seen, told = (torch.from_numpy(x[None].copy()) for x in (seen, told))
     psf = Psf(torch.ones(1, 1, 1, dtype=torch.float64), ONE)
     light = [ONE, ONE[None], BANDS, seen >= 15000.0, [told]]
-    return wiener(seen, psf, *light, doubt=doubt, read_noise=READ)[0].numpy()
+    return wiener(seen, psf, *light, doubt=doubt, least_doubt=least, read_noise=READ)[0].numpy()
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -62,6 +62,15 @@ def test_the_doubt_is_that_of_the_errors_of_the_glare(planted, may_be, seed):
     _, seen = frame(told + planted * around(told[None])[0] * rng.standard_normal(told.shape), rng)
     found = restored(seen, told, None)
     assert any(np.array_equal(found, restored(seen, told, doubt)) for doubt in may_be)
+
+
+def test_a_doubt_that_is_found_is_at_least_the_least_one_and_a_stated_one_is_kept():
+    for planted, may_be in ((0.0, [0.3]), (1.0, [1.0, 3.0])):
+        rng, told = np.random.default_rng([0, int(100 * planted)]), spot()
+        _, seen = frame(told + planted * around(told[None])[0] * rng.standard_normal(told.shape), rng)
+        found = restored(seen, told, None, least=0.3)
+        assert any(np.array_equal(found, restored(seen, told, doubt)) for doubt in may_be)
+        assert np.array_equal(restored(seen, told, 0.1, least=0.3), restored(seen, told, 0.1))
 
 
 @pytest.mark.parametrize("seed", [3, 4])

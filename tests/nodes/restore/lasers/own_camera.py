@@ -150,7 +150,7 @@ def irradiance(mask, kind, side, rng, lamps=0, lamp_strength=30.0):
     photons = daylight(BANDS) * BANDS
     psf = scene_psf(mask, 2 * rim + 1)
     weight = band_response() * photons  # (channel, band)
-    found = np.zeros((3, side, side))
+    found = np.zeros((len(weight), side, side))
     for k in range(3):
         kernels = np.tensordot(weight * basis[k], psf, 1)
         found += fftconvolve(whole[None, :, :, k], kernels, "valid", axes=(1, 2))[:, :side, :side]

@@ -182,6 +182,8 @@ def test_what_is_filled_comes_from_what_is_seen_and_a_smooth_picture_is_removed(
 def test_other_frames_are_refused():
     given = inputs(frame_of([]), "half_ring")
     with pytest.raises(ValueError, match="3 colour channels"):
+        restore.find_lasers(given[0][:2], given[1][:2], *given[2:], read_noise=own.READ, **LENS)
+    with pytest.raises(ValueError, match="same channels"):
         restore.find_lasers(given[0][:1], given[1][:1], *given[2:], read_noise=own.READ, **LENS)
     with pytest.raises(ValueError, match="at least 20 a side"):
         restore.find_lasers(given[0][:, :19], given[1][:, :19], *given[2:], read_noise=own.READ, **LENS)
@@ -191,6 +193,41 @@ def test_other_frames_are_refused():
     empty = found_in(frame_of([], side=32), "half_ring", lamps=0)
     with pytest.raises(ValueError, match="do not fit"):
         restore.found_glare(empty, given[3], given[0][:1], **LENS)
+
+
+def grey(wavelength):
+    """The response of a camera of one channel."""
+    return (0.25 + 0.75 * np.exp(-0.5 * ((np.asarray(wavelength) - 550e-9) / 90e-9) ** 2))[None]
+
+
+def test_one_channel_tells_a_wavelength_by_the_scale_of_the_pattern_and_the_laser_is_removed(monkeypatch):
+    monkeypatch.setattr(own, "response", grey)
+    laser = own.Laser((4.3, -7.8), 533e-9, 1e3)
+    given = inputs(frame_of([laser]), "half_ring")
+    settings = {"read_noise": own.READ, **LENS}
+    found = restore.find_lasers(*given, most=1, lamps=0, **settings)
+    assert (found.direction[0] / PIXEL).tolist() == pytest.approx(laser.spot, abs=0.2)
+    assert float(found.wavelength[0]) == pytest.approx(laser.wavelength, abs=5e-9)
+    assert found.strength[0].tolist() == pytest.approx(laser.channels.tolist(), rel=0.1)
+    text = restore.find_lasers.hooks.check(found, *given, **LENS)[0].text
+    assert text.startswith("1 laser found: +4.")
+    assert text.endswith("with one channel, wavelengths come from the scale of the patterns alone")
+    electrons, clipped, psf, pupil, illuminant, responses, bands = given
+    told = (psf, illuminant, responses, bands, clipped)
+    glare = restore.found_glare(found, pupil, electrons, rank=1, **LENS)
+    clean = inputs(frame_of([]), "half_ring")
+    truth = restore.wiener(clean[0], *told[:-1], clean[1], read_noise=own.READ)
+    blind = restore.wiener(electrons, *told, read_noise=own.READ)
+    searched = restore.wiener(electrons, *told, [glare], read_noise=own.READ)
+    far, near = (float((x - truth)[~clipped].square().mean()) for x in (blind, searched))
+    assert near < 0.1 * far
+
+
+@pytest.mark.slow
+def test_one_channel_takes_no_lamp_for_a_laser(monkeypatch):
+    monkeypatch.setattr(own, "response", grey)
+    for mask in ("plain", "half_ring"):
+        assert int(found_in(frame_of([], mask, "leaves", seed=21, lamps=2), mask).number) == 0
 
 
 @pytest.mark.slow

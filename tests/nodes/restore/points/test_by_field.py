@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.stats import t
 
-from neusee.nodes.restore import measured_psf, spread_by_field, wiener, wiener_by_field
+from neusee.nodes.restore import measured_psf, spread_by_field, wiener, wiener_by_field, wiener_spread
 from neusee.nodes.values import Bands, MeasuredPsf, Psf
 from tests.nodes.restore.inverse.test_posterior_spread import chinese_house
 from tests.nodes.restore.points.independent_camera import CAMERA, READ, blurred, centred, place_in, points
@@ -18,7 +18,7 @@ def known(kernels, draws=None):
     """A measured PSF without error, or with the given draws."""
     kernels = torch.as_tensor(kernels)
     drawn = kernels[None].expand(4, *kernels.shape) if draws is None else draws
-    return MeasuredPsf(kernels, torch.zeros_like(kernels), drawn.float(), torch.zeros(1, 4).double(), ONE, ONE)
+    return MeasuredPsf(kernels, torch.zeros_like(kernels), drawn.float(), torch.zeros(1, 4).double(), *[ONE] * 4)
 
 
 def picture(size, seed=0):
@@ -48,6 +48,41 @@ def test_equal_psfs_in_all_zones_restore_as_one_and_so_does_the_blend_at_a_node(
     contrast = float((one - one.mean()).square().mean().sqrt())
     assert float((one - four).square().mean().sqrt()) < 0.2 * contrast  # each part has a prior of its own
     assert abs(float((one - four).mean())) < 0.01 * contrast
+
+
+def test_the_glare_of_a_laser_is_removed_around_each_node(tmp_path):
+    """A pattern that decays from a bright spot, with no other light in the model: what is left is as without it."""
+    electrons, clipped = picture((40, 44))
+    y, x = np.indices((40, 44))
+    rings = np.cos(0.9 * np.hypot(y - 12.0, x - 30.0)) ** 2 / (1 + 0.05 * ((y - 12.0) ** 2 + (x - 30.0) ** 2))
+    glare = torch.tensor(np.stack([rings, 0.8 * rings, 0.5 * rings]))
+    kernels = np.tile(centred((0.0, 0.0), (9, 9)), (2, 2, 1, 1, 1))
+    clean, blind, told = (
+        wiener_by_field(seen, known(kernels), clipped, light, read_noise=READ, doubt=0.05)
+        for seen, light in (
+            (electrons, None),
+            (electrons + 2e4 * glare, None),
+            (electrons + 2e4 * glare, [3.0 * glare]),
+        )
+    )
+    away, near = (float((found - clean).square().mean().sqrt()) for found in (blind, told))
+    assert near < 0.1 * away
+
+
+def test_one_zone_knows_as_much_as_the_filter_that_is_told_of_lasers():
+    electrons, clipped = (x[:1] for x in picture((24, 26)))
+    away = np.hypot(*(np.indices((24, 26)) - 9.0))
+    glare, others = (torch.tensor(np.cos(r * away) ** 2 / (1 + away**2))[None] for r in (0.9, 0.95))
+    kernels = torch.tensor(centred((0.0, 0.0), (9, 9)))[:1]
+    bands, colour = Bands(550e-9 * ONE[:1], 1e-8 * ONE[:1], ONE[:1]), COLOURS[:1, :1]
+    told, settings = ([glare], [torch.stack([others, 1.01 * glare])]), {"doubt": 0.1, "draws": 2, "read_noise": READ}
+    seen, seed = electrons + 3e4 * glare, torch.Generator().manual_seed
+    found = spread_by_field(seen, known(kernels[None, None]), clipped, colour, *told, **settings, rng=seed(0))
+    camera = (Psf(kernels, ONE[:1]), ONE[:1], colour, bands)
+    there = wiener_spread(seen, *camera, clipped, colour, *told, **settings, rng=seed(0))
+    torch.testing.assert_close(found, there, rtol=1e-6, atol=1e-3)
+    blind = spread_by_field(seen, known(kernels[None, None]), clipped, colour, rng=seed(0), draws=2, read_noise=READ)
+    assert float((found - blind).abs().mean()) > 1.0
 
 
 def test_another_number_of_channels_is_refused():

@@ -100,6 +100,43 @@ def test_a_psf_too_sharp_for_the_pixels_is_said_by_chi_square(tmp_path):
     assert not all(check.ok for check in measured_psf.hooks.check(found))
 
 
+def two_zones(folder, places, frames, lobe=0.0, **other):
+    """Measure two zones beside one another, of 50 x 100 pixels together, from one point in each of them."""
+    rng = np.random.default_rng(0)
+    for number in range(frames):
+        beside_them = [tuple(c + rng.uniform(-0.3, 0.3) for c in place) for place in places]
+        np.save(folder / f"p{number}.npy", points(rng, (50, 100), beside_them, [1e5, 1e5], lobe=lobe))
+    return measure(folder, (50, 100), zones=(1, 2), **other)
+
+
+@pytest.mark.parametrize(("away", "good"), [(25, True), (4, False)])
+def test_a_zone_whose_points_lie_far_from_its_middle_is_named_with_the_inflation_of_its_variance(tmp_path, away, good):
+    """The nodes are in the columns 24.5 and 74.5. For two points the numbers are those of two equations."""
+    found = two_zones(tmp_path, [(10.0, 49.5 - away), (38.0, 49.5 + away)], 2, window=(7, 7), draws=4)
+    whole = found.places[:, 2].numpy().round()
+    right = np.clip((whole - 24.5) / 50, 0, 1)
+    normal = np.einsum("pi,pj->ij", *[np.stack([1 - right, right], 1)] * 2)
+    inverse = np.linalg.inv(normal)
+    np.testing.assert_allclose(found.support[0].numpy(), 1 / inverse.diagonal(), rtol=1e-6)
+    np.testing.assert_allclose(found.inflation[0].numpy(), inverse.diagonal() * normal.diagonal(), rtol=1e-6)
+    (check,) = (each for each in measured_psf.hooks.check(found) if "points or more" in each.text)
+    assert check.ok == good
+    assert ("in zone (1, " in check.text) != good
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frames", [2, 5])
+def test_points_that_tell_two_psfs_at_once_tell_them_within_their_error(tmp_path, frames):
+    """The PSFs must stay in their middles: added, those that lie beside one another make a wider one."""
+    found = two_zones(tmp_path, [(24.5, 38.5), (24.5, 60.5)], frames, window=(11, 11))
+    assert 1.5 < float(found.inflation.max()) < 3
+    truth = centred((0.0, 0.0), (11, 11), lobe=0.0)
+    for zone in (0, 1):
+        wrong = misfit(found, (0, zone), truth)
+        assert 0.6 < wrong.mean() < 1.6, wrong.mean()
+        assert wrong[:, 3:8, 3:8].mean() < 2
+
+
 @pytest.mark.slow
 def test_the_psf_by_field_agrees_within_its_error_at_every_node(tmp_path):
     """Windows overlap, the long exposures are clipped; 1.09 is expected of 24 draws, for a deviation is drawn too."""

@@ -366,3 +366,30 @@ def test_what_is_not_finite_fails_and_is_said(tmp_path, store, monkeypatch):
     assert "NaN or infinite in some draw: developed_quality[mask].psnr" in (folder / "report.html").read_text()
     table = (folder / "table.csv").read_text()
     assert "developed_quality[mask].psnr,,nan,nan" in table
+
+
+# --- what decides when to stop ----------------------------------------------------------------------------------------
+
+
+def test_only_what_is_named_decides_when_to_stop(store, tmp_path):
+    recipe = small("peak, saturated", "lasers.green.strength=lognormal(1e3, 3)")
+    whole = study_recipe("uncertainty", recipe, store, tmp_path / "a", most=96, error=0.01)
+    every = json.loads((whole / "provenance.json").read_text())
+    (least,) = sorted(every["quantities"], key=lambda name: every["quantities"][name]["error"])[:1]
+    enough = every["quantities"][least]["error"] * 2
+    folder = study_recipe("uncertainty", recipe, store, tmp_path / "b", most=96, error=enough, until=(least,))
+    found = json.loads((folder / "provenance.json").read_text())
+    assert found["decided by"] == [least]
+    assert found["draws"] == 64
+    assert found["failed"] == 0
+    assert every["draws"] == 96
+    assert every["failed"] == 1
+    assert "others did not decide" in (folder / "report.html").read_text()
+
+
+@pytest.mark.parametrize("name", ["raw", "peak.none", "pea"])
+def test_a_name_that_nothing_has_is_told_with_the_names_there_are(store, tmp_path, name):
+    recipe = small("peak, saturated", LAWS[0], "lasers.green.strength=normal(1e3, 10)")
+    told = rf"--until {name.split('.')[0]}.*: no output with numbers has this name; there are peak\[plain\]"
+    with pytest.raises(ValueError, match=told):
+        study_recipe("uncertainty", recipe, store, tmp_path, most=64, until=(name,))

@@ -1,0 +1,181 @@
+"""Light levels and series of frames of a recipe, as the sheet of EMVA 1288 needs them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from neusee.nodes.calibrate import (
+    FrameTest,
+    Nonuniformity,
+    SpatialSeries,
+    Stack,
+    coarse,
+    descriptor,
+    descriptor_frames,
+    descriptor_series,
+    inspect_frames,
+    levels,
+    reduce,
+    refuse_descriptor,
+    spatial_series,
+)
+from neusee.nodes.values import Levels
+from neusee.workflows.engine.runner import run
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.store.result_store import Store
+
+Release = Literal["4", "3"]
+#: what the standard wants to be told of the operating point
+OPERATING_POINT = {
+    "camera": "camera",
+    "sensor": "sensor",
+    "gain_setting": "gain setting",
+    "offset_setting": "offset setting",
+    "pixel_pitch": "pixel pitch",
+    "wavelength": "centroid wavelength of the light",
+    "bandwidth": "width of its spectrum (FWHM)",
+    "temperature": "temperature",
+    "laboratory": "laboratory and date",
+}
+_LEVEL = re.compile(r"^[bd]\s+[\d.,]+(\s|$)", re.MULTILINE)  #: a line of a descriptor that begins a light level
+_HALF = 0.5  #: share of saturation at which the lit series is taken
+_TEXT = """# EMVA 1288: the sheet of the measurement {name}.
+steps:
+  measured: {{node: calibrate.descriptor, with: {{file: {file}, scatter: steady}}}}
+outputs: [measured]
+"""
+
+
+class EmvaFrames(NamedTuple):
+    """The input of a sheet."""
+
+    levels: Levels
+    spatial: Nonuniformity
+    frames: int  #: least number of frames of a level
+    tests: Sequence[FrameTest] = ()  #: of the frames themselves
+
+
+def descriptor_recipe(file: Path, changes: Sequence[str] = ()) -> Recipe:
+    """Return the recipe of a sheet of the measurement that an EMVA 1288 descriptor file describes.
+
+    Raises: ValueError for a descriptor or an image that is missing or cannot be read, `RecipeError` with all mistakes
+    of ``changes``.
+    """
+    refuse_descriptor(file)
+    name = "".join(c if c.isalnum() else "_" for c in file.parent.absolute().name or file.stem)
+    text = _TEXT.format(name=file.name, file=_quoted(str(file.absolute())))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"{name}.yaml"
+        path.write_text(text, encoding="utf-8")
+        return load(path, changes)
+
+
+def descriptor_of(path: Path) -> Path:
+    """Return the descriptor file that a path is, or the only one in the folder that a path is.
+
+    Raises: ValueError for a folder without a descriptor, or with several.
+    """
+    if not path.is_dir():
+        return path
+    found = [file for file in sorted(path.glob("*.txt")) if _LEVEL.search(file.read_text("utf-8-sig", "replace"))]
+    if len(found) == 1:
+        return found[0]
+    has = f"has {len(found)} descriptors" if found else "has no descriptor, a .txt with levels in lines b and d"
+    raise ValueError(f"{path} {has}: name one file")
+
+
+def frames_of_recipe(recipe: Recipe, store: Store, release: Release = "4") -> EmvaFrames:
+    """Return levels with the variance in time, and the dark and the lit series, of a recipe that reads frames.
+
+    In release 4 the variance of a level excludes the difference of the means of its frames; in 3 it includes it.
+    Raises: ValueError for a recipe that reads neither frames, a descriptor nor a table.
+    """
+    steps = {path: [s for s in recipe.steps.values() if s.node.path == path] for path in _READERS}
+    scatter: Any = "steady" if release == "4" else "temporal"
+    if described := steps["calibrate.descriptor"]:
+        return _described(described[0], scatter)
+    if reduced := steps["calibrate.reduce"]:
+        return _reduced(recipe, store, reduced, scatter)
+    if tables := steps["calibrate.table"]:
+        found = run(recipe, store, (tables[0].name,)).values[tables[0].name]
+        dark = found.variance[found.photons == 0]
+        tests = [coarse(float(dark.min()), exact=False)] if len(dark) else []
+        return EmvaFrames(found, Nonuniformity(None, None), 2, tests)
+    raise ValueError(f"{recipe.name} has no step of the nodes {', '.join(_READERS)}, so that it has no frames of a "
+                     "sheet of EMVA 1288: give a descriptor, or a recipe as in `neusee run calibrate`")  # fmt: skip
+
+
+_READERS = ("calibrate.descriptor", "calibrate.reduce", "calibrate.table")
+
+
+def _described(step: Step, scatter: Any) -> EmvaFrames:
+    files = step.params["file"]
+    found = descriptor(file=files, scatter=scatter)
+    series = [spatial_series(*each) for each in descriptor_series(files)]
+    stacks = (Stack(name, light, time, scatter, frames) for name, light, time, frames in descriptor_frames(files))
+    return EmvaFrames(found, _nearest_half(series, found), 2, inspect_frames(stacks, exact=False))
+
+
+def _reduced(recipe: Recipe, store: Store, steps: Sequence[Step], scatter: Any) -> EmvaFrames:
+    """Return levels and series of the steps that reduce frames; the levels of most frames are the series."""
+    parts, counts = [], []
+    for step in steps:
+        frames = _frames(recipe, store, step)
+        parts.append(reduce(frames, photons=_of(step)[0], exposure=_of(step)[1], scatter=scatter))
+        counts.append(len(frames))
+    found: Levels = levels(parts)
+    most = max(counts)
+    chosen = [step for step, count in zip(steps, counts, strict=True) if count == most]
+    pair = _dark_and_half([_of(step) for step in chosen], found)
+    series = (spatial_series(*_of(chosen[i]), _frames(recipe, store, chosen[i])) for i in pair)
+    stacks = (Stack(step.name, *_of(step), scatter, _frames(recipe, store, step)) for step in steps)
+    return EmvaFrames(found, _pair(series), min(counts), inspect_frames(stacks, exact=False))
+
+
+def _of(step: Step) -> tuple[float, float]:
+    return float(step.params["photons"]), float(step.params["exposure"])
+
+
+def _frames(recipe: Recipe, store: Store, step: Step) -> Any:
+    (source,) = step.sources
+    return run(recipe, store, (source,)).values[source]
+
+
+def _nearest_half(series: Sequence[SpatialSeries], found: Levels) -> Nonuniformity:
+    return _pair(series[i] for i in _dark_and_half([(s.photons, s.exposure) for s in series], found))
+
+
+def _pair(series: Iterator[SpatialSeries]) -> Nonuniformity:
+    dark: SpatialSeries | None = None
+    lit: SpatialSeries | None = None
+    for each in series:
+        dark, lit = (dark, each) if each.photons else (each, lit)
+    return Nonuniformity(dark, lit)
+
+
+def _dark_and_half(light: Sequence[tuple[float, float]], found: Levels) -> list[int]:
+    """Return the indices of the dark and of the lit series nearest to half of saturation, with one exposure if can be.
+
+    ``light`` has photons and exposure of each series.
+    """
+    top = float(found.photons[found.variance.argmax()])
+    lit = [i for i, (photons, _) in enumerate(light) if photons > 0]
+    dark = [i for i, (photons, _) in enumerate(light) if photons == 0]
+    both = [i for i in lit if any(light[j][1] == light[i][1] for j in dark)]
+    half = min(both or lit, key=lambda i: abs(light[i][0] - _HALF * top), default=None)
+    if not dark:
+        return [] if half is None else [half]
+    times = np.array([light[j][1] for j in dark])
+    own = dark[int(np.abs(times - (times.min() if half is None else light[half][1])).argmin())]
+    return [own] if half is None else [own, half]
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"

@@ -1,0 +1,99 @@
+"""The command ``neusee sheet``: the EMVA 1288 sheet of frames, and the folder with the results."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from neusee.nodes.calibrate import EmvaSheet, emva_sheet
+from neusee.workflows.calibration import emva_figures, emva_pdf
+from neusee.workflows.calibration.emva_frames import OPERATING_POINT, EmvaFrames, Release, frames_of_recipe
+from neusee.workflows.calibration.emva_page import banner, group_of, lead, operating_point, requirements, sections
+from neusee.workflows.calibration.emva_patterns import pattern_tables
+from neusee.workflows.calibration.frame_validity import as_rows
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.report.study_folder import StudyReport, StudyRun, as_json
+from neusee.workflows.store.result_store import Store
+
+_COLUMNS = ("section", "key", "symbol", "quantity", "bound", "value", "unit", "reason")
+_TRANSFER = ("photons", "exposure", "mean", "variance", "mean_dark", "variance_dark")
+
+
+def write_sheet(
+    recipe: Recipe,
+    store: Store,
+    runs: Path,
+    command: Sequence[str] = (),
+    *,
+    release: Release = "4",
+    relative: bool = False,
+    state: Sequence[str] = (),
+) -> Path:
+    """Write the EMVA 1288 sheet of the frames of a recipe: page, PDF, JSON, CSV and pictures; return the folder.
+
+    With ``relative`` the photons of the recipe are known up to a factor, and nothing in photons is stated. ``state``
+    has what is told of the operating point, such as ``temperature=25 °C``.
+    Raises: ValueError for a recipe without frames, without dark frames or without two lit levels, and for a wrong
+    statement.
+    """
+    study_run, told = StudyRun("sheet", recipe, command), operating_point(state)
+    frames = frames_of_recipe(recipe, store, release)
+    sheet = emva_sheet(frames.levels, frames.spatial, photons_told=not relative)
+    document = study_run.document(_document(sheet, frames, told, release))
+    report = _report(recipe, sheet, frames, told, release, document)
+    return study_run.write(runs, digest(document["quantities"]), document, report, "emva1288")
+
+
+def _document(sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any], release: Release) -> dict[str, Any]:
+    """Return the content of ``emva1288.json``."""
+    return {
+        "standard": "EMVA 1288, release 4.0 Linear",
+        "temporal variance": "release 4: without the difference of means" if release == "4" else "release 3.0",
+        "fails": banner(sheet, frames.tests),
+        "quantities": {q.key: {"section": group_of(q, sheet), **asdict(q)} for q in sheet.quantities},
+        "operating point": dict(told),
+        "frames": as_rows(frames.tests),
+        "demands": [each._asdict() for each in requirements(sheet, frames, told)],
+        "deviation": None if sheet.linearity is None else sheet.linearity.deviation.tolist(),
+    }
+
+
+def _report(
+    recipe: Recipe,
+    sheet: EmvaSheet,
+    frames: EmvaFrames,
+    told: Mapping[str, Any],
+    release: Release,
+    document: Mapping[str, Any],
+) -> StudyReport:
+    title, pictures = f"{recipe.name}: EMVA 1288", emva_figures.pictures(sheet)
+    summary = [f"{name}: {'not stated' if told[key] is None else told[key]}" for key, name in OPERATING_POINT.items()]
+    return StudyReport(
+        title,
+        lead(sheet, release),
+        sections(sheet, frames, told, pictures),
+        pictures,
+        tables={
+            "emva1288.csv": (_COLUMNS, _rows(sheet)),
+            "transfer.csv": (_TRANSFER, _levels(sheet)),
+            **pattern_tables(sheet),
+        },
+        files={
+            "emva1288.json": as_json(document),
+            "emva1288.pdf": emva_pdf.pdf(sheet, title, [*summary, document["fails"]]),
+        },
+        banner=document["fails"],
+    )
+
+
+def _rows(sheet: EmvaSheet) -> Iterator[tuple[Any, ...]]:
+    for q in sheet.quantities:
+        value = "" if q.value is None else repr(q.value)
+        yield group_of(q, sheet), q.key, q.symbol, q.name, q.bound, value, q.unit, q.reason
+
+
+def _levels(sheet: EmvaSheet) -> Iterator[tuple[float, ...]]:
+    yield from zip(*(getattr(sheet.transfer, name).tolist() for name in _TRANSFER), strict=True)

@@ -1,0 +1,87 @@
+"""The command ``neusee sheet``: the quantities and plots of EMVA 1288 from frames of flat light."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, split, the_store
+from neusee.workflows.cli.command_list import FAILED, MISSED
+from neusee.workflows.cli.command_options import AsJson, Debug, Out, Quiet, Words, option_words
+from neusee.workflows.cli.interruption import say_folder
+
+if TYPE_CHECKING:
+    from neusee.workflows.graph.recipe_graph import Recipe
+
+
+class StandardRelease(StrEnum):
+    """Release of EMVA 1288 whose variance in time is taken."""
+
+    four = "4"
+    three = "3"
+
+
+def sheet(
+    words: Words = None,
+    release: Annotated[
+        StandardRelease,
+        typer.Option("--release", help="3 keeps the difference of the means of a pair in its variance."),
+    ] = StandardRelease.four,
+    relative: Annotated[
+        bool, typer.Option("--relative", help="Photons are known up to a factor: state nothing in photons.")
+    ] = False,
+    state: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--state", help="State a fact that the standard asks for: --state 'temperature=25 °C'; repeatable."
+        ),
+    ] = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    out: Out = Path("runs"),
+) -> None:
+    """Write the EMVA 1288 sheet of a camera from frames.
+
+    In place of a recipe, name the descriptor of a measurement, or its folder: neusee sheet set. Page, PDF, JSON
+    and CSV have every quantity with the symbol of the standard, or the reason why the frames do not tell it. Where
+    rounding hides the dark noise, the page has a red banner and the exit code is 3.
+    """
+    from neusee.workflows.calibration.run_sheet import write_sheet
+    from neusee.workflows.graph.run_error import RunError
+
+    recipe, command = _loaded(words)
+    said = [word for fact in state or () for word in ("--state", fact)]
+    command += [*option_words({"release": release.value, "relative": relative}), *said]
+    with failing(RunError, code=FAILED), failing(ValueError):
+        folder = write_sheet(
+            recipe, the_store(), out, command, release=release.value, relative=relative, state=state or ()
+        )
+    document = json.loads((folder / "emva1288.json").read_text(encoding="utf-8"))
+    if not quiet and not as_json:
+        say([_line(each) for each in document["quantities"].values()])
+    say_folder(folder, as_json)
+    if document["fails"]:
+        fail(f"{document['fails']} See {folder / 'report.html'}", MISSED)
+
+
+def _loaded(words: list[str] | None) -> tuple[Recipe, list[str]]:
+    """Return the recipe of a descriptor or the named recipe, and the command line."""
+    name, changes, _ = split(words)
+    if Path(name).suffix.lower() != ".txt" and not Path(name).is_dir():
+        return load(words, "sheet")
+    from neusee.workflows.calibration.emva_frames import descriptor_of, descriptor_recipe
+
+    with failing(ValueError, before="nothing was computed: "), refusing():
+        return descriptor_recipe(descriptor_of(Path(name)), changes), ["neusee", "sheet", name, *changes]
+
+
+def _line(quantity: dict[str, object]) -> str:
+    from neusee.nodes.calibrate import Quantity
+
+    found = Quantity(**{name: value for name, value in quantity.items() if name != "section"})  # type: ignore[arg-type]
+    return f"{found.symbol:18s} {found.text:22s} {found.name}" + f" ({found.reason})" * bool(found.reason)
