@@ -15,7 +15,7 @@ from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
 FloatArray = NDArray[np.float64]
 WALKERS, DRAWS = 64, 99
-_FIRST, _GROWTH, _LONGEST = 160, 1.5, 4000  #: steps of the first round, growth for each round, and most steps
+_FIRST, _GROWTH, _LONGEST = 320, 1.5, 4000  #: steps of the first round, growth for each round, and most steps
 _APART = 6.0  #: least length of a chain in autocorrelation times; its first half is discarded
 _ALIKE = 1.25  #: ratio of two standard deviations that chance rarely exceeds, for 64 walkers and three tau each
 _NOT_KEPT = Path("/dev/null/not kept")  #: a file that never exists, because a simulation is too short to be resumed
