@@ -20,7 +20,7 @@ from neusee.nodes.restore._networks._own_network import OwnNetwork, own_network,
 from neusee.nodes.restore._networks._restorer import Restorer, parameter_groups, start_network
 from neusee.nodes.restore._networks._unet import UNet, unet
 from neusee.nodes.restore._networks._unrolled import Unrolled, unrolled
-from neusee.nodes.restore._points import _point_costs  # noqa: F401  attaches the rules of shape and work
+from neusee.nodes.restore._points import _result_shapes as _point_shapes  # noqa: F401  attaches the rules of shape and work
 from neusee.nodes.restore._points._by_field import spread_by_field, wiener_by_field
 from neusee.nodes.restore._points._measured_psf import measured_psf
 from neusee.nodes.restore._sensor_likelihood import MeasuringSensor, measuring_sensor
