@@ -123,7 +123,7 @@ def withheld_electrons(kinds: dict[str, str], sentences: Sequence[str]) -> list[
     known = [name for name in _ELECTRONS if kinds.get("gain") == "none" and kinds.get(name, "none") != "none"]
     kinds |= dict.fromkeys(known, "none")
     kept = [text for text in sentences if not text.startswith(tuple(f"{_plain(name)}: " for name in known))]
-    return kept + [f"{_plain(name)}: {KINDS['none']}: no value in electrons without the gain" for name in known]
+    return [*(f"{_plain(name)}: {KINDS['none']}: no value in electrons without the gain" for name in known), *kept]
 
 
 def weighted_quantiles(values: FloatArray, weight: FloatArray, shares: Sequence[float]) -> FloatArray:
