@@ -277,10 +277,11 @@ def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:
 
 def _corner(result: CalibrationResult) -> Section:
     every = max(1, result.chains.flat.shape[0] // _CORNER)
-    shown = np.stack([x.reshape(-1)[::every] for x in result.draws.values()], -1)
-    names = [f"{_words(r.name)}\n{r.unit}" for r in result.rows()]
-    text = "Every pair of parameters; the recipe's own values are orange. Gain, offset, noise and efficiency correlate."
-    picture = figures.corners(shown, names, [r.nominal for r in result.rows()])
+    told = [r for r in result.rows() if r.kind != "none"]
+    shown = np.stack([result.draws[r.name].reshape(-1)[::every] for r in told], -1)
+    text = """Every pair of parameters of which the frames tell a value or a limit; the recipe's own values are orange.
+        Gain, offset, noise and efficiency correlate."""
+    picture = figures.corners(shown, [f"{_words(r.name)}\n{r.unit}" for r in told], [r.nominal for r in told])
     return Section("Parameters in pairs", text, picture=picture)
 
 

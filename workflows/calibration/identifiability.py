@@ -35,6 +35,8 @@ _REASONS = {
     ("dark_current", "none"): ": no dark was exposed for long enough",
     ("read_noise", "upper"): ": the converter is too coarse for it",
 }
+#: parameters in electrons, of which frames that do not tell the gain give no value
+_ELECTRONS = ("offset", "read_noise", "temporal_dark_noise", "dark_current", "full_well")
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,11 @@ class Identifiability:
     def estimated(self) -> tuple[str, ...]:
         """Return the names of the parameters whose values the measured light levels determine."""
         return tuple(name for name, kind in self.kinds.items() if kind == "estimate")
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """Return the names of the parameters of which the light levels give a value or a limit."""
+        return tuple(name for name, kind in self.kinds.items() if kind != "none")
 
 
 def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
@@ -72,6 +79,7 @@ def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
         if _as_good(problem, mode, ridge):
             kinds |= ridge.kinds
             sentences.append(ridge.text)
+    sentences = withheld_electrons(kinds, sentences)
     count = f"{len(weak)} of {len(problem.names)} parameters cannot be determined from these frames"
     refused = f"{count}: {'; '.join(sentences)}" if 2 * len(weak) > len(problem.names) else ""
     return Identifiability(kinds, sentences, s.tolist(), refused)
@@ -103,7 +111,19 @@ def identify_from_draws(
             named |= set(ridge.kinds)
     rest = [name for name, kind in kinds.items() if kind != "estimate" and name not in named]
     sentences += [f"{_plain(name)}: {KINDS[kinds[name]]}" for name in rest]
+    sentences = withheld_electrons(kinds, sentences)
     return replace(known, kinds=kinds, directions=sentences)
+
+
+def withheld_electrons(kinds: dict[str, str], sentences: Sequence[str]) -> list[str]:
+    """Set each parameter in electrons to ``none`` where the gain is ``none``; return the sentences that then hold.
+
+    The frames are in digital numbers: without a gain, electrons come from its prior.
+    """
+    known = [name for name in _ELECTRONS if kinds.get("gain") == "none" and kinds.get(name, "none") != "none"]
+    kinds |= dict.fromkeys(known, "none")
+    kept = [text for text in sentences if not text.startswith(tuple(f"{_plain(name)}: " for name in known))]
+    return [*(f"{_plain(name)}: {KINDS['none']}: no value in electrons without the gain" for name in known), *kept]
 
 
 def weighted_quantiles(values: FloatArray, weight: FloatArray, shares: Sequence[float]) -> FloatArray:

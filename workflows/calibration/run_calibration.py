@@ -161,13 +161,14 @@ def _refused_report(recipe: Recipe, document: Mapping[str, Any], refused: Frames
 def _document(result: CalibrationResult) -> dict[str, Any]:
     """Return the results of a calibration for ``posterior.json``."""
     problem, flat = result.problem, result.chains.flat
+    told = [i for i, name in enumerate(problem.names) if name in result.identifiability.told]
     return {
         "failed": count_failures(result.checks),
         "parameters": {row.name: _plain(asdict(row)) for row in result.rows()},
         "gaussian": {
-            "coordinates": list(problem.coordinates.labels),
-            "mean": flat.mean(0).tolist(),
-            "covariance": np.cov(flat.T).reshape(len(problem.names), -1).tolist(),
+            "coordinates": [problem.coordinates.labels[i] for i in told],
+            "mean": flat[:, told].mean(0).tolist(),
+            "covariance": np.cov(flat[:, told].T).reshape(len(told), -1).tolist(),
         },
         "stated": {model.name: asdict(model.stated) for model in estimated_models(result)},
         "least_squares": compared(problem.measured, result.rows()) if problem.measured is not None else {},
@@ -198,22 +199,22 @@ def _report(result: CalibrationResult, document: Mapping[str, Any]) -> StudyRepo
 
 
 def _draws(result: CalibrationResult) -> bytes:
-    """Return the bytes of an npz file with posterior draws of each parameter, taken evenly from all chains."""
+    """Return the bytes of an npz file with posterior draws of each parameter that the frames tell, evenly from all."""
     every = max(1, result.chains.flat.shape[0] // _KEPT)
     out = io.BytesIO()
-    draws: dict[str, Any] = {name: x.reshape(-1)[::every] for name, x in result.draws.items()}
+    draws: dict[str, Any] = {name: result.draws[name].reshape(-1)[::every] for name in result.identifiability.told}
     np.savez(out, **draws)
     return out.getvalue()
 
 
 def _inference_data(result: CalibrationResult) -> Any:
-    """Return the draws as ArviZ inference data, with each walker as a chain."""
+    """Return the draws of what the frames tell as ArviZ inference data, with each walker as a chain."""
     chains = result.chains
 
     def by_walker(draws: Any) -> Any:
         return draws.transpose(0, 2, 1).reshape(-1, draws.shape[1])
 
-    posterior = {name: by_walker(x) for name, x in result.draws.items()}
+    posterior = {name: by_walker(result.draws[name]) for name in result.identifiability.told}
     attributes = {"recipe": result.problem.recipe.name, "inference_library": "emcee"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # ArviZ warns of more walkers than steps

@@ -129,6 +129,7 @@ class Posterior:
     joint: Joint
     kinds: Mapping[str, str] = field(default_factory=dict)  #: of `neusee calibrate`: estimate, upper, lower, none
     units: Mapping[str, str] = field(default_factory=dict)  #: as text, for the values whose unit the file gives
+    untold: tuple[str, ...] = ()  #: names that the file has without draws, because no frame tells them
 
 
 def read_posterior(path: Path) -> Posterior:
@@ -172,7 +173,8 @@ def _document(path: Path) -> Posterior:
     rows = {POSTERIOR_NAMES.get(name, name): row for name, row in doc["parameters"].items()}
     columns = {POSTERIOR_NAMES.get(name, name): x for name, x in zip(joint.names, joint.draws.T, strict=True)}
     posterior = _drawn(columns, {name: str(row["unit"]) for name, row in rows.items()})
-    return replace(posterior, kinds={name: str(row["kind"]) for name, row in rows.items()})
+    untold = tuple(name for name in rows if name not in columns)
+    return replace(posterior, kinds={name: str(row["kind"]) for name, row in rows.items()}, untold=untold)
 
 
 def _headed(columns: Mapping[str, FloatArray]) -> tuple[dict[str, FloatArray], dict[str, str]]:

@@ -193,6 +193,9 @@ class _Reader:
             raise ValueError(f"values: the recipe has no value at the path {wrong[0]}")
         if not pairs:
             raise ValueError(f"no value of the recipe is in the posterior, which contains {', '.join(names)}")
+        own = [name for name in posterior.untold if self._value(f"{_BLOCK}.{name}") is not None]
+        if own and given is None:
+            self.notes.append(f"the posterior does not tell {', '.join(own)}: the recipe's own value counts as certain")
         self._conventions(posterior, pairs)
         return pairs
 
