@@ -18,9 +18,10 @@ from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.blocks.train_block import KEY, Training
 from neusee.workflows.training.loop.resumable_loop import Losses
+from neusee.workflows.training.mixed_masks import Samples
 from neusee.workflows.training.parallel.process_mesh import Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.training_pictures import HELD_OUT, Sample, TrainingStream
+from neusee.workflows.training.training_pictures import HELD_OUT, Sample
 
 CONFIDENCE = 0.9  #: of the interval of a mean over photographs
 _ENDS = 1 << 16  #: bytes at each end of a file that identify a photograph
@@ -122,7 +123,7 @@ class Validation:
         self._kept: dict[int, Sample] | None = None
 
     @torch.no_grad()
-    def __call__(self, net: nn.Module, samples: TrainingStream, shared: Shared, fixed: bool) -> Losses:
+    def __call__(self, net: nn.Module, samples: Samples, shared: Shared, fixed: bool) -> Losses:
         """Return means over the held-out photographs with their intervals, by column of the loss table.
 
         Pictures behind a ``fixed`` mask are computed once and kept in the memory of the processor.
@@ -136,20 +137,30 @@ class Validation:
             for who, estimate in (("held_out", net(picture, *sample.given)), ("input", picture)):
                 found |= {f"{i} {who}_{name}": x for name, x in _quality(estimate, truth).items()}
         net.train(trains)
-        names = [f"{i} {who}_{n}" for i in range(len(self.photographs)) for who in ("held_out", "input")
-                 for n in _METRICS]  # fmt: skip
-        return summary(self.mesh.numbers(found, names, self.device), len(self.photographs))
+        each, count = samples.repeats, len(self.photographs)
+        names = [f"{i} {who}_{n}" for i in range(count * each) for who in ("held_out", "input") for n in _METRICS]
+        return summary(_by_photograph(self.mesh.numbers(found, names, self.device), each), count)
 
-    def _pictures(self, samples: TrainingStream, shared: Shared, fixed: bool) -> Iterator[tuple[int, Sample]]:
+    def _pictures(self, samples: Samples, shared: Shared, fixed: bool) -> Iterator[tuple[int, Sample]]:
         if fixed and self._kept is not None:  # empty in a process without a picture, which must not wait for others
             yield from self._kept.items()
             return
         kept: dict[int, Sample] = {}
-        for i, sample in samples.batch(shared, HELD_OUT, 0, len(self.photographs)):
+        for i, sample in samples.batch(shared, HELD_OUT, 0, len(self.photographs) * samples.repeats):
             if fixed:
                 kept[i] = replace(sample, picture=sample.picture.cpu(), truth=sample.truth.cpu())
             yield i, sample
         self._kept = kept if fixed else None
+
+
+def _by_photograph(found: Mapping[str, float], each: int) -> dict[str, float]:
+    """Return the means over the ``each`` pictures of a photograph, from numbers named such as ``0 held_out_PSNR``."""
+    means: dict[str, float] = {}
+    for name, value in found.items():
+        number, _, what = name.partition(" ")
+        at = f"{int(number) // each} {what}"
+        means[at] = means.get(at, 0.0) + value / each
+    return means
 
 
 def _quality(estimate: Tensor, truth: Tensor) -> dict[str, float]:

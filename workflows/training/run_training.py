@@ -24,13 +24,13 @@ from neusee.workflows.training.held_out import Best, Split, Validation
 from neusee.workflows.training.loop.checkpoint import export
 from neusee.workflows.training.loop.resumable_loop import Losses, Progress, ResumableLoop, Watch
 from neusee.workflows.training.mask_design.design_run import MASK, design_in, designed
+from neusee.workflows.training.mixed_masks import require_masks, samples_of
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh, MeshError
 from neusee.workflows.training.tensorboard_log import open_board
 from neusee.workflows.training.training_figures import curves, png, strip
 from neusee.workflows.training.training_iteration import Learner
 from neusee.workflows.training.training_key import key_of_training
 from neusee.workflows.training.training_page import write_page
-from neusee.workflows.training.training_pictures import TrainingStream
 from neusee.workflows.training.warm_start import WarmStart
 
 _COLUMNS = ("stage", "iteration", "LSR", "BSR", "L1", "reconstruction", "adversarial", "critics", "penalty", "slope",
@@ -66,6 +66,7 @@ def train(
     if MASK in stages and mesh.size > 1:
         raise MeshError("--stage mask runs in a single process: start the training without torchrun")
     _require_equal_shares(recipe, settings, mesh)
+    require_masks(recipe, settings, mesh)
     CameraMismatch.of(recipe, settings)  # raises its mistakes before any work
     photographs = _photographs(recipe, settings, bool(with_pictures))
     parts = held_out.split(recipe, settings, photographs)
@@ -158,7 +159,7 @@ class _TrainingLoop(ResumableLoop[Learner]):
         """Train to the end of the present stage, and write the checkpoint with which the next stage begins."""
         fixed = None if self.stage == 1 else frozen(self.recipe, self.settings, self.folder)
         parts = self.recipe, self.settings, self.photographs, self.store, self.device
-        self.samples = TrainingStream(*parts, fixed, self.mesh, self.split.judged)
+        self.samples = samples_of(*parts, fixed, self.mesh, self.split.judged)
         self.best = Best.of(self.rows.rows, self.stage)
         self.run(self._length, self.settings.stages[self.stage].batch)
         if counts := self.samples.pool_counts:

@@ -36,9 +36,10 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import device_kind, stream_seed
 from neusee.workflows.recipe.blocks.train_block import Network, Stage, Training
 from neusee.workflows.training.loop.resumable_loop import Losses, averaged, require_finite
+from neusee.workflows.training.mixed_masks import Samples
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.training_pictures import Sample, TrainingStream
+from neusee.workflows.training.training_pictures import Sample
 from neusee.workflows.training.warm_start import WarmStart
 
 
@@ -128,7 +129,7 @@ class Learner:
 
     # --- one iteration ------------------------------------------------------------------------------------------------
 
-    def iterate(self, samples: TrainingStream, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
+    def iterate(self, samples: Samples, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
         """Train on one batch of pictures; raise `NotFinite` if a loss or gradient is NaN or infinite.
 
         Returns the losses of the batch, and the pictures of this process. Each of several processes has its own
@@ -160,7 +161,7 @@ class Learner:
         return found, seen
 
     @torch.no_grad()
-    def shared(self, samples: TrainingStream) -> Shared:
+    def shared(self, samples: Samples) -> Shared:
         """Return the results that depend on the present mask but on no picture, without gradients."""
         return samples.begin(self.height()) if samples.shared else Shared.of({})
 
@@ -170,7 +171,7 @@ class Learner:
                    "adversarial": self.stage.adversarial}  # fmt: skip
         return [*(["LSR"] if self.learns else []), "L1", *(name for name, weight in weights.items() if weight)]
 
-    def _mask_suppression(self, shared: Shared, samples: TrainingStream) -> Losses:
+    def _mask_suppression(self, shared: Shared, samples: Samples) -> Losses:
         """Backpropagate the laser suppression loss band by band to save memory, and return the mean suppression ratio.
 
         Processes have different bands, or the same bands with smaller weights, so that each band counts once.

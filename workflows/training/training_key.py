@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from pathlib import Path
 from typing import Any
 
 from neusee.nodes.scene import Photographs
@@ -9,7 +11,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings
-from neusee.workflows.recipe.blocks.train_block import KEY, Augment, Network, Training
+from neusee.workflows.recipe.blocks.train_block import FLAT, KEY, Augment, Network, Training
 from neusee.workflows.recipe.own_families import KEY as OWN_NODES
 from neusee.workflows.training.held_out import Split
 from neusee.workflows.training.warm_start import WarmStart
@@ -24,13 +26,22 @@ def key_of_training(
     items = recipe.config.settings.items()
     left_out = (f"{KEY}.", OWN_NODES)
     values = {name: str(setting.value) for name, setting in items if not name.startswith(left_out)}
-    defaults = {"mask": MaskSettings(), "clip": 10.0, "reduction": "mean", "augment": Augment(), "mismatch": None}
+    defaults = {
+        "mask": MaskSettings(),
+        "clip": 10.0,
+        "reduction": "mean",
+        "augment": Augment(),
+        "mismatch": None,
+        "masks": (),
+    }
     usual = {name for name, x in defaults.items() if getattr(settings, name) == x}  # so that older trainings continue
     if not parts.held_out:
         usual |= {"held_out", "held_out_pictures", "validate_every", "patience"}
     without = {*_WITHOUT_EFFECT, "start", *usual}
     block = settings.model_copy(update={"keep": 1, "show": 1}).model_dump(mode="json", exclude=without)
     block["network"] = _identity(settings.network, code)
+    if settings.masks:
+        block["masks"] = [x if x == FLAT else hashlib.sha256(Path(x).read_bytes()).hexdigest() for x in settings.masks]
     names = [path.name for path in photographs.paths]
     away = [[path.name for path in parts.held_out]] if parts.held_out else []
     begun = [{"start": start.digest}] if start else []

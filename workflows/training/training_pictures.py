@@ -66,6 +66,8 @@ _NOTHING = Sample(torch.zeros(0), torch.zeros(0), torch.zeros(0), {})  #: of a p
 class TrainingStream:
     """The training pictures of a recipe, behind a mask that is trained or behind the fixed mask of ``frozen``."""
 
+    repeats = 1  #: pictures of each held-out photograph
+
     def __init__(
         self,
         recipe: Recipe,

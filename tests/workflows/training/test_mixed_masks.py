@@ -1,0 +1,95 @@
+"""Pictures behind several masks in turn: those of recipes that have one of the masks each."""
+
+import csv
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from neusee.nodes.scene import Photographs
+from neusee.workflows import RecipeError, Store, load
+from neusee.workflows.training.held_out import _by_photograph
+from neusee.workflows.training.mixed_masks import MixedMasks, require_masks
+from neusee.workflows.training.parallel.process_mesh import Mesh, MeshError
+from neusee.workflows.training.parallel.shared_graph import Shared
+from neusee.workflows.training.training_pictures import HELD_OUT, TrainingStream
+from tests.workflows.training.test_posed_pictures import POSED
+from tests.workflows.training.test_warm_start import trained
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+WORDS = [*POSED, "train.pool=3", "+mismatch=usual", "sensor.read_noise=uniform(5 e-, 12 e-)"]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    Image.effect_noise((60, 50), 60).convert("RGB").save(folder / "one.png")
+    np.save(folder / "mask.npy", np.random.default_rng(3).uniform(0, 1e-6, (48, 48)))
+    return folder
+
+
+@pytest.mark.slow
+def test_picture_n_stands_behind_mask_n_and_a_held_out_photograph_behind_every_mask(files, tmp_path):
+    """The references are recipes with `doe=flat` and `doe=pixelwise`, and a stream that knows one mask."""
+    store, photographs = Store(tmp_path), Photographs((files / "one.png",))
+    recipe = load("train_small", [*WORDS, f"train.masks=[flat, {files / 'mask.npy'}]"])
+    mixed = MixedMasks(recipe, recipe.training, photographs, store, "cpu", photographs.paths)
+
+    def alone(words, stage, number):
+        other = load("train_small", [*WORDS, *words])
+        held_out = photographs.paths * 3
+        stream = TrainingStream(other, other.training, photographs, store, "cpu", other, held_out=held_out)
+        return stream({}, stage, number)
+
+    found = dict(mixed.batch(Shared.of({}), 2, 1, 3))  # the last is the first of the pool again
+    judged = dict(mixed.batch(Shared.of({}), HELD_OUT, 0, 3))
+    file = [f"doe.file={files / 'mask.npy'}"]
+    for number, words in enumerate([[], ["doe=flat"], ["doe=pixelwise", *file]]):
+        for sample, stage in ((found[(number - 1) % 3], 2), (judged[number], HELD_OUT)):
+            expected = alone(words, stage, number)
+            assert sample.drawn == expected.drawn
+            assert torch.equal(sample.truth, expected.truth)
+            assert torch.equal(sample.picture, expected.picture)
+            assert torch.equal(sample.given[0].psf, expected.given[0].psf)
+    assert not torch.equal(judged[0].given[0].psf, judged[1].given[0].psf)
+    assert mixed.pool_counts["simulated"] == 3
+
+
+def test_a_photograph_counts_once_whatever_the_number_of_its_pictures():
+    found = {"0 a": 1.0, "1 a": 3.0, "2 a": 5.0, "3 a": 9.0, "0 b": 2.0, "1 b": 2.0, "2 b": 4.0, "3 b": 4.0}
+    assert _by_photograph(found, 2) == {"0 a": 2.0, "1 a": 7.0, "0 b": 2.0, "1 b": 4.0}
+    assert _by_photograph(found, 1) == found
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["train.masks=[no.npy]"], r"there is no file .*no\.npy: give height maps in m, or flat"),
+        (["train.masks=[flat]", "train.learn=height"], "where none is trained: write learn: null"),
+    ],
+)
+def test_masks_that_cannot_be_are_refused(words, message):
+    kind = ["train.network={kind: unet, width: 4}", "train.picture=developed[mask]"]
+    with pytest.raises(RecipeError, match=message):
+        load("train_small", [*POSED, *kind, *words])
+
+
+def test_several_processes_are_refused():
+    recipe = load("train_small", [*POSED, "train.masks=[flat]"])
+    with pytest.raises(MeshError, match="runs in a single process"):
+        require_masks(recipe, recipe.training, Mesh(data=2))
+
+
+@pytest.mark.slow
+def test_a_training_behind_two_masks_validates_and_is_not_that_behind_one(tmp_path):
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for i in range(2):
+        Image.effect_noise((60, 50), 40 + 20 * i).convert("RGB").save(folder / f"{i}.png")
+    words = [*POSED, f"train.photographs={folder}", "train.held_out=0.5", "train.validate_every=1"]
+    found = trained([*words, "train.masks=[flat]"], tmp_path)
+    rows = list(csv.DictReader((found / "losses.csv").read_text().splitlines()))
+    assert len(rows) == 2
+    assert all(float(row["held_out_PSNR"]) > 0 for row in rows)
+    assert trained(words, tmp_path) != found
