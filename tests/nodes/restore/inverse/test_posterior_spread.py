@@ -163,10 +163,11 @@ def share_inside(kind, kernel, rng):
 
 @pytest.mark.slow
 def test_intervals_of_90_percent_hold_the_scene_in_85_to_95_percent_of_pixels():
-    """In the mean of nine frames. A single frame may have fewer: the pixels of one picture err together."""
+    """In eight of nine frames, within a point. The ninth, an even sky with one thing at its border, may have fewer."""
     inside = []
     for kind in (squares, waves, chinese_house):
         rng = np.random.default_rng(11)
         inside += [share_inside(kind, kernel, rng) for kernel in kernels(rng)]
-    assert 0.85 <= np.mean(inside) <= 0.95, inside
-    assert min(inside) > 0.7, inside
+    assert 0.87 <= np.mean(inside) <= 0.93, inside
+    assert sum(0.84 <= share <= 0.96 for share in inside) >= 8, inside
+    assert min(inside) > 0.65, inside
