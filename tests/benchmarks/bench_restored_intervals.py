@@ -1,8 +1,8 @@
 """How many pixels of a restored frame lie in their 90 % interval, frame by frame.
 
-    python tests/benchmarks/bench_interval.py results.jsonl --seeds 200 3
-    python tests/benchmarks/bench_interval.py results.jsonl --seeds 200 3 --exact
-    python tests/benchmarks/bench_interval.py results.jsonl --report
+    python tests/benchmarks/bench_restored_intervals.py results.jsonl --seeds 200 3
+    python tests/benchmarks/bench_restored_intervals.py results.jsonl --seeds 200 3 --exact
+    python tests/benchmarks/bench_restored_intervals.py results.jsonl --report
 
 Frames as in `bench_restored_frames.py`, from a camera in NumPy that the recipe describes wrongly, or exactly with
 `--exact`. Each is restored by `neusee restore` with the search, and compared with the light of each pixel behind a
