@@ -1,6 +1,15 @@
 """Calibration nodes, which estimate the constants of a sensor with uncertainties from frames of flat light."""
 
 from neusee.nodes.calibrate import _result_shapes  # noqa: F401  attaches the shape rules
+from neusee.nodes.calibrate._budget._camera_sources import (
+    STATISTICS,
+    camera_sources,
+    source_freedom,
+    variance_shares,
+)
+from neusee.nodes.calibrate._budget._laboratory import Laboratory, laboratory_contributions
+from neusee.nodes.calibrate._budget._sheet_budget import MODEL, sheet_budgets
+from neusee.nodes.calibrate._budget._uncertainty_budget import COVERAGE, NOT_INVOLVED, NOT_STATED, Budget, Contribution
 from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
 from neusee.nodes.calibrate._frames._emva_descriptor import (
     descriptor,
@@ -42,13 +51,21 @@ from neusee.nodes.calibrate._validity._number_tests import coarse
 
 __all__ = [
     "CAMERA_NAMES",
+    "COVERAGE",
+    "MODEL",
     "NAMES",
+    "NOT_INVOLVED",
+    "NOT_STATED",
     "SCATTER_NAMES",
+    "STATISTICS",
+    "Budget",
     "CameraCoordinates",
+    "Contribution",
     "Coordinates",
     "DefectHistogram",
     "EmvaSheet",
     "FrameTest",
+    "Laboratory",
     "LeastSquares",
     "Likelihood",
     "Nonuniformity",
@@ -64,6 +81,7 @@ __all__ = [
     "Sufficient",
     "camera",
     "camera_prior",
+    "camera_sources",
     "coarse",
     "defects",
     "density",
@@ -78,6 +96,7 @@ __all__ = [
     "guess_camera",
     "guess_scatter",
     "inspect_frames",
+    "laboratory_contributions",
     "least_squares",
     "levels",
     "point_source",
@@ -85,11 +104,14 @@ __all__ = [
     "profiles",
     "reduce",
     "refuse_descriptor",
+    "sheet_budgets",
+    "source_freedom",
     "spatial_series",
     "spectrogram",
     "stray_light",
     "stray_prior",
     "sufficient",
     "table",
+    "variance_shares",
     "without_trend",
 ]

@@ -41,6 +41,8 @@ OPERATING_POINT = {
     "pixel_pitch": "pixel pitch",
     "wavelength": "centroid wavelength of the light",
     "bandwidth": "width of its spectrum (FWHM)",
+    "spectrum": "spectrum of the lamp",
+    "photometer": "calibration of the light: instrument and certificate",
     "temperature": "temperature",
     "laboratory": "laboratory and date",
 }

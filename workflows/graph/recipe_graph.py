@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from neusee.workflows.graph.step_record import Event
     from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.safety_block import Safety
+    from neusee.workflows.recipe.blocks.traceability_block import Traceability
     from neusee.workflows.recipe.blocks.train_block import Training
     from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
     from neusee.workflows.recipe.distributions.nominal_values import Uncertain
@@ -94,6 +95,7 @@ class Recipe:
     lifting: LiftTraining | None = field(default=None, compare=False)  #: settings of the training of a lift
     safety: Safety | None = field(default=None, compare=False)  #: settings of the estimate of damage and dazzle
     evaluation: EvaluateSettings | None = field(default=None, compare=False)  #: settings of an evaluation
+    traceability: Traceability | None = field(default=None, compare=False)  #: what the laboratory states of its light
     unbounded: frozenset[str] = frozenset()  #: steps whose errors reach a node without an error bound
 
     def limit(self, step: str) -> float:

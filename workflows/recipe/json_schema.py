@@ -43,6 +43,7 @@ _MEANINGS = {
     "train_lift": "Settings of the training of a network from RGB to spectra.",
     "safety": "Settings of `neusee safety`.",
     "evaluate": "Settings of `neusee evaluate`.",
+    "traceability": "What the laboratory states of its light and temperature, for `neusee calibrate` and `sheet`.",
     "expect": "Numbers from an independent source, which each run checks.",
 }
 #: types of values that a reference may replace
@@ -80,6 +81,7 @@ def _keys() -> dict[str, Schema]:
         "train_lift": {"type": ["object", "null"]},
         "safety": {"type": ["object", "null"]},
         "evaluate": {"type": ["object", "null"]},
+        "traceability": {"type": ["object", "null"]},
         "expect": {"type": "object", "additionalProperties": {"$ref": "#/$defs/expectation"}},
     }
 

@@ -35,10 +35,11 @@ if TYPE_CHECKING:
 
     from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.safety_block import Safety
+    from neusee.workflows.recipe.blocks.traceability_block import Traceability
     from neusee.workflows.recipe.blocks.train_block import Training
     from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 
-BLOCKS = ("train", "train_lift", "evaluate")  #: keys of the blocks of settings in a recipe
+BLOCKS = ("train", "train_lift", "evaluate", "traceability")  #: keys of the blocks of settings in a recipe
 SAFETY = "safety"  #: key of the block that an estimate of damage and dazzle reads
 
 
@@ -100,16 +101,18 @@ def _checked(composed: Composed, graph: CachedGraph) -> Recipe:
 
 def _settings_blocks(
     composed: Composed, modules: Mapping[str, ModuleType]
-) -> tuple[Composed, Training | None, LiftTraining | None, EvaluateSettings | None]:
+) -> tuple[Composed, Training | None, LiftTraining | None, EvaluateSettings | None, Traceability | None]:
     """Return a recipe without its blocks of settings, and these; few recipes need the import of their models."""
     from neusee.workflows.recipe.blocks.evaluate_block import read_evaluate
+    from neusee.workflows.recipe.blocks.traceability_block import read_traceability
     from neusee.workflows.recipe.blocks.train_block import read_training
     from neusee.workflows.recipe.blocks.train_lift_block import read_lift_training
 
     composed, training = read_training(composed, class_context(modules))
     composed, lifting = read_lift_training(composed)
     composed, evaluation = read_evaluate(composed)
-    return composed, training, lifting, evaluation
+    composed, traceability = read_traceability(composed)
+    return composed, training, lifting, evaluation, traceability
 
 
 def check(composed: Composed) -> Recipe:
@@ -118,8 +121,8 @@ def check(composed: Composed) -> Recipe:
     mistakes: list[Diagnostic] = []
     own = read_own_families(composed.root, mistakes)
     composed = composed.with_problems(mistakes)
-    read = _settings_blocks(composed, own.modules) if blocks else (composed, None, None, None)
-    composed, training, lifting, evaluation = read
+    read = _settings_blocks(composed, own.modules) if blocks else (composed, None, None, None, None)
+    composed, training, lifting, evaluation, traceability = read
     composed, uncertain = settle(composed)
     diagnostics = list(composed.diagnostics)
     uncertain = _with_mismatch(composed, uncertain, blocks[0] if training else None, diagnostics)
@@ -148,7 +151,8 @@ def check(composed: Composed) -> Recipe:
     nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
     notes = (*composed.notes, *own.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
     parts = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
-    return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting, evaluation=evaluation, safety=safety)
+    recipe = Recipe(*parts, uncertain=uncertain, safety=safety, traceability=traceability)
+    return replace(recipe, training=training, lifting=lifting, evaluation=evaluation)
 
 
 def _with_mismatch(
