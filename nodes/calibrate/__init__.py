@@ -9,6 +9,7 @@ from neusee.nodes.calibrate._budget._camera_sources import (
 )
 from neusee.nodes.calibrate._budget._laboratory import Laboratory, laboratory_contributions
 from neusee.nodes.calibrate._budget._sheet_budget import MODEL, sheet_budgets
+from neusee.nodes.calibrate._budget._traceability import Traceability
 from neusee.nodes.calibrate._budget._uncertainty_budget import COVERAGE, NOT_INVOLVED, NOT_STATED, Budget, Contribution
 from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
 from neusee.nodes.calibrate._frames._emva_descriptor import (
@@ -79,6 +80,7 @@ __all__ = [
     "Spectrogram",
     "Stack",
     "Sufficient",
+    "Traceability",
     "camera",
     "camera_prior",
     "camera_sources",

@@ -7,8 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from neusee.nodes.calibrate import COVERAGE, NOT_INVOLVED, Budget, Contribution
-from neusee.workflows.recipe.blocks.traceability_block import Traceability
+from neusee.nodes.calibrate import COVERAGE, NOT_INVOLVED, Budget, Contribution, Traceability
 from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn
 from neusee.workflows.report.study_page import Mark, Section, with_uncertainty
 

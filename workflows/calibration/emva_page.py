@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neusee.nodes.calibrate import EmvaSheet, FrameTest, Quantity, SpatialSeries
+from neusee.nodes.calibrate import EmvaSheet, FrameTest, Quantity, SpatialSeries, Traceability
 from neusee.workflows.calibration.budget_page import of_traceability
 from neusee.workflows.calibration.emva_frames import OPERATING_POINT, EmvaFrames, Release
 from neusee.workflows.calibration.frame_validity import frame_section
-from neusee.workflows.recipe.blocks.traceability_block import Traceability
 from neusee.workflows.report.study_page import Mark, Section
 
 _LEVELS, _EXPOSURES, _SERIES = (

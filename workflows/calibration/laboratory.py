@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from neusee.nodes.calibrate import Laboratory
+from neusee.nodes.calibrate import Laboratory, Traceability
 from neusee.workflows.calibration.frame_validity import wider
 from neusee.workflows.calibration.identifiability import Identifiability
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import ModelSpread
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.recipe.blocks.traceability_block import Traceability
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.emcee_sampler import Chains

@@ -11,12 +11,12 @@ from neusee.workflows.graph.diagnostics import Location, nearest
 from neusee.workflows.graph.final_values import Config, Setting
 
 if TYPE_CHECKING:
+    from neusee.nodes.calibrate import Traceability
     from neusee.workflows.engine.runner import Result
     from neusee.workflows.engine.step_job import Executor
     from neusee.workflows.graph.step_record import Event
     from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.safety_block import Safety
-    from neusee.workflows.recipe.blocks.traceability_block import Traceability
     from neusee.workflows.recipe.blocks.train_block import Training
     from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
     from neusee.workflows.recipe.distributions.nominal_values import Uncertain

@@ -33,13 +33,14 @@ from neusee.workflows.recipe.wiring import Wiring, cycles
 if TYPE_CHECKING:
     from types import ModuleType
 
+    from neusee.nodes.calibrate import Traceability
     from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.safety_block import Safety
-    from neusee.workflows.recipe.blocks.traceability_block import Traceability
     from neusee.workflows.recipe.blocks.train_block import Training
     from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 
-BLOCKS = ("train", "train_lift", "evaluate", "traceability")  #: keys of the blocks of settings in a recipe
+TRACED = "traceability"  #: key of the block in which a laboratory states its light and temperature
+BLOCKS = ("train", "train_lift", "evaluate", TRACED)  #: keys of the blocks of settings in a recipe
 SAFETY = "safety"  #: key of the block that an estimate of damage and dazzle reads
 
 
@@ -104,14 +105,18 @@ def _settings_blocks(
 ) -> tuple[Composed, Training | None, LiftTraining | None, EvaluateSettings | None, Traceability | None]:
     """Return a recipe without its blocks of settings, and these; few recipes need the import of their models."""
     from neusee.workflows.recipe.blocks.evaluate_block import read_evaluate
-    from neusee.workflows.recipe.blocks.traceability_block import read_traceability
     from neusee.workflows.recipe.blocks.train_block import read_training
     from neusee.workflows.recipe.blocks.train_lift_block import read_lift_training
 
     composed, training = read_training(composed, class_context(modules))
     composed, lifting = read_lift_training(composed)
     composed, evaluation = read_evaluate(composed)
-    composed, traceability = read_traceability(composed)
+    if TRACED not in composed.root.items:
+        return composed, training, lifting, evaluation, None
+    from neusee.nodes.calibrate import Traceability
+    from neusee.workflows.recipe.blocks.settings_block import read_block
+
+    composed, traceability = read_block(composed, TRACED, Traceability, composed.root.items[TRACED].plain)
     return composed, training, lifting, evaluation, traceability
 
 

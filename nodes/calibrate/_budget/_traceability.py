@@ -1,4 +1,4 @@
-"""What a laboratory states of its light and temperature, which forms the block ``traceability`` of a recipe."""
+"""What a laboratory states of its light and of its temperature, so that its values can be traced to a standard."""
 
 from __future__ import annotations
 
@@ -7,13 +7,10 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from neusee.nodes.units import PositiveLength, Wavelength, read_quantity
-from neusee.workflows.recipe.blocks.settings_block import SettingsBlock, read_block
-from neusee.workflows.recipe.text.composition import Composed
 
-KEY = "traceability"  #: key of the block in a recipe
 _CELSIUS = re.compile(r"([-+]?\d+(?:\.\d+)?)\s*(°C|C|degC)?")
 _ZERO = 273.15  #: K
 
@@ -33,7 +30,13 @@ def _temperature(value: Any) -> float:
     return kelvin
 
 
-class Photometry(SettingsBlock):
+class Statement(BaseModel):
+    """Base class of what a laboratory states; an unknown key is a mistake."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Photometry(Statement):
     """Calibration of the light: what is known of the numbers of photons, and who says so."""
 
     known: Literal["absolute", "relative"] = "absolute"  #: relative: up to a factor, so that no efficiency is told
@@ -46,7 +49,7 @@ class Photometry(SettingsBlock):
     instrument: Text | None = None
 
 
-class Lamp(SettingsBlock):
+class Lamp(Statement):
     """The lamp: its spectrum, and how far its light may have drifted since it was calibrated."""
 
     spectrum: Text | None = None  #: in words, or the name of a file
@@ -57,7 +60,7 @@ class Lamp(SettingsBlock):
     drift: Relative | None = None  #: relative standard uncertainty, from the calibration of the light to the frames
 
 
-class SensorTemperature(SettingsBlock):
+class SensorTemperature(Statement):
     """The temperature of the sensor, and the relative change of its parameters per kelvin."""
 
     value: Annotated[float, BeforeValidator(_temperature, json_schema_input_type=str)] | None = None  #: K
@@ -70,15 +73,9 @@ class SensorTemperature(SettingsBlock):
         return None if self.value is None else f"{self.value - _ZERO:.4g} °C"
 
 
-class Traceability(SettingsBlock):
-    """Settings in the recipe key ``traceability``."""
+class Traceability(Statement):
+    """What a laboratory states of its photons, its lamp and its temperature: the recipe key ``traceability``."""
 
     photons: Photometry = Photometry()
     lamp: Lamp = Lamp()
     temperature: SensorTemperature = SensorTemperature()
-
-
-def read_traceability(composed: Composed) -> tuple[Composed, Traceability | None]:
-    """Return a recipe without its block ``traceability``, and the statements of the block; report mistakes."""
-    block = composed.root.items.get(KEY)
-    return (composed, None) if block is None else read_block(composed, KEY, Traceability, block.plain)
