@@ -21,7 +21,7 @@ _TEXT = f"""By the Guide to the expression of uncertainty in measurement (JCGM 1
     A source that is not stated is missing in u_c: it is not 0."""
 _LINES = """Each source with its type (A: from a series of observations; B: by other means), its distribution, the
     standard uncertainty u(x) of the input, the sensitivity c = dy/dx, the degrees of freedom ν, the contribution
-    u(y) = c u(x), and its share in the variance of the quantity."""
+    u(y) = c u(x), and its share in the variance of the quantity. Sources that do not enter a quantity have no line."""
 
 
 def budget_sections(
@@ -54,8 +54,10 @@ def _row(budget: Budget) -> tuple[Any, ...]:
 
 
 def _lines(budget: Budget) -> Iterator[tuple[Any, ...]]:
+    name = budget.symbol or budget.name
     for c in budget.contributions:
-        name = _named(budget)
+        if c.reason == NOT_INVOLVED:
+            continue
         if c.share is None:
             yield name, c.source, c.kind, c.reason, None, "", None, "", None, ""
         else:

@@ -28,6 +28,7 @@ from neusee.workflows.store.result_store import Store
 
 #: keys of the quantities whose budget the page shows
 BUDGETED = ("eta", "K", "sigma_d", "mu_p_min", "mu_p_sat", "mu_e_sat", "SNR_max", "DR", "DSNU1288", "PRNU1288")
+_PLUS = "U is the expanded uncertainty; + says that a source of it is not stated, which budget.json names."
 _MORE = " The files `budget.json` and `budget.csv` have the budgets of all quantities with a value."
 _COLUMNS = ("section", "key", "symbol", "quantity", "bound", "value", "unit", "reason")
 _TRANSFER = ("photons", "exposure", "mean", "variance", "mean_dark", "variance_dark")
@@ -102,7 +103,7 @@ def _report(
         files={
             "emva1288.json": as_json(document),
             "budget.json": as_json(budget_document(budgets, stated(recipe))),
-            "emva1288.pdf": emva_pdf.pdf(sheet, title, [*summary, document["fails"]]),
+            "emva1288.pdf": emva_pdf.pdf(sheet, title, [*summary, _PLUS, document["fails"]], budgets),
         },
         banner=document["fails"],
     )

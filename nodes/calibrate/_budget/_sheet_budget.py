@@ -32,6 +32,7 @@ MODEL = "model of the response"
 SPACING = "spacing of the light levels"
 _STEP = 0.1  #: standard uncertainties of an input, half the step of a derivative
 _SCALE = 1e-4  #: half the step of a derivative by the photons, relative
+_NOTHING = 1e-6  #: share of a value below which a change is rounding
 _HALF = 0.5 * SENSITIVITY  #: share of saturation up to which the second model fits its lines
 #: by key of the sheet: the parameter of `camera` whose temperature coefficient counts, and its sign
 _COEFFICIENTS = {
@@ -189,7 +190,7 @@ def _budget(
     name, sign = _COEFFICIENTS.get(q.key, (q.key, 1.0))
     key = q.key if q.key in laboratory.coefficients else name
     photons = moves.photons.get(q.key, 0.0)
-    photons = photons if abs(photons) > 1e-6 * abs(q.value) else 0.0
+    photons = photons if abs(photons) > _NOTHING * abs(q.value) else 0.0
     more = laboratory_contributions(key, sign * q.value, photons, laboratory)
     return Budget(q.key, q.name, q.symbol, q.unit, q.value, (*own, *more))
 
@@ -198,20 +199,26 @@ def _of_levels(q: Quantity, moves: _Propagation) -> Iterator[Contribution]:
     assert q.value is not None
     parts = moves.statistics.get(q.key, [])
     u = math.hypot(*(c.share or 0.0 for c in parts), 0.0)
-    yield Contribution(STATISTICS, "A", "normal", u, q.unit, 1.0, welch_satterthwaite(parts))
+    freedom = welch_satterthwaite(parts)
+    if u > _NOTHING * abs(q.value):
+        yield Contribution(STATISTICS, "A", "normal", u, q.unit, 1.0, freedom)
+    else:
+        yield Contribution(STATISTICS, "A", reason=NOT_INVOLVED)
     yield _of_lamp(moves.light.get(q.key, 0.0), q.value, moves)
     if sensitivity := _LOGARITHMS.get(q.key, _SATURATION.get(q.key, 0.0) * q.value):
         yield Contribution(SPACING, "B", "rectangular", moves.spacing, "relative", sensitivity)
     other = moves.other_model.get(q.key)
     if other is None:
         yield Contribution(MODEL, "B", reason=f"{NOT_STATED}: too few levels up to 35 % of saturation")
+    elif abs(other - q.value) <= _NOTHING * abs(q.value):
+        yield Contribution(MODEL, "B", reason=NOT_INVOLVED)
     else:
         yield Contribution(MODEL, "B", "two points", abs(other - q.value) / 2, q.unit)
 
 
 def _of_lamp(sensitivity: float, value: float, moves: _Propagation) -> Contribution:
     scatter, freedom = moves.lamp
-    if sensitivity <= 1e-6 * abs(value):
+    if sensitivity <= _NOTHING * abs(value):
         return Contribution(LAMP, "A", reason=NOT_INVOLVED)
     if not math.isfinite(scatter):
         return Contribution(LAMP, "A", reason=f"{NOT_STATED}: fewer than three levels on the line")
