@@ -18,6 +18,7 @@ from neusee.nodes.calibrate._frames._emva_descriptor import (
     descriptor_series,
     refuse_descriptor,
 )
+from neusee.nodes.calibrate._frames._frame_headers import FrameHeader, frame_header, frame_means
 from neusee.nodes.calibrate._frames._frame_statistics import levels, reduce
 from neusee.nodes.calibrate._frames._level_frames import frames
 from neusee.nodes.calibrate._frames._moment_table import table
@@ -65,6 +66,7 @@ __all__ = [
     "Coordinates",
     "DefectHistogram",
     "EmvaSheet",
+    "FrameHeader",
     "FrameTest",
     "Laboratory",
     "LeastSquares",
@@ -92,6 +94,8 @@ __all__ = [
     "descriptor_series",
     "emva_sheet",
     "expose",
+    "frame_header",
+    "frame_means",
     "frames",
     "general_model",
     "guess",
