@@ -67,7 +67,7 @@ def find_levels(folder: Path) -> FolderLevels:
     frames, source, problems = _found(folder)
     problems += [*_sizes(frames, folder), *_unknown(frames, folder)]
     if problems or not frames:
-        raise FolderRefused("\n".join([*problems, *([] if frames else [f"{folder}: no frames: {_HOW}"])]))
+        raise FolderRefused("\n".join(problems or [f"{folder}: no frames: {_HOW}"]))
     light = _kind_of_light(frames)
     groups = _groups(frames, light)
     levels = tuple(_named(groups))

@@ -11,24 +11,28 @@ from neusee.nodes.calibrate import frame_means
 
 _OFF, _FLOOR = 0.1, 0.01  #: most difference of two frames: of their signal, and of the brightest signal
 
+_CHANCE = 6.0  #: standard errors of a mean, added to the difference
+
 Files = tuple[str, bool, Sequence[Path]]  #: name of a level, True for a dark one, its files
 
 
 def odd_frames(levels: Sequence[Files], folder: Path) -> Iterator[str]:
-    """Yield a sentence for each level whose frames differ too much in their means, and for darks that are not dark."""
-    means = [[(file, mean) for file in files for mean in frame_means(file)] for _, _, files in levels]
-    middles = [float(np.median([mean for _, mean in each])) for each in means]
+    """Yield a sentence for each level whose frames differ too much in their means, or one if darks are not dark."""
+    means = [[(file, *found) for file in files for found in frame_means(file)] for _, _, files in levels]
+    middles = [float(np.median([mean for _, mean, _ in each])) for each in means]
     darks = [middle for middle, (_, dark, _) in zip(middles, levels, strict=True) if dark]
+    lit = float(np.median([middle for middle, (_, dark, _) in zip(middles, levels, strict=True) if not dark]))
+    if lit <= max(darks):
+        yield (f"{folder}: dark frames have means up to {max(darks):.0f} DN, and half of the lit levels no more than "
+               f"{lit:.0f} DN: cover the lens, or check which files are dark")  # fmt: skip
+        return
     black, bright = min(darks), max(middles)
     for (_, dark, _), each, middle in zip(levels, means, middles, strict=True):
         room = _OFF * (0.0 if dark else middle - black) + _FLOOR * (bright - black)
-        values = [mean for _, mean in each]
+        room += _CHANCE * max(error for _, _, error in each)
+        values = [mean for _, mean, _ in each]
         if max(values) - min(values) > room:
-            yield _odd(each, middle, room, folder)
-    lit = [middle for middle, (_, dark, _) in zip(middles, levels, strict=True) if not dark]
-    if bright <= black or float(np.median(lit)) <= max(darks):
-        yield (f"dark frames have means up to {max(darks):.0f} DN, half of the lit levels no more than "
-               f"{float(np.median(lit)):.0f} DN: cover the lens, or check which files are dark")  # fmt: skip
+            yield _odd([(file, mean) for file, mean, _ in each], middle, room, folder)
 
 
 def _odd(each: Sequence[tuple[Path, float]], middle: float, room: float, folder: Path) -> str:

@@ -116,9 +116,9 @@ def _stack(shape: tuple[int, ...]) -> tuple[int, tuple[int, int]]:
     return (1 if len(shape) == 2 else int(shape[0])), (int(shape[-2]), int(shape[-1]))
 
 
-def frame_means(file: Path) -> list[float]:
-    """Return the mean of each frame of a file, DN."""
-    return [float(frame.mean(dtype=np.float64)) for frame in read(file)]
+def frame_means(file: Path) -> list[tuple[float, float]]:
+    """Return the mean of each frame of a file and its standard error by the scatter of the pixels, DN."""
+    return [(float(x.mean(dtype=np.float64)), float(x.std(dtype=np.float64)) / x.size**0.5) for x in read(file)]
 
 
 _HEADERS = {".png": _picture, ".tif": _picture, ".tiff": _picture, ".exr": _exr, ".npy": _plain}
