@@ -14,6 +14,8 @@ from neusee.workflows.report.study_page import Mark, Section, with_uncertainty
 COLUMNS = ("quantity", "symbol", "unit", "value", "source", "type", "distribution", "u(x)", "unit of x", "c", "nu",
            "u(y)", "reason")  # fmt: skip
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, "#CC79A7", "#56B4E9", "#F0E442", BLACK, "#999999", "#882255", "#44AA99")
+#: keys of the quantities of a sheet whose budget the page shows
+BUDGETED = ("eta", "K", "sigma_d", "mu_p_min", "mu_p_sat", "mu_e_sat", "SNR_max", "DR", "DSNU1288", "PRNU1288")
 _LEAST = 1e-4  #: share of a variance below which a source is not drawn
 _TEXT = f"""By the Guide to the expression of uncertainty in measurement (JCGM 100). The combined standard uncertainty
     u_c has all sources that are stated. The expanded uncertainty U is k u_c and holds the value with {COVERAGE:.0%};
@@ -170,8 +172,7 @@ def _finite(freedom: float) -> float | str:
     return freedom if math.isfinite(freedom) else "infinite"
 
 
-@drawn
-def budget_picture(budgets: Sequence[Budget]) -> Any:
+def budget_figure(budgets: Sequence[Budget]) -> Any:
     """Draw the share of each source in the variance of each quantity, as bars that add up to 100 %."""
     sources = list(dict.fromkeys(c.source for b in budgets for c in b.contributions if c.share))
     colours = {source: _COLOURS[i % len(_COLOURS)] for i, source in enumerate(sources)}
@@ -195,6 +196,5 @@ def budget_picture(budgets: Sequence[Budget]) -> Any:
     return figure
 
 
-def unstated(budgets: Sequence[Budget]) -> list[str]:
-    """Return the sources that are missing in a budget, each once."""
-    return list(dict.fromkeys(source for b in budgets for source in b.missing if source != NOT_INVOLVED))
+#: from budgets to the PNG bytes of the picture
+budget_picture = drawn(budget_figure)

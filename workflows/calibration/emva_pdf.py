@@ -9,6 +9,7 @@ from typing import Any
 
 from neusee.nodes.calibrate import COVERAGE, Budget, EmvaSheet
 from neusee.workflows.calibration import emva_figures
+from neusee.workflows.calibration.budget_page import BUDGETED, budget_figure
 from neusee.workflows.report.figures.style import canvas, styled
 
 _LINE = 105  #: characters of a line of the summary
@@ -29,6 +30,8 @@ def pdf(sheet: EmvaSheet, title: str, lines: list[str], budgets: Sequence[Budget
         for draw in emva_figures.PICTURES.values():
             if (figure := draw(sheet)) is not None:
                 pages.savefig(figure, bbox_inches="tight", pad_inches=0.3)
+        if named := [budget for budget in budgets if budget.key in BUDGETED]:
+            pages.savefig(budget_figure(named), bbox_inches="tight", pad_inches=0.3)
     return out.getvalue()
 
 
@@ -43,7 +46,7 @@ def _summary(sheet: EmvaSheet, title: str, lines: list[str], budgets: Mapping[st
     axes[0, 0].text(0, 0.86, shown, fontsize=9, va="top", linespacing=1.4, transform=axes[0, 0].transAxes)
     rows = [(q.symbol, q.name, q.text, _expanded(budgets.get(q.key))) for q in sheet.quantities]
     table = axes[1, 0].table(
-        rows, colLabels=_COLUMNS, colWidths=(0.2, 0.45, 0.2, 0.15), cellLoc="left", loc="upper center"
+        rows, colLabels=_COLUMNS, colWidths=(0.24, 0.42, 0.22, 0.12), cellLoc="left", loc="upper center"
     )
     table.auto_set_font_size(False)
     table.set_fontsize(9)
@@ -54,7 +57,7 @@ def _summary(sheet: EmvaSheet, title: str, lines: list[str], budgets: Mapping[st
 
 
 def _expanded(budget: Budget | None) -> str:
-    """Return the expanded uncertainty of a quantity as text; + says that a source is not stated."""
+    """Return the expanded uncertainty in the unit of the value as text; + says that a source is not stated."""
     if budget is None:
         return "–"
-    return f"{budget.expanded:.2g} {budget.unit}".rstrip() + " +" * bool(budget.missing)
+    return f"{budget.expanded:.2g}" + " +" * bool(budget.missing)

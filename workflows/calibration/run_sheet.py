@@ -10,6 +10,7 @@ from typing import Any
 from neusee.nodes.calibrate import Budget, EmvaSheet, emva_sheet, sheet_budgets
 from neusee.workflows.calibration import emva_figures, emva_pdf
 from neusee.workflows.calibration.budget_page import (
+    BUDGETED,
     COLUMNS,
     budget_document,
     budget_picture,
@@ -26,8 +27,6 @@ from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.study_folder import StudyReport, StudyRun, as_json
 from neusee.workflows.store.result_store import Store
 
-#: keys of the quantities whose budget the page shows
-BUDGETED = ("eta", "K", "sigma_d", "mu_p_min", "mu_p_sat", "mu_e_sat", "SNR_max", "DR", "DSNU1288", "PRNU1288")
 _PLUS = "U is the expanded uncertainty; + says that a source of it is not stated, which budget.json names."
 _MORE = " The files `budget.json` and `budget.csv` have the budgets of all quantities with a value."
 _COLUMNS = ("section", "key", "symbol", "quantity", "bound", "value", "unit", "reason")
