@@ -250,7 +250,7 @@ def test_a_folder_becomes_a_sensor_with_its_uncertainty(working, capsys):
     assert budget["traceability"]["instrument"] == "not stated"
     posterior = json.loads((results / "posterior.json").read_text())
     for name, row in budget["quantities"].items():
-        if name not in ("bend", "twist"):
+        if name not in ("bend", "twist", "lamp"):  # the interval of a wide lamp is not symmetric
             low, high = (posterior["stated"][name][end] for end in ("low", "high"))
             assert row["combined standard uncertainty"] == pytest.approx((high - low) / 2 / 1.645, rel=0.02), name
     lone = [typed(["calibrate", "calibrate", "--sensor", "mine"]), typed(["calibrate", "lab", "--sensor", "My sensor"])]
