@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +35,13 @@ TIMELINE = (
 
 @dataclass(frozen=True, slots=True)
 class DerivedFile:
-    """A figure or data file of a run: the function ``make`` that computes it, and the source of each argument."""
+    """A figure or data file of a run: the function ``make(path, …)`` that writes it, and the source of each argument."""
 
     name: str
     suffix: str
     kind: Sequence[Any]  #: the parts of the key that do not depend on the results
     needs: Mapping[str, str]
-    make: Callable[..., bytes]
+    make: Callable[..., None]
     only_tables: bool = False  #: True for a file that is made only if an argument is a table of the user
 
 
@@ -51,7 +52,7 @@ def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict
     """Draw the pictures of a run; return the paths of the pictures, and the reason for each picture that is missing."""
     drawing = engine(*sorted({figure.draw.partition(":")[0] for figure in FIGURES}), "report.figures.recipe_graph")
     files = (
-        DerivedFile(f.name, ".png", ("figure", f.draw, drawing), f.needs, _function(f.draw), f.only_tables)
+        DerivedFile(f.name, ".png", ("figure", f.draw, drawing), f.needs, _drawing(f.draw), f.only_tables)
         for f in FIGURES
     )
     paths, missing = files_of(files, result, shelf)
@@ -132,12 +133,20 @@ def _made(jobs: Sequence[Job], result: Result, shelf: DerivedFiles, missing: dic
     for (file, key, found), values in zip(new, in_turn(needed, result), strict=True):
         arguments = {name: x.make(values) for name, x in found.items()}
         try:
-            content = file.make(**arguments)
+            paths[file.name] = shelf.keep(key, file.suffix, file.name, partial(file.make, **arguments))
         except (ValueError, Missing, RuntimeError) as error:
             missing[file.name] = str(error).partition("\n")[0]
-            continue
-        paths[file.name] = shelf.keep(key, file.suffix, file.name, content)
     return {file.name: paths[file.name] for file, _, _ in jobs if file.name in paths}
+
+
+def _drawing(path: str) -> Callable[..., None]:
+    """Return a function that writes the picture of the drawing function named ``module:function`` into a file."""
+    draw = _function(path)
+
+    def write(file: Path, /, **arguments: Any) -> None:
+        file.write_bytes(draw(**arguments))
+
+    return write
 
 
 def _function(path: str) -> Callable[..., bytes]:
@@ -151,9 +160,9 @@ def _graph(result: Result, shelf: DerivedFiles, drawing: str) -> Path:
     states = {name: "cached" if done.state == "not needed" else str(done.state) for name, done in result.done.items()}
     again = {name: "left out" if state == "left out" else "cached" for name, state in states.items()}
     sources = {name: list(result.recipe.steps[name].sources) for name in result.done}
-    draw, paths = _function("report.figures.recipe_graph:graph"), []
+    draw, paths = _drawing("report.figures.recipe_graph:graph"), []
     for now in (states, again):
         key = digest("graph", drawing, sources, now)
         found = shelf.find(key, ".png")
-        paths.append(found or shelf.keep(key, ".png", "graph", draw(sources=sources, states=now)))
+        paths.append(found or shelf.keep(key, ".png", "graph", partial(draw, sources=sources, states=now)))
     return paths[0]

@@ -367,7 +367,7 @@ def test_a_second_run_draws_nothing_and_a_changed_value_draws_again(tmp_path, mo
 def test_a_damaged_picture_is_drawn_again(tmp_path):
     store = Store(tmp_path)
     shelf = DerivedFiles(store)
-    path = shelf.keep("ab" * 16, ".png", "test", b"as it was")
+    path = shelf.keep("ab" * 16, ".png", "test", lambda path: path.write_bytes(b"as it was"))
     assert shelf.find("ab" * 16, ".png") == path
     path.chmod(0o644)
     path.write_bytes(b"as it is.")
