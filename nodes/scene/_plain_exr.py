@@ -1,8 +1,8 @@
 """Uncompressed OpenEXR files of one part, written line by line in a few megabytes of memory beside the planes.
 
 Noise and the tails of a PSF do not compress: ZIP saves 0.7 % of a stack of PSFs, and takes ten times as long as a copy.
-The layout is that of OpenEXR 2 (Technical Introduction to OpenEXR, 2013, file layout of scan line images): header, table
-of the offsets of the lines, and for each line its number, its size, and the pixels of one channel after another.
+The layout is that of OpenEXR 2 (OpenEXR file layout, 2013, scan line images): a header, the table of the offsets of the
+lines, and for each line its number, its size, and the pixels of one channel after another.
 """
 
 import struct

@@ -41,11 +41,11 @@ def data_files(recipe: Recipe) -> Iterator[DerivedFile]:
         yield DerivedFile(name, Path(name).suffix, ("file", form, _VERSION), needs, _WRITERS[form])
 
 
-def spectral(path: Path, /, *, cube: Tensor | Psf, bands: Bands) -> None:
-    """Write a spectral cube as OpenEXR in the layout of Fichet et al., JCGT 2021."""
+def spectral(path: Path, /, *, cube: Tensor | Psf, bands: Bands, half: bool = False) -> None:
+    """Write a spectral cube as OpenEXR in the layout of Fichet et al., JCGT 2021, with ``half`` in 16 bits a value."""
     from neusee.nodes.scene import write_spectral
 
-    write_spectral(path, cube.intensity if isinstance(cube, Psf) else cube, bands.centres)
+    write_spectral(path, cube.intensity if isinstance(cube, Psf) else cube, bands.centres, half=half)
 
 
 def safetensors(path: Path, /, **values: Any) -> None:
@@ -66,11 +66,16 @@ def safetensors(path: Path, /, **values: Any) -> None:
             file.write(bytes_of(x))
 
 
-def exr(path: Path, /, *, image: Tensor) -> None:
-    """Write an RGB image (3, y, x) as a float32 OpenEXR file, or a grey image (1, y, x) with the one channel Y."""
+def exr(path: Path, /, *, image: Tensor, half: bool = False) -> None:
+    """Write an RGB image (3, y, x) as an OpenEXR file, or a grey image (1, y, x) with the one channel Y.
+
+    Pixels are float32, or with ``half`` float16. Raises: ValueError for ``half`` and a value beyond float16.
+    """
     import OpenEXR
 
-    values = image.detach().cpu().float().permute(1, 2, 0).contiguous().numpy()
+    if half and float(image.detach().abs().max()) > torch.finfo(torch.float16).max:
+        raise ValueError("values beyond 65504 cannot be written as half floats: write float32")
+    values = image.detach().cpu().to(torch.float16 if half else torch.float32).permute(1, 2, 0).contiguous().numpy()
     pixels = {"Y": values[..., 0].copy()} if len(image) == 1 else {"RGB": values}
     header = {"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage}
     try:
@@ -108,7 +113,7 @@ def _compressed(image: Tensor) -> Iterator[bytes]:
     pack, (planes, height, width) = zlib.compressobj(6, zlib.DEFLATED, 15, 9, zlib.Z_RLE), image.shape
     rows = max(1, _AT_ONCE // (planes * width))
     for top in range(0, height, rows):
-        words = image[:, top : top + rows].double().round().permute(1, 2, 0).to(torch.int32).numpy().astype(">u2")
+        words = image[:, top : top + rows].double().round().permute(1, 2, 0).to(torch.int32).contiguous().numpy().astype(">u2")
         pixels = words.view(np.uint8).reshape(len(words), width, 2 * planes)
         lines = np.ones((len(words), 1 + 2 * planes * width), np.uint8)  # 1: difference from the left
         lines[:, 1:] = np.diff(pixels, axis=1, prepend=np.uint8(0)).reshape(len(words), -1)

@@ -38,7 +38,7 @@ class DerivedFiles:
     def find(self, key: str, suffix: str) -> Path | None:
         """Return the path of the derived file ``key``, or None if the file is missing or has a wrong checksum.
 
-        A file that this object has written is not compared again.
+        A file that this object has written or compared is not compared again.
         """
         from torch import Tensor
 
@@ -47,6 +47,7 @@ class DerivedFiles:
             return path
         with suppress(KeyError, OSError):
             if path.is_file() and self.store.has(key) and _is_right(path, self.store.get(key, Tensor)):
+                self._fresh.add(path)
                 return path
         return None
 
