@@ -9,6 +9,7 @@ drawing function:
     spot[mask,*]                 a dictionary with the value of each copy of a step
     psf[mask].pixel_pitch        a parameter of a step
     line[*].file                 a dictionary with a parameter of each copy of a step
+    variants of psf              errors and run times of variants of a step, from the last study of accuracy
     psf[mask]()                  a function: the node of a step with the parameters of the step
 
 A leading ``?`` marks an optional argument: if the recipe lacks the step, the figure is drawn without this argument.

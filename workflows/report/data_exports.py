@@ -113,7 +113,16 @@ def _compressed(image: Tensor) -> Iterator[bytes]:
     pack, (planes, height, width) = zlib.compressobj(6, zlib.DEFLATED, 15, 9, zlib.Z_RLE), image.shape
     rows = max(1, _AT_ONCE // (planes * width))
     for top in range(0, height, rows):
-        words = image[:, top : top + rows].double().round().permute(1, 2, 0).to(torch.int32).contiguous().numpy().astype(">u2")
+        words = (
+            image[:, top : top + rows]
+            .double()
+            .round()
+            .permute(1, 2, 0)
+            .to(torch.int32)
+            .contiguous()
+            .numpy()
+            .astype(">u2")
+        )
         pixels = words.view(np.uint8).reshape(len(words), width, 2 * planes)
         lines = np.ones((len(words), 1 + 2 * planes * width), np.uint8)  # 1: difference from the left
         lines[:, 1:] = np.diff(pixels, axis=1, prepend=np.uint8(0)).reshape(len(words), -1)

@@ -88,7 +88,7 @@ class FilesBeside:
         known = dict.fromkeys(needed(recipe, wanted(recipe)), "")
         for file in self._files(recipe):
             with suppress(Missing):
-                found = arguments_of(file.needs, recipe, known, self._code)
+                found = arguments_of(file.needs, recipe, known, self._code, self._shelf.store)
                 steps = frozenset(step for each in found.values() for step in each.steps)
                 if steps and not file.only_tables:
                     self._open.append((file, steps))
@@ -102,7 +102,7 @@ class FilesBeside:
         self._held = {name: value for name, value in self._held.items() if name in still}
 
     def _submit(self, file: DerivedFile, recipe: Recipe, keys: Mapping[str, Key]) -> None:
-        found = arguments_of(file.needs, recipe, keys, self._code)
+        found = arguments_of(file.needs, recipe, keys, self._code, self._shelf.store)
         arguments = {name: each.make(self._held) for name, each in found.items()}
         large = _bytes_of(list(arguments.values())) > drawing_process.MOST
         if isinstance(file.make, Drawing) and (large or self._drawer is None):

@@ -20,6 +20,7 @@ from neusee.workflows.report.contents import FIGURES
 from neusee.workflows.report.requirements import Found, Missing, find, is_table
 from neusee.workflows.report.shown_values import in_turn
 from neusee.workflows.store.derived_files import DerivedFiles
+from neusee.workflows.store.result_store import Store
 
 GRAPH = (
     "graph",
@@ -103,7 +104,7 @@ def files_of(
     code, jobs, missing = Code(result.store.code_memo), list[Job](), dict[str, str]()
     for file in files:
         try:
-            found = arguments_of(file.needs, result.recipe, result.keys, code)
+            found = arguments_of(file.needs, result.recipe, result.keys, code, result.store)
         except Missing as why:
             missing[file.name] = str(why)
             continue
@@ -147,7 +148,9 @@ def _in_turn(known: Iterable[StepRecord]) -> tuple[Slot, ...]:
     return tuple(slots)
 
 
-def arguments_of(needs: Mapping[str, str], recipe: Recipe, keys: Mapping[str, str], code: Code) -> dict[str, Found]:
+def arguments_of(
+    needs: Mapping[str, str], recipe: Recipe, keys: Mapping[str, str], code: Code, store: Store
+) -> dict[str, Found]:
     """Find the source of each argument of a drawing function; omit arguments marked by ``?`` whose step is missing.
 
     Raises `Missing` for another argument whose step is missing.
@@ -155,7 +158,7 @@ def arguments_of(needs: Mapping[str, str], recipe: Recipe, keys: Mapping[str, st
     found = {}
     for argument, need in needs.items():
         try:
-            found[argument] = find(need.removeprefix("?"), recipe, keys, code)
+            found[argument] = find(need.removeprefix("?"), recipe, keys, code, store)
         except Missing:
             if not need.startswith("?"):
                 raise

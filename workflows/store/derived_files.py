@@ -43,7 +43,7 @@ class DerivedFiles:
         from torch import Tensor
 
         path = self._path(key, suffix)
-        if path in self._fresh:
+        if path in self._fresh and path.is_file():
             return path
         with suppress(KeyError, OSError):
             if path.is_file() and self.store.has(key) and _is_right(path, self.store.get(key, Tensor)):

@@ -84,7 +84,8 @@ def test_outputs_are_read_by_safetensors(tmp_path):
     found = load_file(path)
     assert found.keys() == {"path", "psf.intensity", "psf.clear_peak", "raw"}
     assert torch.equal(found["raw"], noise(4, 6).t())
-    assert torch.equal(found["psf.intensity"], psf.intensity) and found["path"].dtype == torch.bool
+    assert torch.equal(found["psf.intensity"], psf.intensity)
+    assert found["path"].dtype == torch.bool
 
 
 def test_a_file_that_is_cut_short_is_not_there(tmp_path):
@@ -110,6 +111,7 @@ def test_a_full_disk_leaves_the_file_in_a_temporary_folder(tmp_path):
 
     with pytest.warns(UserWarning, match="No space left"):
         path = shelf.keep("ab" * 16, ".exr", "x", full)
-    assert path.read_bytes() == b"whole" and not path.is_relative_to(tmp_path)
+    assert path.read_bytes() == b"whole"
+    assert not path.is_relative_to(tmp_path)
     assert shelf.keep("cd" * 16, ".exr", "x", full).parent.parent == path.parent.parent
     shelf._spare.cleanup()
