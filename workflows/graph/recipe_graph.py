@@ -94,6 +94,7 @@ class Recipe:
     lifting: LiftTraining | None = field(default=None, compare=False)  #: settings of the training of a lift
     safety: Safety | None = field(default=None, compare=False)  #: settings of the estimate of damage and dazzle
     evaluation: EvaluateSettings | None = field(default=None, compare=False)  #: settings of an evaluation
+    exports: Mapping[str, bool] | None = field(default=None, compare=False)  #: data files, True for half; None: all
     unbounded: frozenset[str] = frozenset()  #: steps whose errors reach a node without an error bound
 
     def limit(self, step: str) -> float:

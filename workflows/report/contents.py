@@ -70,6 +70,15 @@ FILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
 }
 
 
+OUTPUTS = "outputs.safetensors"
+
+
+def files_of(recipe: Recipe) -> dict[str, tuple[str, Mapping[str, str]]]:
+    """Return format and needs of the data files that a recipe asks for, by name."""
+    files = {**FILES, OUTPUTS: ("safetensors", {step: step for step in recipe.outputs})}
+    return {name: file for name, file in files.items() if recipe.exports is None or name in recipe.exports}
+
+
 def wanted(recipe: Recipe) -> tuple[str, ...]:
     """Return the steps that a run must give: outputs, steps of expected numbers, spectral errors, and a mask's rival.
 

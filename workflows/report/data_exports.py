@@ -10,6 +10,7 @@ import json
 import struct
 import zlib
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from torch import Tensor
 from neusee.nodes.values import Bands, Psf
 from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.report.contents import FILES
+from neusee.workflows.report import contents
 from neusee.workflows.report.run_pictures import DerivedFile, files_of
 from neusee.workflows.store.band_files import bytes_of
 from neusee.workflows.store.derived_files import DerivedFiles
@@ -35,10 +36,12 @@ def exports(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[
 
 
 def data_files(recipe: Recipe) -> Iterator[DerivedFile]:
-    """Yield the data files of a recipe."""
-    outputs = {step: step for step in recipe.outputs}
-    for name, (form, needs) in {**FILES, "outputs.safetensors": ("safetensors", outputs)}.items():
-        yield DerivedFile(name, Path(name).suffix, ("file", form, _VERSION), needs, _WRITERS[form])
+    """Yield the data files that a recipe asks for."""
+    for name, (form, needs) in contents.files_of(recipe).items():
+        half = recipe.exports is not None and recipe.exports[name]
+        kind = ("file", form, _VERSION, *(["half"] if half else []))
+        write = partial(_WRITERS[form], half=True) if half else _WRITERS[form]
+        yield DerivedFile(name, Path(name).suffix, kind, needs, write)
 
 
 def spectral(path: Path, /, *, cube: Tensor | Psf, bands: Bands, half: bool = False) -> None:
