@@ -13,6 +13,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Any, Self
 
+from neusee.workflows.engine.memory_use import process_memory
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.keys.code_digest import Code
@@ -25,6 +26,7 @@ from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.serialization import tensors_in
 
 LARGE = 1 << 27  #: bytes; a larger result is held only for files that need nothing else any more
+_SMALL = 1 << 22  #: bytes of a result that is held in any case
 ROOM = 1 << 29  #: bytes of smaller results that are held for files
 
 
@@ -32,13 +34,14 @@ class FilesBeside:
     """Files that are made beside a run; call the object with each result of the run.
 
     Args: files: the files of a recipe. limit: bytes of memory that the process may use; of these, an eighth at most is
-    held for files, and no more than `ROOM` beside one large result.
+    held for files, no more than `ROOM` beside one large result, and nothing once half of the limit is in use. With 0
+    no file is made beside the run.
     """
 
     def __init__(self, files: Callable[[Recipe], Iterable[DerivedFile]], shelf: DerivedFiles, limit: float) -> None:
         self._files, self._shelf = files, shelf
         self._large, self._room = min(LARGE, limit / 32), min(ROOM, limit / 16)
-        self._most = limit / 16
+        self._limit = limit
         self._recipe: Recipe | None = None
         self._code = Code(shelf.store.code_memo)
         self._open: list[tuple[DerivedFile, frozenset[str]]] = []  # files to make, and the steps that they show
@@ -58,13 +61,17 @@ class FilesBeside:
 
     def __call__(self, recipe: Recipe, keys: Mapping[str, Key], step: str, value: Any) -> None:
         """Hold the result of a step as long as files need it, and begin the files that need no other result."""
+        if self._limit <= 0:
+            return
         if recipe is not self._recipe:  # the first result, or a run that begins again with a smaller tolerance
             self._begin(recipe)
         shown = {name for _, steps in self._open for name in steps}
         names = [name for name in shown if keys.get(name) == keys[step]]
         size = _bytes_of(value)
-        if not names or (size > self._large and (self._busy or size > self._most)):
+        if not names or (size > self._large and (self._busy or size > self._limit / 16)):
             return  # the report makes the files of this result
+        if size > _SMALL and process_memory() > self._limit / 2:
+            return
         self._held.update(dict.fromkeys(names, value))
         for file, steps in [job for job in self._open if job[1] <= self._held.keys()]:
             self._open.remove((file, steps))

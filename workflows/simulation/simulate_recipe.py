@@ -67,7 +67,7 @@ def simulate(
     shelf = DerivedFiles(store)
     with (
         warnings.catch_warnings(record=True) as caught,
-        FilesBeside(_files, shelf, memory_limit(memory)) as beside,
+        FilesBeside(_files, shelf, memory_limit(None) if memory is None else 0.0) as beside,
     ):
         warnings.simplefilter("default")
         recipe = with_substitutions(recipe, wanted(recipe))
