@@ -96,6 +96,7 @@ class Recipe:
     safety: Safety | None = field(default=None, compare=False)  #: settings of the estimate of damage and dazzle
     evaluation: EvaluateSettings | None = field(default=None, compare=False)  #: settings of an evaluation
     traceability: Traceability | None = field(default=None, compare=False)  #: what the laboratory states of its light
+    exports: Mapping[str, bool] | None = field(default=None, compare=False)  #: data files, True for half; None: all
     unbounded: frozenset[str] = frozenset()  #: steps whose errors reach a node without an error bound
 
     def limit(self, step: str) -> float:
