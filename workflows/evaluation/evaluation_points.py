@@ -110,7 +110,7 @@ class EvaluationPoints:
             for name, changed in params.items()
         }
         keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), outputs, point.scene)
-        within = [recipe.tolerance, recipe.exact, device_kind(self.device), self.small]
+        within = [recipe.tolerance, recipe.exact, recipe.estimates, device_kind(self.device), self.small]
         own = [self._code.digest(used.__module__) for used in (quality, resize)]
         return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
 

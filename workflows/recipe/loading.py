@@ -15,7 +15,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
 from neusee.workflows.recipe.distributions.mismatch_laws import read_mismatch
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
 from neusee.workflows.recipe.expected_numbers import unaffected_expectations
-from neusee.workflows.recipe.global_settings import expectations, outputs_of, seed_and_tolerance
+from neusee.workflows.recipe.global_settings import estimates_of, expectations, outputs_of, seed_and_tolerance
 from neusee.workflows.recipe.graph_cache import CachedGraph, cache_graph, cached_graph
 from neusee.workflows.recipe.known_before_run import CheckedStep, check_steps, refuse_indices
 from neusee.workflows.recipe.node_families import NO_FAMILY, Own, class_context
@@ -133,7 +133,7 @@ def check(composed: Composed) -> Recipe:
     loops = list(cycles(bound, {name: step.value.key for name, step in steps.items()}))
     diagnostics += loops
     seed, tolerance = seed_and_tolerance(root, references, checker.diagnostics)
-    outputs = outputs_of(root, wiring)
+    estimates, outputs = estimates_of(root, references, checker.diagnostics), outputs_of(root, wiring)
     check_steps(checked, checker, None if loops else outputs)
     expect = expectations(root, wiring)
     safety = _safety(root, references, diagnostics, checker.files)
@@ -148,7 +148,8 @@ def check(composed: Composed) -> Recipe:
     nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
     notes = (*composed.notes, *own.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
     parts = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
-    return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting, evaluation=evaluation, safety=safety)
+    blocks_read = {"training": training, "lifting": lifting, "evaluation": evaluation, "safety": safety}
+    return Recipe(*parts, uncertain=uncertain, estimates=estimates, **blocks_read)
 
 
 def _with_mismatch(

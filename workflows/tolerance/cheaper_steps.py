@@ -20,7 +20,8 @@ from neusee.workflows.tolerance.zero_effect_steps import without_nothing
 if TYPE_CHECKING:
     from neusee.nodes import Node
 
-ESTIMATED = 0.25  #: share of the tolerance for the estimated error of PSFs of few bands
+ESTIMATED = 0.22  #: share of the tolerance for the estimated error of PSFs of few bands
+BESIDE = 0.08  #: share of the tolerance for the channels of an image beside such an estimate, in place of `CHANNELS`
 CHANNELS = 0.25  #: share of the tolerance for the channels of an image; the scene level may depend on a second image
 _LEAST = 2e-5  #: tolerance below which sums over bands cannot be proved, because their round-off alone is 1.4e-6
 _MIXTURE = 0.1  #: share of the tolerance for a low-rank cube, rounded to a power of ten so that the cube seldom changes
@@ -112,11 +113,12 @@ class _Draft:
         weights = self.spectral(image.name, readers)
         if node is None or weights is None or not isinstance(radiance, str):
             return
-        name, within = f"{image.name}.channels", self.recipe.allowed(image.name) * CHANNELS
+        name, within = f"{image.name}.channels", self.recipe.allowed(image.name)
         cube, rows = self._mixture(radiance, image), self._rows(*weights, readers, image)
         # the level of the scene follows the brightest pixel
         largest = any(reader.node.hooks.band_invariant is not None for reader in readers)
         wires = {"radiance": cube, "rows": rows, **self._few_bands(image, cube, rows, largest)}
+        within *= BESIDE if "few" in wires else CHANNELS
         self._add(name, node, wires, {**image.params, "within": within, "largest": largest}, image)
         for reader in readers:
             changed = {i: _exchanged(wire, image.name, name) for i, wire in reader.wires.items()}
@@ -180,10 +182,12 @@ class _Draft:
         return {"psf": few, "few": found}
 
     def _only(self, psf: str, image: str) -> bool:
-        """Return True if no step but ``image`` reads a PSF on the axis, which no output shows and nothing optimises."""
+        """Return True if no step but ``image`` reads a PSF on the axis, and an estimate of its error is allowed."""
+        if not self.recipe.estimates or psf in self.wanted or psf in self.dependent:
+            return False
         step = self.recipe.steps[psf]
         apart = step.wires.get("direction") is not None or any(step.params["angle"])
-        return self.readers.get(psf) == [image] and not apart and psf not in self.wanted and psf not in self.dependent
+        return self.readers.get(psf) == [image] and not apart
 
     def _rows(self, bands: str, responses: str, readers: list[Step], image: Step) -> str:
         """Add a step that computes the weight of each wavelength band in each channel sum; return the step's name."""

@@ -16,7 +16,7 @@ SIDE = 120  #: cells, along each side of a PSF about the axis
 _PART = 240  #: cells, along each side of a part of the scene, with a margin for light from beside
 _BINS = (1, 2, 4)  #: pixels along the side of a cell, the least first
 _GAIN = 4  #: least ratio of the area of the PSF window to that of the thumbnail, below which a choice saves nothing
-_HELD = 0.97  #: share of the light that a window of cells must hold
+_HELD = 0.9  #: share of the light that a window of cells must hold
 _SAMPLES = 256  #: least number of pupil samples across, of which a larger pupil keeps every k-th
 _TILE = 32  #: cells, of the tiles of which the brightest and the one of the most contrast are found
 _PLANES = 4  #: strongest planes of the scene in which the error is estimated
@@ -140,15 +140,15 @@ def _cut(planes: Tensor, at: tuple[int, int]) -> Tensor:
 def estimated(parts: Parts, share: Tensor, light: Tensor) -> tuple[float, float]:
     """Return the errors of the image if the PSF of each band is the mean of few PSFs ``light`` by weights ``share``.
 
-    The first is the root mean square of the worst part and row, the second the change of the brightest pixel; both are
-    relative to the brightest pixel of all parts.
+    The first is the root mean square of the worst part and row, the second the change of the brightest pixel, or a
+    quarter of the first where that is larger; both are relative to the brightest pixel of all parts.
     """
     off = (parts.weights @ share).to(light) @ light.flatten(1) - parts.kernels
     error = _imaged(parts.scene, off, light)
     scale = parts.top.where(parts.top > 0, 1.0)
     rms = error.square().mean((2, 3)).sqrt() / scale
     change = ((parts.image + error).amax((0, 2, 3)) - parts.top).abs() / scale
-    return float(rms.max()), max(float(rms.max()), float(change.max()))
+    return float(rms.max()), max(float(rms.max()) / 4, float(change.max()))
 
 
 def _imaged(spectra: Tensor, kernels: Tensor, like: Tensor) -> Tensor:

@@ -47,7 +47,7 @@ def few_bands(
     an error.
 
     The error is estimated: PSFs of all bands of a thinned pupil are convolved with three parts of the scene: the
-    brightest, the one of the most contrast, and the middle. Their window holds 97 % of the light, in cells of 1, 2 or
+    brightest, the one of the most contrast, and the middle. Their window holds 90 % of the light, in cells of 1, 2 or
     4 pixels along each side. The estimate is twice the error of the worst part. With `largest`, the error of the
     brightest pixel is held too. All bands are kept where no such window is much smaller than that of the PSF.
 
@@ -160,4 +160,3 @@ def _all_bands(count: int) -> FewBands:
 
 def _number(value: float) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)
-

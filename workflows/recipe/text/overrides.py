@@ -12,7 +12,7 @@ from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value, parse
 
 #: recipe keys that are not blocks of parameters
-RESERVED = frozenset({"steps", "seed", "tolerance", "outputs", "expect", "posterior", "nodes", "safety"})
+RESERVED = frozenset({"steps", "seed", "tolerance", "outputs", "expect", "posterior", "nodes", "safety", "estimates"})
 
 Trail = list[tuple[Value, str | int]]  #: values along a path, each with the key of the next value
 
