@@ -178,7 +178,7 @@ class _Draft:
         few = self._add(f"{name}.few", step.node, {"pupil": pupil}, step.params, step)
         checked = {"few": chosen, "psf": few, **given}
         found = self._add(f"{name}.checked", optics.few_bands_checked, checked, lens, step)
-        self.substitutions.append(Substitution(step.name, few, within, "its bands change little from one to the next"))
+        self.substitutions.append(Substitution(step.name, found, within, "PSFs of few bands are enough for the image"))
         return {"psf": few, "few": found}
 
     def _only(self, psf: str, image: str) -> bool:

@@ -145,6 +145,14 @@ def few_bands_checked(
     return few._replace(**dict(zip(("error", "largest"), map(_number, raised), strict=True)))
 
 
+@few_bands_checked.approximation_error
+def _(result: FewBands) -> tuple[float, float]:
+    return float(result.error), float(result.largest)
+
+
+few_bands_checked.hooks.estimated = True
+
+
 @few_bands_checked.check
 def _(result: FewBands, few: FewBands, *inputs: object, **params: object) -> list[Check]:
     bands, count = result.share.shape
