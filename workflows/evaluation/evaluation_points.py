@@ -128,7 +128,7 @@ class EvaluationPoints:
     def _function(self, pipeline: PipelineRecipes, case: str, outputs: tuple[str, ...]) -> Any:
         name = (f"{pipeline.name} {outputs}", case, id(pipeline.recipe))
         if name not in self._functions:
-            recipe = pipeline.recipe(case)
+            recipe = replace(pipeline.recipe(case), estimates=False)  # one PSF for all scenes
             whole = with_substitutions(recipe, outputs)  # as in `run`, but the scene is an argument
             steps = set(needed(whole, outputs))
             inputs = self._inputs(pipeline, case, outputs)
