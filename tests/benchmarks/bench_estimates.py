@@ -1,10 +1,12 @@
-"""Random cameras with PSFs of few bands, against the run in full: `bench_estimates.py [COUNT] [FIRST SEED] [FILE]`.
+"""Random cameras with PSFs of few bands, against the run in full: `bench_estimates.py [small] [COUNT [SEED [FILE]]]`.
 
 Each of COUNT (100) recipes, drawn as the tests draw them, has a pupil of 256 samples, PSFs and a scene of 256 pixels,
-and a sensor of 200 pixels: large enough for an estimate. Outputs are the raw and the developed pictures, and the
-tolerance is between 1e-4 and 3e-2. The error is the largest over these pictures against the run in full. The cost is
-processor time of a cold run, choice, proof and second attempts included, in one process beside the run in full. FILE
-keeps each line, so that a run goes on where it was stopped.
+and a sensor of 200 pixels: large enough for an estimate. With `small` the recipes keep their 48 to 97 pixels, and a
+thumbnail has 20 cells along each side in place of 120, so that estimates are used there too.
+
+Outputs are the raw and the developed pictures, and the tolerance is between 1e-4 and 3e-2. The error is the largest
+over these pictures against the run in full. The cost is processor time of a cold run, choice, proof and second attempts
+included, in one process beside the run in full. FILE keeps each line, so that a run goes on where it was stopped.
 
 One line a recipe on the standard error; a table in Markdown, by tolerance, at the end.
 """
@@ -22,6 +24,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "workflows"))
 import random_recipes
 
+from neusee.nodes.optics._imaging import _band_thumbnail, _few_bands
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.store.result_store import Store
@@ -38,11 +41,11 @@ LARGE = [
 ENDS = (1e-4, 1e-3, 1e-2, 3e-2)
 
 
-def draw(seed):
+def draw(seed, size):
     changes = [c for c in random_recipes.draw(seed)[1] if not c.startswith(("tolerance", "outputs"))]
     tolerance = 10 ** random.Random(-1 - seed).uniform(-4, -1.523)
     bands = ["optics.bands=31"] if random.Random(-1000 - seed).random() < 0.7 else []
-    chosen = [*changes, *LARGE, *bands, "outputs=[raw, developed]", f"tolerance={tolerance:.3g}"]
+    chosen = [*changes, *size, *bands, "outputs=[raw, developed]", f"tolerance={tolerance:.3g}"]
     return load("first_light", chosen)
 
 
@@ -56,8 +59,8 @@ def timed(recipe, memo):
         return seconds, result, used
 
 
-def line(seed, memo):
-    recipe = draw(seed)
+def line(seed, memo, size):
+    recipe = draw(seed, size)
     full, truth, _ = timed(replace(recipe, exact=True), memo)
     ours, result, used = timed(recipe, memo)
     errors = {name: error_of(result[name], value) for name, value in truth.values.items()}
@@ -75,15 +78,18 @@ def line(seed, memo):
     }
 
 
-def main(count, start, file):
-    known = {}
+def main(count, start, file, small):
+    known, size = {}, [] if small else LARGE
+    if small:
+        _band_thumbnail.SIDE = _few_bands.SIDE = 20
+        _band_thumbnail._PART, _band_thumbnail._TILE = 40, 8
     if file and Path(file).exists():
         known = {each["seed"]: each for each in map(json.loads, Path(file).read_text().splitlines())}
     with tempfile.TemporaryDirectory() as folder:
         memo = Store(Path(folder))
         for seed in range(start, start + count):
             if seed not in known:
-                known[seed] = line(seed, memo)
+                known[seed] = line(seed, memo, size)
                 if file:
                     with Path(file).open("a") as out:
                         out.write(json.dumps(known[seed]) + "\n")
@@ -114,5 +120,6 @@ def row(name, lines):
 
 
 if __name__ == "__main__":
-    words = sys.argv[1:]
-    main(*(int(word) for word in (*words[:2], *("100", "0")[len(words[:2]) :])), words[2] if len(words) > 2 else None)
+    words = [word for word in sys.argv[1:] if word != "small"]
+    count, start = (int(word) for word in (*words[:2], *("100", "0")[len(words[:2]) :]))
+    main(count, start, words[2] if len(words) > 2 else None, "small" in sys.argv)

@@ -145,11 +145,10 @@ def check(composed: Composed) -> Recipe:
     if graph is None:
         cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
     config = Config(_final_values(wiring, bound, checker, uncertain) | dict(_settings(blocks, checker)))
-    nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
+    gone = {name: f"null ({value.mark})" for name, value in absent.items()}
     notes = (*composed.notes, *own.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
-    parts = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
-    blocks_read = {"training": training, "lifting": lifting, "evaluation": evaluation, "safety": safety}
-    return Recipe(*parts, uncertain=uncertain, estimates=estimates, **blocks_read)
+    args = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, gone, False, estimates
+    return Recipe(*args, uncertain=uncertain, training=training, lifting=lifting, evaluation=evaluation, safety=safety)
 
 
 def _with_mismatch(

@@ -157,4 +157,5 @@ def _imaged(spectra: Tensor, kernels: Tensor, like: Tensor) -> Tensor:
     size = (_PART, _PART)
     whole = torch.fft.irfft2((spectra[:, None] * torch.fft.rfft2(rows, size)).sum(2), size)
     spans = [slice(m - 1, _PART) for m in like.shape[1:]]
-    return whole[..., spans[0], spans[1]]
+    inner: Tensor = whole[..., spans[0], spans[1]]
+    return inner

@@ -101,9 +101,8 @@ def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omiss
 
     All images are replaced together, because two images that a step compares must be computed in the same way.
     """
-    sparse = with_substitutions(replace(full, exact=False), full.outputs)
-    pairs = {economy.step: economy.instead for economy in sparse.substitutions if economy.instead}
-    exchange = {step: by for step, by in pairs.items() if not sparse.steps[by].node.hooks.estimated}
+    sparse = with_substitutions(replace(full, exact=False, estimates=False), full.outputs)
+    exchange = {economy.step: economy.instead for economy in sparse.substitutions if economy.instead}
     if not exchange:
         return
     beside = tuple(step for name, step in sparse.steps.items() if name not in full.steps)
