@@ -46,7 +46,7 @@ def thumbnails(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> tuple[Tensor
 
     Return None if no window of cells holds the light, or if the PSFs of ``shape`` take little longer.
     """
-    small = _thinned(pupil)
+    small, lens = _thinned(pupil), {**lens, "pixel": "point"}  # square pixels of a thinned pupil would be too wide
     ends = torch.tensor(sorted({0, len(pupil.wavelengths) // 2, len(pupil.wavelengths) - 1}))
     some = small._replace(index=small.index[ends], wavelengths=small.wavelengths[ends])
     reach = float(small.wavelengths.min()) * lens["focal_length"] / (float(small.pitch) * lens["pixel_pitch"])
