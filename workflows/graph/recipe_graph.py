@@ -87,6 +87,7 @@ class Recipe:
     notes: tuple[str, ...] = ()
     absent: Mapping[str, str] = field(default_factory=dict)  #: location of the null, by the name of a step that is null
     exact: bool = False  #: whether every step is computed in full at any tolerance
+    estimates: bool = True  #: whether errors that are estimated, not proved, may count towards the tolerance
     substitutions: tuple[Substitution, ...] = ()  #: cheaper steps in place of full steps; empty after loading
     tolerance_scale: float = 1.0  #: fraction of the tolerance in use; below 1 after a failed proof
     unsubstituted: Recipe | None = field(default=None, compare=False)  #: the recipe before substitutions, if any
