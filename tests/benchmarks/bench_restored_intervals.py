@@ -27,11 +27,11 @@ import torch
 from safetensors.numpy import load_file
 from scipy.ndimage import maximum_filter
 from scipy.signal import fftconvolve
-from scipy.stats import t as student
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from neusee.workflows.cli import app
+from neusee.workflows.report.figures.frame_and_interval import half_width
 from tests.benchmarks import bench_restored_frames as frames
 from tests.nodes.restore.lasers import own_camera as own
 
@@ -110,7 +110,7 @@ def judged(results, truth, seed, exact):
         seen[:RIM], seen[-RIM:], seen[:, :RIM], seen[:, -RIM:] = False, False, False, False
     slope = maximum_filter(np.hypot(*np.gradient(truth.mean(0))), 3)
     edge, even = slope >= np.quantile(slope, 0.8), slope <= np.quantile(slope, 0.4)
-    half = student.ppf(0.95, DRAWS) * results["restored_spread"]
+    half = half_width(results["restored_spread"], DRAWS)
     inside = np.abs(shown - truth) < half
     error = {k: np.sqrt(np.mean((x - truth)[:, seen] ** 2)) for k, x in (("rms", shown), ("developed", developed))}
     named = {"all": seen, "edges": seen & edge, "even": seen & even}
