@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from neusee.nodes.calibrate import FrameTest, Rings
+from neusee.nodes.calibrate import FrameTest, Laboratory, Rings
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration.budget_page import COLUMNS, budget_document, budget_rows
 from neusee.workflows.calibration.calibration_budget import budgets
@@ -135,13 +135,22 @@ def find_posterior(
         *frame_checks(tests, not isinstance(problem.levels, Rings)),
         *checks(problem, mode, identifiability, chains, law),
     ]
-    unwidened = {name: float(x.std()) for name, x in problem.parameters(chains.draws).items()}
-    chains = with_laboratory(problem, widened(problem, chains, tests, recipe.seed), laboratory, recipe.seed)
-    models = with_laboratory_models(widened_models(models, tests), laboratory)
-    if is_relative(recipe):
-        identifiability = without_efficiency(identifiability)
-    result = CalibrationResult(problem, mode, identifiability, chains, tested, models, tests, unwidened)
-    return replace(result, budgets=budgets(result, laboratory))
+    result = CalibrationResult(problem, mode, identifiability, chains, tested, models, tests)
+    return _with_all_uncertainty(result, recipe, laboratory)
+
+
+def _with_all_uncertainty(result: CalibrationResult, recipe: Recipe, laboratory: Laboratory) -> CalibrationResult:
+    """Return a calibration whose draws and intervals have what frames and laboratory leave open, with its budgets."""
+    problem, tests, seed = result.problem, result.frames, recipe.seed
+    known = without_efficiency(result.identifiability) if is_relative(recipe) else result.identifiability
+    found = replace(
+        result,
+        identifiability=known,
+        unwidened={name: float(x.std()) for name, x in problem.parameters(result.chains.draws).items()},
+        chains=with_laboratory(problem, widened(problem, result.chains, tests, seed), laboratory, seed),
+        models=with_laboratory_models(widened_models(result.models, tests), laboratory),
+    )
+    return replace(found, budgets=budgets(found, laboratory))
 
 
 def _accepted_frames(recipe: Recipe, store: Store, progress: Progress) -> Sequence[FrameTest]:

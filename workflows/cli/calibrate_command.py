@@ -59,6 +59,13 @@ def calibrate(
         folder = verbs.calibrate(
             recipe, store=store, out=out, command=command, progress=FewLines(quiet or as_json), **options
         )
+    _say_results(folder, quiet, as_json)
+    if is_folder:
+        _write_sensor(folder, recipe, store, target, quiet or as_json)
+
+
+def _say_results(folder: Path, quiet: bool, as_json: bool) -> None:
+    """Print a line for each parameter, and the folder; end the command with the reason if a check fails."""
     document = json.loads((folder / "posterior.json").read_text())
     if not quiet and not as_json:
         say(_lines(document["parameters"]))
@@ -66,8 +73,6 @@ def calibrate(
     if count := document["failed"]:
         wrong = "; ".join(f"{c['name']}: {c['found']}" for c in document["checks"] if c["mark"] == "fail")
         fail(f"not fit for use: {count} checks fail ({wrong}); see {folder / 'report.html'}", MISSED)
-    if is_folder:
-        _write_sensor(folder, recipe, store, target, quiet or as_json)
 
 
 def _target(sensor: str) -> Path | None:
