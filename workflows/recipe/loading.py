@@ -15,7 +15,8 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
 from neusee.workflows.recipe.distributions.mismatch_laws import read_mismatch
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
 from neusee.workflows.recipe.expected_numbers import unaffected_expectations
-from neusee.workflows.recipe.global_settings import expectations, outputs_of, seed_and_tolerance
+from neusee.workflows.recipe.exported_files import exports_of
+from neusee.workflows.recipe.global_settings import estimates_of, expectations, outputs_of, seed_and_tolerance
 from neusee.workflows.recipe.graph_cache import CachedGraph, cache_graph, cached_graph
 from neusee.workflows.recipe.known_before_run import CheckedStep, check_steps, refuse_indices
 from neusee.workflows.recipe.node_families import NO_FAMILY, Own, class_context
@@ -141,9 +142,10 @@ def check(composed: Composed) -> Recipe:
     loops = list(cycles(bound, {name: step.value.key for name, step in steps.items()}))
     diagnostics += loops
     seed, tolerance = seed_and_tolerance(root, references, checker.diagnostics)
-    outputs = outputs_of(root, wiring)
+    estimates, outputs = estimates_of(root, references, checker.diagnostics), outputs_of(root, wiring)
     check_steps(checked, checker, None if loops else outputs)
     expect = expectations(root, wiring)
+    exports = exports_of(root, wiring)
     safety = _safety(root, references, diagnostics, checker.files)
     references.finish()
     if not composed.whole:  # a missing group causes further errors
@@ -153,10 +155,10 @@ def check(composed: Composed) -> Recipe:
     if graph is None:
         cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
     config = Config(_final_values(wiring, bound, checker, uncertain) | dict(_settings(blocks, checker)))
-    nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
+    gone = {name: f"null ({value.mark})" for name, value in absent.items()}
     notes = (*composed.notes, *own.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
-    parts = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
-    recipe = Recipe(*parts, uncertain=uncertain, safety=safety, traceability=traceability)
+    args = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, gone, False, estimates
+    recipe = Recipe(*args, uncertain=uncertain, safety=safety, traceability=traceability, exports=exports)
     return replace(recipe, training=training, lifting=lifting, evaluation=evaluation)
 
 

@@ -12,9 +12,8 @@ from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value, parse
 
 #: recipe keys that are not blocks of parameters
-RESERVED = frozenset(
-    {"steps", "seed", "tolerance", "outputs", "expect", "posterior", "nodes", "safety", "traceability"}
-)
+_WHOLE = {"steps", "seed", "tolerance", "estimates", "outputs", "exports", "expect", "posterior", "nodes"}
+RESERVED = frozenset(_WHOLE | {"safety", "traceability"})
 _OPEN = ("expect", "posterior", "safety", "traceability")  #: keys below which an override may set a missing path
 
 Trail = list[tuple[Value, str | int]]  #: values along a path, each with the key of the next value
