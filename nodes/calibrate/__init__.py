@@ -36,7 +36,8 @@ from neusee.nodes.calibrate._sheet._patterns import (
 )
 from neusee.nodes.calibrate._sheet._quantity import Quantity
 from neusee.nodes.calibrate._sheet._sheet import EmvaSheet, emva_sheet
-from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Stack
+from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Stack, uncorrected
+from neusee.nodes.calibrate._validity._hidden_faults import Correction, Hidden, corrections
 from neusee.nodes.calibrate._validity._inspection import inspect_frames
 from neusee.nodes.calibrate._validity._number_tests import coarse
 
@@ -46,9 +47,11 @@ __all__ = [
     "SCATTER_NAMES",
     "CameraCoordinates",
     "Coordinates",
+    "Correction",
     "DefectHistogram",
     "EmvaSheet",
     "FrameTest",
+    "Hidden",
     "LeastSquares",
     "Likelihood",
     "Nonuniformity",
@@ -65,6 +68,7 @@ __all__ = [
     "camera",
     "camera_prior",
     "coarse",
+    "corrections",
     "defects",
     "density",
     "descriptor",
@@ -91,5 +95,6 @@ __all__ = [
     "stray_prior",
     "sufficient",
     "table",
+    "uncorrected",
     "without_trend",
 ]

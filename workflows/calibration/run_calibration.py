@@ -124,7 +124,8 @@ def find_posterior(
         *frame_checks(tests, not isinstance(problem.levels, Rings)),
         *checks(problem, mode, identifiability, chains, law),
     ]
-    chains, models = widened(problem, chains, tests, recipe.seed), widened_models(models, tests)
+    chains = widened(problem, chains, tests, recipe.seed)
+    models = widened_models(models, tests, problem.coordinates.prior.may_hide)
     return CalibrationResult(problem, mode, identifiability, chains, tested, models, tests)
 
 
