@@ -29,10 +29,9 @@ import numpy as np
 import torch
 from scipy.stats import binomtest
 
-from neusee.nodes.calibrate import corrections
 from neusee.workflows.calibration.calibration_page import CalibrationResult
 from neusee.workflows.calibration.emcee_sampler import Chains
-from neusee.workflows.calibration.frame_validity import frame_checks, hidden_faults, inspect_recipe, widened
+from neusee.workflows.calibration.frame_validity import frame_checks, inspect_recipe, widened
 from neusee.workflows.calibration.identifiability import identify
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_checks import Check, _of_data, count_failures, importance_samples
@@ -150,6 +149,8 @@ def truth(made, mode):
     current = 5 + float(made._hot.mean())
     level = made.offset + made.gain * (float(made._dsnu.mean()) + 1e-3 * current)
     level -= 0.5 * made._of("truncation")  # numbers that are cut are those of an offset lower by half a number
+    if "black" in made.faults:
+        level -= np.rint(made.offset + made._of("black") * made.gain * made.noise)
     known = {
         "gain": made.gain,
         "quantum_efficiency": made.efficiency * float(made._prnu.mean()),
@@ -224,14 +225,15 @@ def told(result, known):
     for name, interval in models.items():
         stated[name]["spread outside"] = bool(not interval.low <= known[name] <= interval.high)  # 90 %
     spread = result.draws["gain"].std() / result.draws["gain"].mean()
-    added = corrections(hidden_faults(result.frames, result.problem.coordinates.prior.may_hide))["gain"].sd
+    at = result.problem.names.index("gain")  # whose coordinate is its logarithm
+    alone = float(np.sqrt(result.mode.covariance[at, at]))
     return {
         "exit": 3 if count_failures(result.checks) else 0,
         "wrong": [check.name for check in result.checks if check.mark == "fail"],
         "verdicts": {t.name: t.verdict for t in result.frames if t.verdict != "passed"},
         "stated": stated,
         "gain sd": round(float(spread), 5),
-        "wider": round(float(spread / np.sqrt(max(spread**2 - added**2, 1e-12))), 2),
+        "wider": round(float(spread / alone), 2),
     }
 
 
