@@ -98,13 +98,25 @@ def frame_checks(tests: Sequence[FrameTest], given: bool = True) -> list[Check]:
     return found
 
 
+def hidden_checks(tests: Sequence[FrameTest], may_hide: Container[str]) -> list[Check]:
+    """Return what faults that the frames have or may hide change, as a check that cannot fail; none without frames."""
+    found = hidden_faults(tests, may_hide)
+    if not found:
+        return []
+    words = (f"{name} by {100 * x.mean:+.2g} % ± {100 * x.sd:.2g} %" for name, x in corrections(found).items() if x.sd)
+    faults = " and ".join(sorted({h.fault for h in found}))
+    bar = "more pixels hide less; a fault that the camera cannot have is `none` in the step of the priors"
+    return [Check(f"intervals include {faults}", f"{' and '.join(words)}, as the frames show or may hide", bar, "pass")]
+
+
 def _bar(test: FrameTest) -> str:
     return f"{abs(test.number):.3g}, {'at least' if test.limit < 0 else 'at most'} {abs(test.limit):.3g}"
 
 
 def frame_section(tests: Sequence[FrameTest]) -> Section:
     """Return the section of a calibration's page with the tests of its frames."""
-    text = """Each test asks if the frames are such as the likelihood describes. Modelled: the likelihood describes it.
+    text = """Each test asks if the frames are such as the likelihood describes. Modelled: the likelihood describes it,
+        or the posterior is corrected by what the frames show, with the uncertainty of this correction.
         Widened: the intervals include the error that may follow. Refused: the error may exceed 2 %, or is unknown.
         Numbers and limits of noise and patterns are in standard deviations of chance; all tests together fail for
         frames without fault in about 1 % of all measurements (2 of 200)."""

@@ -26,6 +26,7 @@ from neusee.workflows.calibration.frame_validity import (
     as_rows,
     frame_checks,
     frame_section,
+    hidden_checks,
     inspect_recipe,
     lines,
     widened,
@@ -122,6 +123,7 @@ def find_posterior(
     models = compare_models(recipe, store, recipe.seed) if isinstance(problem.levels, Levels) else []
     tested = [
         *frame_checks(tests, not isinstance(problem.levels, Rings)),
+        *hidden_checks(tests, problem.coordinates.prior.may_hide),
         *checks(problem, mode, identifiability, chains, law),
     ]
     chains = widened(problem, chains, tests, recipe.seed)

@@ -77,8 +77,8 @@ def _counted_as_noise(levels: Sequence[Level], products: Sequence[Tensor]) -> It
         slope = torch.linalg.pinv(design)[1] * weight
         yield _share(float(slope @ pattern), float((slope * error).norm()), float(slope @ total), gain=-1.0)
     if bool((~lit).any()):
-        share = pattern[~lit].mean(), error[~lit].norm() / int((~lit).sum()), total[~lit].mean()
-        yield _share(*map(float, share), noise=-0.5)
+        part, unsure, whole = pattern[~lit].mean(), error[~lit].norm() / int((~lit).sum()), total[~lit].mean()
+        yield _share(float(part), float(unsure), float(whole), noise=-0.5)
 
 
 def _share(part: float, error: float, whole: float, gain: float = 0.0, noise: float = 0.0) -> Hidden:

@@ -14,6 +14,7 @@ from neusee.nodes.calibrate import FrameTest, Hidden, corrections
 from neusee.workflows.calibration.emcee_sampler import Chains
 from neusee.workflows.calibration.frame_validity import (
     frame_checks,
+    hidden_checks,
     hidden_faults,
     inspect_recipe,
     lines,
@@ -107,6 +108,10 @@ def test_clean_frames_pass_and_a_table_says_what_is_not_tested(tmp_path):
     assert {test.verdict for test in tests} == {"passed"}
     assert list(lines(tests)) == [f"frames: {len(tests)} of {len(tests)} tests passed"]
     assert {check.mark for check in frame_checks(tests)} == {"pass"}
+    (check,) = hidden_checks(tests, ("mixing", "lag"))
+    assert (check.name, check.mark) == ("intervals include lag and mixing", "pass")
+    assert "gain by " in check.found
+    assert hidden_checks(tests, ("pattern",)) == []  # the temporal variance leaves patterns out
     alone = inspect_recipe(load("calibrate_camera"), Store(tmp_path / "store"))
     assert [test.name for test in alone] == ["the dark noise exceeds rounding"]
     assert [check.mark for check in frame_checks(alone)] == ["pass", "warn"]
