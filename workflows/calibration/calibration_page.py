@@ -11,6 +11,7 @@ import numpy as np
 from neusee.nodes.calibrate import FrameTest, Rings, Sufficient
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration import calibration_figures as figures
+from neusee.workflows.calibration.corner_figure import corners
 from neusee.workflows.calibration.frame_validity import frame_section
 from neusee.workflows.calibration.identifiability import KINDS, Identifiability
 from neusee.workflows.calibration.log_posterior import SensorPosterior
@@ -281,7 +282,7 @@ def _corner(result: CalibrationResult) -> Section:
     shown = np.stack([result.draws[r.name].reshape(-1)[::every] for r in told], -1)
     text = """Every pair of parameters of which the frames tell a value or a limit; the recipe's own values are orange.
         Gain, offset, noise and efficiency correlate."""
-    picture = figures.corners(shown, [f"{_words(r.name)}\n{r.unit}" for r in told], [r.nominal for r in told])
+    picture = corners(shown, [f"{_words(r.name)}\n{r.unit}" for r in told], [r.nominal for r in told])
     return Section("Parameters in pairs", text, picture=picture)
 
 

@@ -105,7 +105,7 @@ def find_posterior(
     key = digest("posterior", engine("calibration.emcee_sampler"), problem.key, walkers, move, recipe.seed)
     file = store.root / "posterior" / f"{key}.h5"
     law = importance_samples(problem, mode, recipe.seed)
-    if law.guide:
+    if problem.coordinates.bent:
         identifiability = identify_from_draws(problem, mode, identifiability, law.samples, law.weights)
     for line in identifiability.directions:
         progress(f"not identifiable: {line}")
