@@ -119,7 +119,7 @@ def frame_section(tests: Sequence[FrameTest]) -> Section:
         or the posterior is corrected by what the frames show, with the uncertainty of this correction.
         Widened: the intervals include the error that may follow. Refused: the error may exceed 2 %, or is unknown.
         Numbers and limits of noise and patterns are in standard deviations of chance; all tests together fail for
-        frames without fault in about 1 % of all measurements (2 of 200)."""
+        frames without fault in less than 2 % of all measurements (1 of 400)."""
     if len(tests) < 2:
         text = "Only moments are given, so that noise, patterns and numbers of the frames are not tested."
     rows = [(t.name, abs(t.number), abs(t.limit), t.verdict, t.sentence) for t in tests]
