@@ -168,20 +168,26 @@ def widened_models(
     models: Iterable[ModelSpread], tests: Sequence[FrameTest], may_hide: Container[str]
 ) -> list[ModelSpread]:
     """Return the intervals to report with the changes by faults that frames have or may hide."""
+    change = changes_by_faults(tests, may_hide)
+    return [replace(m, stated=wider(m.stated, *reversed(change[m.name]))) if m.name in change else m for m in models]
+
+
+def changes_by_faults(tests: Iterable[FrameTest], may_hide: Container[str]) -> dict[str, Correction]:
+    """Return the change of the logarithm that faults of the frames cause or may cause, by the parameter."""
+    tests = list(tests)
     found, shifts = corrections(hidden_faults(tests, may_hide)), relative_shifts(tests)
     gain, noise = (Correction(found[n].mean, math.hypot(found[n].sd, shifts[n])) for n in ("gain", "noise"))
     electrons = Correction(-gain.mean, gain.sd)
     both = Correction(noise.mean - gain.mean, math.hypot(gain.sd, noise.sd))
-    change = {"gain": gain, **dict.fromkeys(_IN_ELECTRONS, electrons), **dict.fromkeys(_NOISES, both)}
-    return [replace(m, stated=_wider(m.stated, change[m.name])) if m.name in change else m for m in models]
+    return {"gain": gain, **dict.fromkeys(_IN_ELECTRONS, electrons), **dict.fromkeys(_NOISES, both)}
 
 
-def _wider(interval: IntervalEstimate, change: Correction) -> IntervalEstimate:
-    """Return an interval of a positive value after a change of its logarithm."""
-    if change.sd < _SMALL:
+def wider(interval: IntervalEstimate, shift: float, moved: float = 0.0) -> IntervalEstimate:
+    """Return an interval of a positive value with a further relative standard deviation, its logarithm ``moved``."""
+    if shift < _SMALL:
         return interval
-    value = interval.value * math.exp(change.mean)
+    value = interval.value * math.exp(moved)
     factors = [
-        math.exp(math.hypot(math.log(interval.value / end), Z_90 * change.sd)) for end in (interval.low, interval.high)
+        math.exp(math.hypot(math.log(interval.value / end), Z_90 * shift)) for end in (interval.low, interval.high)
     ]
     return IntervalEstimate(value, value / factors[0], value * factors[1])
