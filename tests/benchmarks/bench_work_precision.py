@@ -57,9 +57,8 @@ def main():
     reading.add_argument("--repeats", type=int, default=1)
     given = reading.parse_args()
     print(f"load {os.getloadavg()[0]:.1f}\n")
-    print(
-        "| recipe | tolerance | s of processor | in full over this | error | stated error | bands in use | second attempt |"
-    )
+    columns = ("recipe", "tolerance", "s", "in full over this", "error", "stated", "bands in use", "second attempt")
+    print(f"| {' | '.join(columns)} |")
     print("|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         memo = Store(Path(folder))
