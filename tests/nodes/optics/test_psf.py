@@ -213,7 +213,7 @@ def test_any_shape_and_any_height_is_finite_and_right(rows, columns, y, x, scale
     assert float((result - truth).abs().max()) <= 3e-6 * float(psf(pupil, shape=(1, 1), **SENSOR).clear_peak)
 
 
-@pytest.mark.parametrize("method", ["direct", "folded", "bluestein", "kaiser_bessel"])
+@pytest.mark.parametrize("method", ["direct", "folded", "bluestein", "kaiser_bessel", "fused"])
 @pytest.mark.parametrize("kept", [True, False])
 def test_gradients_are_those_of_finite_differences(method, kept, monkeypatch):
     from neusee.nodes.optics._transform import _intensity
