@@ -18,6 +18,7 @@ from pathlib import Path
 
 #: compiler and processor change a result within rounding; the module that takes a source declares the source
 __depends__ = (
+    "unaffected:file",
     "unaffected:CXX",
     "unaffected:XDG_CACHE_HOME",
     "unaffected:ctypes",

@@ -214,31 +214,42 @@ void fft(const Axis& axis, const Complex<T>* in, Complex<T>* ping, Complex<T>* p
     }
 }
 
+#if !defined(__clang__)
+// Exchange the off-diagonal blocks of ``half`` rows and columns within each square of twice that side.
+template <class T, int half>
+inline void exchange(Vector<T>* a) {
+    constexpr int n = Kind<T>::lanes;
+    typename Kind<T>::Whole low, high;
+#pragma GCC unroll 16
+    for (int c = 0; c < n; ++c) {
+        low[c] = c & half ? n + c - half : c;
+        high[c] = c & half ? n + c : c + half;
+    }
+#pragma GCC unroll 16
+    for (int r = 0; r < n; ++r)
+        if (!(r & half)) {
+            const Vector<T> x = a[r], y = a[r | half];
+            a[r] = __builtin_shuffle(x, y, low);
+            a[r | half] = __builtin_shuffle(x, y, high);
+        }
+}
+#endif
+
 // Transpose a square of vectors, row r with column r, in place.
 template <class T>
 inline void transpose(Vector<T>* a) {
-    constexpr int n = Kind<T>::lanes;
 #if defined(__clang__)
-    for (int r = 0; r < n; ++r)
+    for (int r = 0; r < Kind<T>::lanes; ++r)
         for (int c = 0; c < r; ++c) {
             const T kept = a[r][c];
             a[r][c] = a[c][r];
             a[c][r] = kept;
         }
 #else
-    for (int half = 1; half < n; half *= 2) {
-        typename Kind<T>::Whole low, high;
-        for (int c = 0; c < n; ++c) {
-            low[c] = c & half ? n + c - half : c;
-            high[c] = c & half ? n + c : c + half;
-        }
-        for (int r = 0; r < n; ++r)
-            if (!(r & half)) {
-                const Vector<T> x = a[r], y = a[r | half];
-                a[r] = __builtin_shuffle(x, y, low);
-                a[r | half] = __builtin_shuffle(x, y, high);
-            }
-    }
+    exchange<T, 1>(a);
+    exchange<T, 2>(a);
+    exchange<T, 4>(a);
+    if (Kind<T>::lanes > 8) exchange<T, Kind<T>::lanes / 2>(a);
 #endif
 }
 

@@ -213,14 +213,13 @@ struct Gradients {
 
 template <class T>
 inline void add_to(void* grad, bool wide, int64_t at, int64_t count, const Vector<T>& more) {
+    if (wide == (sizeof(T) == sizeof(double))) {
+        T* to = static_cast<T*>(grad) + at;
+        return store<T>(to, load<T>(to, count) + more, count);
+    }
     T part[Kind<T>::lanes];
     std::memcpy(part, &more, sizeof more);
-    for (int64_t i = 0; i < std::min<int64_t>(count, Kind<T>::lanes); ++i) {
-        if (wide)
-            static_cast<double*>(grad)[at + i] += part[i];
-        else
-            static_cast<float*>(grad)[at + i] += float(part[i]);
-    }
+    for (int64_t i = 0; i < std::min<int64_t>(count, Kind<T>::lanes); ++i) static_cast<double*>(grad)[at + i] += part[i];
 }
 
 template <class T>

@@ -90,9 +90,11 @@ template <class A>
 inline void transpose_both(Complex<A>* a) {
     constexpr int n = Kind<A>::lanes;
     Vector<A> re[n], im[n];
+#pragma GCC unroll 16
     for (int i = 0; i < n; ++i) re[i] = a[i].re, im[i] = a[i].im;
     transpose<A>(re);
     transpose<A>(im);
+#pragma GCC unroll 16
     for (int i = 0; i < n; ++i) a[i] = {re[i], im[i]};
 }
 

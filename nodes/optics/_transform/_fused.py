@@ -22,7 +22,7 @@ from neusee.nodes.optics._transform._workspace import Workspace
 __depends__ = ("_fused.cpp", "_field.h", "_fft.h", "unaffected:ctypes", "unaffected:torch.get_num_threads")
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("_fused.cpp", "_field.h", "_fft.h"))
 #: digest of the sources: keys of cached results depend on this file, and so on the sources; a test compares both
-DIGEST = "546a080306e9e9ba"
+DIGEST = "0bf39401afdb50ba"
 _NAMES = {
     (torch.float32, torch.float32): "single",
     (torch.float32, torch.float64): "mixed",
