@@ -5,8 +5,8 @@ machine on which others compute. `--size 2160 64` takes one size. `--part forwar
 backward, spectra).
 Everybody gets the same number of threads and the same clear or defocused disc at 550 nm, and returns the intensity.
 The peers are handed the complex pupil and keep their operators; ours keeps its own, starts from the height map and
-makes the phase each time. What making the complex64 pupil costs in NumPy is a row of its own, and a column adds it to the peers; the
-other way round, `neusee, ready pupil` is handed it as they are, and computes in torch.
+makes the phase each time. What making the complex64 pupil costs in NumPy is a row of its own, and a column adds it to
+the peers; the other way round, `neusee, ready pupil` is handed it as they are, and computes in torch.
 Calls are interleaved, so that a loaded machine slows all alike, and each is preceded by a pause and by a call that
 does not count, because the threads of one library spin for a while and would slow the next. The error is against the
 double sum in complex128 on a subset of rows and columns, relative to the peak. Prints tables in Markdown.
