@@ -29,6 +29,7 @@ _NAMES = {
     (torch.float64, torch.float64): "double",
 }
 _LITTLE = 0.3  #: share of the work of the first axis, up to which all from the first FFT on is float64
+_ALONE = 1 << 18  #: samples for each further thread: to wake a thread takes as long as to transform a few thousand
 _VECTOR = 64  #: bytes of a vector in the C++
 
 
@@ -124,8 +125,9 @@ class FusedPupil:
         operator = getattr(operators(), f"neusee_psf_{name}_{_NAMES[self.dtype, kind]}")
         tiles = [self._tiles(label, y, n, kind) for label, n in (("before", x.n_in), ("behind", x.n_out))]
         structures = [ctypes.byref(s) if isinstance(s, ctypes.Structure) else s for s in (y, x, *given)]
-        threads = ctypes.c_int64(torch.get_num_threads())
-        operator(*structures[:2], threads, *tiles, *structures[2:])
+        samples = rows.n_in * columns.n_in + rows.n_out * columns.n_out
+        threads = min(torch.get_num_threads(), 1 + samples // _ALONE)
+        operator(*structures[:2], ctypes.c_int64(threads), *tiles, *structures[2:])
 
     def _tiles(self, label: str, y: CAxis, n: int, kind: torch.dtype) -> Any:
         """Return the address of memory for all frequencies along y of ``n`` columns, aligned to vectors."""

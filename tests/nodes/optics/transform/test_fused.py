@@ -106,7 +106,8 @@ def test_a_phase_of_many_turns_is_exact(turns):
     assert found == pytest.approx(4 * math.cos(0.3 * math.pi) ** 2, abs=1e-5)
 
 
-def test_the_bits_depend_on_no_thread():
+def test_the_bits_depend_on_no_thread(monkeypatch):
+    monkeypatch.setattr(_fused, "_ALONE", 1)
     light = rough(150, 150)
     before = torch.get_num_threads()
     try:
