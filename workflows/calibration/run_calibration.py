@@ -28,6 +28,7 @@ from neusee.workflows.calibration.frame_validity import (
     as_rows,
     frame_checks,
     frame_section,
+    hidden_checks,
     inspect_recipe,
     lines,
     widened,
@@ -133,24 +134,27 @@ def find_posterior(
     models = compare_models(recipe, store, recipe.seed) if isinstance(problem.levels, Levels) else []
     tested = [
         *frame_checks(tests, not isinstance(problem.levels, Rings)),
+        *hidden_checks(tests, problem.coordinates.prior.may_hide),
         *checks(problem, mode, identifiability, chains, law),
     ]
-    result = CalibrationResult(problem, mode, identifiability, chains, tested, models, tests)
-    return _with_all_uncertainty(result, recipe, laboratory)
+    return _widened(CalibrationResult(problem, mode, identifiability, chains, tested, models, tests), laboratory)
 
 
-def _with_all_uncertainty(result: CalibrationResult, recipe: Recipe, laboratory: Laboratory) -> CalibrationResult:
-    """Return a calibration whose draws and intervals have what frames and laboratory leave open, with its budgets."""
-    problem, tests, seed = result.problem, result.frames, recipe.seed
-    known = without_efficiency(result.identifiability) if is_relative(recipe) else result.identifiability
-    found = replace(
+def _widened(result: CalibrationResult, laboratory: Laboratory) -> CalibrationResult:
+    """Return a calibration with what the frames show or may hide, with what the laboratory states, and its budgets."""
+    problem, tests = result.problem, result.frames
+    told = result.identifiability
+    unwidened = {name: float(x.std()) for name, x in problem.parameters(result.chains.draws).items()}
+    chains = widened(problem, result.chains, tests, problem.recipe.seed)
+    models = widened_models(result.models, tests, problem.coordinates.prior.may_hide)
+    result = replace(
         result,
-        identifiability=known,
-        unwidened={name: float(x.std()) for name, x in problem.parameters(result.chains.draws).items()},
-        chains=with_laboratory(problem, widened(problem, result.chains, tests, seed), laboratory, seed),
-        models=with_laboratory_models(widened_models(result.models, tests), laboratory),
+        identifiability=without_efficiency(told) if is_relative(problem.recipe) else told,
+        chains=with_laboratory(problem, chains, laboratory, problem.recipe.seed),
+        models=with_laboratory_models(models, laboratory),
+        unwidened=unwidened,
     )
-    return replace(found, budgets=budgets(found, laboratory))
+    return replace(result, budgets=budgets(result, laboratory))
 
 
 def _accepted_frames(recipe: Recipe, store: Store, progress: Progress) -> Sequence[FrameTest]:
