@@ -139,7 +139,7 @@ def _sides(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> Flo
 def _slopes(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return derivatives of light levels and prior by coordinate; their Gram matrix is Fisher's information."""
     rows = _differences(lambda p: problem.likelihood(p).scaled.numpy(), theta, step, _sides(problem, theta, step))
-    rounded = problem.recipe.steps[problem.step].params.get("rounding") == "nearest"
+    rounded = problem.recipe.steps[problem.step].params.get("rounding") in ("nearest", "truncation")
     for name in problem.coordinates.edged.intersection(problem.names) if rounded else ():
         at = problem.names.index(name)  # levels depend on this parameter only at edges, where they have no derivative
         rows[:, at] = 0.0
