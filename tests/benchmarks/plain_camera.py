@@ -1,8 +1,9 @@
 """A camera in NumPy alone for simulation-based calibration: no code of the nodes, frames pixel by pixel.
 
 ``frames`` simulates the pixels of one level; ``table`` writes means and temporal variances of pairs for the recipe
-`calibrate_camera`; ``save`` writes the frames themselves for `calibrate.frames`. The response bends by bend and twist,
-y = K e (1 + bend x + twist x**2), with x = y / top, or by a cube, which is none of the models of the response.
+`calibrate_camera`; ``frames_recipe`` writes the frames themselves, and a recipe of `calibrate.density`. The response
+bends by bend and twist, y = K e (1 + bend x + twist x**2), with x = y / top, or by a cube, which is none of the models
+of the response.
 """
 
 import csv
@@ -29,13 +30,14 @@ class PlainCamera:
     truncates: bool = False  #: numbers are cut and not rounded
     well: float = np.inf  #: e-, of the electrons before read noise
     full: float = np.inf  #: e-, of electrons, offset and read noise together
+    first: float = 1e-3  #: s, exposure that counts as none for the dark current
     top: float = 2750.0  #: DN above the dark, of the brightest level that is used
     bits: int = 12
 
-    def frames(self, rng, photons, exposure, first=1e-3, size=96, count=2):
+    def frames(self, rng, photons, exposure, size=96, count=2):
         """Frames (frame, y, x) of one level as whole numbers."""
         light = photons * (1 + self.lamp * rng.standard_normal())
-        mean = self.quantum_efficiency * light + self.dark_current * (exposure - first)
+        mean = self.quantum_efficiency * light + self.dark_current * (exposure - self.first)
         shape = (count, size, size)
         electrons = np.minimum(rng.poisson(max(mean, 0.0), shape), self.well)
         electrons = electrons + self.temporal_dark_noise * rng.standard_normal(shape)
@@ -78,15 +80,61 @@ def table(camera, seed, file, *, size=96, **series):
         writer.writerow(["photons", "exposure_s", "pixels", "mean", "variance"])
         for photons, exposure in camera.series(**series):
             mean, variance = moments(camera.frames(rng, photons, exposure, size=size))
-            writer.writerow([repr(float(photons)), repr(float(exposure)), size * size, repr(mean), repr(variance)])
+            writer.writerow(
+                [repr(float(photons)), repr(float(exposure)), size * size, repr(float(mean)), repr(float(variance))]
+            )
     return file
 
 
-def save(camera, seed, folder, *, size=96, **series):
-    """Write the frames of one measurement as .npy; return (photons, exposure, path) of each level."""
-    rng, levels = np.random.default_rng(seed), []
+RECIPE = """# A measurement with the camera of a benchmark: pixels alike, frames from files.
+defaults: []
+rounding: nearest
+sensor: {gain: 0.25 DN/e-, offset: 240 e-, read_noise: 12 e-, dark_current: 40 e-, full_well: 14000 e-,
+         quantum_efficiency: 0.5, bits: 12}
+steps:
+  frames: {node: calibrate.frames, each: levels, with: {files: "${item.files}"}}
+  level:
+    node: calibrate.reduce
+    each: levels
+    from: frames
+    with: {photons: "${item.photons}", exposure: "${item.exposure}"}
+  levels: {node: calibrate.levels, from: level}
+  sufficient: {node: calibrate.sufficient, from: levels}
+  prior:
+    node: calibrate.prior
+    with:
+      gain: ["${sensor.gain}", 2]
+      offset: ["${sensor.offset}", 100 e-]
+      read_noise: ["${sensor.read_noise}", 2]
+      dark_current: ["${sensor.dark_current}", 10]
+      full_well: ["${sensor.full_well}", 2]
+      quantum_efficiency: ["${sensor.quantum_efficiency}", 2]
+  density:
+    node: calibrate.density
+    from: {levels: sufficient}
+    with:
+      gain: "${sensor.gain}"
+      quantum_efficiency: "${sensor.quantum_efficiency}"
+      offset: "${sensor.offset}"
+      read_noise: "${sensor.read_noise}"
+      dark_current: "${sensor.dark_current}"
+      dark_exposure: 1 s
+      full_well: "${sensor.full_well}"
+      arrivals: poisson
+      rounding: "${rounding}"
+      bits: "${sensor.bits}"
+outputs: [levels, density]
+levels:
+"""
+
+
+def frames_recipe(camera, seed, folder, *, size=96, **series):
+    """Write the frames of one measurement as .npy and a recipe that reads them; return the path of the recipe."""
+    rng, text = np.random.default_rng(seed), RECIPE
     for i, (photons, exposure) in enumerate(camera.series(**series)):
         path = folder / f"level_{i:02d}.npy"
         np.save(path, camera.frames(rng, photons, exposure, size=size))
-        levels.append((photons, exposure, path))
-    return levels
+        text += f"  l{i:02d}: {{files: {path}, photons: {float(photons)!r}, exposure: {float(exposure)!r} s}}\n"
+    recipe = folder / "measurement.yaml"
+    recipe.write_text(text)
+    return recipe
