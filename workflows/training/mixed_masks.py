@@ -59,7 +59,7 @@ class MixedMasks:
             number = first + i
             within = number % self._pool if self._pool and stage != HELD_OUT else number
             stream = self._streams[within % self.repeats]
-            yield i, stream(shared.seen, stage, number)
+            yield i, stream.turned(stream(shared.seen, stage, number), stage, number)
 
 
 Samples = TrainingStream | MixedMasks
