@@ -96,4 +96,4 @@ def behind_each(recipe: Recipe, settings: Training) -> list[Recipe]:
 
 
 def _height_map(file: Path) -> Mapping[str, Any]:
-    return {"file": file, "scale": 0.1}
+    return {"file": file, "scale": 0.1, "between": "nearest"}  # a map may be wrapped, and has edges

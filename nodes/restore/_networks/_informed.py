@@ -27,7 +27,7 @@ class Informed(Restorer):
 
     def __init__(self, width: int = 16) -> None:
         super().__init__()
-        self.body = NAFNet(width, (1, 1, 1), 1, inputs=MAPS, outputs=3)
+        self.body = NAFNet(width, (1, 1, 1), 1, inputs=MAPS, outputs=9)
         self.multiple = self.body.multiple
 
     def begin(self) -> None:
@@ -40,18 +40,21 @@ class Informed(Restorer):
         electrons to colours.
         """
         value, matrix = given
-        change = self.change(value.maps, value.deviation) * value.scale
+        change = self.change(value.answer, value.deviation, value.maps) * value.scale
         fine = picture + torch.tensordot(matrix.to(change), change, 1).to(picture)
         return resize(fine, -(-picture.shape[-2] // 2), -(-picture.shape[-1] // 2)), fine
 
-    def change(self, maps: Tensor, deviation: Tensor) -> Tensor:
+    def change(self, answer: Tensor, deviation: Tensor, maps: Tensor) -> Tensor:
         """Return what the network adds to the answer of the filter (3, y, x), in units of its scale.
 
-        It is multiplied by the root of the predicted error, so that what is certain hardly changes.
+        It is the sum of three parts, each with a map of the network for each channel: a change, multiplied by the root
+        of the predicted error, so that what is certain hardly changes; a share of the answer, which draws it to the
+        mean of the scene; and a share of the mean of its channels, which draws it to grey.
         """
         rows, columns = maps.shape[-2:]
         whole = mirrored(maps.to(self.body.last.weight)[None], -rows % self.multiple, -columns % self.multiple)
-        return self.body.change(whole)[0, :, :rows, :columns].to(deviation) * deviation.sqrt()
+        free, share, grey = self.body.change(whole)[0, :, :rows, :columns].to(answer).split(3)
+        return free * deviation.sqrt() + share * answer + grey * answer.mean(0)
 
 
 @node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])
@@ -99,7 +102,7 @@ def informed(
     if weights is not None:
         net = loaded(partial(Informed, width), weights).requires_grad_(False).eval().to(electrons.device)
         with exact_convolutions(electrons, deterministic=True), torch.autocast(electrons.device.type, enabled=False):
-            result = result + net.change(found.maps, found.deviation) * found.scale
+            result = result + net.change(found.answer, found.deviation, found.maps) * found.scale
     return (result + found.mean).to(electrons)
 
 
