@@ -6,10 +6,10 @@
 The camera is that of `train_neusee`, 128 x 128 pixels. For each photograph the true lens and laser differ from the
 recipe by the laws of `mismatch: usual`, and exposure, read noise and laser are drawn by those of the training. One
 simulated frame is restored by the filter that believes the recipe (`wiener`, doubt 0), with the likeliest doubt (null),
-by the filter with drawn patterns (`wiener_uncertain`), and by `neusee`. Each photograph has two strengths of the laser,
-behind each of three masks; in a third of them the larger one also behind a grey filter and behind a smaller stop that
-protect the sensor as much as the designed mask. Intervals are bootstrap-t over photographs. The folder keeps
-the frames, so that a run that was stopped goes on, and other weights are judged in a minute.
+by the filter with drawn patterns (`wiener_uncertain`), and by `neusee`. Each photograph has a frame behind each of three
+masks, with strengths in turn; a third of them have a strong laser also behind a grey filter and behind a smaller stop
+that protect the sensor as much as the designed mask. Intervals are bootstrap-t over photographs. The folder keeps the
+frames, so that a run that was stopped goes on, and other weights are judged in a minute.
 """
 
 import argparse
@@ -31,7 +31,7 @@ from neusee.workflows.training.training_pictures import HELD_OUT, TrainingStream
 ROOT = Path(__file__).parents[2]
 DESIGNED = ROOT / "recipes" / "samples" / "demonstration_mask.png"
 PEAK = 0.0121247  #: of the laser behind the designed mask at the worst wavelength, over that behind the plain lens
-PAIRS = ((0.0, 1e3), (1e1, 1e4), (1e2, 1e5), (0.0, 1e6))  #: strengths of a photograph, in turn
+IN_TURN = (0.0, 1e4, 1e1, 1e5, 1e2, 1e6, 0.0, 1e3)  #: strengths of the frames
 WEAK, STRONG = (0.0, 1e1, 1e2), (1e3, 1e4, 1e5, 1e6)
 MASKS = ("plain", "half_ring", "designed")
 RIVALS = ("grey", "stop")  #: of the designed mask: the plain lens with as low a peak
@@ -125,22 +125,23 @@ def run(folder, pictures, count):
     recipe_file, store, streams = folder / "judged.yaml", Store(folder / "cache"), {}
     recipe_file.write_text((ROOT / "recipes" / "train_neusee.yaml").read_text() + STEPS)
     for number, photograph in enumerate(held_out):
-        pair = PAIRS[number % len(PAIRS)]
-        for mask in (*MASKS, *(RIVALS if number % EACH == 0 else ())):
-            for strength in pair if mask in MASKS else pair[1:]:
-                if (photograph.name, mask, strength) in done:
-                    continue
-                if mask not in streams:
-                    recipe = load(recipe_file, words(mask))
-                    kind = Judged if mask in MASKS else OfRival
-                    streams[mask] = kind(recipe, recipe.training, photographs, store, "cpu", recipe, held_out=held_out)
-                streams[mask].strength, streams[mask].factor = strength, PEAK if mask in RIVALS else 1.0
-                found, kept = streams[mask]({}, HELD_OUT, number)
-                name = f"{number:03d}_{mask}_{strength:g}"
-                save_file(kept, folder / f"{name}.safetensors")
-                each = {"photograph": photograph.name, "mask": mask, "strength": strength, "file": name, **found}
-                with (folder / "frames.jsonl").open("a") as out:
-                    out.write(json.dumps(each) + "\n")
+        frames = {mask: IN_TURN[(3 * number + m) % len(IN_TURN)] for m, mask in enumerate(MASKS)}
+        if number % EACH == 0:
+            frames |= dict.fromkeys(RIVALS, STRONG[number // EACH % len(STRONG)])
+        for mask, strength in frames.items():
+            if (photograph.name, mask, strength) in done:
+                continue
+            if mask not in streams:
+                recipe = load(recipe_file, words(mask))
+                kind = Judged if mask in MASKS else OfRival
+                streams[mask] = kind(recipe, recipe.training, photographs, store, "cpu", recipe, held_out=held_out)
+            streams[mask].strength, streams[mask].factor = strength, PEAK if mask in RIVALS else 1.0
+            found, kept = streams[mask]({}, HELD_OUT, number)
+            name = f"{number:03d}_{mask}_{strength:g}"
+            save_file(kept, folder / f"{name}.safetensors")
+            each = {"photograph": photograph.name, "mask": mask, "strength": strength, "file": name, **found}
+            with (folder / "frames.jsonl").open("a") as out:
+                out.write(json.dumps(each) + "\n")
 
 
 def rows(folder):
