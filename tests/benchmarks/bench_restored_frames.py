@@ -40,7 +40,6 @@ SIDE, RIM = 128, 8
 MASKS = ("plain", "half_ring", "designed")
 STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
 METHODS = ("nothing", "blind", "told", "search")
-TOLD = {"told": "wiener", "likeliest": "wiener", "uncertain": "wiener_uncertain", "neusee": "neusee"}  #: the laser
 DESIGNED, DEPTH = ROOT / "recipes" / "samples" / "demonstration_mask.png", 33.9189e-6  #: of recipes/doe/demonstration
 
 CAMERA = """\
@@ -181,11 +180,11 @@ def restored(numbers, mask, method, laser, folder):
     """What `neusee restore` returns for a frame, linear sRGB (3, y, x), its numbers of lasers, and processor time."""
     np.save(folder / "frame.npy", numbers)
     words = [f"restore={'wiener_blind' if method in ('blind', 'nothing') else method}"]
-    if method in TOLD:
+    if method == "told":
         y, x = (1e3 * s * own.PITCH / own.FOCAL for s in laser.spot)
         line = f"wavelength: {laser.wavelength * 1e9} nm, fwhm: {laser.fwhm * 1e9} nm, strength: 1"
-        words = [f"restore={TOLD[method]}", *(["restore.doubt=null"] if method == "likeliest" else [])]
-        words += [f"lasers={{it: {{{line}, angle: [{y} mrad, {x} mrad]}}}}"] if laser.strength else []
+        words = ["restore=wiener", f"lasers={{it: {{{line}, angle: [{y} mrad, {x} mrad]}}}}"]
+        words = words if laser.strength else ["restore=wiener"]
     outputs = ["restored", "developed[mask]", *(["search"] if method == "search" else [])]
     start = time.process_time()
     told = io.StringIO()
@@ -233,7 +232,7 @@ def score(picture, truth):
 # --- runs and tables --------------------------------------------------------------------------------------------------
 
 
-def run(path, first, count, picture, kinds, masks, strengths, methods=METHODS):
+def run(path, first, count, picture, kinds, masks, strengths):
     """Append the frames that the file lacks."""
     done = {(r["seed"], r["mask"], r["strength"], r["method"]) for r in rows(path)}
     with tempfile.TemporaryDirectory() as place:
@@ -242,7 +241,7 @@ def run(path, first, count, picture, kinds, masks, strengths, methods=METHODS):
         for seed in range(first, first + count):
             for mask in masks:
                 for strength in strengths:
-                    todo = [m for m in methods if (seed, mask, strength, m) not in done]
+                    todo = [m for m in METHODS if (seed, mask, strength, m) not in done]
                     if not todo:
                         continue
                     kind = kinds[seed % len(kinds)]

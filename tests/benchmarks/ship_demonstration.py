@@ -1,6 +1,6 @@
-"""Write the demonstration's mask and the network of `restore: neusee` as they ship, and say what that changes.
+"""Write the demonstration's mask and network as they ship, and say what that changes.
 
-    python tests/benchmarks/ship_demonstration.py --mask mask.safetensors --network best.safetensors recipes/samples
+    python tests/benchmarks/ship_demonstration.py mask.safetensors network.safetensors recipes/samples
 
 The relief becomes a grey picture of 12 bits that states the height of white and the pitch, the weights become half
 floats.
@@ -8,7 +8,7 @@ floats.
 
 from __future__ import annotations
 
-import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -46,19 +46,13 @@ def network(file: Path, out: Path) -> None:
     weights = load_file(file)
     half = {name: x.to(torch.float16) for name, x in weights.items()}
     worst = max(float((half[n].float() - x).norm() / x.norm().clamp_min(1e-30)) for n, x in weights.items())
-    save_file(half, out / "neusee_network.safetensors", said)
+    save_file(half, out / "demonstration_network.safetensors", said)
     print(f"{sum(x.numel() for x in half.values())} numbers; halving changes a tensor by {worst:.1e} at most")
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--mask", type=Path)
-    parser.add_argument("--network", type=Path)
-    given = parser.parse_args()
-    if given.mask:
-        mask(given.mask, given.out)
-    if given.network:
-        network(given.network, given.out)
-    for path in (given.out / "demonstration_mask.png", given.out / "neusee_network.safetensors"):
+    relief, weights, out = map(Path, sys.argv[1:])
+    mask(relief, out)
+    network(weights, out)
+    for path in out.glob("demonstration_*"):
         print(f"{path.name}: {path.stat().st_size} bytes")

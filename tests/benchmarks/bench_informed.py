@@ -1,12 +1,12 @@
-"""Is `restore: neusee` better than the filter it begins with, on photographs that it never saw?
+"""Is a network of `train_informed` better than the filter it begins with, on photographs that it never saw?
 
-    python tests/benchmarks/bench_neusee.py frames/ --pictures photographs/ --count 37
-    python tests/benchmarks/bench_neusee.py frames/ --report
+    python tests/benchmarks/bench_informed.py frames/ --pictures photographs/ --count 37
+    python tests/benchmarks/bench_informed.py frames/ --report --weights best.safetensors
 
-The camera is that of `train_neusee`, 128 x 128 pixels. For each photograph the true lens and laser differ from the
+The camera is that of `train_informed`, 128 x 128 pixels. For each photograph the true lens and laser differ from the
 recipe by the laws of `mismatch: usual`, and exposure, read noise and laser are drawn by those of the training. One
 simulated frame is restored by the filter that believes the recipe (`wiener`, doubt 0), with the likeliest doubt (null),
-by the filter with drawn patterns (`wiener_uncertain`), and by `neusee`. Each photograph has a frame behind each of three
+by the filter with drawn patterns (`wiener_uncertain`), and by the network. Each photograph has a frame behind each of the
 masks, with strengths in turn; a third of them have a strong laser also behind a grey filter and behind a smaller stop
 that protect the sensor as much as the designed mask. Intervals are bootstrap-t over photographs. The folder keeps the
 frames, so that a run that was stopped goes on, and other weights are judged in a minute.
@@ -39,7 +39,7 @@ STOP = PEAK**0.25  #: the peak falls with the fourth power of the diameter, the 
 BACKGROUND, DIAMETER = 0.7, 11.0
 EACH = 3  #: photographs, of which one stands behind the rivals too
 NO_POOL = ("train.augment.pooled=none", "train.pool=null")
-METHODS = ("developed", "told", "likeliest", "uncertain", "neusee")
+METHODS = ("developed", "told", "likeliest", "uncertain", "network")
 STEPS = """
 steps:
   facts:
@@ -123,7 +123,7 @@ def run(folder, pictures, count):
     folder.mkdir(exist_ok=True)
     done = {(r["photograph"], r["mask"], r["strength"]) for r in rows(folder)}
     recipe_file, store, streams = folder / "judged.yaml", Store(folder / "cache"), {}
-    recipe_file.write_text((ROOT / "recipes" / "train_neusee.yaml").read_text() + STEPS)
+    recipe_file.write_text((ROOT / "recipes" / "train_informed.yaml").read_text() + STEPS)
     for number, photograph in enumerate(held_out):
         frames = {mask: IN_TURN[(3 * number + m) % len(IN_TURN)] for m, mask in enumerate(MASKS)}
         if number % EACH == 0:
@@ -158,7 +158,7 @@ def judged(folder, weights, width):
         kept = load_file(folder / f"{row['file']}.safetensors")
         facts = FilterFacts._make(kept[name].float() for name in FilterFacts._fields)
         with torch.no_grad():
-            row["neusee"] = scored(net(kept["picture"][None], facts, kept["matrix"])[0], kept["truth"])
+            row["network"] = scored(net(kept["picture"][None], facts, kept["matrix"])[0], kept["truth"])
     return found
 
 
@@ -166,10 +166,10 @@ def judged(folder, weights, width):
 
 
 def gain(found, other, what="psnr"):
-    """Mean gain of neusee over another restorer, and its 95 % interval over photographs."""
+    """Mean gain of the network over another restorer, and its 95 % interval over photographs."""
     names = sorted({row["photograph"] for row in found})
     photographs = np.array([names.index(row["photograph"]) for row in found])
-    values, own = (np.array([row[m][what] for row in found]) for m in (other, "neusee"))
+    values, own = (np.array([row[m][what] for row in found]) for m in (other, "network"))
     x = less(values, own, photographs, 0)
     return f"{x.mean:+.2f} ({x.low:+.2f} to {x.high:+.2f})"
 
@@ -188,9 +188,9 @@ def report(found):
                 gains = " | ".join(gain(some, m) if m in has else "" for m in ("likeliest", "uncertain"))
                 print(f"| {mask} | {name} | {len(some)} | {means} | {gains} |")
     some = [r for r in found if r["mask"] in MASKS]
-    print(f"\nAll {len(some)} behind lens and masks, neusee over another restorer:")
+    print(f"\nAll {len(some)} behind lens and masks, the network over another restorer:")
     for m in METHODS[:-1]:
-        each = sorted(r["neusee"]["psnr"] - r[m]["psnr"] for r in some)
+        each = sorted(r["network"]["psnr"] - r[m]["psnr"] for r in some)
         worse = f"{np.mean(np.array(each) < 0):.0%} worse, the worst five by {[round(x, 2) for x in each[:5]]} dB"
         print(f"- {m}: {gain(some, m)} dB, SSIM {gain(some, m, 'ssim')}, {worse}")
 
@@ -200,7 +200,7 @@ if __name__ == "__main__":
     parser.add_argument("folder", type=Path)
     parser.add_argument("--pictures", type=Path, help="folder of photographs that no training saw")
     parser.add_argument("--count", type=int, default=37)
-    parser.add_argument("--weights", type=Path, default=ROOT / "recipes" / "samples" / "neusee_network.safetensors")
+    parser.add_argument("--weights", type=Path, help="of the network: best.safetensors of a training")
     parser.add_argument("--width", type=int, default=12)
     parser.add_argument("--report", action="store_true")
     given = parser.parse_args()
