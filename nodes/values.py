@@ -112,6 +112,16 @@ class Channels(NamedTuple):
     bound: Tensor  #: () float64, upper bound of the root mean square error over max |plane|, for the worst row
     kept: Tensor = torch.zeros(5, dtype=torch.int64)  #: counts of planes, kernels, bands, PSF rows and PSF columns
     largest: Tensor = torch.tensor(torch.inf, dtype=torch.float64)  #: upper bound of the relative error of max |plane|
+    estimated: Tensor = torch.zeros(2, dtype=torch.float64)  #: estimates, beside `bound` and `largest`, by `FewBands`
+
+
+class FewBands(NamedTuple):
+    """A choice of few bands whose PSFs represent all: the PSF of band b is ``sum_j share[b, j]`` times that of j."""
+
+    share: Tensor  #: (band, j) float64; each row sums to 1
+    used: Tensor  #: (j,) int64, which bands, rising
+    error: Tensor  #: () float64, estimate of the root mean square error of the image over its brightest pixel
+    largest: Tensor  #: () float64, estimate of the relative error of the brightest pixel
 
 
 class Levels(NamedTuple):

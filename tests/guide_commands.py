@@ -24,6 +24,7 @@ from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
 from neusee.workflows.recipe import node_families
 from tests.deepinv_without_torchvision import deepinv_or_skip
+from tests.nodes.calibrate.numpy_camera import Camera
 
 ROOT = Path(__file__).parents[1]
 GUIDE = ROOT / "recipes" / "guide"
@@ -113,6 +114,7 @@ def write_reader_files(folder: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
     _write_frames(folder / "my")
+    _write_laboratory(folder / "my" / "lab")
     _write_points(folder / "points")
     shutil.copy(ROOT / "recipes" / "samples" / "camera_levels.csv", folder / "my.csv")
     (folder / "camera.csv").write_text("wavelength,red,green,blue\n400,0,0,1\n550,0,1,0\n700,1,0,0\n")
@@ -144,6 +146,15 @@ def _write_points(folder: Path) -> None:
         light = 4000.0 * down[:, None, None] * right[:, None] * np.array([0.8, 1.0, 0.7])
         electrons = rng.poisson(light) + rng.normal(0.0, 2.4, light.shape)
         np.save(folder / f"point{number}.npy", np.clip(np.round(electrons / 0.37 + 1054.0), 0, 65535).astype(np.uint16))
+
+
+def _write_laboratory(folder: Path) -> None:
+    """Write 16-bit PNG frames of a camera of 24 x 24 pixels, whose names tell exposure and photons."""
+    folder.mkdir(parents=True)
+    for _, photons, time, frames in Camera(seed=5, size=24, darks=3, lit=12, faults={"lamp": 0.003}).levels():
+        for number, frame in enumerate(frames):
+            name = f"flat_{photons:.0f}ph" if photons else "dark"
+            Image.fromarray(frame.astype(np.uint16)).save(folder / f"{name}_{1e3 * time:.4g}ms_{number}.png")
 
 
 def _write_frames(folder: Path) -> None:

@@ -5,11 +5,11 @@
 
 The camera is that of `train_informed`, 128 x 128 pixels. For each photograph the true lens and laser differ from the
 recipe by the laws of `mismatch: usual`, and exposure, read noise and laser are drawn by those of the training. One
-simulated frame is restored by the filter that believes the recipe (`wiener`, doubt 0), with the likeliest doubt (null),
-by the filter with drawn patterns (`wiener_uncertain`), and by the network. Each photograph has a frame behind each of the
-masks, with strengths in turn; a third of them have a strong laser also behind a grey filter and behind a smaller stop
-that protect the sensor as much as the designed mask. Intervals are bootstrap-t over photographs. The folder keeps the
-frames, so that a run that was stopped goes on, and other weights are judged in a minute.
+simulated frame is restored by the filter that believes the recipe (`wiener`, doubt 0), with the likeliest doubt
+(null), by the filter with drawn patterns (`wiener_uncertain`), and by the network. Each photograph has a frame behind
+each mask, with strengths in turn; a third of them have a strong laser also behind a grey filter and behind a smaller
+stop that protect the sensor as much as the designed mask. Intervals are bootstrap-t over photographs. The folder
+keeps the frames, so that a run that was stopped goes on, and other weights are judged in a minute.
 """
 
 import argparse

@@ -15,7 +15,7 @@ from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
 from neusee.nodes.restore._networks._unet import UNet
 from neusee.nodes.restore._networks._unrolled import Unrolled
-from neusee.nodes.values import Channels, Dirt, FoundLasers, LowRankCube, MeasuredPsf, Psf, Pupil
+from neusee.nodes.values import Channels, Dirt, FewBands, FoundLasers, LowRankCube, MeasuredPsf, Psf, Pupil
 
 HERE = Path(__file__).parent
 
@@ -55,6 +55,7 @@ PUPIL = Pupil(DISC, DISC, HEIGHT, 0 * HEIGHT, INDEX, BANDS.centres, torch.tensor
 DIRT = Dirt(rand(16, 16, dtype=torch.float32), HEIGHT.clone())
 LOW_RANK = LowRankCube(rand(2, 12, 12), rand(4, 2), torch.zeros(3, 4, dtype=torch.float64))
 ROWS = spectra.rows(BANDS, RESPONSES)
+ALL_BANDS = FewBands(torch.eye(4, dtype=torch.float64), torch.arange(4), *torch.zeros(2, dtype=torch.float64))
 CHANNELS = Channels(rand(3, 12, 12), rand(3, 4), torch.tensor(0.0, dtype=torch.float64))
 LEVEL = 1e3 * rand(4)
 LASER_PUPIL = PUPIL._replace(index=INDEX[:3], wavelengths=LINE.centres)
@@ -218,8 +219,11 @@ CASES = {
     "metrics.saturated": Case("0", (RAW,), ADC),
     "metrics.spectral_error": Case("0.height", (PUPIL, BANDS, LIGHT, RESPONSES), LENS),
     "optics.direction": Case("focal_length", (), {**LENS, "focal_length": number(0.11), "shape": (64, 64)}),
+    "optics.few_bands": Case("0.height", (PUPIL, LOW_RANK, ROWS), {**LENS, "shape": (9, 9), "within": 0.1}),
+    "optics.few_bands_checked": Case("2.height", (ALL_BANDS, PSF, PUPIL, LOW_RANK, ROWS), LENS),
     "optics.image": Case("1.intensity", (SCENE, PSF)),
     "optics.image_channels": Case("1.intensity", (LOW_RANK, PSF, ROWS)),
+    "optics.pupil_of_bands": Case("0.height", (PUPIL, ALL_BANDS)),
     "optics.psf": Case("0.height", (PUPIL,), {**LENS, "shape": (9, 9)}),
     "optics.pupil": Case("0", (HEIGHT, INDEX, BANDS, STOP, DIRT)),
     "optics.laser_irradiance": Case("0.intensity", (Psf(rand(3, 9, 9), rand(3)), LINE), {"strength": 10.0, **WELL}),

@@ -1,9 +1,7 @@
-"""The pictures of a calibration: photon-transfer curve, corner plot of the parameters, and traces of the chains."""
+"""The pictures of a calibration: photon-transfer curve, rings about a source, and traces of the chains."""
 
 from __future__ import annotations
 
-import textwrap
-import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +16,6 @@ if TYPE_CHECKING:
 
 _BAND = (5.0, 50.0, 95.0)  #: percentiles
 _POINTS = 1500  #: most points of a chain in the picture
-_PAGE = 11.4  #: inches, the width of the page at 100 pixels an inch
-_LABEL_PAD = 0.08  #: distance of the labels from the numbers of an axis, as a share of a panel
-_WIDEST = 13  #: characters of a line of a label
-_NEARLY_ALL = (0.005, 0.995)  #: quantiles, so that a single draw does not squeeze a panel of the corner plot
 _LEAST = 0.1  #: DN², the variance at which a level without scatter is drawn
 _CLIPPED = {"marker": "v", "color": VERMILION, "markerfacecolor": "none",
             "label": "clipped or coarse: numbers counted one by one; variance at most as drawn"}  # fmt: skip
@@ -89,54 +83,6 @@ def rings(
     reach = max(3.5, 1.1 * float(np.abs(distance).max(initial=0.0)))
     below.set_ylim(-reach, reach)
     return figure
-
-
-@drawn
-def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -> Any:
-    """Draw a corner plot of all pairs of parameters, with the recipe's own values in orange."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    size = 1.75 * len(names) + 0.6
-    text = 10 * max(1.0, size / _PAGE)  # a large picture is shrunk to the width of the page
-    figure = Figure(figsize=(size, size), dpi=100)
-    FigureCanvasAgg(figure)
-    style = {"label_kwargs": {"fontsize": text}, "color": BLUE, "plot_datapoints": False, "labelpad": _LABEL_PAD}
-    style["max_n_ticks"] = 3 if size < _PAGE else 2
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # ArviZ, which corner imports, warns once a day; corner, of sparse contours
-        import corner
-
-        corner.corner(
-            draws,
-            labels=[_wrapped(name) for name in names],
-            truths=list(nominal),
-            truth_color=ORANGE,
-            range=_ranges(draws, nominal),
-            fig=figure,
-            **style,
-        )
-    for ax in figure.axes:
-        ax.tick_params(labelsize=0.9 * text)
-    return figure
-
-
-def _wrapped(label: str) -> str:
-    """Return a label with its lines broken between words, so that it is no wider than a panel."""
-    return "\n".join(textwrap.fill(line, _WIDEST) for line in label.splitlines())
-
-
-def _ranges(draws: FloatArray, nominal: Sequence[float]) -> list[tuple[float, float]]:
-    """Return the range of each parameter in the corner plot: nearly all draws, and the recipe's value if among them."""
-    ends = np.quantile(draws, _NEARLY_ALL, axis=0).T
-    rim = 0.1 * (ends[:, 1] - ends[:, 0])
-    shown = np.column_stack([ends[:, 0] - rim, ends[:, 1] + rim]).clip(draws.min(0)[:, None], draws.max(0)[:, None])
-    own = np.asarray(nominal)
-    inside = (own >= draws.min(0)) & (own <= draws.max(0))
-    low, high = (
-        np.where(inside, which(shown[:, i], own), shown[:, i]) for i, which in ((0, np.minimum), (1, np.maximum))
-    )
-    return [(float(a), float(b)) if b > a else (float(a) - 0.5, float(a) + 0.5) for a, b in zip(low, high, strict=True)]
 
 
 @drawn

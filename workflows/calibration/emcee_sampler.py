@@ -83,9 +83,9 @@ def sample(
     """Sample until each chain is 50 autocorrelation times long and the effective sample size is at least ``wanted``.
 
     ``file`` keeps the draws; if the file exists, the chains continue from its last step. With a ``guide`` the walkers
-    start at its samples, and half of their proposals are from its mixture.
+    start at its samples, and most of their proposals are from its density.
     """
-    moves = GuidedMove(move(how), guide.mixture) if guide else move(how)
+    moves = GuidedMove(move(how), guide.density) if guide else move(how)
     runs = [start_ensemble(problem, mode, file, index, seed, walkers, moves, guide) for index in range(ENSEMBLES)]
     before, steps = _round(min(run.iteration for run in runs))
     tau_before, kept = _longest_time(runs, before) if before else np.inf, True

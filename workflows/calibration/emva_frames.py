@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,6 +26,7 @@ from neusee.nodes.calibrate import (
 )
 from neusee.nodes.values import Levels
 from neusee.workflows.engine.runner import run
+from neusee.workflows.frames.descriptor_file import quoted
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
@@ -41,10 +41,11 @@ OPERATING_POINT = {
     "pixel_pitch": "pixel pitch",
     "wavelength": "centroid wavelength of the light",
     "bandwidth": "width of its spectrum (FWHM)",
+    "spectrum": "spectrum of the lamp",
+    "photometer": "calibration of the light: instrument and certificate",
     "temperature": "temperature",
     "laboratory": "laboratory and date",
 }
-_LEVEL = re.compile(r"^[bd]\s+[\d.,]+(\s|$)", re.MULTILINE)  #: a line of a descriptor that begins a light level
 _HALF = 0.5  #: share of saturation at which the lit series is taken
 _TEXT = """# EMVA 1288: the sheet of the measurement {name}.
 steps:
@@ -70,25 +71,11 @@ def descriptor_recipe(file: Path, changes: Sequence[str] = ()) -> Recipe:
     """
     refuse_descriptor(file)
     name = "".join(c if c.isalnum() else "_" for c in file.parent.absolute().name or file.stem)
-    text = _TEXT.format(name=file.name, file=_quoted(str(file.absolute())))
+    text = _TEXT.format(name=file.name, file=quoted(str(file.absolute())))
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"{name}.yaml"
         path.write_text(text, encoding="utf-8")
         return load(path, changes)
-
-
-def descriptor_of(path: Path) -> Path:
-    """Return the descriptor file that a path is, or the only one in the folder that a path is.
-
-    Raises: ValueError for a folder without a descriptor, or with several.
-    """
-    if not path.is_dir():
-        return path
-    found = [file for file in sorted(path.glob("*.txt")) if _LEVEL.search(file.read_text("utf-8-sig", "replace"))]
-    if len(found) == 1:
-        return found[0]
-    has = f"has {len(found)} descriptors" if found else "has no descriptor, a .txt with levels in lines b and d"
-    raise ValueError(f"{path} {has}: name one file")
 
 
 def frames_of_recipe(recipe: Recipe, store: Store, release: Release = "4") -> EmvaFrames:
@@ -175,7 +162,3 @@ def _dark_and_half(light: Sequence[tuple[float, float]], found: Levels) -> list[
     times = np.array([light[j][1] for j in dark])
     own = dark[int(np.abs(times - (times.min() if half is None else light[half][1])).argmin())]
     return [own] if half is None else [own, half]
-
-
-def _quoted(text: str) -> str:
-    return "'" + text.replace("'", "''") + "'"

@@ -138,16 +138,21 @@ def widened(problem: SensorPosterior, chains: Chains, tests: Sequence[FrameTest]
 
 def widened_models(models: Iterable[ModelSpread], tests: Sequence[FrameTest]) -> list[ModelSpread]:
     """Return the intervals to report with the errors that the tests of frames leave open."""
+    extra = widths_of_tests(tests)
+    return [replace(model, stated=wider(model.stated, extra.get(model.name, 0.0))) for model in models]
+
+
+def widths_of_tests(tests: Iterable[FrameTest]) -> Mapping[str, float]:
+    """Return the relative standard deviation that the tests of frames leave open, by the parameter that it moves."""
     shifts = relative_shifts(tests)
-    extra: Mapping[str, float] = {
+    return {
         "gain": shifts["gain"],
         **{name: shifts["gain"] for name in _IN_ELECTRONS},
         **{name: math.hypot(shifts["gain"], shifts["noise"]) for name in _NOISES},
     }
-    return [replace(model, stated=_wider(model.stated, extra.get(model.name, 0.0))) for model in models]
 
 
-def _wider(interval: IntervalEstimate, shift: float) -> IntervalEstimate:
+def wider(interval: IntervalEstimate, shift: float) -> IntervalEstimate:
     """Return an interval of a positive value with a further relative standard deviation."""
     if shift < _SMALL:
         return interval

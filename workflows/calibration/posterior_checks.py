@@ -11,7 +11,7 @@ import numpy as np
 
 from neusee.nodes.calibrate import Likelihood, Rings
 from neusee.workflows.calibration.identifiability import Identifiability
-from neusee.workflows.calibration.importance_sampling import Guide, draw_guide, draw_samples, weights
+from neusee.workflows.calibration.importance_sampling import Guide, draw_guide, weights
 from neusee.workflows.calibration.level_misfit import is_camera, misfits
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
@@ -62,7 +62,7 @@ class ImportanceSamples:
     samples: FloatArray  #: (draw, free)
     weights: FloatArray  #: (draw,) sum 1
     tail: float  #: k-hat; above 0.7 the weights are unreliable
-    guide: Guide | None = None  #: the mixture of a posterior that may be long and bent
+    guide: Guide  #: the density from which the samples were drawn
 
     def mean(self) -> FloatArray:
         """Return the weighted mean (free,) of the samples."""
@@ -94,14 +94,12 @@ def arviz() -> Any:
 
 def importance_samples(problem: SensorPosterior, mode: LaplaceFit, seed: int) -> ImportanceSamples:
     """Draw importance samples from the posterior, and return them with Pareto-smoothed weights."""
-    rng, guide = np.random.default_rng(seed), None
-    if problem.coordinates.bent:
-        guide = draw_guide(problem, mode, rng)
-    samples, log = (guide.samples, guide.log) if guide else draw_samples(problem, mode, rng)
+    guide = draw_guide(problem, mode, np.random.default_rng(seed))
+    log = guide.log
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         smooth, tail = arviz().psislw(np.where(np.isfinite(log), log - log.max(), _NEVER))
-    return ImportanceSamples(samples, weights(smooth), float(tail), guide)
+    return ImportanceSamples(guide.samples, weights(smooth), float(tail), guide)
 
 
 def checks(
@@ -146,10 +144,11 @@ def _of_peak(
     below = mode.log - float(chains.log.max())
     distance = f"{abs(below):.2g} nats {'below' if below > 0 else 'above'} the mode"
     yield Check("the best draw is near the mode", distance, f"within {_BELOW:.0f} nats", _mark(abs(below) <= _BELOW))
-    at = [i for i, name in enumerate(problem.names) if law.guide or identifiability.kinds[name] == "estimate"]
+    bent = problem.coordinates.bent
+    at = [i for i, name in enumerate(problem.names) if bent or identifiability.kinds[name] == "estimate"]
     if not at:
         return
-    if law.guide:
+    if bent:
         size = 1 / float((law.weights**2).sum())
         text, least = f"effective sample size {size:.0f} of {len(law.weights)}", _WEIGHTED * len(law.weights)
         yield Check("weighted draws are numerous enough", text, f"at least {least:.0f}", _mark(size >= least, "warn"))
@@ -177,7 +176,7 @@ def _of_data(
     if is_camera(problem):
         for found in misfits(problem, law.samples, law.weights, mode.theta):
             yield Check(found.name, found.found, found.bar, _mark(found.good))
-    if law.guide and isinstance(problem.levels, Rings):
+    if isinstance(problem.levels, Rings):
         yield from _of_rings(problem, law, law.guide)
     count = len(identifiability.directions)
     weak = f"{count} of {len(identifiability.strengths)} directions are not determined"

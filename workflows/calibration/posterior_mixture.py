@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -16,12 +17,28 @@ if TYPE_CHECKING:
 _PARTICLES, _BESIDE = 1000, 200  #: particles, and draws about the mode
 _FAR = 40.0  #: nats below the best point at which a particle is lost in a mode that does not count
 _PARTS = 14  #: components that are fitted
-_TAIL = 6.0  #: degrees of freedom of each component
+_TAIL = 6.0  #: degrees of freedom of each component, where the mixture has no others
 _ROUNDS, _STEPS, _TRIED = 16, 8, 2000  #: most fits, steps of each fit, samples on which a fit is tried
 _SOFT, _ENOUGH = 0.3, 0.4  #: effective sample fractions: to fit the next mixture, to stop
 _BROAD, _WIDER = 0.05, 2.0  #: share and width of one broad component, which bounds the weights
 _BORROWED = 0.03  #: share of samples whose covariance in all is added to that of the components
 _NEVER = -1e300  #: log density of an impossible sample
+
+
+Random = np.random.Generator | np.random.RandomState
+
+
+class Density(Protocol):
+    """A density like the posterior, from which samples can be drawn."""
+
+    def draw(self, count: int, rng: Random) -> FloatArray:
+        """Draw samples (count, free)."""
+
+    def log_density(self, samples: FloatArray) -> FloatArray:
+        """Return the logarithm of the density at samples (draw, free), up to a constant."""
+
+    def propose(self, own: FloatArray, rng: Random) -> tuple[FloatArray, FloatArray]:
+        """Return new samples like ``own`` (draw, free), and the logarithm of the density at ``own`` over that there."""
 
 
 @dataclass(frozen=True)
@@ -31,34 +48,55 @@ class Mixture:
     shares: FloatArray  #: (component,) sum 1
     centres: FloatArray  #: (component, free)
     roots: FloatArray  #: (component, free, free) lower triangular roots of the scale matrices
+    tails: FloatArray | float = _TAIL  #: (component,) degrees of freedom
 
-    def draw(self, count: int, rng: np.random.Generator | np.random.RandomState) -> FloatArray:
+    def draw(self, count: int, rng: Random) -> FloatArray:
         """Draw samples (count, free)."""
         part = rng.choice(len(self.shares), size=count, p=self.shares)
         normal = rng.standard_normal((count, self.centres.shape[1]))
-        off = normal / np.sqrt(rng.chisquare(_TAIL, (count, 1)) / _TAIL)
+        tail = np.broadcast_to(self.tails, self.shares.shape)[part]
+        off = normal / np.sqrt(rng.chisquare(tail) / tail)[:, None]
         samples: FloatArray = self.centres[part] + np.einsum("nij,nj->ni", self.roots[part], off)
         return samples
 
     def log_density(self, samples: FloatArray) -> FloatArray:
         """Return the logarithm of the density at samples (draw, free), up to a constant."""
-        power = -0.5 * (_TAIL + self.centres.shape[1])
-        return _log_sum(self._levels() + power * np.log1p(self._squares(samples) / _TAIL))
+        power = 0.5 * (self.tails + self.centres.shape[1])
+        return log_sum(self._levels + self._constants - power * np.log1p(self._squares(samples) / self.tails))
+
+    def propose(self, own: FloatArray, rng: Random) -> tuple[FloatArray, FloatArray]:
+        """Return new samples like ``own`` (draw, free), and the logarithm of the density at ``own`` over that there."""
+        drawn = self.draw(len(own), rng)
+        return drawn, self.log_density(own) - self.log_density(drawn)
 
     def normal_shares(self, samples: FloatArray) -> FloatArray:
         """Return the share (draw, component) of each component in the density of normal components at samples."""
-        logs = self._levels() - 0.5 * self._squares(samples)
-        shares: FloatArray = np.exp(logs - _log_sum(logs)[:, None])
+        logs = self._levels - 0.5 * self._squares(samples)
+        shares: FloatArray = np.exp(logs - log_sum(logs)[:, None])
         return shares
 
+    @cached_property
     def _levels(self) -> FloatArray:
         widths = np.diagonal(self.roots, axis1=1, axis2=2)
         levels: FloatArray = np.log(self.shares.clip(1e-300)) - np.log(widths).sum(1)
         return levels
 
+    @cached_property
+    def _constants(self) -> FloatArray:
+        """Return what the degrees of freedom of each component add to its log density at the centre."""
+        from scipy.special import gammaln
+
+        half, free = 0.5 * np.asarray(self.tails), self.centres.shape[1]
+        constants: FloatArray = gammaln(half + 0.5 * free) - gammaln(half) - 0.5 * free * np.log(2 * half)
+        return constants
+
+    @cached_property
+    def _inverses(self) -> FloatArray:
+        return np.linalg.inv(self.roots).astype(np.float64)
+
     def _squares(self, samples: FloatArray) -> FloatArray:
         """Return the squared distance (draw, component) from each centre, in widths of the component."""
-        away = np.linalg.inv(self.roots) @ (samples.T[None] - self.centres[:, :, None])
+        away = self._inverses @ (samples.T[None] - self.centres[:, :, None])
         squares: FloatArray = (away**2).sum(1).T
         return squares
 
@@ -77,14 +115,14 @@ def fit_mixture(
     first = mixture = kept = _fitted(points, np.full(len(points), 1 / len(points)), rng)
     best = -1.0
     for _ in range(_ROUNDS):
-        samples, log = _weighed(problem, mixture, _TRIED, rng)
-        fraction = _effective(log)
+        samples, log = weighed(problem, mixture, _TRIED, rng)
+        fraction = effective(log)
         if fraction > best:
             best, kept = fraction, mixture
         if fraction >= _ENOUGH:
             break
-        mixture = _joined(first, _fitted(samples, _normalised(_softened(log)), rng))
-    return kept, *_weighed(problem, kept, count, rng)
+        mixture = _joined(first, _fitted(samples, normalised(softened(log)), rng))
+    return kept, *weighed(problem, kept, count, rng)
 
 
 def _joined(one: Mixture, other: Mixture) -> Mixture:
@@ -94,12 +132,12 @@ def _joined(one: Mixture, other: Mixture) -> Mixture:
     return Mixture(shares, centres, roots)
 
 
-def _weighed(
-    problem: SensorPosterior, mixture: Mixture, count: int, rng: np.random.Generator
+def weighed(
+    problem: SensorPosterior, density: Density, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return samples of a mixture, and the logarithm of posterior over mixture of each."""
-    samples = mixture.draw(count, rng)
-    return samples, _finite(problem.log_posterior(samples)) - mixture.log_density(samples)
+    """Return samples of a density, and the logarithm of posterior over density of each."""
+    samples = density.draw(count, rng)
+    return samples, finite(problem.log_posterior(samples)) - density.log_density(samples)
 
 
 def _start(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator) -> FloatArray:
@@ -112,13 +150,13 @@ def _start(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator)
 
 def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -> Mixture:
     """Return the mixture that expectation and maximisation find for weighted samples, and a broad component."""
-    centre, whole = _moments(samples, weight)
-    root = np.linalg.cholesky(_firm(whole))
+    centre, whole = moments(samples, weight)
+    root = np.linalg.cholesky(firm(whole))
     at = _apart(np.linalg.solve(root, (samples - centre).T).T, weight, rng)
     found = Mixture(np.full(_PARTS, 1 / _PARTS), samples[at], np.repeat(0.5 * root[None], _PARTS, 0))
     for _ in range(_STEPS):
         parts = weight[:, None] * found.normal_shares(samples)
-        found = _maximised(samples, parts, whole)
+        found = maximised(samples, parts, whole)
     return Mixture(
         np.append((1 - _BROAD) * found.shares, _BROAD),
         np.concatenate([found.centres, centre[None]]),
@@ -137,25 +175,29 @@ def _apart(places: FloatArray, weight: FloatArray, rng: np.random.Generator) -> 
     return chosen
 
 
-def _maximised(samples: FloatArray, parts: FloatArray, whole: FloatArray) -> Mixture:
-    """Return the mixture of normal components with the moments of samples, by their shares ``parts``."""
+def maximised(samples: FloatArray, parts: FloatArray, whole: FloatArray, borrowed: float = _BORROWED) -> Mixture:
+    """Return the mixture of normal components with the moments of samples, by their shares ``parts``.
+
+    ``borrowed`` is the share of samples with the covariance ``whole`` that is added to all components together.
+    """
     shares = parts.sum(0)
     centres = parts.T @ samples / shares.clip(1e-300)[:, None]
     away = samples[None] - centres[:, None]
     sums = np.swapaxes(away * parts.T[:, :, None], 1, 2) @ away
-    borrowed = _BORROWED / len(shares)
-    covariance = (sums + borrowed * whole) / (shares + borrowed)[:, None, None]
-    roots = np.linalg.cholesky(_firm(covariance)).astype(np.float64)
+    each = borrowed / len(shares)
+    covariance = (sums + each * whole) / (shares + each)[:, None, None]
+    roots = np.linalg.cholesky(firm(covariance)).astype(np.float64)
     return Mixture(shares / shares.sum(), centres, roots)
 
 
-def _moments(samples: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+def moments(samples: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the mean and the covariance of weighted samples."""
     centre = weight @ samples
     away = samples - centre
     return centre, away.T @ (weight[:, None] * away)
 
 
-def _firm(covariance: FloatArray) -> FloatArray:
+def firm(covariance: FloatArray) -> FloatArray:
     """Return covariances (..., free, free) whose rounding cannot make a variance negative."""
     firm = covariance.copy()
     at = np.arange(covariance.shape[-1])
@@ -163,33 +205,35 @@ def _firm(covariance: FloatArray) -> FloatArray:
     return firm
 
 
-def _softened(log: FloatArray) -> FloatArray:
+def softened(log: FloatArray) -> FloatArray:
     """Return ``log`` times the largest factor, up to 1, whose weights leave enough effective samples for a fit."""
-    if _effective(log) >= _SOFT:
+    if effective(log) >= _SOFT:
         return log
     low, high = 1e-12, 1.0
     for _ in range(40):
         middle = (low * high) ** 0.5
-        low, high = (middle, high) if _effective(middle * log) >= _SOFT else (low, middle)
+        low, high = (middle, high) if effective(middle * log) >= _SOFT else (low, middle)
     return low * log
 
 
-def _effective(log: FloatArray) -> float:
+def effective(log: FloatArray) -> float:
     """Return the effective sample size of weights with the logarithms ``log``, divided by their number."""
-    return float(1 / (_normalised(log) ** 2).sum() / len(log))
+    return float(1 / (normalised(log) ** 2).sum() / len(log))
 
 
-def _normalised(log: FloatArray) -> FloatArray:
+def normalised(log: FloatArray) -> FloatArray:
+    """Return weights with a sum of 1 from the logarithms of unnormalised weights."""
     weight = np.exp(log - log.max())
-    normalised: FloatArray = weight / weight.sum()
-    return normalised
+    whole: FloatArray = weight / weight.sum()
+    return whole
 
 
-def _finite(log: FloatArray) -> FloatArray:
+def finite(log: FloatArray) -> FloatArray:
+    """Return logarithms with a very small number in place of minus infinity and NaN."""
     return np.nan_to_num(log, nan=_NEVER, neginf=_NEVER)
 
 
-def _log_sum(logs: FloatArray) -> FloatArray:
+def log_sum(logs: FloatArray) -> FloatArray:
     """Return the logarithm of the sum of exponentials along the last axis."""
     top = logs.max(-1)
     total: FloatArray = top + np.log(np.exp(logs - top[..., None]).sum(-1))

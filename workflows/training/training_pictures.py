@@ -96,7 +96,7 @@ class TrainingStream:
         self._made = self._outputs(2 if frozen else 1)
         recipe, self.psf = self._mismatch.camera(believed, self._made, settings.psf)
         outputs = (*self._made, self.psf)
-        recipe = with_substitutions(recipe, outputs, {learn} if learn else ())
+        recipe = with_substitutions(replace(recipe, estimates=False), outputs, {learn} if learn else ())
         order = needed(recipe, outputs)
         keeps = self._pool and settings.keep_pool
         self._stored = StoredPool(recipe, settings, self._made, store, device) if keeps else None

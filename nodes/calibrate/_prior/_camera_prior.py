@@ -63,6 +63,7 @@ class CameraCoordinates(Free):
 
     every: ClassVar[tuple[str, ...]] = CAMERA_NAMES
     linear: ClassVar[frozenset[str]] = _LINEAR
+    widths: ClassVar[frozenset[str]] = frozenset({"scatter", "lamp", "drift"})
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -63,6 +63,7 @@ class Free:
 
     every: ClassVar[tuple[str, ...]]  #: the names of all parameters, free or held
     linear: ClassVar[frozenset[str]]  #: the parameters that may be 0 or negative
+    widths: ClassVar[frozenset[str]] = frozenset()  #: the parameters that are widths of the noise of the levels
     edged: ClassVar[frozenset[str]] = frozenset()  #: the parameters that rounded numbers
     #: constrain by edges and not by a slope: the last row of `Likelihood.scaled` describes the free one of these
 

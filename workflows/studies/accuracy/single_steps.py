@@ -28,6 +28,7 @@ from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.report.measured_variants import keep_variants
 from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import each_tensor, tensors_in
@@ -98,7 +99,10 @@ def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: fl
     key = _key(recipe, name, patience, store)
     compute = partial(_measure, recipe, step, store, patience)
     found = compute_once(store, key, StepMeasurement, compute, {"step": f"study accuracy: {name}"})
-    return StepTried(name, step.node.path, share, found)
+    tried = StepTried(name, step.node.path, share, found)
+    if rows := [(v.line, v.label, v.error, v.seconds) for v in tried.variants]:
+        keep_variants(recipe, name, rows, store, Code(store.code_memo))
+    return tried
 
 
 def _key(recipe: Recipe, name: str, patience: float, store: Store) -> str:
