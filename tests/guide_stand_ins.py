@@ -180,7 +180,7 @@ STAND_INS = {
     "\"train.mismatch={height_error.rms: 'uniform(0 nm, 20 nm)', height_error.depth: 'normal(0, 0.01)'}\"": StandIn(
         "ten minutes", more=(*TRAINING, *ONE)),
     'train my/train_smallnet.yaml "train.export=[pt2]"': StandIn("minutes", more=SMALLNET),
-    "train train_informed train.photographs=my_photographs": StandIn("half an hour", more=(
+    "train train_informed train.photographs=my_photographs +mismatch=usual": StandIn("half an hour", more=(
         *TRAINING[:-2], "train.network.width=2", "train.pool=2", "train.masks=[flat]", "train.stages.2.iterations=1",
         "train.stages.2.batch=2")),
     "train train_unrolled train.photographs=my_photographs": StandIn("half an hour", more=(

@@ -38,7 +38,7 @@ RIVALS = ("grey", "stop")  #: of the designed mask: the plain lens with as low a
 STOP = PEAK**0.25  #: the peak falls with the fourth power of the diameter, the light with its square
 BACKGROUND, DIAMETER = 0.7, 11.0
 EACH = 3  #: photographs, of which one stands behind the rivals too
-NO_POOL = ("train.augment.pooled=none", "train.pool=null")
+NO_POOL = ("+mismatch=usual", "train.augment.pooled=none", "train.pool=null")
 METHODS = ("developed", "told", "likeliest", "uncertain", "network")
 STEPS = """
 steps:

@@ -53,7 +53,8 @@ class Informed(Restorer):
         """
         rows, columns = maps.shape[-2:]
         whole = mirrored(maps.to(self.body.last.weight)[None], -rows % self.multiple, -columns % self.multiple)
-        free, share, grey = self.body.change(whole)[0, :, :rows, :columns].to(answer).split(3)
+        told: Tensor = self.body.change(whole)[0, :, :rows, :columns].to(answer)
+        free, share, grey = told[:3], told[3:6], told[6:]
         return free * deviation.sqrt() + share * answer + grey * answer.mean(0)
 
 
