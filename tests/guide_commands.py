@@ -22,6 +22,7 @@ from neusee.nodes import own_modules
 from neusee.nodes.restore._networks._informed import Informed
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
+from neusee.workflows.frames.sensor_group import FIRST
 from neusee.workflows.recipe import node_families
 from tests.deepinv_without_torchvision import deepinv_or_skip
 from tests.nodes.calibrate.numpy_camera import Camera
@@ -155,6 +156,9 @@ def _write_laboratory(folder: Path) -> None:
         for number, frame in enumerate(frames):
             name = f"flat_{photons:.0f}ph" if photons else "dark"
             Image.fromarray(frame.astype(np.uint16)).save(folder / f"{name}_{1e3 * time:.4g}ms_{number}.png")
+    sensor = folder.parents[1] / "sensor" / "lab.yaml"  # until the command of the page writes the real one
+    sensor.parent.mkdir()
+    sensor.write_text(f"{FIRST}, a stand-in.\ndefaults: [small]\nsensor: {{read_noise: 8 e-}}\n", encoding="utf-8")
 
 
 def _write_frames(folder: Path) -> None:

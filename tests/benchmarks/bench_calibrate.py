@@ -74,7 +74,7 @@ def nuts(problem, best, draws=1000, warmup=500, chains=4):
     """Independent draws, seconds with and without compilation."""
     levels = problem.levels
     photons, exposure, n, mean, variance, nu = (jnp.asarray(x.numpy()) for x in levels[:6])
-    prior = [jnp.asarray(x[problem.coordinates.prior.width.isfinite()].numpy()) for x in problem.coordinates.prior]
+    prior = [jnp.asarray(x[problem.coordinates.prior.width.isfinite()].numpy()) for x in problem.coordinates.prior[:2]]
     values, vectors = np.linalg.eigh(best.covariance)
     root, middle = jnp.asarray(vectors * np.sqrt(values)), jnp.asarray(best.theta)
 

@@ -502,9 +502,10 @@ _ELSEWHERE = {
         "restore.richardson_lucy", "restore.shading", "restore.unrolled", "restore.wiener", "restore.wiener_by_field",
         "restore.wiener_problem", "spectra.compress"),
     "copies, counts or states": ("laser.bright_pixels", "laser.damaged_pixels", "laser.dazzle", "laser.dazzle_curve",
-        "metrics.saturated", "optics.stop", "restore.clipped", "sensor.crop", "sensor.limits", "spectra.filters"),
+        "metrics.saturated", "optics.pupil_of_bands", "optics.stop", "restore.clipped", "sensor.crop", "sensor.limits",
+        "spectra.filters"),
     "has a stated error above 1e-11": ("flare.stray_light", "flare.stray_shares", "metrics.quality",
-        "metrics.spectral_error"),
+        "metrics.spectral_error", "optics.few_bands", "optics.few_bands_checked"),
 }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from neusee.nodes.calibrate import FrameTest, Rings
+from neusee.nodes.calibrate import FrameTest, Laboratory, Rings
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration.budget_page import COLUMNS, budget_document, budget_rows
 from neusee.workflows.calibration.calibration_budget import budgets
@@ -28,6 +28,7 @@ from neusee.workflows.calibration.frame_validity import (
     as_rows,
     frame_checks,
     frame_section,
+    hidden_checks,
     inspect_recipe,
     lines,
     widened,
@@ -133,14 +134,26 @@ def find_posterior(
     models = compare_models(recipe, store, recipe.seed) if isinstance(problem.levels, Levels) else []
     tested = [
         *frame_checks(tests, not isinstance(problem.levels, Rings)),
+        *hidden_checks(tests, problem.coordinates.prior.may_hide),
         *checks(problem, mode, identifiability, chains, law),
     ]
-    unwidened = {name: float(x.std()) for name, x in problem.parameters(chains.draws).items()}
-    chains = with_laboratory(problem, widened(problem, chains, tests, recipe.seed), laboratory, recipe.seed)
-    models = with_laboratory_models(widened_models(models, tests), laboratory)
-    if is_relative(recipe):
-        identifiability = without_efficiency(identifiability)
-    result = CalibrationResult(problem, mode, identifiability, chains, tested, models, tests, unwidened)
+    return _widened(CalibrationResult(problem, mode, identifiability, chains, tested, models, tests), laboratory)
+
+
+def _widened(result: CalibrationResult, laboratory: Laboratory) -> CalibrationResult:
+    """Return a calibration with what the frames show or may hide, with what the laboratory states, and its budgets."""
+    problem, tests = result.problem, result.frames
+    told = result.identifiability
+    unwidened = {name: float(x.std()) for name, x in problem.parameters(result.chains.draws).items()}
+    chains = widened(problem, result.chains, tests, problem.recipe.seed)
+    models = widened_models(result.models, tests, problem.coordinates.prior.may_hide)
+    result = replace(
+        result,
+        identifiability=without_efficiency(told) if is_relative(problem.recipe) else told,
+        chains=with_laboratory(problem, chains, laboratory, problem.recipe.seed),
+        models=with_laboratory_models(models, laboratory),
+        unwidened=unwidened,
+    )
     return replace(result, budgets=budgets(result, laboratory))
 
 
