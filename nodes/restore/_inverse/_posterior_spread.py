@@ -70,7 +70,7 @@ def wiener_spread(
             holds under the model of the filter: not for light that the filter is not told of, such as a laser or the
             halo of a laser behind dirt, not for a wrong PSF, and not for the colour of paints. Too narrow for an even
             scene onto which a mask spreads light from beyond the frame. The iteration adds what `restore.wiener` says.
-            Nine frames of 44 pixels a side: intervals of 90 % hold 88 % of the pixels, 85 to 94 % in eight frames, 66 % in one.
+            Nine frames of 44 x 44 pixels: intervals of 90 % hold 88 % of the pixels, 85 to 94 % in eight, 66 % in one.
             The result has a derivative with respect to ``matrix`` alone; draws and fitted power count as constants.
     Raises: ValueError as `restore.wiener`.
     Source: Papandreou and Yuille, Gaussian sampling by local perturbations, NIPS 23 (2010), algorithm 1; Sykulski,
