@@ -19,6 +19,7 @@ from PIL import Image
 from safetensors.torch import save_file
 
 from neusee.nodes import own_modules
+from neusee.nodes.restore._networks._informed import Informed
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
 from neusee.workflows.frames.sensor_group import FIRST
@@ -118,9 +119,8 @@ def write_reader_files(folder: Path) -> None:
     _write_points(folder / "points")
     shutil.copy(ROOT / "recipes" / "samples" / "camera_levels.csv", folder / "my.csv")
     (folder / "camera.csv").write_text("wavelength,red,green,blue\n400,0,0,1\n550,0,1,0\n700,1,0,0\n")
-    network = start_network(partial(NAFNet, width=16), torch.Generator().manual_seed(0))
-    for name in ("net", "best"):
-        save_file(network.state_dict(), folder / f"{name}.safetensors")
+    for name, kind in {"net": partial(NAFNet, width=16), "best": partial(Informed, width=12)}.items():
+        save_file(start_network(kind, torch.Generator().manual_seed(0)).state_dict(), folder / f"{name}.safetensors")
     names: dict[str, Any] = {}
     exec((folder / "my" / "smallnet.py").read_text(encoding="utf-8"), names)
     save_file(names["SmallUNet"](16).state_dict(), folder / "smallnet.safetensors")

@@ -46,7 +46,7 @@ from neusee.workflows.calibration.laboratory import (
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import compare_models
 from neusee.workflows.calibration.posterior_checks import arviz, checks, count_failures, importance_samples
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
+from neusee.workflows.calibration.posterior_mode import search_mode
 from neusee.workflows.calibration.standard_fit import compared
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
@@ -109,7 +109,7 @@ def find_posterior(
     laboratory = laboratory_of(recipe)
     tests = _accepted_frames(recipe, store, progress)
     problem = SensorPosterior.of(recipe, store)
-    mode = find_mode(problem, initial_theta(problem))
+    mode = search_mode(problem)
     identifiability = identify(problem, mode)
     if identifiability.refused:
         raise CalibrationRefused(identifiability.refused)

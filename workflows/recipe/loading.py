@@ -144,8 +144,7 @@ def check(composed: Composed) -> Recipe:
     seed, tolerance = seed_and_tolerance(root, references, checker.diagnostics)
     estimates, outputs = estimates_of(root, references, checker.diagnostics), outputs_of(root, wiring)
     check_steps(checked, checker, None if loops else outputs)
-    expect = expectations(root, wiring)
-    exports = exports_of(root, wiring)
+    expect, exports = expectations(root, wiring), exports_of(root, wiring)
     safety = _safety(root, references, diagnostics, checker.files)
     references.finish()
     if not composed.whole:  # a missing group causes further errors

@@ -25,9 +25,9 @@ from neusee.workflows.report.run_pictures import DerivedFile, Drawing, arguments
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.serialization import tensors_in
 
-LARGE = 1 << 27  #: bytes; a larger result is held only for files that need nothing else any more
+LARGE = 1 << 26  #: bytes; a larger result is held only for files that need nothing else any more
 _SMALL = 1 << 22  #: bytes of a result that is held in any case
-ROOM = 1 << 29  #: bytes of smaller results that are held for files
+ROOM = 1 << 27  #: bytes of smaller results that are held for files
 
 
 class FilesBeside:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from typing import Any
 
 from neusee.workflows.engine.provenance import machine, timestamp
 from neusee.workflows.graph.recipe_graph import Recipe, needed
@@ -11,14 +12,14 @@ from neusee.workflows.keys.cache_key import code_of, digest, plain
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.store.result_store import Store
 
-Row = tuple[str, str, float, float]  #: property that is changed, new value, error, seconds
+Row = tuple[Any, ...]  #: property that is changed, new value, error, seconds
 
 
-def keep_variants(recipe: Recipe, step: str, rows: Sequence[Row], store: Store, code: Code) -> None:
+def keep_variants(recipe: Recipe, step: str, rows: Sequence[Row], store: Store) -> None:
     """Keep the errors and run times of the variants of a step, for recipes with this step, its inputs and machine."""
-    store.put(
-        _key(recipe, step, code), [list(row) for row in rows], {"step": f"variants of {step}", "date": timestamp()}
-    )
+    if rows:
+        about = {"step": f"variants of {step}", "date": timestamp(), "seconds": 0.0}
+        store.put(_key(recipe, step, Code(store.code_memo)), [list(row) for row in rows], about)
 
 
 def variants_of(recipe: Recipe, family: str, store: Store, code: Code) -> list[Row]:

@@ -63,7 +63,7 @@ class Drawing:
 
 def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
     """Draw the pictures of a run; return the paths of the pictures, and the reason for each picture that is missing."""
-    paths, missing = files_of(figures(), result, shelf)
+    paths, missing = files_of(figure_files(), result, shelf)
     now, _ = (
         shelf.find(key, ".png") or shelf.keep(key, ".png", "graph", partial(GRAPH_DRAWING, **arguments))
         for key, arguments in graphs(result)
@@ -71,7 +71,7 @@ def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict
     return {**paths, "graph": now}, missing
 
 
-def figures() -> Iterator[DerivedFile]:
+def figure_files() -> Iterator[DerivedFile]:
     """Yield the pictures that show results of steps."""
     for f in FIGURES:
         kind = ("figure", f.draw, _drawing_code())

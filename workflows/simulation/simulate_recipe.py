@@ -24,7 +24,7 @@ from neusee.workflows.report.data_exports import data_files, exports
 from neusee.workflows.report.files_beside import FilesBeside
 from neusee.workflows.report.run_code import code_text
 from neusee.workflows.report.run_folder import NotWritten, RunFolder, new_run
-from neusee.workflows.report.run_pictures import GRAPH_DRAWING, DerivedFile, figures, graphs, pictures, timeline
+from neusee.workflows.report.run_pictures import GRAPH_DRAWING, DerivedFile, figure_files, graphs, pictures, timeline
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -93,7 +93,7 @@ def _watched() -> Iterator[None]:
 
 
 def _files(recipe: Recipe) -> Iterator[DerivedFile]:
-    yield from figures()
+    yield from figure_files()
     yield from data_files(recipe)
 
 

@@ -99,10 +99,8 @@ def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: fl
     key = _key(recipe, name, patience, store)
     compute = partial(_measure, recipe, step, store, patience)
     found = compute_once(store, key, StepMeasurement, compute, {"step": f"study accuracy: {name}"})
-    tried = StepTried(name, step.node.path, share, found)
-    if rows := [(v.line, v.label, v.error, v.seconds) for v in tried.variants]:
-        keep_variants(recipe, name, rows, store, Code(store.code_memo))
-    return tried
+    keep_variants(recipe, name, [tuple(variant.values()) for variant in found.variants], store)
+    return StepTried(name, step.node.path, share, found)
 
 
 def _key(recipe: Recipe, name: str, patience: float, store: Store) -> str:
@@ -216,9 +214,6 @@ def _median_time(compute: Callable[[], Any]) -> tuple[Any, float]:
     while len(times) < _TIMES and sum(times) < _LONG_ENOUGH:
         times.append(_time_once(compute)[1])
     return value, median(times)
-
-
-# --- smaller inputs, on which the reference is fast enough ------------------------------------------------------------
 
 
 def cut_inputs(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
