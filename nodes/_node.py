@@ -79,6 +79,9 @@ class Hooks:
     #: upper bounds in root mean square; a list input has a list, an absent input None; without this hook the inputs
     #: must satisfy the tolerance themselves, because the error of the result is not known
     propagate_error: Callable[..., float] | None = None
+    #: True if `propagate_error` or `approximation_error` gives an estimate and no bound, which a recipe with
+    #: ``estimates: false`` does not use
+    estimated: bool = False
     #: (result): the error of a cheaper form relative to its largest element, in root mean square and for the largest
     #: element alone; both include the approximations of the inputs
     approximation_error: Callable[[Any], tuple[float, float]] | None = None

@@ -112,6 +112,16 @@ class Channels(NamedTuple):
     bound: Tensor  #: () float64, upper bound of the root mean square error over max |plane|, for the worst row
     kept: Tensor = torch.zeros(5, dtype=torch.int64)  #: counts of planes, kernels, bands, PSF rows and PSF columns
     largest: Tensor = torch.tensor(torch.inf, dtype=torch.float64)  #: upper bound of the relative error of max |plane|
+    estimated: Tensor = torch.zeros(2, dtype=torch.float64)  #: estimates, beside `bound` and `largest`, by `FewBands`
+
+
+class FewBands(NamedTuple):
+    """A choice of few bands whose PSFs represent all: the PSF of band b is ``sum_j share[b, j]`` times that of j."""
+
+    share: Tensor  #: (band, j) float64; each row sums to 1
+    used: Tensor  #: (j,) int64, which bands, rising
+    error: Tensor  #: () float64, estimate of the root mean square error of the image over its brightest pixel
+    largest: Tensor  #: () float64, estimate of the relative error of the brightest pixel
 
 
 class Levels(NamedTuple):
@@ -172,6 +182,16 @@ class WienerProblem(NamedTuple):
     doubts: Tensor  #: (pattern, channel, y, x), patterns that are added with a strength of mean 0 and variance 1
     answer: Tensor  #: (channel, y, x), what the filter restores, in units of ``scale``
     seen: Tensor  #: (channel, y, x), the blurred answer, in which light from beyond the frame counts too
+    scale: Tensor  #: (channel, 1, 1) e-, of the answer behind a perfect lens
+    mean: Tensor  #: (channel, 1, 1) e-, of the scene behind a perfect lens
+
+
+class FilterFacts(NamedTuple):
+    """What `restore.wiener` finds in a picture and knows of it, as maps that a network can see."""
+
+    answer: Tensor  #: (channel, y, x), what the filter restores, of mean 0 and in units of ``scale``
+    deviation: Tensor  #: (channel, y, x), predicted error of the answer, in units of ``scale``
+    maps: Tensor  #: (map, y, x), in the order that `restore.filter_facts` states
     scale: Tensor  #: (channel, 1, 1) e-, of the answer behind a perfect lens
     mean: Tensor  #: (channel, 1, 1) e-, of the scene behind a perfect lens
 

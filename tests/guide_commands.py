@@ -19,10 +19,13 @@ from PIL import Image
 from safetensors.torch import save_file
 
 from neusee.nodes import own_modules
+from neusee.nodes.restore._networks._informed import Informed
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
+from neusee.workflows.frames.sensor_group import FIRST
 from neusee.workflows.recipe import node_families
 from tests.deepinv_without_torchvision import deepinv_or_skip
+from tests.nodes.calibrate.numpy_camera import Camera
 
 ROOT = Path(__file__).parents[1]
 GUIDE = ROOT / "recipes" / "guide"
@@ -112,12 +115,12 @@ def write_reader_files(folder: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
     _write_frames(folder / "my")
+    _write_laboratory(folder / "my" / "lab")
     _write_points(folder / "points")
     shutil.copy(ROOT / "recipes" / "samples" / "camera_levels.csv", folder / "my.csv")
     (folder / "camera.csv").write_text("wavelength,red,green,blue\n400,0,0,1\n550,0,1,0\n700,1,0,0\n")
-    network = start_network(partial(NAFNet, width=16), torch.Generator().manual_seed(0))
-    for name in ("net", "best"):
-        save_file(network.state_dict(), folder / f"{name}.safetensors")
+    for name, kind in {"net": partial(NAFNet, width=16), "best": partial(Informed, width=12)}.items():
+        save_file(start_network(kind, torch.Generator().manual_seed(0)).state_dict(), folder / f"{name}.safetensors")
     names: dict[str, Any] = {}
     exec((folder / "my" / "smallnet.py").read_text(encoding="utf-8"), names)
     save_file(names["SmallUNet"](16).state_dict(), folder / "smallnet.safetensors")
@@ -144,6 +147,18 @@ def _write_points(folder: Path) -> None:
         light = 4000.0 * down[:, None, None] * right[:, None] * np.array([0.8, 1.0, 0.7])
         electrons = rng.poisson(light) + rng.normal(0.0, 2.4, light.shape)
         np.save(folder / f"point{number}.npy", np.clip(np.round(electrons / 0.37 + 1054.0), 0, 65535).astype(np.uint16))
+
+
+def _write_laboratory(folder: Path) -> None:
+    """Write 16-bit PNG frames of a camera of 24 x 24 pixels, whose names tell exposure and photons."""
+    folder.mkdir(parents=True)
+    for _, photons, time, frames in Camera(seed=5, size=24, darks=3, lit=12, faults={"lamp": 0.003}).levels():
+        for number, frame in enumerate(frames):
+            name = f"flat_{photons:.0f}ph" if photons else "dark"
+            Image.fromarray(frame.astype(np.uint16)).save(folder / f"{name}_{1e3 * time:.4g}ms_{number}.png")
+    sensor = folder.parents[1] / "sensor" / "lab.yaml"  # until the command of the page writes the real one
+    sensor.parent.mkdir()
+    sensor.write_text(f"{FIRST}, a stand-in.\ndefaults: [small]\nsensor: {{read_noise: 8 e-}}\n", encoding="utf-8")
 
 
 def _write_frames(folder: Path) -> None:

@@ -40,7 +40,7 @@ from tests.guide_commands import (
     write_reader_files,
 )
 from tests.guide_machines import scheduler, together
-from tests.guide_stand_ins import LIGHT, SMALL_OPTIONS, STAND_INS, NotDeclared, StandIn, stand_in, typed
+from tests.guide_stand_ins import LABORATORY, LIGHT, SMALL_OPTIONS, STAND_INS, NotDeclared, StandIn, stand_in, typed
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:typer")
 
@@ -160,6 +160,8 @@ def test_every_command_runs(words, place, reader, tmp_path, monkeypatch, capfd):
         carry_out("train train_demonstration --stage mask", place, monkeypatch)
     if words.startswith("restore"):
         write_frame(place, monkeypatch)
+    if "sensor=lab" in words and "posterior:" not in Path("sensor/lab.yaml").read_text():
+        carry_out(LABORATORY, place, monkeypatch)
     carry_out(words, place, monkeypatch)
     assert capfd.readouterr().out
 

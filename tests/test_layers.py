@@ -28,9 +28,9 @@ ROOMS = (
     "graph", "keys", "recipe.text", "recipe.blocks", "recipe.distributions", "recipe", "store", "placement",
     "tolerance", "engine", "report.figures", "report", "contract", "explain", "simulation", "comparison", "safety",
     "restoration", "protection", "priors", "sweeps", "training.loop",
-    "training.parallel", "training.mask_design", "training", "training.lift", "evaluation", "calibration", "studies",
-    "studies.accuracy", "studies.stability", "studies.leave_out", "studies.uncertainty", "studies.calibration",
-    "studies.protection", "api",
+    "training.parallel", "training.mask_design", "training", "training.lift", "evaluation", "frames", "calibration",
+    "studies", "studies.accuracy", "studies.stability", "studies.leave_out", "studies.uncertainty",
+    "studies.calibration", "studies.protection", "api",
     "handbook", "answers", "cli",
 )  # fmt: skip
 DOOR = ""  #: neusee.workflows itself, which offers names of all rooms: no room imports it

@@ -1,6 +1,16 @@
 """Calibration nodes, which estimate the constants of a sensor with uncertainties from frames of flat light."""
 
 from neusee.nodes.calibrate import _result_shapes  # noqa: F401  attaches the shape rules
+from neusee.nodes.calibrate._budget._camera_sources import (
+    STATISTICS,
+    camera_sources,
+    source_freedom,
+    variance_shares,
+)
+from neusee.nodes.calibrate._budget._laboratory import Laboratory, laboratory_contributions
+from neusee.nodes.calibrate._budget._sheet_budget import MODEL, sheet_budgets
+from neusee.nodes.calibrate._budget._traceability import Traceability
+from neusee.nodes.calibrate._budget._uncertainty_budget import COVERAGE, NOT_INVOLVED, NOT_STATED, Budget, Contribution
 from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
 from neusee.nodes.calibrate._frames._emva_descriptor import (
     descriptor,
@@ -8,6 +18,7 @@ from neusee.nodes.calibrate._frames._emva_descriptor import (
     descriptor_series,
     refuse_descriptor,
 )
+from neusee.nodes.calibrate._frames._frame_headers import FrameHeader, frame_header, frame_means
 from neusee.nodes.calibrate._frames._frame_statistics import levels, reduce
 from neusee.nodes.calibrate._frames._level_frames import frames
 from neusee.nodes.calibrate._frames._moment_table import table
@@ -36,19 +47,31 @@ from neusee.nodes.calibrate._sheet._patterns import (
 )
 from neusee.nodes.calibrate._sheet._quantity import Quantity
 from neusee.nodes.calibrate._sheet._sheet import EmvaSheet, emva_sheet
-from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Stack
+from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Stack, uncorrected
+from neusee.nodes.calibrate._validity._hidden_faults import Correction, Hidden, corrections
 from neusee.nodes.calibrate._validity._inspection import inspect_frames
 from neusee.nodes.calibrate._validity._number_tests import coarse
 
 __all__ = [
     "CAMERA_NAMES",
+    "COVERAGE",
+    "MODEL",
     "NAMES",
+    "NOT_INVOLVED",
+    "NOT_STATED",
     "SCATTER_NAMES",
+    "STATISTICS",
+    "Budget",
     "CameraCoordinates",
+    "Contribution",
     "Coordinates",
+    "Correction",
     "DefectHistogram",
     "EmvaSheet",
+    "FrameHeader",
     "FrameTest",
+    "Hidden",
+    "Laboratory",
     "LeastSquares",
     "Likelihood",
     "Nonuniformity",
@@ -62,9 +85,12 @@ __all__ = [
     "Spectrogram",
     "Stack",
     "Sufficient",
+    "Traceability",
     "camera",
     "camera_prior",
+    "camera_sources",
     "coarse",
+    "corrections",
     "defects",
     "density",
     "descriptor",
@@ -72,12 +98,15 @@ __all__ = [
     "descriptor_series",
     "emva_sheet",
     "expose",
+    "frame_header",
+    "frame_means",
     "frames",
     "general_model",
     "guess",
     "guess_camera",
     "guess_scatter",
     "inspect_frames",
+    "laboratory_contributions",
     "least_squares",
     "levels",
     "point_source",
@@ -85,11 +114,15 @@ __all__ = [
     "profiles",
     "reduce",
     "refuse_descriptor",
+    "sheet_budgets",
+    "source_freedom",
     "spatial_series",
     "spectrogram",
     "stray_light",
     "stray_prior",
     "sufficient",
     "table",
+    "uncorrected",
+    "variance_shares",
     "without_trend",
 ]

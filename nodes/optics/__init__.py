@@ -3,6 +3,7 @@
 from neusee.nodes.optics import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.optics._imaging._band_image import image
 from neusee.nodes.optics._imaging._channel_image import image_channels
+from neusee.nodes.optics._imaging._few_bands import few_bands, few_bands_checked, pupil_of_bands
 from neusee.nodes.optics._laser_direction import direction, field_of_view
 from neusee.nodes.optics._laser_spot import laser_irradiance
 from neusee.nodes.optics._phase_steps import mask_turns, pupil_has_large_steps
@@ -13,6 +14,8 @@ from neusee.nodes.optics._white_irradiance import white_irradiance
 
 __all__ = [
     "direction",
+    "few_bands",
+    "few_bands_checked",
     "field_of_view",
     "image",
     "image_channels",
@@ -21,6 +24,7 @@ __all__ = [
     "psf",
     "pupil",
     "pupil_has_large_steps",
+    "pupil_of_bands",
     "stop",
     "white_irradiance",
 ]

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from neusee.nodes.optics._imaging._band_image import image
 from neusee.nodes.optics._imaging._channel_image import image_channels
+from neusee.nodes.optics._imaging._few_bands import few_bands, few_bands_checked, pupil_of_bands
 from neusee.nodes.optics._laser_direction import direction
 from neusee.nodes.optics._laser_spot import laser_irradiance
 from neusee.nodes.optics._psf import _nodes, psf
@@ -15,7 +16,7 @@ from neusee.nodes.optics._transform._sample_axis import Axis
 from neusee.nodes.optics._transform._scaled_transform import _expected_seconds
 from neusee.nodes.optics._white_irradiance import white_irradiance
 from neusee.nodes.shape_rules import at_least_single, blank, double, known, transform_operations
-from neusee.nodes.values import Bands, Channels, LowRankCube, Psf, Pupil, Stop, Wavefront
+from neusee.nodes.values import Bands, Channels, FewBands, LowRankCube, Psf, Pupil, Stop, Wavefront
 
 _WAVE, _SQUARE = 10.0, 8.0  #: operations for the wave at a sample of the pupil, and for its square at a pixel
 _SHORT, _FINE = 400e-9, 4e-6  #: m, wavelength and pupil pitch where no value is known
@@ -74,17 +75,43 @@ def _(result: Tensor, radiance: Tensor, psf: Psf, *, border: str = "zero", **par
     return 8.0 * size[0] * size[1] + around, result[..., 0, 0].numel() * 3 * transform_operations(*size)
 
 
+@few_bands.shape
+def _(pupil: Pupil, *others: Any, **params: Any) -> FewBands:
+    """Return the choice of all bands, because the number of bands in use is not known before the run."""
+    count = len(pupil.wavelengths)
+    return FewBands(double(count, count), blank(count, dtype=torch.int64), double(), double())
+
+
+@few_bands_checked.shape
+def _(few: FewBands, *others: Any, **params: Any) -> FewBands:
+    return few
+
+
+@pupil_of_bands.shape
+def _(pupil: Pupil, few: FewBands) -> Pupil:
+    """Return the pupil of all bands: the number of bands in use is not known before the run, nor are they."""
+    return pupil
+
+
+@few_bands.work
+@few_bands_checked.work
+def _(result: FewBands, *inputs: Any, **params: Any) -> tuple[float, float]:
+    """Return the work of PSFs of all bands in 480 x 480 pixels, which is that of a mask that spreads the light."""
+    pixels = len(result.share) * 480.0**2
+    return 16.0 * pixels, 100.0 * pixels
+
+
 @image_channels.shape
-def _(radiance: LowRankCube, psf: Psf, rows: Tensor, **params: Any) -> Channels:
+def _(radiance: LowRankCube, psf: Psf, rows: Tensor, *few: Any, **params: Any) -> Channels:
     dtype = at_least_single(radiance.planes, psf.intensity)
     planes = blank(len(rows), *radiance.planes.shape[1:], dtype=dtype)
     kept = blank(5, dtype=torch.int64)
-    return Channels(planes, double(*rows.shape), double(), kept, double())
+    return Channels(planes, double(*rows.shape), double(), kept, double(), double(2))
 
 
 @image_channels.work
 def _(
-    result: Channels, radiance: LowRankCube, psf: Psf, rows: Tensor, *, border: str = "zero", **params: Any
+    result: Channels, radiance: LowRankCube, psf: Psf, rows: Tensor, *few: Any, border: str = "zero", **params: Any
 ) -> tuple[float, float]:
     (high, wide), (k, y, x), r = _padded(radiance.planes, psf, border), radiance.planes.shape, len(rows)
     m, n = (min(a, 2 * b - 1) for a, b in zip(psf.intensity.shape[-2:], (y, x), strict=True))

@@ -1,11 +1,12 @@
 """The colour matrix, which converts electrons of the channels to the colour of the scene in daylight."""
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from neusee.nodes import Check, node
+from neusee.nodes import Check, ErrorBound, TensorStats, node
 from neusee.nodes.scene._grey import luminance
 from neusee.nodes.sensor._exposure import channel_weights
 from neusee.nodes.sensor._saturation import Efficiency
@@ -57,6 +58,15 @@ def _(result: Tensor, *inputs: Any, **params: float) -> list[Check]:
     off = (spectra @ counts.T @ result.T - spectra @ _target(bands.centres, len(result[0])).T).square().mean().sqrt()
     what = "colour" if len(result[0]) > 1 else "luminance"
     return [Check(f"rms {what} error {float(off):.3f} on colour charts", float(off) < 0.1)]
+
+
+@colour_matrix.propagate_error
+def _(bands: ErrorBound, illuminant: ErrorBound, responses: ErrorBound, level: ErrorBound, **params: Any) -> float:
+    """Return an error bound of the matrix, which is inversely proportional to the factor `level`."""
+    result: TensorStats = params["result"]
+    if any(given.rms for given in (bands, illuminant, responses)) or level.share >= 1.0:
+        return math.inf
+    return level.share / (1.0 - level.share) * max(abs(result.min), abs(result.max))
 
 
 def _target(centres: Tensor, channels: int) -> Tensor:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from neusee.nodes import ParameterError
 from neusee.nodes.constants import SPEED_OF_LIGHT
+from neusee.nodes.scene._plain_exr import write_lines
 
 _NAME = re.compile(r"(S0|T)\.(\d*,?\d*(?:[eE][-+]?\d+)?)(Y|Z|E|P|T|G|M|k|h|da|d|c|m|u|n|p)?(m|Hz)")
 _PREFIX = {
@@ -88,13 +89,14 @@ def write_spectral(
     *,
     kind: Literal["emissive", "reflective"] = "emissive",
     header: Mapping[str, Any] | None = None,
+    half: bool = False,
 ) -> None:
-    """Write a spectral cube (band, y, x) with its wavelengths in m to an OpenEXR file, as lossless float32.
+    """Write a spectral cube (band, y, x) with its wavelengths in m to an uncompressed OpenEXR file, as float32.
 
-    Raises: ValueError where cube and wavelengths differ in number, and where two bands would get the same name.
+    With ``half`` the file has float16, half as many bytes, in which values below 6e-8 become zero.
+    Raises: ValueError where cube and wavelengths differ in number, where two bands would get the same name, and where a
+    value is beyond the range of float16.
     """
-    import OpenEXR
-
     wavelengths = [float(w) for w in centres]
     if cube.ndim != 3 or len(wavelengths) != len(cube):
         raise ValueError(
@@ -105,10 +107,8 @@ def write_spectral(
     names = [quantity + "." + f"{w * 1e9:.6f}nm".replace(".", ",") for w in wavelengths]
     if len(set(names)) < len(names):
         raise ValueError(f"bands closer than 1e-6 nm would have equal channel names: {names}")
-    planes = cube.detach().cpu().float().contiguous().numpy()
-    about = {"spectralLayoutVersion": "1.0", "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    about |= {"emissiveUnits": "W.m^-2"} if kind == "emissive" else {}
-    OpenEXR.File({**about, **(header or {})}, dict(zip(names, planes, strict=True))).write(str(path))
+    about = {"spectralLayoutVersion": "1.0", **({"emissiveUnits": "W.m^-2"} if kind == "emissive" else {})}
+    write_lines(path, names, cube, {**about, **(header or {})}, half)
 
 
 def read_spectral(path: Path | str) -> tuple[Tensor, Tensor, dict[str, Any]]:

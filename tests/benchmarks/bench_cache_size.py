@@ -1,4 +1,4 @@
-"""`cache ls` and `cache gc` of a large cache: processor seconds and peak memory, as a table in RESULTS.md.
+"""`cache ls`, `cache gc` and the start of a run with a large cache: seconds and memory, as a table in RESULTS.md.
 
     python tests/benchmarks/bench_cache_size.py [--results N ...]
 
@@ -28,10 +28,13 @@ file of 1 kB.
 """
 COLUMNS = "| results | command | processor s | peak MB |\n|---|---|---|---|\n"
 COMMANDS = {
-    "cache ls": ["ls"],
-    "cache gc --dry-run": ["gc", "--dry-run"],
-    "cache gc --budget 155 MB": ["gc", "--budget", "155 MB"],
-    "cache gc, again": ["gc", "--budget", "155 MB"],
+    "cache ls": ["cache", "ls"],
+    "cache ls --all": ["cache", "ls", "--all"],
+    "plan laser_free": ["plan", "laser_free"],
+    "run laser_free": ["run", "laser_free", "--quiet"],
+    "cache gc --dry-run": ["cache", "gc", "--dry-run"],
+    "cache gc --budget 155 MB": ["cache", "gc", "--budget", "155 MB"],
+    "cache gc, again": ["cache", "gc", "--budget", "155 MB"],
 }
 
 
@@ -77,9 +80,9 @@ def fill(root: Path, count: int) -> None:
 
 def measured(root: Path, words: list[str]) -> tuple[float, float, str]:
     """Return the processor seconds and the peak in MB of one command, and the last line that it prints."""
-    command = [sys.executable, "-m", "neusee", "cache", *words]
+    command = [sys.executable, "-m", "neusee", *words]
     with tempfile.TemporaryFile() as out:
-        process = subprocess.Popen(command, env={**os.environ, "NEUSEE_CACHE": str(root)}, stdout=out)
+        process = subprocess.Popen(command, env={**os.environ, "NEUSEE_CACHE": str(root)}, stdout=out, cwd=root.parent)
         _, status, used = os.wait4(process.pid, 0)
         if status:
             raise SystemExit(f"{' '.join(command)} ended with status {status}")

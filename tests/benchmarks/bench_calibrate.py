@@ -75,7 +75,7 @@ def by_pixel(problem, store, parameters):
 def density_target(problem):
     """The log posterior of a sensor whose pixels are alike, of the coordinates of `calibrate.prior`."""
     photons, exposure, n, mean, variance, nu = (jnp.asarray(x.numpy()) for x in problem.levels[:6])
-    prior = [jnp.asarray(x[problem.coordinates.prior.width.isfinite()].numpy()) for x in problem.coordinates.prior]
+    prior = [jnp.asarray(x[problem.coordinates.prior.width.isfinite()].numpy()) for x in problem.coordinates.prior[:2]]
 
     def log(theta):
         a, b, s, d, w, q = theta

@@ -10,11 +10,12 @@ from safetensors.torch import save_file
 
 from neusee.nodes import calibrate, doe, optics, spectra
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba
+from neusee.nodes.restore._networks._informed import Informed
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
 from neusee.nodes.restore._networks._unet import UNet
 from neusee.nodes.restore._networks._unrolled import Unrolled
-from neusee.nodes.values import Channels, Dirt, FoundLasers, LowRankCube, MeasuredPsf, Psf, Pupil
+from neusee.nodes.values import Channels, Dirt, FewBands, FoundLasers, LowRankCube, MeasuredPsf, Psf, Pupil
 
 HERE = Path(__file__).parent
 
@@ -54,6 +55,7 @@ PUPIL = Pupil(DISC, DISC, HEIGHT, 0 * HEIGHT, INDEX, BANDS.centres, torch.tensor
 DIRT = Dirt(rand(16, 16, dtype=torch.float32), HEIGHT.clone())
 LOW_RANK = LowRankCube(rand(2, 12, 12), rand(4, 2), torch.zeros(3, 4, dtype=torch.float64))
 ROWS = spectra.rows(BANDS, RESPONSES)
+ALL_BANDS = FewBands(torch.eye(4, dtype=torch.float64), torch.arange(4), *torch.zeros(2, dtype=torch.float64))
 CHANNELS = Channels(rand(3, 12, 12), rand(3, 4), torch.tensor(0.0, dtype=torch.float64))
 LEVEL = 1e3 * rand(4)
 LASER_PUPIL = PUPIL._replace(index=INDEX[:3], wavelengths=LINE.centres)
@@ -123,6 +125,11 @@ def _networks(folder):
         "restore.fft_mamba": Case(
             "0", (single,), {"weights": saved(folder, "fft_mamba", partial(FFTMamba, **sizes)), **sizes}
         ),
+        "restore.informed": Case(
+            "0",
+            (WIDE_RAW, PSF, LIGHT, RESPONSES, BANDS, torch.zeros(3, 48, 48, dtype=torch.bool)),
+            {"weights": saved(folder, "informed", partial(Informed, 2)), "width": 2, "read_noise": 5.0},
+        ),
         "restore.nafnet": Case("0", (single,), {"weights": saved(folder, "nafnet", partial(NAFNet, 4)), "width": 4}),
         "restore.network": Case(
             "0",
@@ -186,6 +193,7 @@ CASES = {
     "flare.stray_shares": Case("0.intensity", (PSF, PSF, PUPIL), STRAY),
     "losses.background_loss": Case("0.intensity", (PSF, SCENE)),
     "losses.charbonnier": Case("0", (PICTURE, OTHER)),
+    "losses.log_error": Case("0", (PICTURE, OTHER)),
     "losses.contrast": Case("0.intensity", (WIDE,)),
     "losses.fft_l1": Case("0", (PICTURE, OTHER)),
     "losses.filtered_error": Case("0.intensity", (WIDE, LIGHT, RESPONSES, BANDS), SEEN),
@@ -211,8 +219,11 @@ CASES = {
     "metrics.saturated": Case("0", (RAW,), ADC),
     "metrics.spectral_error": Case("0.height", (PUPIL, BANDS, LIGHT, RESPONSES), LENS),
     "optics.direction": Case("focal_length", (), {**LENS, "focal_length": number(0.11), "shape": (64, 64)}),
+    "optics.few_bands": Case("0.height", (PUPIL, LOW_RANK, ROWS), {**LENS, "shape": (9, 9), "within": 0.1}),
+    "optics.few_bands_checked": Case("2.height", (ALL_BANDS, PSF, PUPIL, LOW_RANK, ROWS), LENS),
     "optics.image": Case("1.intensity", (SCENE, PSF)),
     "optics.image_channels": Case("1.intensity", (LOW_RANK, PSF, ROWS)),
+    "optics.pupil_of_bands": Case("0.height", (PUPIL, ALL_BANDS)),
     "optics.psf": Case("0.height", (PUPIL,), {**LENS, "shape": (9, 9)}),
     "optics.pupil": Case("0", (HEIGHT, INDEX, BANDS, STOP, DIRT)),
     "optics.laser_irradiance": Case("0.intensity", (Psf(rand(3, 9, 9), rand(3)), LINE), {"strength": 10.0, **WELL}),
@@ -240,6 +251,12 @@ CASES = {
     ),
     "restore.white_level": Case(
         "0", (RAW, torch.zeros(RAW.shape, dtype=torch.bool), PSF, BANDS, LIGHT, RESPONSES), WELL
+    ),
+    "restore.filter_facts": Case(
+        "0",
+        (WIDE_RAW, PSF, LIGHT, RESPONSES, BANDS, torch.zeros(3, 48, 48, dtype=torch.bool)),
+        {"read_noise": 5.0},
+        to=1e-3,
     ),
     "restore.wiener_problem": Case(
         "0",

@@ -46,12 +46,11 @@ def test_a_planned_device_that_computed_nothing_has_a_row():
     assert [label.get_text() for label in lanes.get_yticklabels()] == ["cpu", "cuda:0"]
 
 
-def test_a_legend_hides_no_measured_point(monkeypatch):
-    rows = [(p, 9, 1e-3, e) for p, e in (("single", 1e-7), ("double", 1e-15))]
-    monkeypatch.setattr(numerics, "precision_trial", lambda step, pupil: rows)
-    figure = numerics.error_time.__wrapped__(step=None, pupil=None)
+def test_a_legend_hides_no_measured_point():
+    rows = [("as used", "", 1e-7, 1e-3), ("precision", "double", 0.0, 1e-3)]
+    figure = numerics.error_time.__wrapped__(rows=rows)
     assert figure.axes[0].get_legend() is None
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["single precision", "double precision"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["as used", "precision"]
 
 
 def test_a_sensor_without_noise_has_no_line_of_dark_noise():

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from neusee.nodes.calibrate import FrameTest, Rings, Sufficient
+from neusee.nodes.calibrate import Budget, FrameTest, Rings, Sufficient
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration import calibration_figures as figures
+from neusee.workflows.calibration.budget_page import budget_picture, budget_sections
 from neusee.workflows.calibration.corner_figure import corners
 from neusee.workflows.calibration.frame_validity import frame_section
 from neusee.workflows.calibration.identifiability import KINDS, Identifiability
+from neusee.workflows.calibration.laboratory import RELATIVE, stated
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import IntervalEstimate, ModelSpread
 from neusee.workflows.calibration.posterior_checks import Check, count_failures
@@ -37,17 +40,8 @@ NOT_TOLD = {
     "lower": ("mean", "sd", "high"),
     "none": ("mean", "sd", "low", "high"),
 }
-_PURE = (
-    "quantum_efficiency",
-    "spread",
-    "scatter",
-    "lamp",
-    "bend",
-    "twist",
-    "l",
-    "s",
-    "core",
-)  #: without a unit
+#: without a unit
+_PURE = ("quantum_efficiency", "spread", "scatter", "lamp", "bend", "twist", "l", "s", "core")
 
 
 @dataclass(frozen=True)
@@ -93,6 +87,13 @@ class CalibrationResult:
     checks: Sequence[Check]
     models: Sequence[ModelSpread] = ()  #: of a camera of unknown response
     frames: Sequence[FrameTest] = ()  #: the tests of the frames
+    unwidened: Mapping[str, float] = field(default_factory=dict)  #: sd of each parameter in the draws of the walk
+    budgets: Sequence[Budget] = ()  #: the uncertainty budgets of the estimates
+
+    @cached_property
+    def budget_picture(self) -> bytes | None:
+        """Return the picture of the uncertainty budgets, or None where nothing has a value."""
+        return budget_picture(self.budgets) if self.budgets else None
 
     @property
     def params(self) -> Mapping[str, Any]:
@@ -163,8 +164,9 @@ def sections(result: CalibrationResult) -> list[Section]:
     models = (_models,) if result.models else ()
     frames = (_frames,) if result.frames else ()
     standard = (_standard,) if result.problem.measured is not None else ()
-    parts = (_parameters, *standard, *models, _checks, *frames, _not_determined, _curve, _corner, _chains)
-    return [part(result) for part in parts]
+    parts = (_checks, *frames, _not_determined, _curve, _corner, _chains)
+    budget = budget_sections(result.budgets, stated(result.problem.recipe), result.budget_picture)
+    return [*(part(result) for part in (_parameters, *standard, *models)), *budget, *(part(result) for part in parts)]
 
 
 def _standard(result: CalibrationResult) -> Section:
@@ -223,7 +225,8 @@ def _checks(result: CalibrationResult) -> Section:
 def _not_determined(result: CalibrationResult) -> Section:
     text = """Singular values of the derivatives of the levels per standard deviation of the prior, computed before any
         sampling. In a direction below 3 the prior constrains the parameters more than the frames do."""
-    strengths, directions = result.identifiability.strengths, result.identifiability.directions
+    strengths = result.identifiability.strengths
+    directions = [line for line in result.identifiability.directions if line != RELATIVE]
     rows = list(zip(strengths, [""] * (len(strengths) - len(directions)) + [*directions], strict=True))
     marks: dict[tuple[int, int], Mark] = {(i, 0): "warn" if text else "pass" for i, (_, text) in enumerate(rows)}
     return Section("What the levels determine", text, ("strength", "not determined"), rows, marks=marks)

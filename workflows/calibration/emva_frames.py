@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,9 +23,11 @@ from neusee.nodes.calibrate import (
     reduce,
     refuse_descriptor,
     spatial_series,
+    uncorrected,
 )
 from neusee.nodes.values import Levels
 from neusee.workflows.engine.runner import run
+from neusee.workflows.frames.descriptor_file import quoted
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
@@ -41,10 +42,11 @@ OPERATING_POINT = {
     "pixel_pitch": "pixel pitch",
     "wavelength": "centroid wavelength of the light",
     "bandwidth": "width of its spectrum (FWHM)",
+    "spectrum": "spectrum of the lamp",
+    "photometer": "calibration of the light: instrument and certificate",
     "temperature": "temperature",
     "laboratory": "laboratory and date",
 }
-_LEVEL = re.compile(r"^[bd]\s+[\d.,]+(\s|$)", re.MULTILINE)  #: a line of a descriptor that begins a light level
 _HALF = 0.5  #: share of saturation at which the lit series is taken
 _TEXT = """# EMVA 1288: the sheet of the measurement {name}.
 steps:
@@ -70,25 +72,11 @@ def descriptor_recipe(file: Path, changes: Sequence[str] = ()) -> Recipe:
     """
     refuse_descriptor(file)
     name = "".join(c if c.isalnum() else "_" for c in file.parent.absolute().name or file.stem)
-    text = _TEXT.format(name=file.name, file=_quoted(str(file.absolute())))
+    text = _TEXT.format(name=file.name, file=quoted(str(file.absolute())))
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"{name}.yaml"
         path.write_text(text, encoding="utf-8")
         return load(path, changes)
-
-
-def descriptor_of(path: Path) -> Path:
-    """Return the descriptor file that a path is, or the only one in the folder that a path is.
-
-    Raises: ValueError for a folder without a descriptor, or with several.
-    """
-    if not path.is_dir():
-        return path
-    found = [file for file in sorted(path.glob("*.txt")) if _LEVEL.search(file.read_text("utf-8-sig", "replace"))]
-    if len(found) == 1:
-        return found[0]
-    has = f"has {len(found)} descriptors" if found else "has no descriptor, a .txt with levels in lines b and d"
-    raise ValueError(f"{path} {has}: name one file")
 
 
 def frames_of_recipe(recipe: Recipe, store: Store, release: Release = "4") -> EmvaFrames:
@@ -120,7 +108,7 @@ def _described(step: Step, scatter: Any) -> EmvaFrames:
     found = descriptor(file=files, scatter=scatter)
     series = [spatial_series(*each) for each in descriptor_series(files)]
     stacks = (Stack(name, light, time, scatter, frames) for name, light, time, frames in descriptor_frames(files))
-    return EmvaFrames(found, _nearest_half(series, found), 2, inspect_frames(stacks, exact=False))
+    return EmvaFrames(found, _nearest_half(series, found), 2, [*map(uncorrected, inspect_frames(stacks, exact=False))])
 
 
 def _reduced(recipe: Recipe, store: Store, steps: Sequence[Step], scatter: Any) -> EmvaFrames:
@@ -136,7 +124,7 @@ def _reduced(recipe: Recipe, store: Store, steps: Sequence[Step], scatter: Any) 
     pair = _dark_and_half([_of(step) for step in chosen], found)
     series = (spatial_series(*_of(chosen[i]), _frames(recipe, store, chosen[i])) for i in pair)
     stacks = (Stack(step.name, *_of(step), scatter, _frames(recipe, store, step)) for step in steps)
-    return EmvaFrames(found, _pair(series), min(counts), inspect_frames(stacks, exact=False))
+    return EmvaFrames(found, _pair(series), min(counts), [*map(uncorrected, inspect_frames(stacks, exact=False))])
 
 
 def _of(step: Step) -> tuple[float, float]:
@@ -175,7 +163,3 @@ def _dark_and_half(light: Sequence[tuple[float, float]], found: Levels) -> list[
     times = np.array([light[j][1] for j in dark])
     own = dark[int(np.abs(times - (times.min() if half is None else light[half][1])).argmin())]
     return [own] if half is None else [own, half]
-
-
-def _quoted(text: str) -> str:
-    return "'" + text.replace("'", "''") + "'"

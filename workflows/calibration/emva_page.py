@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neusee.nodes.calibrate import EmvaSheet, FrameTest, Quantity, SpatialSeries
+from neusee.nodes.calibrate import EmvaSheet, FrameTest, Quantity, SpatialSeries, Traceability
+from neusee.workflows.calibration.budget_page import of_traceability
 from neusee.workflows.calibration.emva_frames import OPERATING_POINT, EmvaFrames, Release
 from neusee.workflows.calibration.frame_validity import frame_section
 from neusee.workflows.report.study_page import Mark, Section
@@ -101,13 +102,20 @@ def lead(sheet: EmvaSheet, release: Release) -> str:
 
 
 def sections(
-    sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any], pictures: Mapping[str, bytes]
+    sheet: EmvaSheet,
+    frames: EmvaFrames,
+    told: Mapping[str, Any],
+    pictures: Mapping[str, bytes],
+    budget: Sequence[Section] = (),
 ) -> list[Section]:
-    """Return the sections of the page in the order of the standard, without plots that the frames do not allow."""
+    """Return the sections of the page in the order of the standard, without plots that the frames do not allow.
+
+    The sections ``budget`` have the uncertainty of the quantities.
+    """
     found = (_section(sheet, heading, text, pictures.get(name)) for heading, name, text in _SECTIONS)
     kept = (s for s in found if s.rows or s.picture)
     tested = replace(frame_section(frames.tests), text=_TESTED if len(frames.tests) > 1 else _MOMENTS)
-    return [*kept, tested, _compliance(sheet, frames, told)]
+    return [*kept, *budget, tested, _compliance(sheet, frames, told)]
 
 
 def requirements(sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any]) -> list[Requirement]:
@@ -115,12 +123,13 @@ def requirements(sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any]) 
     return [*_of_transfer(sheet, frames), *_of_series(sheet), *_of_told(told), *_elsewhere()]
 
 
-def operating_point(statements: Sequence[str]) -> dict[str, str | None]:
+def operating_point(statements: Sequence[str], traced: Traceability | None = None) -> dict[str, str | None]:
     """Return what statements such as ``temperature=25 °C`` tell of the operating point; None where nothing is told.
 
+    What the recipe states in the block ``traceability`` counts where no statement says otherwise.
     Raises: ValueError for a statement that is not a key of `OPERATING_POINT`, ``=`` and a text.
     """
-    told: dict[str, str | None] = dict.fromkeys(OPERATING_POINT)
+    told: dict[str, str | None] = {**dict.fromkeys(OPERATING_POINT), **(of_traceability(traced) if traced else {})}
     for statement in statements:
         key, sign, value = (part.strip() for part in statement.partition("="))
         if key not in told or not sign or not value:

@@ -6,14 +6,16 @@ import io
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from neusee.nodes.calibrate import FrameTest, Rings
+from neusee.nodes.calibrate import FrameTest, Laboratory, Rings
 from neusee.nodes.values import Levels
+from neusee.workflows.calibration.budget_page import COLUMNS, budget_document, budget_rows
+from neusee.workflows.calibration.calibration_budget import budgets
 from neusee.workflows.calibration.calibration_page import (
     NOT_TOLD,
     CalibrationResult,
@@ -26,12 +28,21 @@ from neusee.workflows.calibration.frame_validity import (
     as_rows,
     frame_checks,
     frame_section,
+    hidden_checks,
     inspect_recipe,
     lines,
     widened,
     widened_models,
 )
 from neusee.workflows.calibration.identifiability import identify, identify_from_draws
+from neusee.workflows.calibration.laboratory import (
+    is_relative,
+    laboratory_of,
+    stated,
+    with_laboratory,
+    with_laboratory_models,
+    without_efficiency,
+)
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import compare_models
 from neusee.workflows.calibration.posterior_checks import arviz, checks, count_failures, importance_samples
@@ -40,7 +51,7 @@ from neusee.workflows.calibration.standard_fit import compared
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.report.study_folder import Content, Progress, StudyReport, StudyRun, as_json, silent
+from neusee.workflows.report.study_folder import Content, CsvTable, Progress, StudyReport, StudyRun, as_json, silent
 from neusee.workflows.store.result_store import Store
 
 _KEPT = 4000  #: draws in the file ``draws.npz``
@@ -95,6 +106,7 @@ def find_posterior(
 
     emcee_sampler.move(move)  # raises for a wrong name before anything is computed
     arviz()
+    laboratory = laboratory_of(recipe)
     tests = _accepted_frames(recipe, store, progress)
     problem = SensorPosterior.of(recipe, store)
     mode = search_mode(problem)
@@ -122,10 +134,27 @@ def find_posterior(
     models = compare_models(recipe, store, recipe.seed) if isinstance(problem.levels, Levels) else []
     tested = [
         *frame_checks(tests, not isinstance(problem.levels, Rings)),
+        *hidden_checks(tests, problem.coordinates.prior.may_hide),
         *checks(problem, mode, identifiability, chains, law),
     ]
-    chains, models = widened(problem, chains, tests, recipe.seed), widened_models(models, tests)
-    return CalibrationResult(problem, mode, identifiability, chains, tested, models, tests)
+    return _widened(CalibrationResult(problem, mode, identifiability, chains, tested, models, tests), laboratory)
+
+
+def _widened(result: CalibrationResult, laboratory: Laboratory) -> CalibrationResult:
+    """Return a calibration with what the frames show or may hide, with what the laboratory states, and its budgets."""
+    problem, tests = result.problem, result.frames
+    told = result.identifiability
+    unwidened = {name: float(x.std()) for name, x in problem.parameters(result.chains.draws).items()}
+    chains = widened(problem, result.chains, tests, problem.recipe.seed)
+    models = widened_models(result.models, tests, problem.coordinates.prior.may_hide)
+    result = replace(
+        result,
+        identifiability=without_efficiency(told) if is_relative(problem.recipe) else told,
+        chains=with_laboratory(problem, chains, laboratory, problem.recipe.seed),
+        models=with_laboratory_models(models, laboratory),
+        unwidened=unwidened,
+    )
+    return replace(result, budgets=budgets(result, laboratory))
 
 
 def _accepted_frames(recipe: Recipe, store: Store, progress: Progress) -> Sequence[FrameTest]:
@@ -188,14 +217,19 @@ def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
 def _report(result: CalibrationResult, document: Mapping[str, Any]) -> StudyReport:
     parts = sections(result)
     curve = "rings" if isinstance(result.problem.levels, Rings) else "transfer"
-    pictures = {name: part.picture for name, part in zip((curve, "corner", "chains"), parts[-3:], strict=True)}
+    pictures: dict[str, bytes | None] = {
+        name: part.picture for name, part in zip((curve, "corner", "chains"), parts[-3:], strict=True)
+    }
+    pictures["budget"] = result.budget_picture
     files: dict[str, Content] = {
         "posterior.json": as_json(document),
+        "budget.json": as_json(budget_document(result.budgets, stated(result.problem.recipe))),
         "draws.npz": _draws(result),
         "posterior.nc": lambda path: _inference_data(result).to_netcdf(str(path)),
     }
     title = f"{result.problem.recipe.name}: posterior"
-    return StudyReport(title, lead(result), parts, pictures, files=files, banner=banner(result))
+    tables: dict[str, CsvTable] = {"budget.csv": (COLUMNS, budget_rows(result.budgets))}
+    return StudyReport(title, lead(result), parts, pictures, tables, files, banner=banner(result))
 
 
 def _draws(result: CalibrationResult) -> bytes:

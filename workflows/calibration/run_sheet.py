@@ -7,17 +7,28 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from neusee.nodes.calibrate import EmvaSheet, emva_sheet
+from neusee.nodes.calibrate import Budget, EmvaSheet, emva_sheet, sheet_budgets
 from neusee.workflows.calibration import emva_figures, emva_pdf
+from neusee.workflows.calibration.budget_page import (
+    BUDGETED,
+    COLUMNS,
+    budget_document,
+    budget_picture,
+    budget_rows,
+    budget_sections,
+)
 from neusee.workflows.calibration.emva_frames import OPERATING_POINT, EmvaFrames, Release, frames_of_recipe
 from neusee.workflows.calibration.emva_page import banner, group_of, lead, operating_point, requirements, sections
 from neusee.workflows.calibration.emva_patterns import pattern_tables
 from neusee.workflows.calibration.frame_validity import as_rows
+from neusee.workflows.calibration.laboratory import is_relative, laboratory_of, stated
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.study_folder import StudyReport, StudyRun, as_json
 from neusee.workflows.store.result_store import Store
 
+_PLUS = "U is the expanded uncertainty; + says that a source of it is not stated, which budget.json names."
+_MORE = " The files `budget.json` and `budget.csv` have the budgets of all quantities with a value."
 _COLUMNS = ("section", "key", "symbol", "quantity", "bound", "value", "unit", "reason")
 _TRANSFER = ("photons", "exposure", "mean", "variance", "mean_dark", "variance_dark")
 
@@ -39,11 +50,13 @@ def write_sheet(
     Raises: ValueError for a recipe without frames, without dark frames or without two lit levels, and for a wrong
     statement.
     """
-    study_run, told = StudyRun("sheet", recipe, command), operating_point(state)
+    study_run, told = StudyRun("sheet", recipe, command), operating_point(state, stated(recipe))
+    laboratory, photons_told = laboratory_of(recipe), not (relative or is_relative(recipe))
     frames = frames_of_recipe(recipe, store, release)
-    sheet = emva_sheet(frames.levels, frames.spatial, photons_told=not relative)
+    sheet = emva_sheet(frames.levels, frames.spatial, photons_told=photons_told)
+    budgets = sheet_budgets(frames.levels, sheet, laboratory, photons_told)
     document = study_run.document(_document(sheet, frames, told, release))
-    report = _report(recipe, sheet, frames, told, release, document)
+    report = _report(recipe, sheet, frames, told, release, document, budgets)
     return study_run.write(runs, digest(document["quantities"]), document, report, "emva1288")
 
 
@@ -68,22 +81,28 @@ def _report(
     told: Mapping[str, Any],
     release: Release,
     document: Mapping[str, Any],
+    budgets: Sequence[Budget],
 ) -> StudyReport:
     title, pictures = f"{recipe.name}: EMVA 1288", emva_figures.pictures(sheet)
+    named = [budget for budget in budgets if budget.key in BUDGETED]
+    budget = {"budget": budget_picture(named)} if named else {}
+    traced = budget_sections(named, stated(recipe), budget.get("budget"), _MORE)
     summary = [f"{name}: {'not stated' if told[key] is None else told[key]}" for key, name in OPERATING_POINT.items()]
     return StudyReport(
         title,
         lead(sheet, release),
-        sections(sheet, frames, told, pictures),
-        pictures,
+        sections(sheet, frames, told, pictures, traced),
+        pictures | budget,
         tables={
             "emva1288.csv": (_COLUMNS, _rows(sheet)),
             "transfer.csv": (_TRANSFER, _levels(sheet)),
+            "budget.csv": (COLUMNS, budget_rows(budgets)),
             **pattern_tables(sheet),
         },
         files={
             "emva1288.json": as_json(document),
-            "emva1288.pdf": emva_pdf.pdf(sheet, title, [*summary, document["fails"]]),
+            "budget.json": as_json(budget_document(budgets, stated(recipe))),
+            "emva1288.pdf": emva_pdf.pdf(sheet, title, [*summary, _PLUS, document["fails"]], budgets),
         },
         banner=document["fails"],
     )

@@ -55,8 +55,10 @@ def _run(arguments: list[str]) -> int:
         if say_stored_answer(arguments):
             return DONE
     from neusee.workflows.cli.interruption import print_warning
+    from neusee.workflows.cli.thread_settings import settle_threads
     from neusee.workflows.cli.typer_program import run_program
 
+    settle_threads(arguments[0] if arguments else "")
     with warnings.catch_warnings():
         warnings.showwarning = print_warning
         return run_program(arguments, completes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from neusee.workflows.store.derived_files import DerivedFiles
     from neusee.workflows.store.result_store import Store
 
+_PAGE = 50  #: results that `ls` shows
 _HEAD = ("date", "bytes", "seconds", "step", "recipe", "key", "")
 
 cache = typer.Typer(help="List, check, remove and keep stored results.", no_args_is_help=True, rich_markup_mode=None)
@@ -28,12 +30,14 @@ Key = Annotated[str, typer.Argument(metavar="KEY", help="The first digits of a k
 
 
 @cache.command("ls")
-def ls() -> None:
-    """List the stored results.
+def ls(
+    whole: Annotated[bool, typer.Option("--all", help="List every stored result, the newest last.")] = False,
+) -> None:
+    """List the newest stored results.
 
     For each result: when it was computed, its bytes and seconds, its step and the recipe that first needed it.
     """
-    for line in ls_lines(the_store()):
+    for line in ls_lines(the_store(), whole):
         print(line)
 
 
@@ -91,29 +95,62 @@ def why(key: Key) -> None:
 # --- what the commands print ------------------------------------------------------------------------------------------
 
 
-def ls_lines(store: Store) -> Iterator[str]:
+def ls_lines(store: Store, whole: bool = False) -> Iterator[str]:
     """Yield a line for each cached result with its date, bytes, seconds, step, recipe and key, the newest last.
 
-    Of each result, one short text is held in memory.
+    Without ``whole``, these are the newest 50. In a long journal their number and bytes are those that it tells, so
+    that the time does not grow with each result. Of each result, one short text is held in memory.
     """
-    pins, widths = store.pinned(), [*map(len, _HEAD)]
-    rows, kept, size = list[str](), 0, 0
-    for key, about in store.entries():
-        row = _row(key, about, key in pins)
-        widths = [*map(max, widths, map(len, row))]
-        rows.append("\0".join(row))
-        if is_kept(about):
-            kept, size = kept + 1, size + _size(about)
-    rows.sort(key=lambda row: row[: row.index("\0")])
-    for line in ("\0".join(_HEAD), *rows) if rows else ():
-        yield "  ".join(f"{cell:<{width}}" for cell, width in zip(line.split("\0"), widths, strict=True)).rstrip()
-    last = f"{_count(kept, 'result')}, {format_size(size)}, in {store.root}"
-    if kept < len(rows):
-        last += f"; of {_count(len(rows) - kept, 'more result')} the receipt alone"
+    pins = store.pinned()
+    if whole or not store.journal.is_long():
+        rows, kept, size = _every_row(store, pins)
+        receipts, by = len(rows) - kept, ""
+    else:
+        rows = _newest_rows(store, pins)
+        kept, size, receipts = store.journal.totals()
+        by = " by the journal"
+    shown = rows if whole else rows[-_PAGE:]
+    yield from _aligned(shown)
+    if kept + receipts > len(shown):
+        yield f"the newest {len(shown)}; `neusee cache ls --all` lists all"
+    last = f"{_count(kept, 'result')}, {format_size(size)}{by}, in {store.root}"
+    if receipts:
+        last += f"; of {_count(receipts, 'more result')} the receipt alone"
     last += _answers_text(answer_upkeep.answers(store.disk))
     if store.budget is not None:
         last += f"; the budget is {format_size(store.budget)}"
     yield last
+
+
+def _every_row(store: Store, pins: set[str]) -> tuple[list[str], int, int]:
+    """Return the row of each result in order of time, the number of stored values and their bytes."""
+    rows, kept, size = list[str](), 0, 0
+    for key, about in store.entries():
+        rows.append("\0".join(_row(key, about, key in pins)))
+        if is_kept(about):
+            kept, size = kept + 1, size + _size(about)
+    return sorted(rows, key=_row_date), kept, size
+
+
+def _newest_rows(store: Store, pins: set[str]) -> list[str]:
+    """Return the rows of the newest results of the journal that still have metadata, in order of time."""
+    newest = dict.fromkeys(row["key"] for row in reversed(store.journal.latest()))
+    found = ((key, store.about(key)) for key in newest)
+    some = itertools.islice(((key, about) for key, about in found if about is not None), _PAGE)
+    return sorted(("\0".join(_row(key, about, key in pins)) for key, about in some), key=_row_date)
+
+
+def _row_date(row: str) -> str:
+    return row[: row.index("\0")]
+
+
+def _aligned(rows: Sequence[str]) -> Iterator[str]:
+    """Yield the head of the table and its rows in columns, or nothing without a row."""
+    widths = [*map(len, _HEAD)]
+    for row in rows:
+        widths = [*map(max, widths, map(len, row.split("\0")))]
+    for line in ("\0".join(_HEAD), *rows) if rows else ():
+        yield "  ".join(f"{cell:<{width}}" for cell, width in zip(line.split("\0"), widths, strict=True)).rstrip()
 
 
 def verify_lines(store: Store) -> tuple[list[str], int]:

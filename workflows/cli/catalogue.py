@@ -72,7 +72,7 @@ def schema(
     """Print the JSON schema of recipes for editors."""
     import json
 
-    from neusee.workflows.recipe import json_schema
+    from neusee.workflows.handbook import json_schema
 
     say([json.dumps(json_schema.schema(_own(recipe)), indent=1)])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -48,6 +49,7 @@ Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the fo
 
 
 _COUNT = re.compile(r"(?P<what>(?:stage \d, )?\D{0,20})(?P<done>\d+)(?: draws)?(?: of |/)(?:about )?(?P<all>\d+)\b")
+_STEPS = re.compile(r"\d+ of about \d+ ")
 _COUNT_AT_END = re.compile(r"(?P<what>)\((?P<done>\d+) of (?P<all>\d+)\)$")
 
 
@@ -77,6 +79,31 @@ class ProgressLines:
             return ""
         seconds = (now - began) / (done - first) * (whole - done)
         return f"; about {lasts(seconds)} left" if seconds >= 1 else ""
+
+
+class FewLines(ProgressLines):
+    """A printer of lines of progress that keeps lines with a count few.
+
+    On a terminal a line with a count takes the place of the one before. Elsewhere, as in a file, it is printed after
+    half a minute, and then each time when the command has run twice as long.
+    """
+
+    def __init__(self, quiet: bool, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(quiet, clock)
+        self._began_at, self._next, self._open = clock(), 30.0, False
+
+    def __call__(self, line: str) -> None:
+        counted = _STEPS.match(line) is not None
+        left = self._left(line)
+        passed = self._clock() - self._began_at
+        if self._quiet or (counted and not sys.stdout.isatty() and passed < self._next):
+            return
+        if counted and sys.stdout.isatty():
+            print(f"\r\x1b[K{line}{left}", end="", flush=True)
+        else:
+            self._next = 2 * passed if counted else self._next
+            print(f"{chr(10) * self._open}{line}{left}", flush=True)
+        self._open = counted and sys.stdout.isatty()
 
 
 def progress_lines(quiet: bool) -> Callable[[str], None]:

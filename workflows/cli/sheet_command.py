@@ -47,9 +47,9 @@ def sheet(
 ) -> None:
     """Write the EMVA 1288 sheet of a camera from frames.
 
-    In place of a recipe, name the descriptor of a measurement, or its folder: neusee sheet set. Page, PDF, JSON
-    and CSV have every quantity with the symbol of the standard, or the reason why the frames do not tell it. Where
-    rounding hides the dark noise, the page has a red banner and the exit code is 3.
+    In place of a recipe, name the descriptor of a measurement, its folder, or a folder of frames: neusee sheet set.
+    Page, PDF, JSON and CSV have every quantity with the symbol of the standard, or the reason why the frames do not
+    tell it. Where rounding hides the dark noise, the page has a red banner and the exit code is 3.
     """
     from neusee.workflows.calibration.run_sheet import write_sheet
     from neusee.workflows.graph.run_error import RunError
@@ -74,9 +74,13 @@ def _loaded(words: list[str] | None) -> tuple[Recipe, list[str]]:
     name, changes, _ = split(words)
     if Path(name).suffix.lower() != ".txt" and not Path(name).is_dir():
         return load(words, "sheet")
-    from neusee.workflows.calibration.emva_frames import descriptor_of, descriptor_recipe
+    from neusee.workflows.calibration.emva_frames import descriptor_recipe
+    from neusee.workflows.frames.descriptor_file import descriptor_of, descriptors_in
+    from neusee.workflows.frames.folder_recipe import recipe_of_folder
 
     with failing(ValueError, before="nothing was computed: "), refusing():
+        if Path(name).is_dir() and not descriptors_in(Path(name)):
+            return recipe_of_folder(Path(name), the_store(), changes), ["neusee", "sheet", name, *changes]
         return descriptor_recipe(descriptor_of(Path(name)), changes), ["neusee", "sheet", name, *changes]
 
 

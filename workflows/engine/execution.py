@@ -1,7 +1,7 @@
 """Execution of one run: the keys of the steps, the choice to load or compute each value, and the records.
 
-No function here is recursive over the graph. Values are kept by key, so that two steps with the same
-key are computed once. A step that is left out has the key of its input.
+No function is recursive over the graph. Values are kept by key: two steps with one key are computed once. A step that
+is left out has the key of its input.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from neusee.workflows.engine.load_or_recompute import Upstream, cheaper_to_recom
 from neusee.workflows.engine.local_executor import Local
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare, room_for
-from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, StepJob
+from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, Show, StepJob
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order, nodes_of
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event, StepRecord
@@ -48,8 +48,9 @@ class Execution:
         wanted: Iterable[str],
         executor: Executor | None,
         memory: int | None,
+        show: Show = lambda *_: None,
     ) -> None:
-        self.recipe, self.store, self.devices, self.watch = recipe, store, devices, watch
+        self.recipe, self.store, self.devices, self.watch, self.show = recipe, store, devices, watch, show
         self.wanted = frozenset(wanted)
         self.own = Local(devices, store, self._fetch, memory, nodes_of(recipe, self.wanted))
         self.executor = executor or self.own
@@ -134,8 +135,7 @@ class Execution:
 
     def missing(self, names: Iterable[str]) -> set[Key]:
         """Return the cache keys of all values that must be computed to obtain the results of the steps ``names``."""
-        below = Upstream(self.known, self.sources)
-        in_order(below, [self.keys[name] for name in names])
+        in_order(below := Upstream(self.known, self.sources), [self.keys[name] for name in names])
         return set(below.missing)
 
     def sources(self, key: Key) -> list[Key]:
@@ -180,6 +180,7 @@ class Execution:
                 key, sources = outcome.work.key, outcome.work.sources
                 if outcome.value is not None or not outcome.kept:
                     self.values[key] = outcome.value
+                    self.show(self.recipe, self.keys, outcome.work.step.name, outcome.value)
                 uses.subtract(sources)
                 self._free([*sources, key], uses, keep)
         for key in targets:

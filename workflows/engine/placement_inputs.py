@@ -177,5 +177,5 @@ def _one_after_another(
 
 
 def past_costs(store: Store, sizes: Mapping[str, Size]) -> Costs:
-    """Return the costs of steps with the given sizes, from the journal of a result store."""
-    return Costs(store.journal.rows(), sizes)
+    """Return the costs of steps with the given sizes, from the newest lines of the journal of a result store."""
+    return Costs(store.journal.latest(), sizes)

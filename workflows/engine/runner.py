@@ -16,7 +16,7 @@ from neusee.workflows.engine.memory_use import give_back, process_peak
 from neusee.workflows.engine.memory_watch import limited
 from neusee.workflows.engine.node_call import to_device
 from neusee.workflows.engine.placement_inputs import running_peak
-from neusee.workflows.engine.step_job import Executor
+from neusee.workflows.engine.step_job import Executor, Show
 from neusee.workflows.graph.recipe_graph import Recipe, needed, unknown_step
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key
@@ -91,12 +91,14 @@ def run(
     device: str = "cpu",
     executor: Executor | None = None,
     memory: int | None = None,
+    show: Show | None = None,
 ) -> Result:
     """Return the values of the steps ``outputs``; compute the values that are not in ``store``.
 
     Args: outputs: if None, the outputs of the recipe. device: one or several devices, such as
     ``cuda:0,cuda:1,cpu``, the preferred device first. executor: computes the steps in place of this process.
     memory: bytes that this process, and each GPU, may use; if None, most of the memory that is free.
+    show: is told each computed result, while later steps wait.
     Raises `RunError`, which names the step, and ValueError for a device that this machine does not have.
     """
     began = time.perf_counter()
@@ -107,7 +109,7 @@ def run(
             raise ValueError(unknown_step(name, recipe.steps))
     recipe, store, watch = with_substitutions(recipe, wanted), store or open_store(), watch or (lambda event: None)
     while True:
-        work = Execution(recipe, store, device.split(","), watch, wanted, executor, memory)
+        work = Execution(recipe, store, device.split(","), watch, wanted, executor, memory, show or (lambda *_: None))
         try:
             with limited(memory_limit(memory)):
                 return _attempt(work, wanted, began)

@@ -22,7 +22,7 @@ from neusee.workflows.engine.memory_watch import guarded
 from neusee.workflows.engine.node_call import call, examine
 from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.engine.write_behind import LARGE, WriteBehind
-from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, device_kind, is_private, plain
 from neusee.workflows.keys.input_file_digest import file_stamps
@@ -33,6 +33,8 @@ from neusee.workflows.store.serialization import pack, tensors_in
 
 Read = Key | tuple[Key, ...] | None  #: content of one input: one value, a list of values, or nothing
 Fetch = Callable[[Key], Any]
+#: function that is told each computed result: the recipe of the run, the keys known so far, the step and its value
+Show = Callable[[Recipe, Mapping[str, Key], str, Any], None]
 _WATCHED = 1 << 20  #: bytes of inputs from which the memory of a step is measured
 
 

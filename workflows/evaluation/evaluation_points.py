@@ -110,7 +110,7 @@ class EvaluationPoints:
             for name, changed in params.items()
         }
         keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), outputs, point.scene)
-        within = [recipe.tolerance, recipe.exact, device_kind(self.device), self.small]
+        within = [recipe.tolerance, recipe.exact, recipe.estimates, device_kind(self.device), self.small]
         own = [self._code.digest(used.__module__) for used in (quality, resize)]
         return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
 
@@ -128,7 +128,7 @@ class EvaluationPoints:
     def _function(self, pipeline: PipelineRecipes, case: str, outputs: tuple[str, ...]) -> Any:
         name = (f"{pipeline.name} {outputs}", case, id(pipeline.recipe))
         if name not in self._functions:
-            recipe = pipeline.recipe(case)
+            recipe = replace(pipeline.recipe(case), estimates=False)  # one PSF for all scenes
             whole = with_substitutions(recipe, outputs)  # as in `run`, but the scene is an argument
             steps = set(needed(whole, outputs))
             inputs = self._inputs(pipeline, case, outputs)

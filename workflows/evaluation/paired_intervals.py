@@ -21,6 +21,7 @@ from neusee.workflows.evaluation.confidence_intervals import (
 )
 
 _DRAWS = 10_000  #: sets of photographs that the bootstrap draws
+_SMALL = 30  #: photographs below which neither end may lie nearer than that of Student's t distribution
 _AT_ONCE = 500  #: sets in memory at once
 
 
@@ -29,7 +30,9 @@ def ratio(top: Numbers, bottom: Numbers, photographs: Numbers, seed: int) -> Int
 
     Args: top, bottom: (picture,) values of the same unit, or 1 as ``bottom`` for the mean of ``top``. photographs:
     (picture,) the number of the photograph of each picture. seed: of the draws.
-    The limits are NaN for fewer than five photographs.
+    The limits are NaN for fewer than five photographs. For fewer than thirty each end is that of the bootstrap or of
+    Student's t distribution, whichever lies farther away, times the root of n/(n - 1), by which drawn sets of n
+    photographs scatter too little; skewed photographs need both.
     Source: Davison and Hinkley, Bootstrap Methods and their Application (1997), section 5.2.1, studentized bootstrap.
     """
     a, b = sums_by_photograph(top, photographs), sums_by_photograph(bottom, photographs)
@@ -39,7 +42,16 @@ def ratio(top: Numbers, bottom: Numbers, photographs: Numbers, seed: int) -> Int
     rest = a - value * b
     error = _standard_error((rest**2).sum(), b.sum(), count)
     low, high = np.quantile(_drawn_errors(rest, b, seed), _LIMITS, method="inverted_cdf")
+    if count < _SMALL:
+        least, wider = _student(count - 1), math.sqrt(count / (count - 1))
+        low, high = wider * min(low, -least), wider * max(high, least)
     return Interval(value, *(float(value - q * error) if error else value for q in (high, low)))
+
+
+def _student(freedom: int) -> float:
+    from scipy.stats import t
+
+    return float(t.ppf(_LIMITS[1], freedom))
 
 
 _LIMITS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)

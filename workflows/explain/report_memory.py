@@ -11,7 +11,7 @@ from neusee.workflows.engine.local_executor import program_memory
 from neusee.workflows.engine.placement_inputs import prepare
 from neusee.workflows.engine.step_job import Lane, StepJob
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.report.contents import FIGURES, FILES
+from neusee.workflows.report.contents import FIGURES, files_of
 
 #: Three numbers that tests/benchmarks/bench_memory.py fits to the measured memory of the reports of shipped recipes.
 DRAWING = 74.3e6  #: bytes of the libraries that draw pictures and write files
@@ -66,7 +66,7 @@ def shown_at_once(recipe: Recipe, costs: Costs) -> float:
 def _jobs(recipe: Recipe) -> tuple[Sequence[Sequence[str]], ...]:
     """Return the steps that each picture shows, and the steps that each data file shows."""
     pictures = [list(_found(recipe, figure.needs)) for figure in FIGURES]
-    return pictures, [*(list(_found(recipe, needs)) for _, needs in FILES.values()), recipe.outputs]
+    return pictures, [list(_found(recipe, needs)) for _, needs in files_of(recipe).values()]
 
 
 def _found(recipe: Recipe, needs: Mapping[str, str]) -> Iterator[str]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.resolved_keys import Resolved
 from neusee.workflows.explain.change_causes import Comparison, Origin
-from neusee.workflows.explain.stored_origin import because, keys_in, rows_of, state_of
+from neusee.workflows.explain.stored_origin import because, keys_in, state_of
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.graph.step_record import Event
@@ -43,7 +43,7 @@ def explained(recipe: Recipe, store: Store, watch: Callable[[Event], None]) -> C
     def tell(event: Event) -> None:
         done = event.done
         if done is None:
-            before[event.step] = keys_in(rows_of(store, event.step))
+            before[event.step] = keys_in(row for row in store.journal.latest() if row["step"] == event.step)
         elif done.state == "run":
             why = _at_once(comparison, recipe.steps[done.step], done.key, before.pop(done.step, []))
             event = Event(event.step, replace(done, why=why))

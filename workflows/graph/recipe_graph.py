@@ -11,6 +11,7 @@ from neusee.workflows.graph.diagnostics import Location, nearest
 from neusee.workflows.graph.final_values import Config, Setting
 
 if TYPE_CHECKING:
+    from neusee.nodes.calibrate import Traceability
     from neusee.workflows.engine.runner import Result
     from neusee.workflows.engine.step_job import Executor
     from neusee.workflows.graph.step_record import Event
@@ -86,6 +87,7 @@ class Recipe:
     notes: tuple[str, ...] = ()
     absent: Mapping[str, str] = field(default_factory=dict)  #: location of the null, by the name of a step that is null
     exact: bool = False  #: whether every step is computed in full at any tolerance
+    estimates: bool = True  #: whether errors that are estimated, not proved, may count towards the tolerance
     substitutions: tuple[Substitution, ...] = ()  #: cheaper steps in place of full steps; empty after loading
     tolerance_scale: float = 1.0  #: fraction of the tolerance in use; below 1 after a failed proof
     unsubstituted: Recipe | None = field(default=None, compare=False)  #: the recipe before substitutions, if any
@@ -94,6 +96,8 @@ class Recipe:
     lifting: LiftTraining | None = field(default=None, compare=False)  #: settings of the training of a lift
     safety: Safety | None = field(default=None, compare=False)  #: settings of the estimate of damage and dazzle
     evaluation: EvaluateSettings | None = field(default=None, compare=False)  #: settings of an evaluation
+    traceability: Traceability | None = field(default=None, compare=False)  #: what the laboratory states of its light
+    exports: Mapping[str, bool] | None = field(default=None, compare=False)  #: data files, True for half; None: all
     unbounded: frozenset[str] = frozenset()  #: steps whose errors reach a node without an error bound
 
     def limit(self, step: str) -> float:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from neusee.workflows.handbook.json_schema import schema
 from neusee.workflows.handbook.plain_markdown import escaped, table
 from neusee.workflows.recipe.distributions.scalar import KINDS
-from neusee.workflows.recipe.json_schema import schema
 from neusee.workflows.recipe.loading import groups, recipes
 
 _TYPES = {"integer": "whole number", "array": "list", "object": "mapping", "string": "text", "null": "none"}

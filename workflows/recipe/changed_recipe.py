@@ -18,4 +18,6 @@ def changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
         path.write_text(recipe.config.to_yaml(), encoding="utf-8")
         loaded = load(path, overrides)
     loaded = replace(loaded, name=recipe.name, title=recipe.title, seed=recipe.seed, outputs=recipe.outputs, expect=())
-    return replace(loaded, tolerance=recipe.tolerance, exact=recipe.exact)
+    return replace(
+        loaded, tolerance=recipe.tolerance, exact=recipe.exact, estimates=recipe.estimates and loaded.estimates
+    )

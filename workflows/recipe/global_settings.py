@@ -13,6 +13,7 @@ from neusee.workflows.recipe.text.yaml_values import Value, kind
 from neusee.workflows.recipe.wiring import Wiring
 
 _EXPECTED = ("step", "at", "value", "rtol")
+ESTIMATES = "estimates"  #: key of a recipe, false if only proved errors may count towards the tolerance
 _NUMBERS = {"seed": "must be a whole number of 0 or more", "tolerance": "must be a number of 0 or more"}
 
 
@@ -26,6 +27,17 @@ def seed_and_tolerance(root: Value, references: References, diagnostics: list[Di
             if not _is_number(value.data, whole=key == "seed") or value.data < 0:
                 diagnostics.append(Diagnostic(value.mark, f"{key} = {value.data}", _NUMBERS[key]))
     return numbers["seed"], numbers["tolerance"]
+
+
+def estimates_of(root: Value, references: References, diagnostics: list[Diagnostic]) -> bool:
+    """Return True if a run may use cheaper steps whose error is estimated and not proved, as by default."""
+    if ESTIMATES not in root.items:
+        return True
+    value = references.resolve(root.items[ESTIMATES], Scope({}, ESTIMATES))
+    if value.data is BROKEN or isinstance(value.data, bool):
+        return bool(value.data)
+    diagnostics.append(Diagnostic(value.mark, f"{ESTIMATES} = {value.plain}", "must be true or false"))
+    return True
 
 
 def outputs_of(root: Value, wiring: Wiring) -> tuple[str, ...]:

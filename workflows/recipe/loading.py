@@ -15,7 +15,8 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
 from neusee.workflows.recipe.distributions.mismatch_laws import read_mismatch
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
 from neusee.workflows.recipe.expected_numbers import unaffected_expectations
-from neusee.workflows.recipe.global_settings import expectations, outputs_of, seed_and_tolerance
+from neusee.workflows.recipe.exported_files import exports_of
+from neusee.workflows.recipe.global_settings import estimates_of, expectations, outputs_of, seed_and_tolerance
 from neusee.workflows.recipe.graph_cache import CachedGraph, cache_graph, cached_graph
 from neusee.workflows.recipe.known_before_run import CheckedStep, check_steps, refuse_indices
 from neusee.workflows.recipe.node_families import NO_FAMILY, Own, class_context
@@ -33,12 +34,14 @@ from neusee.workflows.recipe.wiring import Wiring, cycles
 if TYPE_CHECKING:
     from types import ModuleType
 
+    from neusee.nodes.calibrate import Traceability
     from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.safety_block import Safety
     from neusee.workflows.recipe.blocks.train_block import Training
     from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 
-BLOCKS = ("train", "train_lift", "evaluate")  #: keys of the blocks of settings in a recipe
+TRACED = "traceability"  #: key of the block in which a laboratory states its light and temperature
+BLOCKS = ("train", "train_lift", "evaluate", TRACED)  #: keys of the blocks of settings in a recipe
 SAFETY = "safety"  #: key of the block that an estimate of damage and dazzle reads
 
 
@@ -100,7 +103,7 @@ def _checked(composed: Composed, graph: CachedGraph) -> Recipe:
 
 def _settings_blocks(
     composed: Composed, modules: Mapping[str, ModuleType]
-) -> tuple[Composed, Training | None, LiftTraining | None, EvaluateSettings | None]:
+) -> tuple[Composed, Training | None, LiftTraining | None, EvaluateSettings | None, Traceability | None]:
     """Return a recipe without its blocks of settings, and these; few recipes need the import of their models."""
     from neusee.workflows.recipe.blocks.evaluate_block import read_evaluate
     from neusee.workflows.recipe.blocks.train_block import read_training
@@ -109,7 +112,13 @@ def _settings_blocks(
     composed, training = read_training(composed, class_context(modules))
     composed, lifting = read_lift_training(composed)
     composed, evaluation = read_evaluate(composed)
-    return composed, training, lifting, evaluation
+    if TRACED not in composed.root.items:
+        return composed, training, lifting, evaluation, None
+    from neusee.nodes.calibrate import Traceability
+    from neusee.workflows.recipe.blocks.settings_block import read_block
+
+    composed, traceability = read_block(composed, TRACED, Traceability, composed.root.items[TRACED].plain)
+    return composed, training, lifting, evaluation, traceability
 
 
 def check(composed: Composed) -> Recipe:
@@ -118,8 +127,8 @@ def check(composed: Composed) -> Recipe:
     mistakes: list[Diagnostic] = []
     own = read_own_families(composed.root, mistakes)
     composed = composed.with_problems(mistakes)
-    read = _settings_blocks(composed, own.modules) if blocks else (composed, None, None, None)
-    composed, training, lifting, evaluation = read
+    read = _settings_blocks(composed, own.modules) if blocks else (composed, None, None, None, None)
+    composed, training, lifting, evaluation, traceability = read
     composed, uncertain = settle(composed)
     diagnostics = list(composed.diagnostics)
     uncertain = _with_mismatch(composed, uncertain, blocks[0] if training else None, diagnostics)
@@ -133,9 +142,9 @@ def check(composed: Composed) -> Recipe:
     loops = list(cycles(bound, {name: step.value.key for name, step in steps.items()}))
     diagnostics += loops
     seed, tolerance = seed_and_tolerance(root, references, checker.diagnostics)
-    outputs = outputs_of(root, wiring)
+    estimates, outputs = estimates_of(root, references, checker.diagnostics), outputs_of(root, wiring)
     check_steps(checked, checker, None if loops else outputs)
-    expect = expectations(root, wiring)
+    expect, exports = expectations(root, wiring), exports_of(root, wiring)
     safety = _safety(root, references, diagnostics, checker.files)
     references.finish()
     if not composed.whole:  # a missing group causes further errors
@@ -145,10 +154,11 @@ def check(composed: Composed) -> Recipe:
     if graph is None:
         cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
     config = Config(_final_values(wiring, bound, checker, uncertain) | dict(_settings(blocks, checker)))
-    nulls = {name: f"null ({value.mark})" for name, value in absent.items()}
+    gone = {name: f"null ({value.mark})" for name, value in absent.items()}
     notes = (*composed.notes, *own.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
-    parts = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, nulls
-    return Recipe(*parts, uncertain=uncertain, training=training, lifting=lifting, evaluation=evaluation, safety=safety)
+    args = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, gone, False, estimates
+    recipe = Recipe(*args, uncertain=uncertain, safety=safety, traceability=traceability, exports=exports)
+    return replace(recipe, training=training, lifting=lifting, evaluation=evaluation)
 
 
 def _with_mismatch(

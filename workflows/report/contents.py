@@ -9,6 +9,7 @@ drawing function:
     spot[mask,*]                 a dictionary with the value of each copy of a step
     psf[mask].pixel_pitch        a parameter of a step
     line[*].file                 a dictionary with a parameter of each copy of a step
+    variants of psf              errors and run times of variants of a step, from the last study of accuracy
     psf[mask]()                  a function: the node of a step with the parameters of the step
 
 A leading ``?`` marks an optional argument: if the recipe lacks the step, the figure is drawn without this argument.
@@ -67,6 +68,15 @@ LINES = "line[*]"
 FILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
     name: (file["format"], file["needs"]) for name, file in _TABLES["files"].items()
 }
+
+
+OUTPUTS = "outputs.safetensors"
+
+
+def files_of(recipe: Recipe) -> dict[str, tuple[str, Mapping[str, str]]]:
+    """Return format and needs of the data files that a recipe asks for, by name."""
+    files = {**FILES, OUTPUTS: ("safetensors", {step: step for step in recipe.outputs})}
+    return {name: file for name, file in files.items() if recipe.exports is None or name in recipe.exports}
 
 
 def wanted(recipe: Recipe) -> tuple[str, ...]:

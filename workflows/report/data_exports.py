@@ -1,12 +1,17 @@
-"""Data files of a run: spectral OpenEXR, RGB OpenEXR, PNG of 16 bits and safetensors."""
+"""Data files of a run: spectral OpenEXR, RGB OpenEXR, PNG of 16 bits and safetensors.
+
+Each file is written once, straight to where it stays, piece by piece. Stacks of planes are not compressed, because they
+are noise and tails of PSFs, which do not compress.
+"""
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -14,81 +19,131 @@ from torch import Tensor
 
 from neusee.nodes.values import Bands, Psf
 from neusee.workflows.engine.runner import Result
-from neusee.workflows.report.contents import FILES
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.report import contents
 from neusee.workflows.report.run_pictures import DerivedFile, files_of
+from neusee.workflows.store.band_files import bytes_of
 from neusee.workflows.store.derived_files import DerivedFiles
+from neusee.workflows.store.serialization import tensor_kind
 
-_VERSION = 1  #: version of the file formats; to be increased when a file is written differently
+_VERSION = 2  #: version of the file formats; to be increased when a file is written differently
+_AT_ONCE = 1 << 22  #: values of an image that are encoded together
 
 
 def exports(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
     """Write the data files of a run; return the paths of the files, and the reason for each file that is missing."""
-    outputs = {step: step for step in result.recipe.outputs}
-    contents = {**FILES, "outputs.safetensors": ("safetensors", outputs)}
-    files = (
-        DerivedFile(name, Path(name).suffix, ("file", form, _VERSION), needs, _WRITERS[form])
-        for name, (form, needs) in contents.items()
-    )
-    return files_of(files, result, shelf)
+    return files_of(data_files(result.recipe), result, shelf)
 
 
-def spectral(cube: Tensor | Psf, bands: Bands) -> bytes:
-    """Encode a spectral cube as OpenEXR in the layout of Fichet et al., JCGT 2021."""
+def data_files(recipe: Recipe) -> Iterator[DerivedFile]:
+    """Yield the data files that a recipe asks for."""
+    for name, (form, needs) in contents.files_of(recipe).items():
+        half = recipe.exports is not None and recipe.exports[name]
+        kind = ("file", form, _VERSION, *(["half"] if half else []))
+        write = partial(_WRITERS[form], half=True) if half else _WRITERS[form]
+        yield DerivedFile(name, Path(name).suffix, kind, needs, write)
+
+
+def spectral(path: Path, /, *, cube: Tensor | Psf, bands: Bands, half: bool = False) -> None:
+    """Write a spectral cube as OpenEXR in the layout of Fichet et al., JCGT 2021, with ``half`` in 16 bits a value."""
     from neusee.nodes.scene import write_spectral
 
-    values = cube.intensity if isinstance(cube, Psf) else cube
-    return _written(".exr", lambda path: write_spectral(path, values.detach().cpu().float(), bands.centres))
+    write_spectral(path, cube.intensity if isinstance(cube, Psf) else cube, bands.centres, half=half)
 
 
-def safetensors(**values: Any) -> bytes:
-    """Encode the tensors of each step as safetensors; the name of a tensor is ``step`` or ``step.field``."""
-    from safetensors.torch import save
-
+def safetensors(path: Path, /, **values: Any) -> None:
+    """Write the tensors of each step as safetensors; the name of a tensor is ``step`` or ``step.field``."""
     tensors: dict[str, Tensor] = {}
     for name, value in values.items():
         fields = value._asdict() if hasattr(value, "_asdict") else {"": value}
-        found = {f"{name}.{k}".rstrip("."): v for k, v in fields.items() if isinstance(v, Tensor)}
-        tensors |= {k: v.detach().cpu().clone(memory_format=torch.contiguous_format) for k, v in found.items()}
-    return save(tensors)
+        tensors |= {f"{name}.{k}".rstrip("."): v for k, v in fields.items() if isinstance(v, Tensor)}
+    header, end = dict[str, Any](), 0
+    for name, x in tensors.items():
+        header[name] = {"dtype": tensor_kind(x), "shape": list(x.shape), "data_offsets": [end, end + x.nbytes]}
+        end += x.nbytes
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    with path.open("wb") as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        for x in tensors.values():
+            file.write(bytes_of(x))
 
 
-def exr(image: Tensor) -> bytes:
-    """Encode an RGB image (3, y, x) as a float32 OpenEXR file, or a grey image (1, y, x) with the one channel Y."""
+def exr(path: Path, /, *, image: Tensor, half: bool = False) -> None:
+    """Write an RGB image (3, y, x) as an OpenEXR file, or a grey image (1, y, x) with the one channel Y.
+
+    Pixels are float32, or with ``half`` float16. Raises: ValueError for ``half`` and a value beyond float16.
+    """
     import OpenEXR
 
-    values = image.detach().cpu().float().permute(1, 2, 0).contiguous().numpy()
+    if half and float(image.detach().abs().max()) > torch.finfo(torch.float16).max:
+        raise ValueError("values beyond 65504 cannot be written as half floats: write float32")
+    values = image.detach().cpu().to(torch.float16 if half else torch.float32).permute(1, 2, 0).contiguous().numpy()
     pixels = {"Y": values[..., 0].copy()} if len(image) == 1 else {"RGB": values}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    return _written(".exr", lambda path: OpenEXR.File(header, pixels).write(str(path)))
+    header = {"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage}
+    try:
+        OpenEXR.File(header, pixels).write(str(path))
+    except RuntimeError as error:  # such as a full disk
+        raise OSError(str(error)) from error
 
 
-def png16(image: Tensor) -> bytes:
-    """Encode an image of integers in [0, 65535] as a lossless 16-bit PNG: RGB for (3, y, x), grey for (1, y, x)."""
-    words = image.detach().cpu().double().round()
-    if image.ndim != 3 or image.shape[0] not in (1, 3) or float(words.min()) < 0 or float(words.max()) > 65535:
+def png16(path: Path, /, *, image: Tensor) -> None:
+    """Write an image of integers in [0, 65535] as a lossless 16-bit PNG: RGB for (3, y, x), grey for (1, y, x)."""
+    path.write_bytes(_png16(image))
+
+
+def _png16(image: Tensor) -> bytes:
+    low, high = (float(x) for x in image.aminmax()) if image.numel() else (0.0, 0.0)
+    if image.ndim != 3 or image.shape[0] not in (1, 3) or not (low >= 0 and round(high) <= 65535):
         raise ValueError(
             "a 16-bit PNG needs shape (3, y, x) or (1, y, x) and values in [0, 65535]; this image has shape "
             f"{tuple(image.shape)}"
         )
     height, width = image.shape[1:]
-    big = words.permute(1, 2, 0).to(torch.int32).numpy().astype(">u2").reshape(height, -1)
-    lines = b"".join(b"\0" + row.tobytes() for row in big)
     head = struct.pack(">IIBBBBB", width, height, 16, 2 if len(image) == 3 else 0, 0, 0, 0)
-    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(lines, 6)), (b"IEND", b""))
+    chunks = ((b"IHDR", head), (b"IDAT", b"".join(_compressed(image.detach().cpu()))), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(*c) for c in chunks)
 
 
-def srgb(image: Tensor, source: Path, draws: int) -> bytes:
-    """Encode a restored picture in linear sRGB, white 1, as an sRGB PNG of 16 bits that names the frame."""
+def _compressed(image: Tensor) -> Iterator[bytes]:
+    """Yield the compressed lines of a PNG of 16 bits, each as differences from the pixel at the left.
+
+    Of a picture with noise the differences take less room than the pixels, and runs and the lengths of codes are all
+    that is worth looking for: a third of the time of a full search, and no more bytes.
+    """
+    import numpy as np
+
+    pack, (planes, height, width) = zlib.compressobj(6, zlib.DEFLATED, 15, 9, zlib.Z_RLE), image.shape
+    rows = max(1, _AT_ONCE // (planes * width))
+    for top in range(0, height, rows):
+        words = (
+            image[:, top : top + rows]
+            .double()
+            .round()
+            .permute(1, 2, 0)
+            .to(torch.int32)
+            .contiguous()
+            .numpy()
+            .astype(">u2")
+        )
+        pixels = words.view(np.uint8).reshape(len(words), width, 2 * planes)
+        lines = np.ones((len(words), 1 + 2 * planes * width), np.uint8)  # 1: difference from the left
+        lines[:, 1:] = np.diff(pixels, axis=1, prepend=np.uint8(0)).reshape(len(words), -1)
+        yield pack.compress(lines.data)
+    yield pack.flush()
+
+
+def srgb(path: Path, /, *, image: Tensor, source: Path, draws: int) -> None:
+    """Write a restored picture in linear sRGB, white 1, as an sRGB PNG of 16 bits that names the frame."""
     from neusee.workflows.report.figures.style import encoded
 
     codes = torch.from_numpy(encoded(image)).permute(2, 0, 1) * 65535.0
-    return _named(png16(codes), source, draws)
+    path.write_bytes(_named(_png16(codes), source, draws))
 
 
-def marked(marked: Tensor, source: Path, draws: int) -> bytes:
-    """Encode the pixels with a marked channel as white on black, as a PNG that names the frame."""
-    return _named(png16(marked.any(0, keepdim=True) * 65535.0), source, draws)
+def marked(path: Path, /, *, marked: Tensor, source: Path, draws: int) -> None:
+    """Write the pixels with a marked channel as white on black, as a PNG that names the frame."""
+    path.write_bytes(_named(_png16(marked.any(0, keepdim=True) * 65535.0), source, draws))
 
 
 def _named(png: bytes, source: Path, draws: int) -> bytes:
@@ -103,15 +158,7 @@ def _chunk(name: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
 
 
-def _written(suffix: str, write: Callable[[Path], Any]) -> bytes:
-    """Let the function ``write`` write a temporary file, and return the bytes of this file."""
-    with TemporaryDirectory(prefix="neusee-") as folder:
-        path = Path(folder) / f"file{suffix}"
-        write(path)
-        return path.read_bytes()
-
-
-_WRITERS: dict[str, Callable[..., bytes]] = {
+_WRITERS: dict[str, Callable[..., None]] = {
     "spectral": spectral,
     "exr": exr,
     "png16": png16,

@@ -11,7 +11,10 @@ from typing import Any
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys.cache_key import code_of, plain
 from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.report.measured_variants import variants_of
+from neusee.workflows.store.result_store import Store
 
+_MEASURED = "variants of "
 _PARAMETER = re.compile(r"(?P<step>[^.]+)\.(?P<name>\w+)")
 
 
@@ -44,11 +47,13 @@ class Found:
     identity: Any  #: plain JSON
 
 
-def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code) -> Found:
+def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code, store: Store) -> Found:
     """Find the source of an argument of a drawing function in a recipe, from a text such as ``psf[mask]``.
 
-    The module `contents` lists all forms of this text.
+    The module `contents` lists all forms of this text. ``store`` has what studies measured.
     """
+    if need.startswith(_MEASURED):
+        return _variants(need.removeprefix(_MEASURED), recipe, code, store)
     if need.endswith("()"):
         step = _step(need[:-2], recipe)
         params = [[name, plain(value)] for name, value in step.params.items()]
@@ -62,6 +67,16 @@ def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code) -> Foun
     if need not in keys:
         raise Missing(f"no output of this run needs the step {need}")
     return Found((need,), lambda values: values[need], keys[need])
+
+
+def _variants(family: str, recipe: Recipe, code: Code, store: Store) -> Found:
+    """Find the errors and run times of the variants of a step, which a study of accuracy has measured."""
+    if not any(name.partition("[")[0] == family for name in recipe.steps):
+        raise Missing(f"the recipe has no step {family}")
+    rows = variants_of(recipe, family, store, code)
+    if not rows:
+        raise Missing(f"`neusee study accuracy {recipe.name}` measures it, and the next run shows it")
+    return Found((), lambda values: rows, rows)
 
 
 def _parameter(step: str, name: str, recipe: Recipe) -> Any:

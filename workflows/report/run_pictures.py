@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from neusee.workflows.engine.runner import Result
+from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.step_record import StepRecord
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code
@@ -18,6 +20,7 @@ from neusee.workflows.report.contents import FIGURES
 from neusee.workflows.report.requirements import Found, Missing, find, is_table
 from neusee.workflows.report.shown_values import in_turn
 from neusee.workflows.store.derived_files import DerivedFiles
+from neusee.workflows.store.result_store import Store
 
 GRAPH = (
     "graph",
@@ -34,28 +37,61 @@ TIMELINE = (
 
 @dataclass(frozen=True, slots=True)
 class DerivedFile:
-    """A figure or data file of a run: the function ``make`` that computes it, and the source of each argument."""
+    """A figure or data file of a run: ``make(path, …)`` that writes it, and the source of each argument."""
 
     name: str
     suffix: str
     kind: Sequence[Any]  #: the parts of the key that do not depend on the results
     needs: Mapping[str, str]
-    make: Callable[..., bytes]
+    make: Callable[..., None]
     only_tables: bool = False  #: True for a file that is made only if an argument is a table of the user
 
 
 Job = tuple[DerivedFile, str, Mapping[str, Found]]  #: a file, its key, and the arguments of its ``make``
 
 
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """The function ``module:function`` that draws a picture, which `files_beside` may call in another process."""
+
+    path: str
+
+    def __call__(self, file: Path, /, **arguments: Any) -> None:
+        """Write the picture of the results ``arguments`` into a file."""
+        file.write_bytes(_function(self.path)(**arguments))
+
+
 def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
     """Draw the pictures of a run; return the paths of the pictures, and the reason for each picture that is missing."""
-    drawing = engine(*sorted({figure.draw.partition(":")[0] for figure in FIGURES}), "report.figures.recipe_graph")
-    files = (
-        DerivedFile(f.name, ".png", ("figure", f.draw, drawing), f.needs, _function(f.draw), f.only_tables)
-        for f in FIGURES
+    paths, missing = files_of(figure_files(), result, shelf)
+    now, _ = (
+        shelf.find(key, ".png") or shelf.keep(key, ".png", "graph", partial(GRAPH_DRAWING, **arguments))
+        for key, arguments in graphs(result)
     )
-    paths, missing = files_of(files, result, shelf)
-    return {**paths, "graph": _graph(result, shelf, drawing)}, missing
+    return {**paths, "graph": now}, missing
+
+
+def figure_files() -> Iterator[DerivedFile]:
+    """Yield the pictures that show results of steps."""
+    for f in FIGURES:
+        kind = ("figure", f.draw, _drawing_code())
+        yield DerivedFile(f.name, ".png", kind, f.needs, Drawing(f.draw), f.only_tables)
+
+
+def graphs(result: Result) -> list[tuple[str, Mapping[str, Any]]]:
+    """Return key and arguments of the graph of a run, and in advance those of the graph of an identical later run."""
+    states = {name: "cached" if done.state == "not needed" else str(done.state) for name, done in result.done.items()}
+    again = {name: "left out" if state == "left out" else "cached" for name, state in states.items()}
+    sources = {name: list(result.recipe.steps[name].sources) for name in result.done}
+    return [
+        (digest("graph", _drawing_code(), sources, each), {"sources": sources, "states": each})
+        for each in (states, again)
+    ]
+
+
+def _drawing_code() -> str:
+    modules = sorted({figure.draw.partition(":")[0] for figure in FIGURES})
+    return engine(*modules, "report.figures.recipe_graph")
 
 
 def files_of(
@@ -68,14 +104,14 @@ def files_of(
     code, jobs, missing = Code(result.store.code_memo), list[Job](), dict[str, str]()
     for file in files:
         try:
-            found = _arguments(file.needs, result, code)
+            found = arguments_of(file.needs, result.recipe, result.keys, code, result.store)
         except Missing as why:
             missing[file.name] = str(why)
             continue
         if file.only_tables and not any(is_table(x.make({})) for x in found.values()):
             missing[file.name] = ""
             continue
-        jobs.append((file, digest(*file.kind, [[name, x.identity] for name, x in found.items()]), found))
+        jobs.append((file, key_of_file(file, found), found))
     code.save()
     return _made(jobs, result, shelf, missing), missing
 
@@ -112,16 +148,26 @@ def _in_turn(known: Iterable[StepRecord]) -> tuple[Slot, ...]:
     return tuple(slots)
 
 
-def _arguments(needs: Mapping[str, str], result: Result, code: Code) -> dict[str, Found]:
-    """Find the source of each argument of a drawing function; omit arguments marked by ``?`` whose step is missing."""
+def arguments_of(
+    needs: Mapping[str, str], recipe: Recipe, keys: Mapping[str, str], code: Code, store: Store
+) -> dict[str, Found]:
+    """Find the source of each argument of a drawing function; omit arguments marked by ``?`` whose step is missing.
+
+    Raises `Missing` for another argument whose step is missing.
+    """
     found = {}
     for argument, need in needs.items():
         try:
-            found[argument] = find(need.removeprefix("?"), result.recipe, result.keys, code)
+            found[argument] = find(need.removeprefix("?"), recipe, keys, code, store)
         except Missing:
             if not need.startswith("?"):
                 raise
     return found
+
+
+def key_of_file(file: DerivedFile, found: Mapping[str, Found]) -> str:
+    """Return the key of a file: the digest of how it is made and of what it shows."""
+    return digest(*file.kind, [[name, x.identity] for name, x in found.items()])
 
 
 def _made(jobs: Sequence[Job], result: Result, shelf: DerivedFiles, missing: dict[str, str]) -> dict[str, Path]:
@@ -132,11 +178,9 @@ def _made(jobs: Sequence[Job], result: Result, shelf: DerivedFiles, missing: dic
     for (file, key, found), values in zip(new, in_turn(needed, result), strict=True):
         arguments = {name: x.make(values) for name, x in found.items()}
         try:
-            content = file.make(**arguments)
+            paths[file.name] = shelf.keep(key, file.suffix, file.name, partial(file.make, **arguments))
         except (ValueError, Missing, RuntimeError) as error:
             missing[file.name] = str(error).partition("\n")[0]
-            continue
-        paths[file.name] = shelf.keep(key, file.suffix, file.name, content)
     return {file.name: paths[file.name] for file, _, _ in jobs if file.name in paths}
 
 
@@ -146,14 +190,4 @@ def _function(path: str) -> Callable[..., bytes]:
     return lambda **arguments: getattr(importlib.import_module(f"neusee.workflows.{module}"), name)(**arguments)
 
 
-def _graph(result: Result, shelf: DerivedFiles, drawing: str) -> Path:
-    """Draw the graph of a run with the states of all steps, and in advance the graph of an identical later run."""
-    states = {name: "cached" if done.state == "not needed" else str(done.state) for name, done in result.done.items()}
-    again = {name: "left out" if state == "left out" else "cached" for name, state in states.items()}
-    sources = {name: list(result.recipe.steps[name].sources) for name in result.done}
-    draw, paths = _function("report.figures.recipe_graph:graph"), []
-    for now in (states, again):
-        key = digest("graph", drawing, sources, now)
-        found = shelf.find(key, ".png")
-        paths.append(found or shelf.keep(key, ".png", "graph", draw(sources=sources, states=now)))
-    return paths[0]
+GRAPH_DRAWING = Drawing("report.figures.recipe_graph:graph")

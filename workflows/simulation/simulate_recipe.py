@@ -20,10 +20,11 @@ from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report import run_html, run_page, run_timing
 from neusee.workflows.report.contents import wanted
-from neusee.workflows.report.data_exports import exports
+from neusee.workflows.report.data_exports import data_files, exports
+from neusee.workflows.report.files_beside import FilesBeside
 from neusee.workflows.report.run_code import code_text
 from neusee.workflows.report.run_folder import NotWritten, RunFolder, new_run
-from neusee.workflows.report.run_pictures import pictures, timeline
+from neusee.workflows.report.run_pictures import GRAPH_DRAWING, DerivedFile, figure_files, graphs, pictures, timeline
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -63,15 +64,21 @@ def simulate(
         if watch is not None:
             watch(event)
 
-    with warnings.catch_warnings(record=True) as caught:
+    shelf = DerivedFiles(store)
+    with (
+        warnings.catch_warnings(record=True) as caught,
+        FilesBeside(_files, shelf, memory_limit(None) if memory is None else 0.0) as beside,
+    ):
         warnings.simplefilter("default")
         recipe = with_substitutions(recipe, wanted(recipe))
-        result = run(recipe, store, wanted(recipe), explained(recipe, store, note), device, executor, memory)
+        told = explained(recipe, store, note)
+        result = run(recipe, store, wanted(recipe), told, device, executor, memory, beside)
         result = replace(result, done={name: finished.get(name, done) for name, done in result.done.items()})
         key = digest([[name, result.keys[name]] for name in wanted(result.recipe)])
         with limited(memory_limit(memory)), _watched(), new_run(runs, recipe.name, key) as folder:
             folder.said = {"began": began}
-            doc = _write(result, folder, command, caught)
+            bars = _rest(result, beside)
+            doc = _write(result, shelf, folder, command, caught, bars)
     return Simulation(folder.path, doc, folder.taken)
 
 
@@ -85,10 +92,28 @@ def _watched() -> Iterator[None]:
         raise NotWritten(f"the report was stopped, and no part of it is left: {error}") from error
 
 
+def _files(recipe: Recipe) -> Iterator[DerivedFile]:
+    yield from figure_files()
+    yield from data_files(recipe)
+
+
+def _rest(result: Result, beside: FilesBeside) -> bytes | None:
+    """Draw what shows no result of a step, while the last files of results are made; return the timeline."""
+    for key, arguments in graphs(result):
+        beside.add("graph", key, GRAPH_DRAWING, arguments)
+    bars = timeline(result)
+    beside.finish()
+    return bars
+
+
 def _write(
-    result: Result, folder: RunFolder, command: Sequence[str], caught: Sequence[warnings.WarningMessage]
+    result: Result,
+    shelf: DerivedFiles,
+    folder: RunFolder,
+    command: Sequence[str],
+    caught: Sequence[warnings.WarningMessage],
+    bars: bytes | None,
 ) -> dict[str, Any]:
-    shelf = DerivedFiles(result.store)
     drawn, missing = pictures(result, shelf)
     files, refused = exports(result, shelf)
     doc = run_page.document(result, command, (str(warning.message) for warning in caught), missing)
@@ -99,7 +124,7 @@ def _write(
     shown = {name: path.read_bytes() for name, path in drawn.items()}
     for name, path in drawn.items():
         folder.take(f"figures/{name}.png", path)
-    if bars := timeline(result):
+    if bars:
         folder.write("figures/timeline.png", bars)
         shown["timeline"] = bars
     for name, path in files.items():

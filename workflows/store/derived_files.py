@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,45 +33,56 @@ class DerivedFiles:
         self.store = store
         self.folder = store.root / "files"
         self._spare: TemporaryDirectory[str] | None = None
+        self._fresh: set[Path] = set()
 
     def find(self, key: str, suffix: str) -> Path | None:
-        """Return the path of the derived file ``key``, or None if the file is missing or has a wrong checksum."""
+        """Return the path of the derived file ``key``, or None if the file is missing or has a wrong checksum.
+
+        A file that this object has written or compared is not compared again.
+        """
         from torch import Tensor
 
         path = self._path(key, suffix)
+        if path in self._fresh and path.is_file():
+            return path
         with suppress(KeyError, OSError):
             if path.is_file() and self.store.has(key) and _is_right(path, self.store.get(key, Tensor)):
+                self._fresh.add(path)
                 return path
         return None
 
-    def keep(self, key: str, suffix: str, what: str, content: bytes) -> Path:
-        """Write a read-only file by atomic rename and store its checksum; return the path of the file."""
+    def keep(self, key: str, suffix: str, what: str, write: Callable[[Path], None]) -> Path:
+        """Let ``write`` write a file beside its final path, rename the file, and store its checksum; return its path.
+
+        The file is read-only. If the folder cannot be written, it is written into a temporary folder.
+        """
         try:
-            path = self._written(key, suffix, content)
+            path = self._written(key, suffix, write)
         except OSError as error:
             self.store.report_failure(error)
-            self._spare = TemporaryDirectory(prefix="neusee-")
+            self._spare = self._spare or TemporaryDirectory(prefix="neusee-")
             self.folder = Path(self._spare.name)
-            path = self._written(key, suffix, content)
+            path = self._written(key, suffix, write)
         about = {
             "step": what,
             "seconds": 0.0,
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "file": path.name,
-            "file_bytes": len(content),
+            "file_bytes": path.stat().st_size,
         }
         self.store.put(key, _digest(path, "sha256" if secrets() else _FAST), about)
+        self._fresh.add(path)
         return path
 
     def _path(self, key: str, suffix: str) -> Path:
         return self.folder / key[:2] / f"{key}{suffix}"
 
-    def _written(self, key: str, suffix: str, content: bytes) -> Path:
+    def _written(self, key: str, suffix: str, write: Callable[[Path], None]) -> Path:
         path = self._path(key, suffix)
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f".{key}.{os.getpid()}{suffix}")
         try:
-            part.write_bytes(content)
+            write(part)
             part.chmod(0o444)
             part.replace(path)
         finally:

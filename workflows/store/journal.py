@@ -13,7 +13,7 @@ import re
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
-from typing import Any
+from typing import Any, BinaryIO
 
 from neusee.workflows.keys.seal import FORMAT, seal_record, unseal_record
 from neusee.workflows.store import metadata
@@ -28,6 +28,8 @@ _KEY = slice(len(_START), len(_START) + 32)
 _NAMES = {"key", "node", "kept", *_FIELDS}
 _HEAD = re.compile(rb'\{"journal":"[0-9a-f]{16}","format":%d\}' % FORMAT)
 _SPARE = 20_000  #: superseded lines from which the file is rewritten
+_LATEST = 1 << 20  #: bytes at the end of the file that `Journal.latest` reads, about 3000 lines
+_TOTALS = re.compile(rb'^%s([^"]+)".*?,"bytes":(\d*).*?,"kept":(true|false)' % _START, re.M)
 
 
 def row_of(key: str, about: Row) -> Row:
@@ -63,6 +65,32 @@ class Journal:
         """
         self._read()
         return self._rows
+
+    def latest(self) -> list[Row]:
+        """Return the newest lines of the journal: all of a short one, and some thousand of a long one.
+
+        The time that this takes does not grow with the number of results.
+        """
+        self._read(whole=False)
+        return self._rows
+
+    def totals(self) -> tuple[int, int, int]:
+        """Return the number of stored results, their bytes, and the number of results without a stored value.
+
+        The lines are counted without a check of their seals.
+        """
+        newest = dict[bytes, tuple[int, bool]]()
+        with suppress(OSError), open(self._path, "rb", opener=_opened) as file:
+            for key, size, kept in _TOTALS.findall(file.read()):
+                newest[key] = int(size or 0), kept == b"true"
+        sizes = [size for size, kept in newest.values() if kept]
+        return len(sizes), sum(sizes), len(newest) - len(sizes)
+
+    def is_long(self) -> bool:
+        """Return True if `latest` has only a part of the lines."""
+        with suppress(OSError):
+            return os.stat(self._path).st_size > _LATEST
+        return False
 
     def of_step(self, name: str) -> list[Row]:
         """Return the journal lines of the step ``name``, the newest line last."""
@@ -118,21 +146,27 @@ class Journal:
 
     def _forget(self) -> None:
         self._rows = []
-        self._head, self._offset, self._fileless = b"", 0, False
+        self._head, self._offset, self._fileless, self._whole = b"", 0, False, True
 
-    def _read(self) -> None:
+    def _read(self, whole: bool = True) -> None:
         with self._guard:
+            if whole and not self._whole:
+                self._forget()
             if not self._fileless:
-                self._read_new_lines()
+                self._read_new_lines(whole)
 
-    def _read_new_lines(self) -> None:
-        """Read the lines added to the journal file since the last call; rebuild a missing or damaged file."""
+    def _read_new_lines(self, whole: bool) -> None:
+        """Read the lines added to the journal file since the last call; rebuild a missing or damaged file.
+
+        If ``whole`` is False, the first call reads the end of the file alone.
+        """
         try:
             with open(self._path, "rb", opener=_opened) as file:
                 head = file.readline(100).strip()
                 if head != self._head or os.fstat(file.fileno()).st_size < self._offset:
                     self._forget()
-                file.seek(self._offset or len(head))
+                start = self._offset or self._first_byte(file, len(head), whole)
+                file.seek(start)
                 raw = file.read()
         except FileNotFoundError:
             return self._rebuild()
@@ -140,10 +174,20 @@ class Journal:
             return
         if not _HEAD.fullmatch(head):
             return self._rebuild()
-        self._head, self._offset = head, (self._offset or len(head)) + len(raw)
+        self._head, self._offset = head, start + len(raw)
         self._rows += _parsed(raw)
-        if len(self._rows) > _SPARE and len(self._rows) > 2 * len({row["key"] for row in self._rows}):
+        if self._whole and len(self._rows) > _SPARE and len(self._rows) > 2 * len({row["key"] for row in self._rows}):
             self._replace(list({row["key"]: row for row in self._rows}.values()))
+
+    def _first_byte(self, file: BinaryIO, head: int, whole: bool) -> int:
+        """Return where the first read begins: after the first line, or at the start of a line near the end."""
+        size = os.fstat(file.fileno()).st_size
+        if whole or size - head <= _LATEST:
+            return head
+        self._whole = False
+        file.seek(size - _LATEST)
+        file.readline(_LATEST)
+        return file.tell()
 
     def _each(self) -> Iterator[tuple[str, Row]]:
         return itertools.chain(metadata.each(self._disk), self._others())

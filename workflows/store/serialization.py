@@ -272,6 +272,14 @@ def _kind(x: Tensor) -> tuple[str, list[int], bool]:
     return _DTYPES[real], [*x.shape, 2] if x.is_complex() else list(x.shape), x.is_complex()
 
 
+def tensor_kind(x: Tensor) -> str:
+    """Return the name that safetensors gives to the type of a tensor; raise ValueError for a type without a name."""
+    name = "C64" if x.dtype == torch.complex64 else _DTYPES.get(x.dtype)
+    if name is None:
+        raise ValueError(f"safetensors has no name for {x.dtype}")
+    return name
+
+
 def _tensor(data: Any, offset: int, kind: Any, shape: Any, is_complex: bool) -> Tensor:
     """Return the tensor at an offset of ``data``; raise `ValueError` if type, shape or size cannot be right."""
     dtype = _NAMES.get(kind) if isinstance(kind, str) else None

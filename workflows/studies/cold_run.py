@@ -37,4 +37,4 @@ def key_parts(recipe: Recipe, code: Code, device: str = "cpu") -> list[Any]:
     keys: dict[str, Key] = {}
     for name in needed(recipe, recipe.outputs):
         keys[name], _ = key_of(recipe.steps[name], keys, recipe.seed, code, device)
-    return [[keys[name] for name in recipe.outputs], recipe.tolerance, recipe.exact]
+    return [[keys[name] for name in recipe.outputs], recipe.tolerance, recipe.exact, recipe.estimates]

@@ -135,7 +135,7 @@ def _failed(point: Point, error: Exception, seconds: float, left: float) -> Poin
 
 def _costs(store: Store) -> dict[str, float]:
     known: dict[str, list[float]] = defaultdict(list)
-    for row in store.journal.rows():
+    for row in store.journal.latest():
         if row["step"] and row["seconds"] is not None:
             known[row["step"]].append(row["seconds"])
     return {step: median(seconds) for step, seconds in known.items()}

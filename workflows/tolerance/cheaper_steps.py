@@ -20,6 +20,8 @@ from neusee.workflows.tolerance.zero_effect_steps import without_nothing
 if TYPE_CHECKING:
     from neusee.nodes import Node
 
+ESTIMATED = 0.22  #: share of the tolerance for the estimated error of PSFs of few bands
+BESIDE = 0.08  #: share of the tolerance for the channels of an image beside such an estimate, in place of `CHANNELS`
 CHANNELS = 0.25  #: share of the tolerance for the channels of an image; the scene level may depend on a second image
 _LEAST = 2e-5  #: tolerance below which sums over bands cannot be proved, because their round-off alone is 1.4e-6
 _MIXTURE = 0.1  #: share of the tolerance for a low-rank cube, rounded to a power of ten so that the cube seldom changes
@@ -42,7 +44,7 @@ def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection
     if not images or recipe.tolerance * recipe.tolerance_scale <= _LEAST:
         return recipe
     dependent = _dependent(recipe, order, pinned)
-    draft = _Draft(recipe, wanted, _readers(recipe, order))
+    draft = _Draft(recipe, wanted, _readers(recipe, order), frozenset(dependent))
     for image in images:
         if image.name not in pinned and image.wires.get("radiance") not in dependent:
             draft.collapse(image)
@@ -99,6 +101,7 @@ class _Draft:
     recipe: Recipe
     wanted: frozenset[str]
     readers: Mapping[str, list[str]]
+    dependent: frozenset[str] = frozenset()  #: steps that change while a value is optimised
     added: dict[str, Step] = field(default_factory=dict)
     rewired: dict[str, Step] = field(default_factory=dict)
     substitutions: list[Substitution] = field(default_factory=list)
@@ -110,11 +113,12 @@ class _Draft:
         weights = self.spectral(image.name, readers)
         if node is None or weights is None or not isinstance(radiance, str):
             return
-        name, within = f"{image.name}.channels", self.recipe.allowed(image.name) * CHANNELS
+        name, within = f"{image.name}.channels", self.recipe.allowed(image.name)
         cube, rows = self._mixture(radiance, image), self._rows(*weights, readers, image)
-        wires = {"radiance": cube, "psf": image.wires.get("psf"), "rows": rows}
         # the level of the scene follows the brightest pixel
         largest = any(reader.node.hooks.band_invariant is not None for reader in readers)
+        wires = {"radiance": cube, "rows": rows, **self._few_bands(image, cube, rows, largest)}
+        within *= BESIDE if "few" in wires else CHANNELS
         self._add(name, node, wires, {**image.params, "within": within, "largest": largest}, image)
         for reader in readers:
             changed = {i: _exchanged(wire, image.name, name) for i, wire in reader.wires.items()}
@@ -156,6 +160,34 @@ class _Draft:
             return wire is None
         step = self.recipe.steps[wire]
         return step.node.hooks.band_invariant is not None and step.node.hooks.band_invariant(step.params)
+
+    def _few_bands(self, image: Step, cube: str, rows: str, largest: bool) -> dict[str, Wire]:
+        """Add steps that compute the PSF of an image for few bands, if nothing else reads it; return the wires."""
+        from neusee.nodes import optics
+
+        name = image.wires.get("psf")
+        step = self.recipe.steps[name] if isinstance(name, str) else None
+        if step is None or step.node is not optics.psf or not self._only(step.name, image.name):
+            return {"psf": name}
+        lens = {p: step.params[p] for p in ("focal_length", "pixel_pitch", "pixel", "sensor")}
+        given = {"pupil": step.wires["pupil"], "radiance": cube, "rows": rows}
+        within = self.recipe.allowed(image.name) * ESTIMATED
+        params = {**lens, "shape": step.params["shape"], "within": within, "largest": largest}
+        chosen = self._add(f"{name}.choice", optics.few_bands, given, params, step)
+        pupil = self._add(f"{name}.pupil", optics.pupil_of_bands, {"pupil": given["pupil"], "few": chosen}, {}, step)
+        few = self._add(f"{name}.few", step.node, {"pupil": pupil}, step.params, step)
+        checked = {"few": chosen, "psf": few, **given}
+        found = self._add(f"{name}.checked", optics.few_bands_checked, checked, lens, step)
+        self.substitutions.append(Substitution(step.name, found, within, "PSFs of few bands are enough for the image"))
+        return {"psf": few, "few": found}
+
+    def _only(self, psf: str, image: str) -> bool:
+        """Return True if no step but ``image`` reads a PSF on the axis, and an estimate of its error is allowed."""
+        if not self.recipe.estimates or psf in self.wanted or psf in self.dependent:
+            return False
+        step = self.recipe.steps[psf]
+        apart = step.wires.get("direction") is not None or any(step.params["angle"])
+        return self.readers.get(psf) == [image] and not apart
 
     def _rows(self, bands: str, responses: str, readers: list[Step], image: Step) -> str:
         """Add a step that computes the weight of each wavelength band in each channel sum; return the step's name."""

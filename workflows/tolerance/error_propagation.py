@@ -60,7 +60,7 @@ def tolerance_frontier(recipe: Recipe, order: Iterable[str], wanted: Iterable[st
     for name in order:
         step = recipe.steps[name]
         reads = [source for source in step.sources if source in inexact]
-        if reads and not _bounds_its_error(step):
+        if reads and not _bounds_its_error(step, recipe):
             frontier |= dict.fromkeys(reads)
         elif reads or step.node.hooks.approximation_error is not None or step.node.hooks.skip_bound is not None:
             inexact.add(name)
@@ -71,13 +71,19 @@ def unbounded_steps(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
     """Return the steps whose errors reach a node that gives no bound on the error of its result."""
     unbounded = set[str]()
     for name in reversed(order):
-        if name in unbounded or not _bounds_its_error(recipe.steps[name]):
+        if name in unbounded or not _bounds_its_error(recipe.steps[name], recipe):
             unbounded.update(recipe.steps[name].sources)
     return frozenset(unbounded)
 
 
-def _bounds_its_error(step: Step) -> bool:
-    return step.node.hooks.propagate_error is not None or step.node.hooks.approximation_error is not None
+def _bounds_its_error(step: Step, recipe: Recipe) -> bool:
+    return _propagates(step, recipe) or step.node.hooks.approximation_error is not None
+
+
+def _propagates(step: Step, recipe: Recipe) -> bool:
+    """Return True if the node of a step tells how errors pass through it, by a bound or by an estimate in use."""
+    hooks = step.node.hooks
+    return hooks.propagate_error is not None and (recipe.estimates or not hooks.estimated)
 
 
 def proof(
@@ -93,7 +99,7 @@ def proof(
         if own is None and not any(bound.rms for bound in _flat(inputs)):
             continue  # exact, like almost every step
         facts, error = facts_of(name), done(name).error
-        carried = _carried(step, inputs, facts)
+        carried = _carried(step, inputs, facts, _propagates(step, recipe))
         if math.isinf(carried):
             shares = {source: bounds[source].share for source in step.sources if source in bounds}
             held |= {source: share for source, share in shares.items() if math.isfinite(share)}
@@ -115,12 +121,12 @@ def _own(step: Step, done: StepRecord, facts_of: FactsOf) -> float | None:
     return share * largest / max(1.0 - share, 1e-3)
 
 
-def _carried(step: Step, inputs: list[_Input], result: TensorStats | None) -> float:
+def _carried(step: Step, inputs: list[_Input], result: TensorStats | None, known: bool) -> float:
     """Return the error of a step's result that comes from errors of its inputs, or infinity if no bound is known."""
     errors, hooks = [bound.rms for bound in _flat(inputs)], step.node.hooks
     if not any(errors) or hooks.approximation_error is not None:  # this hook covers all errors of the result
         return 0.0
-    if hooks.propagate_error is None or result is None or math.inf in errors:
+    if hooks.propagate_error is None or not known or result is None or math.inf in errors:
         return math.inf
     try:
         return float(hooks.propagate_error(*inputs, result=result, **step.params))

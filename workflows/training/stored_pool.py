@@ -70,5 +70,5 @@ class StoredPool:
         if private := next(filter(is_private, own), None):
             return private
         cut = [settings.size, settings.patch, settings.patches, settings.precision, self._resize]
-        within = [list(pixels.shape), noise, recipe.tolerance, recipe.exact, device_kind(self.device)]
+        within = [list(pixels.shape), noise, recipe.tolerance, recipe.exact, recipe.estimates, device_kind(self.device)]
         return digest("training picture", engine(*_CODE), own, cut, within)

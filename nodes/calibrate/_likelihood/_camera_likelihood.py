@@ -36,6 +36,11 @@ class _Camera(NamedTuple):
     twist: Tensor
 
 
+#: the parameter of `camera` for each field of `_Camera`
+CAMERA_PARAMETERS = ("gain", "quantum_efficiency", "dark_signal", "temporal_dark_noise", "dark_current", "scatter",
+                     "lamp", "drift", "bend", "twist")  # fmt: skip
+
+
 class _Signal(NamedTuple):
     """The measured means, converted to electrons by the response of a camera; each tensor is (..., level)."""
 

@@ -11,8 +11,8 @@ from neusee.nodes import Check, node
 from neusee.nodes.optics._imaging._band_image import Border, image, reach
 from neusee.nodes.optics._imaging._collapsed_plan import Given, choose, with_windows
 from neusee.nodes.optics._imaging._convolve_plan import convolved, guessed, majorant, rounding
-from neusee.nodes.optics._imaging._psf_energy import passed
-from neusee.nodes.values import Channels, LowRankCube, Psf
+from neusee.nodes.optics._imaging._psf_energy import Passed, passed, spread
+from neusee.nodes.values import Channels, FewBands, LowRankCube, Psf
 
 Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: as a share of the brightest pixel
 _TRIES = 3  #: plans tried: with the brightest pixels estimated, then measured, then with nothing omitted
@@ -23,6 +23,7 @@ def image_channels(
     radiance: LowRankCube,
     psf: Psf,
     rows: Tensor,
+    few: FewBands | None = None,
     *,
     border: Border = "zero",
     within: Share = 0.0,
@@ -34,7 +35,8 @@ def image_channels(
     Plane i is the sum over k of planes[k] convolved with sum_b rows[i, b] basis[b, k] psf[b]: three planes and three
     rows take 15 transforms where 31 bands take 93. Planes, kernels, bands and the tails of the PSF are omitted as far
     as the root mean square error `within` allows, whichever saves the most time; 0 omits nothing. With `largest` only
-    the error of the low-rank cube is allowed, and the error of the brightest pixel is bounded as well.
+    the error of the low-rank cube is allowed, and the error of the brightest pixel is bounded as well. With `few`, the
+    PSFs are those of few bands, and the PSF of every other band is interpolated between two of these.
 
     Shapes: radiance k planes (y, x), psf.intensity (band, any, any), rows (row, band) -> planes (row, y, x).
     Units:  those of the radiance times those of the rows.
@@ -42,27 +44,34 @@ def image_channels(
             by the sum of each PSF (Young's inequality, as for the root mean square; where the border reflects, three
             times that of the scene); of the brightest pixel, the image of the largest residual of each pixel;
             tails, by Young's inequality; kernels, by the sum of their residuals. Estimated, not proved: round-off of
-            the transforms, from the powers of planes and kernels, never less than was measured.
+            the transforms, from the powers of planes and kernels, never less than was measured; and `estimated`, the
+            error by few bands.
             Planes and PSF receive gradients; basis and rows are constants.
     Raises: ValueError where scene, PSF and rows have different bands, or the scene is a batch.
     Source: linearity of incoherent imaging, Goodman, Introduction to Fourier Optics, 4th ed., ch. 7.
     """
-    planes, intensity = _fitted(radiance, psf, rows)
+    share = None if few is None or few.share.shape[0] == few.share.shape[1] else few.share.double().cpu()
+    planes, intensity = _fitted(radiance, psf, rows, share)
     unit = rows.detach().abs().amax(1).double().cpu()
     unit = unit.where(unit > 0, 1.0)
     scaled = rows.detach().double().cpu() / unit[:, None]
-    given = _given(radiance, planes, intensity, scaled, border)
+    given = _given(radiance, planes, scaled, border, spread(passed(intensity.detach()), share), share)
     result, bound, kept = _formed(planes, intensity, given, 0.0 if largest else within)
     top = _top(result, radiance, intensity, given) if largest else math.inf
     brightest = torch.tensor(top, dtype=torch.float64)
     scale = unit.to(result)[:, None, None]
     result = result * scale if result.requires_grad else result.mul_(scale)
-    return Channels(result, rows.detach().double(), bound, kept, brightest)
+    estimated = torch.zeros(2, dtype=torch.float64) if few is None else torch.stack([few.error, few.largest]).cpu()
+    return Channels(result, rows.detach().double(), bound, kept, brightest, estimated)
 
 
 @image_channels.reference
-def _(radiance: LowRankCube, psf: Psf, rows: Tensor, *, border: Border = "zero", **_: Any) -> Channels:
+def _(
+    radiance: LowRankCube, psf: Psf, rows: Tensor, few: FewBands | None = None, *, border: Border = "zero", **_: Any
+) -> Channels:
     assert image.hooks.reference is not None
+    if few is not None:
+        psf = psf._replace(intensity=torch.einsum("bj,jyx->byx", few.share, psf.intensity.double()))
     cube = torch.tensordot(radiance.basis.double(), radiance.planes.double(), 1)
     bands = image.hooks.reference(cube, psf, border=border)
     zero = torch.zeros((), dtype=torch.float64)
@@ -71,7 +80,8 @@ def _(radiance: LowRankCube, psf: Psf, rows: Tensor, *, border: Border = "zero",
 
 @image_channels.approximation_error
 def _(result: Channels) -> tuple[float, float]:
-    return float(result.bound), float(result.largest)
+    error, top = result.estimated.tolist()
+    return float(result.bound) + error, float(result.largest) + top
 
 
 @image_channels.check
@@ -81,12 +91,16 @@ def _(result: Channels, *inputs: Any, within: float = 0.0, **params: Any) -> lis
         f"{planes} planes and {kernels} kernels of {y} x {x} for {result.rows.shape[1]} bands, "
         f"{result.rows.shape[1] - bands} left out, within {float(result.bound):.2g}"
     )
+    if float(result.estimated[0]):
+        text = f"{text}; PSFs of few bands, estimated error {float(result.estimated[0]):.2g}"
     return [Check(text, within == 0 or float(result.bound) <= within)]
 
 
-def _fitted(radiance: LowRankCube, psf: Psf, rows: Tensor) -> tuple[Tensor, Tensor]:
+def _fitted(radiance: LowRankCube, psf: Psf, rows: Tensor, share: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return the basis images of the scene, and the part of the PSF that reaches the scene, in the same precision."""
-    bands = {len(radiance.basis), len(psf.intensity), rows.shape[-1]}
+    count = len(psf.intensity)
+    known = count if share is None else len(share) if share.shape[1] == count else -1
+    bands = {len(radiance.basis), known, rows.shape[-1]}
     if len(bands) > 1 or radiance.planes.ndim != 3 or psf.intensity.ndim != 3 or rows.ndim != 2:
         raise ValueError(
             f"radiance of {len(radiance.basis)} bands in planes {tuple(radiance.planes.shape)}, PSF "
@@ -99,7 +113,9 @@ def _fitted(radiance: LowRankCube, psf: Psf, rows: Tensor) -> tuple[Tensor, Tens
     return planes.to(dtype), kernel.to(dtype)
 
 
-def _given(radiance: LowRankCube, planes: Tensor, intensity: Tensor, rows: Tensor, border: Border) -> Given:
+def _given(
+    radiance: LowRankCube, planes: Tensor, rows: Tensor, border: Border, through: Passed, share: Tensor | None
+) -> Given:
     flat = planes.detach().flatten(1)
     gram = (flat @ flat.T).double().cpu()
     copies = 9 if border == "reflect" else 1
@@ -115,9 +131,10 @@ def _given(radiance: LowRankCube, planes: Tensor, intensity: Tensor, rows: Tenso
         most,
         gram,
         copies,
-        passed(intensity.detach()),
+        through,
         (planes.shape[1], planes.shape[2]),
         border == "reflect",
+        share,
     )
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._imaging._psf_energy import Passed, by_window
+from neusee.nodes.optics._imaging._psf_energy import Passed, by_window, spread
 from neusee.nodes.optics._imaging._summed_convolution import Mix
 from neusee.nodes.optics._transform._chirp_transform import smooth
 
@@ -28,6 +28,7 @@ class Given(NamedTuple):
     passed: Passed
     size: tuple[int, int]
     reflect: bool
+    share: Tensor | None = None  #: (band, j) weights of the PSFs in each band, where only few bands have a PSF
 
 
 class Plan(NamedTuple):
@@ -60,11 +61,11 @@ class Fewer(NamedTuple):
 def with_windows(given: Given, intensity: Tensor, brightest: Tensor, within: float) -> Given:
     """Return ``given`` with the light that smaller PSF windows omit, or unchanged if these windows omit too much."""
     few, signed = slice(_EVERY // 2, None, _EVERY), given.passed.signed
-    if len(intensity) > _EVERY:
+    if given.share is None and len(intensity) > _EVERY:
         some = given._replace(rows=given.rows[:, few], basis=given.basis[few], rest=given.rest[:, few])
         if not _narrow(some._replace(passed=by_window(intensity[few], signed)), within * brightest):
             return given
-    return given._replace(passed=by_window(intensity, signed))
+    return given._replace(passed=spread(by_window(intensity, signed), given.share))
 
 
 def _narrow(given: Given, limit: Tensor) -> bool:
@@ -127,10 +128,12 @@ def _plans(
 
     def plan(kernels: Tensor | None, mix: Mix, off: Tensor) -> Plan:
         window = given.passed.windows[j]
-        return Plan(k, bands, window, kernels, mix, off, _cost(given, window, k, len(bands), kernels, mix), False)
+        each = len(bands) if given.share is None else given.share.shape[1]
+        return Plan(k, bands, window, kernels, mix, off, _cost(given, window, k, each, kernels, mix), False)
 
     yield plan(sums, Mix(u, x, None, count), off)
-    yield plan(None, Mix(rows, basis, None), off)
+    if given.share is None:
+        yield plan(None, Mix(rows, basis, None), off)
     if within is not None:
         limit, few = within
         for q in (few.off + off <= limit).all(1).nonzero()[:1, 0].tolist():

@@ -16,7 +16,7 @@ _SOME = 16  #: rows of the PSF summed at a time; these rows of 31 bands fit in t
 def convolved(planes: Tensor, intensity: Tensor, given: Given, plan: Plan) -> Tensor:
     """Return weighted sums (row, y, x) over the bands of the image, from the basis images and kernels of ``plan``."""
     scene = bordered(planes[: plan.planes], given, plan.window)
-    return summed(scene, _kernels(intensity, plan), plan.mix, _where(given, plan.window))
+    return summed(scene, _kernels(intensity, given, plan), plan.mix, _where(given, plan.window))
 
 
 def _where(given: Given, window: tuple[int, int]) -> Where:
@@ -30,7 +30,8 @@ def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
     """Return an upper bound (y, x) of the image error from an error ``off`` (y, x) in every band of the scene."""
     window = (intensity.shape[1], intensity.shape[2])
     heaviest = given.rows.abs().amax(0).to(intensity)
-    kernel = _summed_bands(heaviest[None], intensity, given.passed.signed)
+    weights = heaviest[None] if given.share is None else heaviest[None] @ given.share.to(heaviest)
+    kernel = _summed_bands(weights, intensity, given.passed.signed)
     reached = summed(bordered(off[None], given, window), kernel, Mix(None, None, None), _where(given, window))
     return reached[0].clamp_min_(0)
 
@@ -45,13 +46,14 @@ def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:
     return wide
 
 
-def _kernels(intensity: Tensor, plan: Plan) -> Tensor:
+def _kernels(intensity: Tensor, given: Given, plan: Plan) -> Tensor:
     stack = centred(intensity, plan.window)
     if plan.kernels is None:
         return stack if len(plan.bands) == len(stack) else stack[plan.bands.to(stack.device)]
-    weights = plan.kernels.new_zeros(len(plan.kernels), len(stack))
-    weights = weights.index_copy_(1, plan.bands, plan.kernels).to(stack)
-    return _summed_bands(weights, stack)
+    weights = plan.kernels.new_zeros(len(plan.kernels), len(given.basis))
+    weights = weights.index_copy_(1, plan.bands, plan.kernels)
+    weights = weights if given.share is None else weights @ given.share
+    return _summed_bands(weights.to(stack), stack)
 
 
 def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Tensor:

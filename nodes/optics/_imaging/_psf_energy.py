@@ -50,6 +50,14 @@ def by_window(intensity: Tensor, signed: bool) -> Passed:
     return Passed(windows, sums.sum((1, 2)), tops.amax((1, 2)), beyond, above, signed)
 
 
+def spread(of: Passed, share: Tensor | None) -> Passed:
+    """Return bounds for bands whose PSFs are weighted means, with weights ``share`` (band, j), of the measured PSFs."""
+    if share is None:
+        return of
+    beyond, above = of.beyond @ share.T, of.above @ share.T
+    return Passed(of.windows, share @ of.total, share @ of.peak, beyond, above, of.signed)
+
+
 def centred(stack: Tensor, window: tuple[int, int]) -> Tensor:
     """Return the samples of each PSF in a window about the central sample n // 2."""
     (top, bottom), (left, right) = (_inside(n, w) for n, w in zip(stack.shape[1:], window, strict=True))

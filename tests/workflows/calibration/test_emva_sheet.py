@@ -12,9 +12,10 @@ import torch
 
 from neusee.nodes.calibrate import Nonuniformity, emva_sheet, levels, reduce, spatial_series
 from neusee.workflows.calibration import emva_figures, emva_pdf
-from neusee.workflows.calibration.emva_frames import EmvaFrames, descriptor_of, descriptor_recipe, frames_of_recipe
+from neusee.workflows.calibration.emva_frames import EmvaFrames, descriptor_recipe, frames_of_recipe
 from neusee.workflows.calibration.emva_page import operating_point, requirements, sections
 from neusee.workflows.cli import app
+from neusee.workflows.frames.descriptor_file import descriptor_of
 from neusee.workflows.store.result_store import Store
 from tests.nodes.calibrate.numpy_emva import quantities
 
@@ -90,7 +91,8 @@ def curves(folder, name):
 
 
 def test_a_descriptor_gives_page_tables_and_document(neusee, archive, tmp_path):
-    code, out, _ = neusee(str(archive), "--state", "temperature=25 °C")
+    light = "traceability.photons={relative_uncertainty: 0.03, instrument: photodiode}"
+    code, out, _ = neusee(str(archive), light, "--state", "temperature=25 °C")
     assert code == 0
     folder = results(out, tmp_path)
     document = json.loads((folder / "emva1288.json").read_text())
@@ -118,6 +120,16 @@ def test_a_descriptor_gives_page_tables_and_document(neusee, archive, tmp_path):
     assert demands["two frames or more at each level"] == ("2", "pass")
     assert demands["series of 16 or more lit frames for spatial quantities"] == ("16 frames", "pass")
     assert demands["both series at one exposure"][1] == "pass"
+    assert demands["stated: calibration of the light: instrument and certificate"] == ("photodiode", "pass")
+    budgets = json.loads((folder / "budget.json").read_text())["quantities"]
+    assert {key for key, each in found.items() if each["value"] is not None and not each["bound"]} == set(budgets)
+    parts = {each["source"]: each for each in budgets["eta"]["sources"]}
+    light = parts["photometric calibration of the light"]
+    assert light["contribution"] == pytest.approx(0.03 * found["eta"]["value"])
+    assert parts["temperature"]["reason"] == "not stated", "a temperature is stated, but no uncertainty of it"
+    assert "contribution" not in parts["temperature"]
+    whole = sum(each.get("contribution", 0) ** 2 for each in parts.values()) ** 0.5
+    assert budgets["eta"]["combined standard uncertainty"] == pytest.approx(whole)
     assert re.search(r"^σ_d +1[0-4]\.\d+ e- ", out, re.MULTILINE)
 
 

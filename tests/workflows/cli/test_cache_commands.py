@@ -120,3 +120,25 @@ def test_the_answers_of_commands_are_listed_verified_and_removed(store):
     )
     assert re.fullmatch("1 answer of commands of 20.* kB went", cache_commands.gc_lines(store, "60 kB")[0])
     assert not list((store.root / "answers").rglob("*.answer"))
+
+
+def test_a_long_list_shows_its_newest_page_and_says_how_to_see_all(tmp_path, monkeypatch):
+    """The journal tells number and bytes; a result that is gone since is not shown."""
+    store = Store(tmp_path)
+    for i in range(60):
+        store.put(f"{i:032x}", torch.full((2000,), float(i)), {"step": f"s{i}", "date": f"2026-01-01T00:00:{i:02d}"})
+    short = list(cache_commands.ls_lines(store))
+    monkeypatch.setattr("neusee.workflows.store.journal._LATEST", 14_000)
+    again = Store(tmp_path)
+    assert again.journal.is_long()
+    assert 50 < len(again.journal.latest()) < 60  # a part
+    long = list(cache_commands.ls_lines(again))
+    assert long[:-1] == short[:-1]
+    assert long[-2:] == [
+        "the newest 50; `neusee cache ls --all` lists all",
+        f"60 results, 480 kB by the journal, in {store.root}",
+    ]
+    assert len(list(cache_commands.ls_lines(again, whole=True))) == 62
+    for suffix in ("json", "safetensors"):
+        (tmp_path / "00" / f"{59:032x}.{suffix}").unlink()
+    assert not any("s59" in line for line in cache_commands.ls_lines(Store(tmp_path)))

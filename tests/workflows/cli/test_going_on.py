@@ -14,7 +14,7 @@ import pytest
 
 from neusee.workflows.api import verbs
 from neusee.workflows.cli import app
-from neusee.workflows.cli.command_options import ProgressLines, option_words
+from neusee.workflows.cli.command_options import FewLines, ProgressLines, option_words
 
 pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.filterwarnings("default")]
 
@@ -362,3 +362,17 @@ def test_one_list_is_printed_once(neusee, here):
     assert err.count("see the names above") == 99
     assert "and 200 more like these" in err
     assert len(err.splitlines()) == 102
+
+
+def test_lines_of_steps_are_few_in_a_file(capsys):
+    """Lines of steps at 1, 2 … 400 s: printed after half a minute, and then each time after twice as long."""
+    now = [0.0]
+    show = FewLines(False, lambda: now[0])
+    show("frames: 13 of 13 tests passed")
+    for second in range(1, 401):
+        now[0] = float(second)
+        show(f"{second} of about 400 steps of 4 x 64 walkers")
+    show("not identifiable: lamp")
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["frames:", "30", "60", "120", "240", "not"]
+    assert lines[1].endswith("; about 6 min 10 s left")

@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 from neusee.workflows import Store, load, run
 from neusee.workflows.cli.app import app
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.recipe import json_schema, node_families
+from neusee.workflows.handbook import json_schema
+from neusee.workflows.recipe import node_families
 from neusee.workflows.recipe.loading import families_of
 
 NODE = '''\

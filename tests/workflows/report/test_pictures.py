@@ -111,11 +111,7 @@ def linear_image(radiance: torch.Tensor, psf: Psf) -> torch.Tensor:
     return full[..., top : top + radiance.shape[-2], left : left + radiance.shape[-1]]
 
 
-def psf_step(p: Pupil, *, shape: tuple[int, int] = (N, N), precision: str = "double") -> Psf:
-    return psf_of(p, shape=shape, precision=precision)
-
-
-psf_step.reference = psf_of  # type: ignore[attr-defined]
+VARIANTS = [("as used", "", 3e-7, 0.02), ("precision", "double", 2e-15, 0.05), ("allowed error", "1e-4", 4e-5, 0.01)]
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +154,7 @@ def drawings(light: SimpleNamespace, table_arguments: dict) -> dict[str, tuple]:
         "tables": (own_tables.tables, table_arguments),
         "sensor": (photon_transfer.transfer, dict(measured=transfer_curve())),
         "stability": (numerics.stability, dict(step=linear_image, psf=light.plain)),
-        "error_time": (numerics.error_time, dict(step=psf_step, pupil=pupil(4.0))),
+        "error_time": (numerics.error_time, dict(rows=VARIANTS)),
         "graph": (
             recipe_graph.graph,
             dict(
@@ -203,8 +199,7 @@ def test_every_figure_is_a_picture_and_the_same_one_each_time(drawings, name):
     width, height = struct.unpack(">II", first[16:24])
     assert 500 < width < 2000
     assert 250 < height < 2000
-    if name != "error_time":  # it shows how long something took
-        assert draw(**arguments) == first
+    assert draw(**arguments) == first
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -303,12 +298,6 @@ def test_laser_added_as_shifted_psf_is_sound_where_a_joint_convolution_is_not(li
     assert float(errors[1, -1]) > 50 * float(errors[0, -1])
 
 
-def test_error_falls_with_precision():
-    rows = numerics.precision_trial(psf_step, pupil(4.0))
-    worst = {p: max(e for name, _, _, e in rows if name == p) for p in ("single", "double")}
-    assert worst["double"] < worst["single"] < 1e-4
-
-
 def test_graph_places_no_two_boxes_on_one_another_and_readers_below():
     sources = {f"s{i}": [f"s{j}" for j in range(max(0, i - 3), i)] + ["root"] for i in range(45)} | {"root": []}
     wires, _, _ = recipe_graph.grouped(sources, {})
@@ -367,11 +356,11 @@ def test_a_second_run_draws_nothing_and_a_changed_value_draws_again(tmp_path, mo
 def test_a_damaged_picture_is_drawn_again(tmp_path):
     store = Store(tmp_path)
     shelf = DerivedFiles(store)
-    path = shelf.keep("ab" * 16, ".png", "test", b"as it was")
+    path = shelf.keep("ab" * 16, ".png", "test", lambda path: path.write_bytes(b"as it was"))
     assert shelf.find("ab" * 16, ".png") == path
     path.chmod(0o644)
     path.write_bytes(b"as it is.")
-    assert shelf.find("ab" * 16, ".png") is None
+    assert DerivedFiles(store).find("ab" * 16, ".png") is None
     path.unlink()
     assert DerivedFiles(Store(tmp_path)).find("ab" * 16, ".png") is None
 

@@ -203,3 +203,22 @@ def test_threads_may_write_and_read_at_once(tmp_path):
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(lambda i: store.put_receipt(key_of(i), about(i)), range(1, 80)))
     assert sorted(keys(Store(tmp_path))) == sorted(map(key_of, range(80)))
+
+
+def test_the_newest_lines_of_a_long_journal_are_read_alone(tmp_path, monkeypatch):
+    """What others add is seen, all lines are still there for who asks, and changes of the file lose none."""
+    monkeypatch.setattr(journal, "_LATEST", 5000)
+    writer = Store(tmp_path)
+    for i in range(60):
+        writer.put(f"{i:032x}", float(i), {"step": f"s{i}", "recipe": "r"})
+    found = journal.Journal(writer.disk)
+    assert found.is_long()
+    newest = [row["step"] for row in found.latest()]
+    assert 5 < len(newest) < 30
+    assert newest == [f"s{i}" for i in range(60 - len(newest), 60)]
+    writer.put("ab" * 16, 1.0, {"step": "last", "recipe": "r"})
+    assert [row["step"] for row in found.latest()] == [*newest, "last"]
+    found.mark_evicted({"ab" * 16})
+    assert len(found.rows()) == 61
+    assert journal.Journal(writer.disk).totals()[::2] == (60, 1)
+    assert len(found.latest()) == 61  # all are read by now

@@ -25,7 +25,7 @@ class SettingsBlock(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-Settings = TypeVar("Settings", bound=SettingsBlock)
+Settings = TypeVar("Settings", bound=BaseModel)
 
 
 def read_block(

@@ -12,7 +12,9 @@ from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value, parse
 
 #: recipe keys that are not blocks of parameters
-RESERVED = frozenset({"steps", "seed", "tolerance", "outputs", "expect", "posterior", "nodes", "safety"})
+_WHOLE = {"steps", "seed", "tolerance", "estimates", "outputs", "exports", "expect", "posterior", "nodes"}
+RESERVED = frozenset(_WHOLE | {"safety", "traceability"})
+_OPEN = ("expect", "posterior", "safety", "traceability")  #: keys below which an override may set a missing path
 
 Trail = list[tuple[Value, str | int]]  #: values along a path, each with the key of the next value
 
@@ -92,7 +94,7 @@ def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], gro
 def _implied(root: Value, path: tuple[str, ...]) -> bool:
     """Return True if an override may set a missing path without a ``+``, as for a global key or a key of a step."""
     if path[0] != "steps":
-        return path[0] in RESERVED and (len(path) == 1 or path[0] in ("expect", "posterior", "safety"))
+        return path[0] in RESERVED and (len(path) == 1 or path[0] in _OPEN)
     steps = root.items.get("steps")
     return len(path) > 2 and steps is not None and path[1] in steps.items
 

@@ -2,57 +2,41 @@
 
 from __future__ import annotations
 
-import timeit
-from collections.abc import Callable
-from functools import partial
+import itertools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from neusee.nodes.values import Psf, Pupil
+from neusee.nodes.values import Psf
 from neusee.workflows.report.figures.point_labels import PointLabel, place_labels, plain_ticks
-from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, canvas, drawn
+from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn
 
+_LEAST = 1e-17  #: an error of zero has no place on a logarithmic axis
 STRENGTHS = (0.0, 1.0, 1e3, 1e6)  #: peak of the laser divided by the white of the scene
 METHODS = ("shifted PSF, added", "scene and laser\nin one convolution")
 
 
 @drawn
-def error_time(*, step: Callable[..., Any], pupil: Pupil) -> Any:
-    """Draw the error of a computed PSF against run time, for each floating-point precision and PSF window size."""
+def error_time(*, rows: Sequence[tuple[str, str, float, float]]) -> Any:
+    """Draw the error of variants of a step over their run time; a row has property, new value, error and seconds."""
     figure, axes = canvas(6.4, 4.2)
     ax = axes[0, 0]
-    rows = precision_trial(step, pupil)
-    for precision, colour, mark in (("single", BLUE, "o"), ("double", GREEN, "s")):
-        mine = [row for row in rows if row[0] == precision]
-        ax.loglog([r[2] * 1e3 for r in mine], [r[3] for r in mine], mark, color=colour, label=f"{precision} precision")
+    marks = zip(
+        dict.fromkeys(line for line, *_ in rows), itertools.cycle((BLUE, GREEN, VERMILION, ORANGE)), strict=False
+    )
+    for line, colour in marks:
+        mine = [row for row in rows if row[0] == line]
+        ax.loglog([r[3] * 1e3 for r in mine], [max(r[2], _LEAST) for r in mine], "o", color=colour, label=line)
     ax.margins(x=0.25, y=0.35)
     plain_ticks(ax.xaxis)
-    xlabel = "run time (ms), fastest of three; labels: window in pixels"
-    ax.set(title="PSF of one band: error against run time", xlabel=xlabel, ylabel="largest error / peak")
+    ax.set(title="PSF: error against run time", xlabel="run time (ms)", ylabel="error / peak")
     figure.legend(loc="outside lower center", ncols=2)
-    place_labels(figure, {ax: [PointLabel(1e3 * seconds, e, f"{window}²", BLACK) for _, window, seconds, e in rows]})
+    place_labels(
+        figure, {ax: [PointLabel(1e3 * took, max(e, _LEAST), text, BLACK) for _, text, e, took in rows if text]}
+    )
     return figure
-
-
-def precision_trial(step: Callable[..., Any], pupil: Pupil) -> list[tuple[str, int, float, float]]:
-    """Measure run time and error of the PSF of the middle band, for each floating-point precision and PSF window size.
-
-    The rows are (precision, window, seconds, error relative to the direct float64 sum).
-    """
-    band = slice(len(pupil.wavelengths) // 2, len(pupil.wavelengths) // 2 + 1)
-    one = pupil._replace(index=pupil.index[band], wavelengths=pupil.wavelengths[band])
-    truth = step.reference(one, shape=(9, 9)).intensity.double()  # type: ignore[attr-defined]
-    rows = []
-    for precision in ("single", "double"):
-        for window in (9, 65, 257):
-            compute = partial(step, one, shape=(window, window), precision=precision)
-            seconds = min(timeit.repeat(compute, number=1, repeat=3))
-            middle = slice(window // 2 - 4, window // 2 + 5)
-            error = (compute().intensity[..., middle, middle].double() - truth).abs().max() / truth.max()
-            rows.append((precision, window, seconds, max(float(error), 1e-17)))
-    return rows
 
 
 @drawn

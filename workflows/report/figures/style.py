@@ -17,6 +17,7 @@ P = ParamSpec("P")
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 BLACK = "#000000"
 
+_MARGIN = 0.08  #: inches around what is drawn
 _RC: Mapping[str, Any] = {
     "font.family": ["DejaVu Sans"],
     "font.size": 10,
@@ -66,9 +67,16 @@ def styled() -> Iterator[None]:
 
 
 def png_of(figure: Any) -> bytes:
-    """Return a matplotlib figure as the bytes of a PNG file, cut to what is drawn."""
-    out = io.BytesIO()
-    figure.savefig(out, format="png", bbox_inches="tight", pad_inches=0.08, metadata={"Software": "neusee"})
+    """Return a matplotlib figure as the bytes of a PNG file, cut to what is drawn.
+
+    The axes are placed here, because `savefig` draws the whole figure twice to place them.
+    """
+    out, engine = io.BytesIO(), figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+    drawn_part = figure.get_tightbbox(figure.canvas.get_renderer()).padded(_MARGIN)
+    figure.set_layout_engine(None)
+    figure.savefig(out, format="png", bbox_inches=drawn_part, metadata={"Software": "neusee"})
     return out.getvalue()
 
 

@@ -28,6 +28,7 @@ from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.report.measured_variants import keep_variants
 from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import each_tensor, tensors_in
@@ -98,6 +99,7 @@ def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: fl
     key = _key(recipe, name, patience, store)
     compute = partial(_measure, recipe, step, store, patience)
     found = compute_once(store, key, StepMeasurement, compute, {"step": f"study accuracy: {name}"})
+    keep_variants(recipe, name, [tuple(variant.values()) for variant in found.variants], store)
     return StepTried(name, step.node.path, share, found)
 
 
@@ -212,9 +214,6 @@ def _median_time(compute: Callable[[], Any]) -> tuple[Any, float]:
     while len(times) < _TIMES and sum(times) < _LONG_ENOUGH:
         times.append(_time_once(compute)[1])
     return value, median(times)
-
-
-# --- smaller inputs, on which the reference is fast enough ------------------------------------------------------------
 
 
 def cut_inputs(node: Node, inputs: list[Any], size: Cut) -> list[Any]:

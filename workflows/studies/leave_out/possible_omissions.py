@@ -101,7 +101,7 @@ def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omiss
 
     All images are replaced together, because two images that a step compares must be computed in the same way.
     """
-    sparse = with_substitutions(replace(full, exact=False), full.outputs)
+    sparse = with_substitutions(replace(full, exact=False, estimates=False), full.outputs)
     exchange = {economy.step: economy.instead for economy in sparse.substitutions if economy.instead}
     if not exchange:
         return

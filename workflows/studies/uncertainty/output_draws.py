@@ -97,7 +97,7 @@ class OutputDraws:
         recipe = self.inputs.recipe
         keys = self._keys(self.inputs.theta(self._named(row)))
         outputs = [[name, keys[name]] for name in self.outputs]
-        within = [recipe.tolerance, recipe.exact, device_kind(self.device)]
+        within = [recipe.tolerance, recipe.exact, recipe.estimates, device_kind(self.device)]
         return digest("uncertainty draw", engine("studies.uncertainty.output_draws"), outputs, within)
 
     def _keys(self, theta: Mapping[str, Any]) -> dict[str, str]:

@@ -6,7 +6,7 @@ import pytest
 
 import neusee.recipes
 from neusee.workflows.graph.diagnostics import Location
-from neusee.workflows.recipe.json_schema import REFERENCE, schema
+from neusee.workflows.handbook.json_schema import REFERENCE, schema
 from neusee.workflows.recipe.text.yaml_values import parse
 
 _schema = functools.cache(schema)  #: of the toy nodes, for all tests: it takes half a second

@@ -18,6 +18,7 @@ from pydantic_core import core_schema
 from neusee.nodes import Node, units
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.distributions.scalar import KINDS
+from neusee.workflows.recipe.exported_files import ALL, HALF, NAMES, NONE
 from neusee.workflows.recipe.loading import groups
 from neusee.workflows.recipe.node_families import Own, all_nodes
 from neusee.workflows.recipe.wiring import takes_many
@@ -37,12 +38,15 @@ _MEANINGS = {
     "steps": "The graph: under each name a node, its inputs and its parameters; null removes a step.",
     "seed": "Start of all random numbers.",
     "tolerance": "Largest error of an output, relative to its largest element; 0 is exact.",
+    "estimates": "False: only errors with a proved bound count towards the tolerance; true: estimated errors too.",
     "outputs": "Steps whose results the run is for.",
+    "exports": "Data files that a run writes: all, none, or a list of names; NAME.exr@half has half floats.",
     "posterior": "Joint distribution of several values.",
     "train": "Settings of `neusee train`.",
     "train_lift": "Settings of the training of a network from RGB to spectra.",
     "safety": "Settings of `neusee safety`.",
     "evaluate": "Settings of `neusee evaluate`.",
+    "traceability": "What the laboratory states of its light and temperature, for `neusee calibrate` and `sheet`.",
     "expect": "Numbers from an independent source, which each run checks.",
 }
 #: types of values that a reference may replace
@@ -74,14 +78,22 @@ def _keys() -> dict[str, Schema]:
         "steps": {"type": "object", "additionalProperties": {"$ref": "#/$defs/step"}},
         "seed": {"anyOf": [{"type": "integer", "minimum": 0}, REFERENCE]},
         "tolerance": {"anyOf": [{"type": "number", "minimum": 0}, REFERENCE]},
+        "estimates": {"anyOf": [{"type": "boolean"}, REFERENCE]},
         "outputs": {"type": ["array", "string"], "items": {"type": "string"}},
+        "exports": {"anyOf": [{"enum": [ALL, NONE]}, {"type": "array", "items": {"enum": _exported()}}, REFERENCE]},
         "posterior": {"anyOf": [{"type": "string"}, {"type": "object"}, {"type": "null"}]},
         "train": {"anyOf": [{"$ref": "#/$defs/train"}, {"type": "null"}]},
         "train_lift": {"type": ["object", "null"]},
         "safety": {"type": ["object", "null"]},
         "evaluate": {"type": ["object", "null"]},
+        "traceability": {"type": ["object", "null"]},
         "expect": {"type": "object", "additionalProperties": {"$ref": "#/$defs/expectation"}},
     }
+
+
+def _exported() -> list[str]:
+    """Return the words that name a data file of a run, with half floats or without."""
+    return [*NAMES, *(name + HALF for name in NAMES if name.endswith(".exr"))]
 
 
 def _defaults() -> Schema:

@@ -1,0 +1,38 @@
+"""The page of speed beside peers: intervals of its ratios, and its rows."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from scipy.stats import binom
+
+from neusee import recipes
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+from paired_times import Comparison, median_ranks
+
+PAGE = Path(recipes.__file__).parent / "guide" / "benchmarks.md"
+
+
+@pytest.mark.parametrize("count", [6, 9, 10, 20, 101])
+def test_the_interval_of_a_median_is_the_narrowest_that_holds_it_often_enough(count):
+    """The median lies below the value of rank k with the probability of at most k of ``count`` fair coins."""
+    low, high = median_ranks(count)
+    assert high == count - 1 - low
+    assert 1 - 2 * binom.cdf(low, count, 0.5) >= 0.95
+    assert 1 - 2 * binom.cdf(low + 1, count, 0.5) < 0.95
+
+
+def test_a_ratio_is_of_the_same_turn():
+    """A turn in which all take ten times as long changes nothing."""
+    found = Comparison("x", {"neusee": [1.0, 10.0, 1.0], "peer": [2.0, 20.0, 2.0]}, {}, 0.0)
+    assert found.ratio("peer") == (2.0, 2.0, 2.0)
+
+
+def test_every_ratio_of_the_page_lies_in_its_interval():
+    rows = re.findall(r"\| ([0-9.]+) \(([0-9.]+) to ([0-9.]+)\) \|", PAGE.read_text(encoding="utf-8"))
+    assert rows
+    for row in rows:
+        middle, low, high = map(float, row)
+        assert low <= middle <= high

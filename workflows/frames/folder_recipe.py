@@ -1,0 +1,144 @@
+"""The recipe of a calibration of the frames in a folder, which is written into the results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from neusee.nodes.calibrate import LeastSquares, least_squares, refuse_descriptor
+from neusee.workflows.engine.runner import run
+from neusee.workflows.frames.descriptor_file import descriptor_of, descriptors_in, quoted
+from neusee.workflows.frames.frame_folder import FolderLevel, FolderLevels, FolderRefused, find_levels
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.store.result_store import Store
+
+_EFFICIENCY = 0.5  #: electrons per photon, which relative light is scaled to
+_DESCRIBED = """# The sensor of the frames in {folder}, as the descriptor {name} describes them.
+steps:
+  measured: {{node: calibrate.descriptor, with: {{file: {file}, scatter: steady}}}}
+"""
+_READ = """# The sensor of the frames in {folder}, found by {source}.
+levels:
+{levels}
+steps:
+  frames: {{node: calibrate.frames, each: levels, with: {{files: "${{item.files}}"}}}}
+  level:
+    node: calibrate.reduce
+    each: levels
+    from: frames
+    with: {{photons: "${{item.photons}}", exposure: "${{item.exposure}}", scatter: steady}}
+  measured: {{node: calibrate.levels, from: level}}
+"""
+_REST = """  least_squares: {{node: calibrate.least_squares, from: measured}}
+  prior:   # free parameters, with a median and a factor each; signal and bends with a mean and a standard deviation
+    node: calibrate.camera_prior
+    with:
+      gain: ["${{camera.gain}}", 10]
+      quantum_efficiency: ["${{camera.quantum_efficiency}}", 3]
+      dark_signal: ["${{camera.dark_signal}}", 1000]
+      temporal_dark_noise: ["${{camera.temporal_dark_noise}}", 5]
+      dark_current: {current}
+      scatter: ["${{camera.scatter}}", 3]
+      lamp: ["${{camera.lamp}}", 10]
+      drift: ["${{camera.drift}}", 5]
+      bend: [0, 0.05]                # y = K e (1 + bend x + twist x2), x = 1 at the brightest level used
+      twist: [0, 0.05]
+  camera:
+    node: calibrate.camera
+    from: {{levels: measured}}
+    with:
+      gain: "${{camera.gain}}"
+      quantum_efficiency: "${{camera.quantum_efficiency}}"
+      dark_signal: "${{camera.dark_signal}}"
+      temporal_dark_noise: "${{camera.temporal_dark_noise}}"
+      dark_current: "${{camera.dark_current}}"
+      dark_exposure: 1 s
+      scatter: "${{camera.scatter}}"
+      lamp: "${{camera.lamp}}"
+      drift: "${{camera.drift}}"
+camera:                    # first estimates by least squares; the frames decide
+  gain: {gain:.4g} DN/e-
+  quantum_efficiency: {efficiency:.4g}
+  dark_signal: {signal:.6g}
+  temporal_dark_noise: {noise:.4g} e-
+  dark_current: {dark:.4g} e-     # per second
+  scatter: 0.003
+  lamp: 0.01
+  drift: {drift:.3g}
+{traced}outputs: [measured, least_squares, camera]
+"""
+_RELATIVE = """traceability:
+  photons: {known: relative}   # no radiometry: no quantum efficiency is told
+"""
+
+
+def recipe_of_folder(folder: Path, store: Store, changes: Sequence[str] = ()) -> Recipe:
+    """Return the recipe of a calibration of the frames in a folder; the frames are read, and reduced to moments.
+
+    Raises: `FolderRefused` with all reasons why the frames are no measurement, `RecipeError` with all mistakes of
+    ``changes``.
+    """
+    name = "".join(c if c.isalnum() else "_" for c in folder.absolute().name) or "frames"
+    if descriptors_in(folder):
+        return _described(descriptor_of(folder), name, store, changes)
+    found, scale = find_levels(folder), 1.0
+    fit = _fit(_loaded(name, _read(folder, found, scale) + "outputs: [measured]\n"), store)
+    if found.light != "photons":
+        scale = float(fit.efficiency) / _EFFICIENCY
+    times = len({level.exposure for level in found.levels if level.dark})
+    rest = _rest(fit, float(fit.efficiency) / scale, times, found.light != "photons")
+    return _loaded(name, _read(folder, found, scale) + rest, changes)
+
+
+def _described(file: Path, name: str, store: Store, changes: Sequence[str]) -> Recipe:
+    """Return the recipe of a calibration of the frames that a descriptor of EMVA 1288 names."""
+    refuse_descriptor(file)
+    head = _DESCRIBED.format(folder=name, name=file.name, file=quoted(str(file.absolute())))
+    recipe = _loaded(name, head + "outputs: [measured]\n")
+    levels = run(recipe, store, ("measured",)).values["measured"]
+    fit = _fit(recipe, store)
+    times = len(set(levels.exposure[levels.photons == 0].tolist()))
+    return _loaded(name, head + _rest(fit, float(fit.efficiency), times, False), changes)
+
+
+def _fit(recipe: Recipe, store: Store) -> LeastSquares:
+    try:
+        fit: LeastSquares = least_squares(run(recipe, store, ("measured",)).values["measured"])
+    except ValueError as error:
+        raise FolderRefused(str(error)) from None
+    return fit
+
+
+def _loaded(name: str, text: str, changes: Sequence[str] = ()) -> Recipe:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"{name}.yaml"
+        path.write_text(text, encoding="utf-8")
+        return load(path, changes)
+
+
+def _read(folder: Path, found: FolderLevels, scale: float) -> str:
+    levels = "\n".join(_level(level, scale) for level in found.levels)
+    return _READ.format(folder=" ".join(folder.name.split()) or ".", source=found.source, levels=levels)
+
+
+def _level(level: FolderLevel, scale: float) -> str:
+    files = ", ".join(quoted(str(file.absolute())) for file in level.files)
+    return f"  {level.name}: {{photons: {level.light * scale:.8g}, exposure: {level.exposure:.9g} s, files: [{files}]}}"
+
+
+def _rest(fit: LeastSquares, efficiency: float, times: int, relative: bool) -> str:
+    """Return the steps after the levels, with first estimates; ``times`` is the number of exposures of darks."""
+    gain, noise = float(fit.gain), max(float(fit.temporal_dark_noise), 0.1)
+    dark = float(fit.dark_current)
+    return _REST.format(
+        gain=gain,
+        efficiency=min(max(efficiency, 0.02), 0.98),
+        signal=float(fit.dark_signal),
+        noise=noise,
+        dark=dark if dark > 0 else float(times > 1),  # NaN where all darks have one exposure
+        current='["${camera.dark_current}", 10]' if times > 1 else "null   # all darks have one exposure",
+        drift=max(0.01 * noise * gain, 0.003),
+        traced=_RELATIVE if relative else "",
+    )

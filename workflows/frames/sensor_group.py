@@ -1,0 +1,156 @@
+"""The option of the group ``sensor`` that a calibration gives, with its uncertainties as a joint distribution."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neusee.nodes.calibrate import emva_sheet, frame_header
+from neusee.nodes.values import Levels
+from neusee.workflows.engine.runner import run
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.store.result_store import Store
+
+_NAME = re.compile(r"[a-z][a-z0-9_]*")
+FIRST = "# Sensor by `neusee calibrate`"  #: begins each file that this module writes
+#: parameter of the posterior: value of a sensor, and its unit
+_VALUES = {
+    "gain": ("gain", "DN/e-"),
+    "quantum_efficiency": ("quantum_efficiency", ""),
+    "temporal_dark_noise": ("read_noise", "e-"),
+    "read_noise": ("read_noise", "e-"),
+    "offset": ("offset", "e-"),
+}
+_BITS = (8, 10, 12, 14, 16)  #: of common converters
+_NOTES = {
+    "quantum_efficiency": "electrons per photon",
+    "read_noise": "temporal dark noise of the shortest dark frames",
+    "offset": "dark signal over gain",
+    "dark_current": "mean of one exposure, as long as `exposure` says",
+}
+
+
+class SensorFrames(NamedTuple):
+    """What the frames say of the sensor beside the posterior."""
+
+    shape: tuple[int, int]  #: (y, x)
+    bits: int  #: of a digital number
+    full_well: float | None  #: e-; None if no level reached saturation
+    exposure: float  #: s, of the shortest dark frames
+
+
+def sensor_target(name: str, folder: Path) -> Path:
+    """Return the file of a sensor group in a folder.
+
+    Raises: ValueError for a name that is no word, and for a file that somebody else wrote.
+    """
+    if not _NAME.fullmatch(name):
+        raise ValueError(f"--sensor {name}: write a word of a-z, 0-9 and _, such as mine")
+    file = folder / "sensor" / f"{name}.yaml"
+    if file.exists() and not file.read_text(encoding="utf-8", errors="replace").startswith(FIRST):
+        raise ValueError(f"--sensor {name}: {file} exists and was not written by a calibration: choose another name")
+    return file
+
+
+def frames_of_sensor(recipe: Recipe, store: Store) -> SensorFrames:
+    """Return what the frames of a calibration of a folder say of the sensor.
+
+    Saturation counts where the variance falls above it, as in EMVA 1288.
+    """
+    files = [file for step in recipe.steps.values() for file in _files(step)]
+    header = frame_header(files[0])
+    levels: Levels = run(recipe, store, ("measured",)).values["measured"]
+    full = emva_sheet(levels, photons_told=False)["mu_e_sat"]
+    brightest = max(float(levels.mean.max()), float(levels.cell_value.max()) if len(levels.cell_value) else 0.0)
+    bits = next((b for b in _BITS if brightest < 2**b), header.bits)
+    dark = levels.exposure[levels.photons == 0]
+    return SensorFrames(header.shape, bits, None if full.bound else full.value, float(dark.min()))
+
+
+def _files(step: Step) -> Sequence[Path]:
+    if step.node.path == "calibrate.frames":
+        return tuple(step.params["files"])
+    return tuple(step.params["file"][1:]) if step.node.path == "calibrate.descriptor" else ()
+
+
+def sensor_text(results: Path, frames: SensorFrames) -> str:
+    """Return the text of the option of the group ``sensor`` from the results of a calibration.
+
+    Values and standard uncertainties are those of the budget, correlations those of the draws.
+    Raises: ValueError for a calibration that failed a check, or whose frames do not tell the gain.
+    """
+    posterior = json.loads((results / "posterior.json").read_text(encoding="utf-8"))
+    budget = json.loads((results / "budget.json").read_text(encoding="utf-8"))["quantities"]
+    if posterior["failed"]:
+        raise ValueError(f"{posterior['failed']} checks of the calibration fail, so that no sensor group is written")
+    if "gain" not in budget:
+        raise ValueError("the frames do not tell the gain, so that no sensor group is written")
+    with np.load(results / "draws.npz") as file:
+        draws = {name: np.asarray(file[name], np.float64) for name in file}
+    values = _values(budget, draws, frames.exposure)
+    return _written(values, frames, results.name)
+
+
+class _Value(NamedTuple):
+    mean: float
+    unit: str
+    draws: NDArray[np.float64]  #: with the mean and the standard uncertainty of the budget
+
+
+def _values(budget: Mapping[str, Any], draws: Mapping[str, NDArray[np.float64]], exposure: float) -> dict[str, _Value]:
+    """Return each value of a sensor that the budget has, by its name in the group."""
+    moved = {name: _moved(draws[name], row) for name, row in budget.items() if name in draws}
+    found = {new: _Value(budget[name]["value"], unit, moved[name]) for name, (new, unit) in _VALUES.items()
+             if name in moved}  # fmt: skip
+    if "dark_signal" in moved:
+        electrons = moved["dark_signal"] / moved["gain"]
+        found["offset"] = _Value(budget["dark_signal"]["value"] / budget["gain"]["value"], "e-", electrons)
+    if "dark_current" in moved:
+        of = float(str(budget["dark_current"]["unit"]).removeprefix("e- in ").removesuffix(" s"))
+        one = exposure / of
+        found["dark_current"] = _Value(one * budget["dark_current"]["value"], "e-", one * moved["dark_current"])
+    return found
+
+
+def _moved(draws: NDArray[np.float64], row: Mapping[str, Any]) -> NDArray[np.float64]:
+    """Return draws that are shifted and scaled to the value and the combined standard uncertainty of a budget."""
+    z: NDArray[np.float64] = (draws - draws.mean()) / draws.std(ddof=1)
+    moved: NDArray[np.float64] = row["value"] + row["combined standard uncertainty"] * z
+    return moved
+
+
+def _written(values: Mapping[str, _Value], frames: SensorFrames, source: str) -> str:
+    lines = [f"{FIRST}: {source}.", "# What the frames do not tell is that of the packaged sensor: check pixel_pitch.",
+             "defaults: [small]", "sensor:", f"  shape: [{frames.shape[0]}, {frames.shape[1]}]",
+             f"  exposure: {frames.exposure:.9g} s", f"  bits: {frames.bits}"]  # fmt: skip
+    if frames.full_well is not None:
+        lines.append(f"  full_well: {frames.full_well:.5g} e-   # of the level of the largest variance")
+    else:
+        lines.append("  # full_well: no frame reached saturation")
+    for name, value in values.items():
+        note = f"   # {_NOTES[name]}" if name in _NOTES else ""
+        lines.append(f"  {name}: {_text(value.mean, value.unit)}{note}")
+    lines += [f"  # {name}: no value from these frames" for name in ("quantum_efficiency", "dark_current")
+              if name not in values]  # fmt: skip
+    correlation = np.atleast_2d(np.corrcoef([value.draws for value in values.values()]))
+    means = ", ".join(f"sensor.{name}: {_text(value.mean, value.unit)}" for name, value in values.items())
+    widths = ", ".join(f"sensor.{name}: {_text(float(v.draws.std(ddof=1)), v.unit)}" for name, v in values.items())
+    rows = ", ".join("[" + ", ".join(f"{x:.6f}" for x in row) + "]" for row in _symmetric(correlation))
+    return "\n".join([*lines, "posterior:   # standard uncertainties, which `neusee study uncertainty` draws together",
+                      f"  mean: {{{means}}}", f"  sd: {{{widths}}}", f"  correlation: [{rows}]", ""])  # fmt: skip
+
+
+def _symmetric(correlation: NDArray[np.float64]) -> NDArray[np.float64]:
+    rounded = np.round((correlation + correlation.T) / 2, 6)
+    np.fill_diagonal(rounded, 1.0)
+    return rounded
+
+
+def _text(value: float, unit: str) -> str:
+    return f"{value:.6g} {unit}".rstrip()
