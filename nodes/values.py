@@ -186,6 +186,16 @@ class WienerProblem(NamedTuple):
     mean: Tensor  #: (channel, 1, 1) e-, of the scene behind a perfect lens
 
 
+class FilterFacts(NamedTuple):
+    """What `restore.wiener` finds in a picture and knows of it, as maps that a network can see."""
+
+    answer: Tensor  #: (channel, y, x), what the filter restores, of mean 0 and in units of ``scale``
+    deviation: Tensor  #: (channel, y, x), predicted error of the answer, in units of ``scale``
+    maps: Tensor  #: (map, y, x), in the order that `restore.filter_facts` states
+    scale: Tensor  #: (channel, 1, 1) e-, of the answer behind a perfect lens
+    mean: Tensor  #: (channel, 1, 1) e-, of the scene behind a perfect lens
+
+
 class MeasuredPsf(NamedTuple):
     """PSFs that frames of point sources gave, at the nodes of a grid over the frame, and how sure they are.
 

@@ -19,8 +19,10 @@ from PIL import Image
 from safetensors.torch import save_file
 
 from neusee.nodes import own_modules
+from neusee.nodes.restore._networks._informed import Informed
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
+from neusee.workflows.frames.sensor_group import FIRST
 from neusee.workflows.recipe import node_families
 from tests.deepinv_without_torchvision import deepinv_or_skip
 from tests.nodes.calibrate.numpy_camera import Camera
@@ -117,9 +119,8 @@ def write_reader_files(folder: Path) -> None:
     _write_points(folder / "points")
     shutil.copy(ROOT / "recipes" / "samples" / "camera_levels.csv", folder / "my.csv")
     (folder / "camera.csv").write_text("wavelength,red,green,blue\n400,0,0,1\n550,0,1,0\n700,1,0,0\n")
-    network = start_network(partial(NAFNet, width=16), torch.Generator().manual_seed(0))
-    for name in ("net", "best"):
-        save_file(network.state_dict(), folder / f"{name}.safetensors")
+    for name, kind in {"net": partial(NAFNet, width=16), "best": partial(Informed, width=12)}.items():
+        save_file(start_network(kind, torch.Generator().manual_seed(0)).state_dict(), folder / f"{name}.safetensors")
     names: dict[str, Any] = {}
     exec((folder / "my" / "smallnet.py").read_text(encoding="utf-8"), names)
     save_file(names["SmallUNet"](16).state_dict(), folder / "smallnet.safetensors")
@@ -155,6 +156,9 @@ def _write_laboratory(folder: Path) -> None:
         for number, frame in enumerate(frames):
             name = f"flat_{photons:.0f}ph" if photons else "dark"
             Image.fromarray(frame.astype(np.uint16)).save(folder / f"{name}_{1e3 * time:.4g}ms_{number}.png")
+    sensor = folder.parents[1] / "sensor" / "lab.yaml"  # until the command of the page writes the real one
+    sensor.parent.mkdir()
+    sensor.write_text(f"{FIRST}, a stand-in.\ndefaults: [small]\nsensor: {{read_noise: 8 e-}}\n", encoding="utf-8")
 
 
 def _write_frames(folder: Path) -> None:

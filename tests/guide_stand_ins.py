@@ -180,14 +180,15 @@ STAND_INS = {
     "\"train.mismatch={height_error.rms: 'uniform(0 nm, 20 nm)', height_error.depth: 'normal(0, 0.01)'}\"": StandIn(
         "ten minutes", more=(*TRAINING, *ONE)),
     'train my/train_smallnet.yaml "train.export=[pt2]"': StandIn("minutes", more=SMALLNET),
-    "train train_hour train.photographs=my_photographs": StandIn("a quarter of an hour", more=(
-        *TRAINING[:-2], "train.network.width=4", "train.stages.2.iterations=1", "train.stages.2.batch=2")),
+    "train train_informed train.photographs=my_photographs +mismatch=usual": StandIn("half an hour", more=(
+        *TRAINING[:-2], "train.network.width=2", "train.pool=2", "train.masks=[flat]", "train.stages.2.iterations=1",
+        "train.stages.2.batch=2")),
     "train train_unrolled train.photographs=my_photographs": StandIn("half an hour", more=(
         *TRAINING[:-2], "train.network.width=2", "train.pool=2", "train.stages.2.iterations=1",
         "train.stages.2.batch=2")),
-    "evaluate train_hour --data photographs --scenes 20 "
-    '--pipelines "flat+none, five_half_rings+wiener, five_half_rings+nafnet@best.safetensors"': StandIn(
-        "20 scenes", instead={"20": "1"}, more=("--strengths", "30", "+evaluate={mismatch: null}"), constants=WEAK),
+    "evaluate train_informed --data photographs --scenes 8 --strengths 0,1e3,1e5 "
+    '--pipelines "half_ring+wiener_uncertain, half_ring+informed@best.safetensors"': StandIn(
+        "8 scenes", instead={"8": "1", "0,1e3,1e5": "30"}, more=("+evaluate={mismatch: null}",), constants=WEAK),
     "train my/train_smallnet.yaml train.start=smallnet.safetensors train.rates.weights=5e-5": StandIn(
         "minutes", more=SMALLNET),
     "train train_demonstration --stage mask": StandIn("half an hour", more=DEMONSTRATION),

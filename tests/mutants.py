@@ -146,13 +146,19 @@ MUTANTS = (
         "nodes/optics/_transform/_pupil_field.py",
         "_FEW_TURNS = 2.0",
         "_FEW_TURNS = 2e9",
-        within("nodes/optics", "psf_independent.py"),
+        within("nodes/optics", "psf_independent.py::test_without_a_compiler_the_error_is_as_stated_too"),
     ),
     Mutant(
         "nodes/optics/_transform/_pupil_field.py",
         "torch.add(self.tilt_u[columns], turns, alpha=self.view.turns_height, out=turns)",
         "torch.add(self.tilt_u[columns], (self.screens.height[rows, columns] * self.view.turns_height), out=turns)",
-        within("nodes/optics", "psf_independent.py::test_the_error_is_as_stated_from_the_height_map_to_the_intensity"),
+        within("nodes/optics", "psf_independent.py::test_without_a_compiler_the_error_is_as_stated_too"),
+    ),
+    Mutant(
+        "nodes/optics/_transform/_field.h",
+        "        turns.part[i] = t - ((t + Kind<double>::round) - Kind<double>::round);",
+        "        turns.part[i] = __builtin_convertvector(__builtin_convertvector(t, Eight), Turns);",
+        within("nodes/optics/transform", "fused.py::test_a_phase_of_many_turns_is_exact"),
     ),
     Mutant(
         "nodes/optics/_phase_steps.py",

@@ -70,6 +70,8 @@ def test_every_command_line_parses_and_its_recipe_loads(words, folder, monkeypat
         return
     given = values["words"] or (["train_small"] if command == "train" else [])
     name, changes, first = split(given)
+    if command == "calibrate" and (folder / name).is_dir():  # its recipe follows from the frames
+        return
     if command == "sweep":
         for point in points(read_words(changes, folder, first), values["paired"]):
             load(name, point.overrides, folder)

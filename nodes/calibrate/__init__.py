@@ -47,7 +47,8 @@ from neusee.nodes.calibrate._sheet._patterns import (
 )
 from neusee.nodes.calibrate._sheet._quantity import Quantity
 from neusee.nodes.calibrate._sheet._sheet import EmvaSheet, emva_sheet
-from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Stack
+from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Stack, uncorrected
+from neusee.nodes.calibrate._validity._hidden_faults import Correction, Hidden, corrections
 from neusee.nodes.calibrate._validity._inspection import inspect_frames
 from neusee.nodes.calibrate._validity._number_tests import coarse
 
@@ -64,10 +65,12 @@ __all__ = [
     "CameraCoordinates",
     "Contribution",
     "Coordinates",
+    "Correction",
     "DefectHistogram",
     "EmvaSheet",
     "FrameHeader",
     "FrameTest",
+    "Hidden",
     "Laboratory",
     "LeastSquares",
     "Likelihood",
@@ -87,6 +90,7 @@ __all__ = [
     "camera_prior",
     "camera_sources",
     "coarse",
+    "corrections",
     "defects",
     "density",
     "descriptor",
@@ -118,6 +122,7 @@ __all__ = [
     "stray_prior",
     "sufficient",
     "table",
+    "uncorrected",
     "variance_shares",
     "without_trend",
 ]

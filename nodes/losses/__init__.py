@@ -11,7 +11,7 @@ from neusee.nodes.losses._protected_losses import (
     filtered_error,
     information,
 )
-from neusee.nodes.losses._restoration_losses import charbonnier, fft_l1
+from neusee.nodes.losses._restoration_losses import charbonnier, fft_l1, log_error
 from neusee.nodes.losses._spectral_loss import mrae
 from neusee.nodes.losses._wiener_loss import NoiseVariance, OneBandShare, wiener
 
@@ -31,6 +31,7 @@ __all__ = [
     "filtered_error",
     "gradient_penalty",
     "information",
+    "log_error",
     "mrae",
     "suppression_loss",
     "wiener",

@@ -12,6 +12,7 @@ from neusee.nodes.metrics._picture_quality import require_same_shape
 
 Reduction = Literal["mean", "sum"]
 _LEAST = 1e-30  #: least power, because the root has no gradient at 0
+_NEAR, _BEYOND = 1e-6, 0.1  #: least mean square of a difference, and the slope of colours that no display shows
 
 
 @node()
@@ -59,6 +60,33 @@ def fft_l1(estimate: Tensor, truth: Tensor, *, reduction: Reduction = "mean") ->
     spectrum: Tensor = torch.fft.fft2(estimate.double() - truth.double(), norm=norm)
     loss = _reduced((spectrum.real.square() + spectrum.imag.square() + _LEAST).sqrt(), reduction)
     return loss.to(single(estimate).dtype)
+
+
+@node()
+def log_error(estimate: Tensor, truth: Tensor) -> Tensor:
+    """Average over pictures the logarithm of the mean squared difference of the encoded pictures.
+
+    It is -ln(10) / 10 of the PSNR of `metrics.quality`. A decibel counts alike in every picture, whereas in a mean of
+    errors a few pictures that cannot be restored rule. Outside of [0, 1] a tenth of the linear value counts, so that
+    the loss has a slope where a display shows black or white.
+
+    Shapes: estimate and truth (..., 3, y, x), linear sRGB -> ().
+    Units:  none; 0 for pictures that differ by 1 everywhere.
+    Error:  1e-6 is added to each mean, so that pictures above 50 dB hardly count; 1e-6 in float32.
+    Raises: ValueError for pictures of different shapes.
+    Source: ours; sRGB as IEC 61966-2-1.
+    """
+    require_same_shape(estimate, truth)
+    square = (_encoded(single(estimate)) - _encoded(single(truth))).square().mean((-3, -2, -1))
+    return (square + _NEAR).log().mean()
+
+
+def _encoded(picture: Tensor) -> Tensor:
+    from kornia.color import linear_rgb_to_rgb
+
+    inside = picture.clamp(0, 1)
+    encoded: Tensor = linear_rgb_to_rgb(inside)
+    return encoded + _BEYOND * (picture - inside)
 
 
 def _reduced(errors: Tensor, reduction: Reduction) -> Tensor:

@@ -19,6 +19,8 @@ from neusee.nodes.optics._transform._scaled_transform import Method
 from neusee.nodes.units import Angle, PositiveLength, Shape
 from neusee.nodes.values import Psf, Pupil
 
+_PART = 1 << 15  #: samples of the pupil that are summed in the type of the pupil
+
 
 class _Camera(Geometry):
     """The geometry of lens, sensor and source, to which the direction of a laser is added."""
@@ -117,9 +119,10 @@ def _focus(pupil: Pupil, camera: _Camera, dtype: torch.dtype, method: Method) ->
 
 def _area(pupil: Pupil) -> tuple[float, float]:
     """Return the sum of the light and the sum of the field over all samples of the pupil without mask and dirt."""
-    rows = pupil.aperture.detach()
-    light, field = torch.bmm(rows[:, None, :], rows[:, :, None]), rows.sum(dim=1)
-    return float(light.sum(dtype=torch.float64)), float(field.sum(dtype=torch.float64))
+    parts = torch.split(pupil.aperture.detach().flatten(), _PART)  # read from memory once for both sums
+    light, field = zip(*((torch.dot(x, x), x.sum()) for x in parts), strict=True)
+    total_light, total_field = (float(torch.stack(sums).sum(dtype=torch.float64)) for sums in (light, field))
+    return total_light, total_field
 
 
 def _alpha(pupil: Pupil, camera: _Camera, band: int) -> float:

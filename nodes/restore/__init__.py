@@ -3,6 +3,7 @@
 from neusee.nodes.restore import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.restore._colour_matrix import colour_matrix
 from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons
+from neusee.nodes.restore._inverse._filter_facts import filter_facts
 from neusee.nodes.restore._inverse._frame_blur import FrameBlur, frame_blur
 from neusee.nodes.restore._inverse._nearby_glare import nearby_glare
 from neusee.nodes.restore._inverse._posterior_spread import wiener_spread
@@ -13,6 +14,7 @@ from neusee.nodes.restore._lasers._find_lasers import find_lasers
 from neusee.nodes.restore._lasers._found_glare import found_glare, found_nearby
 from neusee.nodes.restore._networks._critic import critic_slopes, critics, skip_critic_draws
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba, fft_mamba
+from neusee.nodes.restore._networks._informed import Informed, informed
 from neusee.nodes.restore._networks._nafnet import NAFNet, nafnet
 from neusee.nodes.restore._networks._network_export import export_network, require_exportable
 from neusee.nodes.restore._networks._network_node import network
@@ -30,6 +32,7 @@ from neusee.nodes.restore._white_level import white_level
 __all__ = [
     "FFTMamba",
     "FrameBlur",
+    "Informed",
     "MeasuringSensor",
     "NAFNet",
     "OwnNetwork",
@@ -44,10 +47,12 @@ __all__ = [
     "electrons",
     "export_network",
     "fft_mamba",
+    "filter_facts",
     "find_lasers",
     "found_glare",
     "found_nearby",
     "frame_blur",
+    "informed",
     "measured_psf",
     "measuring_sensor",
     "nafnet",

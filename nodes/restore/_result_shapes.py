@@ -12,6 +12,7 @@ from neusee.nodes.restore._colour_matrix import colour_matrix
 from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons
 from neusee.nodes.restore._inverse._conjugate_gradients import LOWEST
 from neusee.nodes.restore._inverse._fft_grid import halvings, torus
+from neusee.nodes.restore._inverse._filter_facts import EACH, MAPS, filter_facts
 from neusee.nodes.restore._inverse._hidden_pixels import MOST, STEPS
 from neusee.nodes.restore._inverse._lowest_frequencies import MODES, SHARE
 from neusee.nodes.restore._inverse._nearby_glare import nearby_glare
@@ -22,6 +23,7 @@ from neusee.nodes.restore._inverse._wiener_problem import wiener_problem
 from neusee.nodes.restore._lasers._find_lasers import find_lasers
 from neusee.nodes.restore._lasers._found_glare import found_glare, found_nearby
 from neusee.nodes.restore._networks._fft_mamba import fft_mamba
+from neusee.nodes.restore._networks._informed import informed
 from neusee.nodes.restore._networks._nafnet import nafnet
 from neusee.nodes.restore._networks._network_node import network
 from neusee.nodes.restore._networks._own_network import tried
@@ -32,7 +34,7 @@ from neusee.nodes.restore._shading._frame_cells import grid
 from neusee.nodes.restore._shading._shading_node import shading
 from neusee.nodes.restore._white_level import white_level
 from neusee.nodes.shape_rules import at_least_single, blank, double, like_first, transform_operations
-from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil, Shading, WienerProblem
+from neusee.nodes.values import Bands, FilterFacts, FoundLasers, Psf, Pupil, Shading, WienerProblem
 
 _SYSTEM = 35.0  #: bytes for each element of a dense system: the matrix, its factors and copies
 _INVERTED = 0.30  #: operations of a transform that take as long as one of the cube of the side of an inverted matrix
@@ -47,7 +49,7 @@ _LAWS = 400.0  #: bytes, and operations, of the laws of a scene for each element
 _FIELD = 60.0  #: products of matrices of the knots
 _LAYER = 1e-3  #: operations of a transform that take as long as one of a layer
 
-for node in (electrons, wiener, wiener_by_field, richardson_lucy, fft_mamba, nafnet, network, unet, unrolled):
+for node in (electrons, wiener, wiener_by_field, richardson_lucy, fft_mamba, informed, nafnet, network, unet, unrolled):
     node.shape(like_first)
 
 
@@ -181,6 +183,27 @@ def _(
 def _(result: WienerProblem, *inputs: Any, **params: Any) -> tuple[float, float]:
     work: tuple[float, float] = wiener.hooks.work(result.picture, *inputs)  # type: ignore[misc]
     return work
+
+
+@filter_facts.shape
+def _(electrons: Tensor, *inputs: Any, **params: Any) -> FilterFacts:
+    fine = torch.float64 if max(electrons.shape[-2:]) <= PRECISE else at_least_single(electrons)
+    frame, one = tuple(electrons.shape), (len(electrons), 1, 1)
+    maps = (MAPS + EACH * (len(electrons) - 3), *frame[1:])
+    return FilterFacts._make(blank(*shape, dtype=fine) for shape in (frame, frame, maps, one, one))
+
+
+@filter_facts.work
+def _(result: FilterFacts, *inputs: Any, **params: Any) -> tuple[float, float]:
+    work: tuple[float, float] = wiener.hooks.work(result.answer, *inputs)  # type: ignore[misc]
+    return work
+
+
+@informed.work
+def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, width: int = 16, **params: Any) -> tuple[float, float]:
+    memory, operations = wiener.hooks.work(result, electrons, psf, *others)  # type: ignore[misc]
+    of_layers, layers = _layers(result, width=width)
+    return memory + of_layers, operations + layers
 
 
 @unrolled.work

@@ -14,7 +14,7 @@ from neusee.nodes.sensor._saturation import Well
 from neusee.nodes.torch_func import transformed
 from neusee.nodes.units import Gain, Shape
 
-Rounding = Literal["nearest", "dithered_floor"]
+Rounding = Literal["nearest", "dithered_floor", "truncation"]
 _BLOCK = 2**18  #: pixels that are converted at a time, so that their float64 numbers stay in the cache of the processor
 Bits = Annotated[int, Field(ge=1, le=16)]
 
@@ -72,8 +72,9 @@ def digitize(
     Units:  electrons e-; gain K of EMVA 1288, DN/e-, which a recipe may also write as e-/DN; result DN in
             [0, 2**bits - 1].
     Error:  `nearest` rounds the float64 product of electrons and gain half to even: every number is exact unless the
-            product is within 1e-11 DN of the middle of two numbers. Variance 1/12 DN2. `dithered_floor`,
-            floor(x + U(-1/2, 1/2)) as printed, is 1/2 DN too low with up to 1/6 DN2 more variance. Integral
+            product is within 1e-11 DN of the middle of two numbers. Variance 1/12 DN2. `truncation`, floor(x), as many
+            converters cut, is 1/2 DN too low with the same variance. `dithered_floor`, floor(x + U(-1/2, 1/2)) as
+            printed, is 1/2 DN too low with up to 1/6 DN2 more variance. Integral
             nonlinearity is left out. The gradient is that of the numbers before rounding, and 0 where the converter
             clips.
     Raises: ValueError for `dithered_floor` without rng.
@@ -82,27 +83,28 @@ def digitize(
     if rounding == "dithered_floor" and rng is None:
         raise ValueError("rounding dithered_floor needs random numbers: give rng=torch.Generator()")
     electrons = single(electrons)
-    whole = _whole_numbers(electrons.detach(), gain, 2**bits - 1, rng if rounding == "dithered_floor" else None)
+    whole = _whole_numbers(electrons.detach(), gain, 2**bits - 1, rounding, rng)
     if not (electrons.requires_grad or transformed()):
         return whole
     ideal = (electrons * gain).clamp(0, 2**bits - 1)
     return ideal + (whole - ideal).detach()  # the sum is exact: the difference is a multiple of the last bit of `ideal`
 
 
-def _whole_numbers(electrons: Tensor, gain: float, top: int, rng: Generator | None) -> Tensor:
-    """Return the digital numbers from 0 to ``top``, rounded half to even, or with a dither from ``rng``.
+def _whole_numbers(electrons: Tensor, gain: float, top: int, rounding: Rounding, rng: Generator | None) -> Tensor:
+    """Return the digital numbers from 0 to ``top``, rounded half to even, cut, or cut with a dither from ``rng``.
 
     The product is float64: in float32, one number in a thousand would be off by one.
     """
     result = torch.empty_like(electrons, memory_format=torch.contiguous_format)
     flat, whole, dither = electrons.reshape(-1), result.view(-1), None
-    if rng is not None:
+    if rounding == "dithered_floor" and rng is not None:
         dither = torch.rand(electrons.shape, generator=rng, device=rng.device, dtype=torch.float32) - 0.5
         dither = dither.to(electrons.device).reshape(-1)
     for at in range(0, flat.numel(), _BLOCK):
         part = slice(at, at + _BLOCK)
         line = flat[part].double() * gain
-        line = line.round_() if dither is None else line.add_(dither[part]).floor_()
+        line = line if dither is None else line.add_(dither[part])
+        line = line.round_() if rounding == "nearest" else line.floor_()
         whole[part] = line.clamp_(0, top)
     return result
 
@@ -120,6 +122,8 @@ def _(
     line = [float(Fraction(x) * Fraction(gain)) for x in electrons.flatten().tolist()]
     if rounding == "nearest":
         whole = [round(min(max(x, 0.0), float(top))) for x in line]
+    elif rounding == "truncation":
+        whole = [min(max(math.floor(x), 0), top) for x in line]
     else:
         dither = torch.rand(electrons.shape, generator=rng, dtype=torch.float32).flatten().tolist()
         whole = [min(max(math.floor(x + (d - 0.5)), 0), top) for x, d in zip(line, dither, strict=True)]

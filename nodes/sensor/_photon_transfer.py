@@ -57,7 +57,7 @@ def photon_transfer(
     light = _rise(full_well / quantum_efficiency, 1.0 / quantum_efficiency, levels)
     measured = torch.tensor([_pair(frame(p), frame(p)) for p in light], dtype=torch.float64)
     signal = measured[:, 0] - measured[0, 0]
-    floor = gain**2 * (read_noise**2 + expected) + (1.0 / 12.0 if rounding == "nearest" else 1.0 / 6.0)
+    floor = gain**2 * (read_noise**2 + expected) + (1.0 / 6.0 if rounding == "dithered_floor" else 1.0 / 12.0)
     return torch.stack([signal, measured[:, 1], floor + gain * signal], 1)
 
 

@@ -1,13 +1,14 @@
 """How quickly a sensor's posterior is drawn: `python tests/benchmarks/bench_calibrate.py`.
 
-The recipe `calibrate` (15 levels of 2 x 256 x 256 pixels, the paper's sensor) and its posterior, in one process:
+Both modes, in one process: the recipe `calibrate` (15 levels of 2 x 256 x 256 pixels) and the recipe
+`calibrate_camera` (32 levels of a real camera):
 
 - the likelihood of 64 sensors at once, against that of one summed pixel by pixel (float64, each pixel's own cell);
-- draws that are as good as independent, by the longest autocorrelation time, a second of sampling: emcee as `neusee
-  calibrate` runs it (its first round, four ensembles), against numpyro's NUTS on the same levels without the saturated
-  one and the same coordinates, whitened at the peak, in JAX and float64, with and without its compilation.
-
-Seconds are medians of three; those of NUTS are of one run.
+- effective draws (ArviZ, bulk, the least of all coordinates) a second of processor time: `neusee calibrate` from the
+  search on, with the density that guides its walkers, against numpyro's NUTS with a likelihood of its own in JAX and
+  float64, whitened at the mode, with warm-up and without compilation; NUTS in mode density without the saturated level,
+  where the likelihood has no slope, and neusee then too;
+- the largest difference of the means, in standard deviations, and of the standard deviations.
 """
 
 import os
@@ -30,7 +31,8 @@ from numpyro.infer import MCMC, NUTS
 from neusee.nodes.calibrate._likelihood._quantised_gaussian import log_cell
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
+from neusee.workflows.calibration.posterior_checks import importance_samples
+from neusee.workflows.calibration.posterior_mode import search_mode
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
@@ -70,92 +72,141 @@ def by_pixel(problem, store, parameters):
     return median(once), sum(len(x) for x in pixels)
 
 
-def nuts(problem, best, draws=1000, warmup=500, chains=4):
-    """Independent draws, seconds with and without compilation."""
-    levels = problem.levels
-    photons, exposure, n, mean, variance, nu = (jnp.asarray(x.numpy()) for x in levels[:6])
-    prior = [jnp.asarray(x[problem.coordinates.prior.width.isfinite()].numpy()) for x in problem.coordinates.prior]
-    values, vectors = np.linalg.eigh(best.covariance)
-    root, middle = jnp.asarray(vectors * np.sqrt(values)), jnp.asarray(best.theta)
+def density_target(problem):
+    """The log posterior of a sensor whose pixels are alike, of the coordinates of `calibrate.prior`."""
+    photons, exposure, n, mean, variance, nu = (jnp.asarray(x.numpy()) for x in problem.levels[:6])
+    prior = [jnp.asarray(x[problem.coordinates.prior.width.isfinite()].numpy()) for x in problem.coordinates.prior[:2]]
 
-    def log(z):
-        a, b, s, d, w, q = middle + root @ z
+    def log(theta):
+        a, b, s, d, w, q = theta
         k = jnp.exp(a)
         m, v = b + jnp.exp(d) * exposure / 0.1 + jnp.exp(q) * photons, jnp.exp(2 * s) + 1.0 / 12.0
         v = v + k * (jnp.exp(d) * exposure / 0.1 + jnp.exp(q) * photons)
         told = -0.5 * jnp.sum((nu + 1) * jnp.log(v) + nu * variance / v + n * (mean - m) ** 2 / v)
-        theta = jnp.array([-a, b / k, s - a, d - a, w - a, q - a])
+        free = jnp.array([-a, b / k, s - a, d - a, w - a, q - a])
+        free = free.at[0].set(a)
         below = jnp.sum(n * jax.scipy.special.log_ndtr((jnp.exp(w) - m) / jnp.sqrt(v)))
-        return told + below - 0.5 * jnp.sum(((theta - prior[0]) / prior[1]) ** 2) - a
+        return told + below - 0.5 * jnp.sum(((free - prior[0]) / prior[1]) ** 2) - a
 
-    at = jnp.zeros(len(best.theta))
-    ours = problem.log_posterior(np.stack([best.theta, best.theta + 0.01 * best.covariance.diagonal() ** 0.5]))
-    step = jnp.linalg.solve(root, jnp.asarray(0.01 * best.covariance.diagonal() ** 0.5))
-    assert abs(float(log(step) - log(at)) - (ours[1] - ours[0])) < 1e-6, "not the same posterior"
+    return log
+
+
+def camera_target(problem):
+    """The log posterior of a real camera, of the coordinates of `calibrate.camera_prior`."""
+    levels = [x.numpy() for x in problem.levels[:6]]
+    signal = levels[3] - levels[3][(levels[0] == 0) & (levels[1] == levels[1][levels[0] == 0].min())][0]
+    lit = levels[0] > 0
+    used = ~lit | (signal <= 0.7 * signal[lit][levels[4][lit].argmax()])
+    used &= ~np.isin(np.arange(len(lit)), problem.levels.cell_level.numpy())
+    top, first = signal[used].max(), levels[1][~lit].min()
+    photons, exposure, n, mean, variance, nu = (jnp.asarray(x[used]) for x in levels)
+    centre, width = (jnp.asarray(x.numpy()) for x in problem.coordinates.prior)
+
+    def log(theta):
+        k, q, noise, current, scatter, lamp, drift = (jnp.exp(theta[i]) for i in (0, 1, 3, 4, 5, 6, 7))
+        b, t = theta[8], theta[9]
+        y = mean - theta[2]
+        x = y / top
+        curve = 1 + b * x + t * x**2
+        e = y / (k * curve)
+        slope = k * curve**2 / (curve - x * (b + 2 * t * x))
+        v = slope**2 * (noise**2 + e) + 1 / 12
+        light = q * photons
+        wide = 2 / nu + scatter**2
+        off = jnp.log(variance) - jnp.log(v) + 1 / nu
+        error = variance / n + drift**2 + (lamp * light * slope) ** 2
+        away = (e - light - current * (exposure - first)) * slope
+        told = -0.5 * jnp.sum(off**2 / wide + jnp.log(wide) + away**2 / error + jnp.log(error))
+        return told - 0.5 * jnp.sum(((theta - centre) / width) ** 2)
+
+    return log
+
+
+def nuts(problem, best, target, draws=4000, warmup=1000, chains=4):
+    """Draws (chain, draw, free) by numpyro, and the seconds of processor time with and without compilation."""
+    values, vectors = np.linalg.eigh(best.covariance)
+    root, middle = jnp.asarray(vectors * np.sqrt(values)), jnp.asarray(best.theta)
+    at = best.theta + 0.3 * best.covariance.diagonal() ** 0.5 * np.random.default_rng(0).standard_normal(
+        (3, len(middle))
+    )
+    ours = problem.log_posterior(at)
+    theirs = np.array([float(target(jnp.asarray(x))) for x in at])
+    assert np.ptp(theirs - ours) < 1e-6, f"not the same posterior: {theirs - ours}"
 
     def potential(z):
-        return -log(z)
+        return -target(middle + root @ z)
 
-    def drawn():
-        sampler = MCMC(
-            NUTS(potential_fn=potential), num_warmup=warmup, num_samples=draws, num_chains=chains,
-            chain_method="vectorized", progress_bar=False,
-        )  # fmt: skip
-        began = time.perf_counter()
-        sampler.run(jax.random.PRNGKey(1), init_params=jnp.zeros((chains, len(best.theta))))
+    sampler = MCMC(
+        NUTS(potential_fn=potential, target_accept_prob=0.9), num_warmup=warmup, num_samples=draws, num_chains=chains,
+        chain_method="vectorized", progress_bar=False,
+    )  # fmt: skip
+    seconds = []
+    for seed in (1, 2):
+        began = time.process_time()
+        sampler.run(jax.random.PRNGKey(seed), init_params=jnp.zeros((chains, len(middle))))
         samples = np.asarray(sampler.get_samples(group_by_chain=True)) @ np.asarray(root).T + best.theta
-        return sampler, samples, time.perf_counter() - began
-
-    sampler, samples, first = drawn()
-    began = time.perf_counter()
-    sampler.run(jax.random.PRNGKey(2), init_params=jnp.zeros((chains, len(best.theta))))
-    np.asarray(sampler.get_samples())
-    again = time.perf_counter() - began
-    worth = min(float(arviz.ess(samples[..., i])) for i in range(samples.shape[-1]))
-    return worth, first, again, samples
+        seconds.append(time.process_time() - began)
+    return samples, *seconds
 
 
-def ours(problem, best, how):
-    """Draws of the first round of four ensembles of 64, and their seconds."""
-    emcee_sampler._LONGEST, found = emcee_sampler._FIRST, []
-    for _ in range(3):
-        with tempfile.TemporaryDirectory() as folder:
-            began = time.perf_counter()
-            chains = emcee_sampler.sample(problem, best, Path(folder) / "c.h5", seed=7, how=how)
-            found.append(time.perf_counter() - began)
-    by_tau = chains.flat.shape[0] / chains.tau
-    walkers = chains.draws.transpose(3, 0, 2, 1).reshape(chains.draws.shape[-1], -1, chains.draws.shape[1])
-    by_arviz = min(float(arviz.ess(x)) for x in walkers)
-    return min(by_tau, by_arviz), statistics.median(found), chains
+def ours(problem):
+    """Draws (chain, draw, free) as `neusee calibrate` makes them, and their seconds of processor time."""
+    began = time.process_time()
+    best = search_mode(problem)
+    law = importance_samples(problem, best, 7)
+    with tempfile.TemporaryDirectory() as folder:
+        chains = emcee_sampler.sample(problem, best, Path(folder) / "c.h5", seed=7, guide=law.guide)
+    seconds = time.process_time() - began
+    walkers = chains.draws.transpose(0, 2, 1, 3)
+    return walkers.reshape(-1, *walkers.shape[2:]), seconds, chains
+
+
+def worth(samples):
+    """The least effective sample size of all coordinates."""
+    return min(float(arviz.ess(samples[..., i], method="bulk")) for i in range(samples.shape[-1]))
+
+
+def beside_nuts(mode, problem, target):
+    mine, seconds, chains = ours(problem)
+    theirs, first, again = nuts(problem, search_mode(problem), target)
+    rows = [
+        ("neusee", mine, seconds),
+        ("numpyro NUTS", theirs, again),
+        ("numpyro NUTS, with compilation", theirs, first),
+    ]
+    rates = []
+    for name, samples, spent in rows:
+        rates.append(worth(samples) / spent)
+        print(f"| {mode} | {name} | {worth(samples):.0f} | {spent:.2f} | {rates[-1]:.0f} |", flush=True)
+    a, b = (x.reshape(-1, x.shape[-1]) for x in (mine, theirs))
+    off, ratio = np.abs(a.mean(0) - b.mean(0)) / b.std(0), a.std(0) / b.std(0)
+    print(f"\nmode {mode}: processor time of an effective draw, NUTS over neusee {rates[0] / rates[1]:.1f}; tau "
+          f"{chains.tau:.1f} of {chains.steps} steps; means within {off.max():.3f} sd, standard deviations within "
+          f"{np.abs(ratio - 1).max():.1%}\n", flush=True)  # fmt: skip
 
 
 def main():
     warnings.simplefilter("ignore")
     numpyro.set_host_device_count(1)
+    torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         store = Store(Path(folder))
         problem = SensorPosterior.of(load("calibrate"), store)
-        best = find_mode(problem, initial_theta(problem))
+        best = search_mode(problem)
         samples = best.draw(64, np.random.default_rng(0))
         vector = median(lambda: [problem.log_posterior(samples) for _ in range(100)]) / 6400
         pixel, count = by_pixel(problem, store, problem.parameters(best.theta))
         print(
             f"likelihood of a sensor, 64 at once: {1e6 * vector:.1f} us; of {count} pixels one by one: {pixel:.3f} s,"
         )
-        print(f"ratio {pixel / vector:.0f}")
-        print("| levels | method | independent draws | s | draws / s |\n|---|---|---|---|---|")
-        for name in ("de", "stretch"):
-            worth, seconds, _ = ours(problem, best, name)
-            print(f"| 15 | emcee, {name} | {worth:.0f} | {seconds:.2f} | {worth / seconds:.0f} |", flush=True)
+        print(f"ratio {pixel / vector:.0f}\n")
+        head = "| mode | method | effective draws | processor s | draws / s |\n|---|---|---|---|---|"
+        print(head)
+        camera = SensorPosterior.of(load("calibrate_camera"), store)
+        beside_nuts("camera", camera, camera_target(camera))
+        print(head)
         lit = SensorPosterior.of(load("calibrate", [LIT]), store)
-        best = find_mode(lit, initial_theta(lit))
-        worth, seconds, chains = ours(lit, best, "de")
-        print(f"| 14 | emcee, de | {worth:.0f} | {seconds:.2f} | {worth / seconds:.0f} |", flush=True)
-        worth, first, again, other = nuts(lit, best)
-        print(f"| 14 | numpyro NUTS, compiled before | {worth:.0f} | {again:.2f} | {worth / again:.0f} |")
-        print(f"| 14 | numpyro NUTS, with compilation | {worth:.0f} | {first:.2f} | {worth / first:.0f} |")
-        width = chains.flat.std(0) / other.reshape(-1, other.shape[-1]).std(0)
-        print("standard deviations, emcee over NUTS:", " ".join(f"{x:.2f}" for x in width))
+        beside_nuts("density", lit, density_target(lit))
 
 
 if __name__ == "__main__":

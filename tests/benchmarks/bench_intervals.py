@@ -1,4 +1,4 @@
-"""How often intervals hold the truth for few photographs: `python tests/benchmarks/bench_intervals.py`.
+"""How often intervals hold the truth for few photographs: `python tests/benchmarks/bench_intervals.py 1000 5 8 20`.
 
 Samples of known mean from four laws, and differences of two methods with skewed errors on the same photographs. Beside
 `paired_intervals.less`, of `neusee evaluate`, stand the bootstrap-t alone and Student's t. The share of 1000 samples
@@ -12,7 +12,7 @@ from scipy.stats import t as student
 
 from neusee.workflows.evaluation import paired_intervals
 
-TIMES = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
+TIMES, *COUNTS = [int(word) for word in sys.argv[1:]] or [1000, 5, 8, 20]
 DRAWS = 2000
 
 
@@ -56,7 +56,7 @@ def main():
     paired_intervals._DRAWS = DRAWS
     small = paired_intervals._SMALL
     print("| photographs | law | neusee | bootstrap-t alone | Student's t |\n|---|---|---|---|---|")
-    for n in (5, 8, 20):
+    for n in COUNTS:
         for name, (draw, truth) in LAWS.items():
             rows = (measure(draw, truth, n, small), measure(draw, truth, n, 0), of_student(draw, truth, n))
             print(f"| {n} | {name} | " + " | ".join(f"{h:.1%} ({w:.2f})" for h, w in rows) + " |", flush=True)

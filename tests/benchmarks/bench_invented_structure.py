@@ -26,9 +26,9 @@ from matplotlib.font_manager import findfont
 from PIL import Image, ImageDraw, ImageFont
 from safetensors.numpy import load_file
 from scipy.ndimage import uniform_filter
-from scipy.stats import t as student
 
 from neusee.workflows.cli import app
+from neusee.workflows.report.figures.frame_and_interval import half_width
 from tests.benchmarks import bench_restored_frames as frames
 from tests.nodes.restore.lasers import own_camera as own
 
@@ -119,7 +119,7 @@ def one(seed, mask, strength, folder):
         picture, spread, clipped = restored(numbers, mask, method, folder)
         gains = np.median(truth, (1, 2)) / np.maximum(np.median(picture, (1, 2)), 1e-9)
         seen = read(frames.encoded(picture * gains[:, None, None]).mean(0))
-        outside = (np.abs(picture - truth / gains[:, None, None]) > student.ppf(0.95, DRAWS) * spread).mean(0)
+        outside = (np.abs(picture - truth / gains[:, None, None]) > half_width(spread, DRAWS)).mean(0)
         empty = np.zeros_like(clipped)
         for (down, right), item in zip(PLACES, what, strict=True):
             if item is None:

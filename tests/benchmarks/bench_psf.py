@@ -1,9 +1,13 @@
-"""The PSF beside prysm, hcipy, poppy, scipy and finufft: `python tests/benchmarks/bench_psf.py [REPEATS]`.
+"""The PSF beside prysm, hcipy, poppy, scipy and finufft: `python tests/benchmarks/bench_psf.py [REPEATS] [OPTIONS]`.
 
-Everybody gets two threads and the same clear or defocused disc at 550 nm, and returns the intensity. The peers are
-handed the complex pupil and keep their operators; ours keeps its own, starts from the height map and makes the phase
-each time. What making the complex64 pupil costs in NumPy is a row of its own, and a column adds it to the peers; the
-other way round, `neusee, ready pupil` is handed it as they are.
+`--one-thread` takes the least processor time of one thread instead of the median of the time on two threads, for a
+machine on which others compute. `--size 2160 64` takes one size. `--part forward` takes one table (forward, methods,
+backward, spectra). `--fast` leaves out plain matrices: those of the peers for windows of 1024 and more, where they
+take six to thirty times as long as ours, and those with torch's own gradient.
+Everybody gets the same number of threads and the same clear or defocused disc at 550 nm, and returns the intensity.
+The peers are handed the complex pupil and keep their operators; ours keeps its own, starts from the height map and
+makes the phase each time. What making the complex64 pupil costs in NumPy is a row of its own, and a column adds it to
+the peers; the other way round, `neusee, ready pupil` is handed it as they are, and computes in torch.
 Calls are interleaved, so that a loaded machine slows all alike, and each is preceded by a pause and by a call that
 does not count, because the threads of one library spin for a while and would slow the next. The error is against the
 double sum in complex128 on a subset of rows and columns, relative to the peak. Prints tables in Markdown.
@@ -11,12 +15,15 @@ double sum in complex128 on a subset of rows and columns, relative to the peak. 
 
 # ruff: noqa: E402 (threads are set before anybody starts theirs)
 import os
+import sys
 
-os.environ.update({name: "2" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")})
+ONE = "--one-thread" in sys.argv
+THREADS = 1 if ONE else 2
+os.environ.update({name: str(THREADS) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")})
 
+import math
 import statistics
 import subprocess
-import sys
 import time
 import warnings
 from functools import partial
@@ -74,8 +81,13 @@ def pupil_call(p):
 
 
 def ours(p, k, method="auto"):
-    camera = _Camera(FOCAL, PIXEL, (k, k), (0.0, 0.0), False, False)
+    camera = _Camera(FOCAL, PIXEL, (k, k))
     return lambda: _focus(p, camera, torch.float32, method).intensity[0].numpy()
+
+
+def by_torch(p, k):
+    """Ours where there is no compiler, by grids."""
+    return _focus(p, _Camera(FOCAL, PIXEL, (k, k)), torch.float32, "kaiser_bessel")
 
 
 def from_field(f, k):
@@ -125,7 +137,7 @@ def scipy_call(f, k):
 def finufft_call(f, k, eps, kind):
     n, step = len(f), 2 * np.pi * DIAMETER / len(f) * PIXEL / (WAVELENGTH * FOCAL)
     points = (step * (np.arange(k) - k // 2)).astype("float32" if kind == "complex64" else "float64")
-    plans = [finufft.Plan(2, (n,), m, eps, -1, kind, nthreads=2) for m in (n, k)]
+    plans = [finufft.Plan(2, (n,), m, eps, -1, kind, nthreads=THREADS) for m in (n, k)]
     for plan in plans:
         plan.setpts(points)
 
@@ -138,7 +150,7 @@ def finufft_call(f, k, eps, kind):
 
 def contenders(n, k, p):
     f, exact = field(p), field(p, np.complex128)
-    return {
+    every = {
         "neusee": ours(p, k),
         "neusee, ready pupil": from_field(f, k),
         "hcipy ZoomFFT c64": hcipy_call(f, k, hcipy.ZoomFastFourierTransform),
@@ -151,6 +163,8 @@ def contenders(n, k, p):
         "finufft 1d2 c128, 1e-8": finufft_call(exact, k, 1e-8, "complex128"),
         "poppy MFT": poppy_call(exact, k),
     }
+    fast = "--fast" in sys.argv and k >= 1024
+    return {name: call for name, call in every.items() if not (fast and {"MFT", "mdft"} & set(name.split()))}
 
 
 def subset(p, k):
@@ -170,22 +184,24 @@ def error(image, where, truth):
 
 def seconds(call):
     """Time of a second call in a row, after the threads of whoever ran before have stopped spinning."""
-    time.sleep(0.15)
+    clock = time.process_time if ONE else time.perf_counter
+    if not ONE:
+        time.sleep(0.15)
+        call()
+    start = clock()
     call()
-    start = time.perf_counter()
-    call()
-    return time.perf_counter() - start
+    return clock() - start
 
 
 def interleaved(calls, repeats):
-    """Median seconds of each call, taken in turns; what is slow is taken twice."""
+    """Median seconds of each call (on one thread the least), taken in turns; what is slow is taken twice."""
     times = {name: [] for name in calls}
     first = {name: seconds(call) for name, call in calls.items()}
     for turn in range(repeats):
         for name, call in calls.items():
             if turn < 2 or first[name] < SLOW:
                 times[name].append(seconds(call))
-    return {name: statistics.median(t) for name, t in times.items()}
+    return {name: (min if ONE else statistics.median)(t) for name, t in times.items()}
 
 
 def forward(repeats):
@@ -206,9 +222,9 @@ def forward(repeats):
 
 
 def methods(repeats):
-    print("\n| pupil -> window | auto | kaiser_bessel | bluestein | folded | direct |\n|---|---|---|---|---|---|")
+    names = ("auto", "kaiser_bessel", "bluestein", "folded", "direct")
+    print("\n| pupil -> window | " + " | ".join(names) + " |\n|---|---|---|---|---|---|")
     for n, k in SIZES:
-        names = ("auto", "kaiser_bessel", "bluestein", "folded", "direct")
         times = interleaved({m: ours(pupil(n), k, m) for m in names}, repeats)
         print(f"| {n} -> {k} | " + " | ".join(f"{1e3 * times[m]:.1f}" for m in names) + " |", flush=True)
 
@@ -228,8 +244,8 @@ def plain_autograd(p, k):
 
 
 def backward(repeats):
-    print("\n| pupil -> window | forward ms | forward + backward ms | ratio | torch autograd, matrices: f + b ms |")
-    print("|---|---|---|---|---|")
+    print("\n| pupil -> window | forward ms | forward + backward ms | ratio | the same without C++ | ratio of both | "
+          "torch autograd, matrices: f + b ms |\n|---|---|---|---|---|---|---|")  # fmt: skip
     for n, k in SIZES:
         p = pupil(n, 3.0)
         camera = dict(focal_length=FOCAL, pixel_pitch=PIXEL, shape=(k, k))
@@ -242,10 +258,16 @@ def backward(repeats):
         def image(height, p=p, camera=camera):
             return psf(p._replace(height=height), **camera).intensity[0]
 
-        calls = {"f": ours(p, k), "fb": partial(learn, image), "torch": partial(learn, plain_autograd(p, k))}
+        def grids(height, p=p, k=k):
+            return by_torch(p._replace(height=height), k).intensity[0]
+
+        calls = {"f": ours(p, k), "fb": partial(learn, image), "grids": partial(learn, grids)}
+        if "--fast" not in sys.argv:
+            calls["torch"] = partial(learn, plain_autograd(p, k))
         t = interleaved(calls, repeats)
         print(f"| {n} -> {k} | {1e3 * t['f']:.1f} | {1e3 * t['fb']:.1f} | {t['fb'] / t['f']:.2f} | "
-              f"{1e3 * t['torch']:.0f} |", flush=True)  # fmt: skip
+              f"{1e3 * t['grids']:.1f} | {t['fb'] / t['grids']:.2f} | {1e3 * t.get('torch', math.nan):.0f} |",
+              flush=True)  # fmt: skip
 
 
 def peak_gigabytes():
@@ -261,7 +283,7 @@ def all_bands(who, learn=False):
     p = pupil(2160, wavelengths=bands, height=1e-6 * torch.rand(2160, 2160))
     Path("/proc/self/clear_refs").write_text("5")  # the peak so far, the parent's too, no longer counts
     before = peak_gigabytes()
-    start = time.perf_counter()
+    start, worked = time.perf_counter(), time.process_time()
     if who == "neusee":
         height = p.height.requires_grad_(learn)
         out = psf(p._replace(height=height), focal_length=FOCAL, pixel_pitch=PIXEL, shape=(2048, 2048)).intensity
@@ -272,31 +294,36 @@ def all_bands(who, learn=False):
         for band, wavelength in enumerate(bands):
             globals()["WAVELENGTH"] = wavelength
             out[band] = hcipy_call(field(p), 2048, hcipy.ZoomFastFourierTransform)()
-    took, after = time.perf_counter() - start, peak_gigabytes()
-    print(f"{took:.2f} {after:.2f} {before:.2f}")
+    took, worked, after = time.perf_counter() - start, time.process_time() - worked, peak_gigabytes()
+    print(f"{took:.2f} {worked:.2f} {after:.2f} {before:.2f}")
 
 
 def spectra():
-    print(
-        "\n| 31 bands, height -> 2048^2 PSFs, a process of its own, cold | s (three runs) | peak GB | before the call |"
-    )
-    print("|---|---|---|---|")
+    print("\n| 31 bands, height -> 2048^2 PSFs, a process of its own, cold | s (three runs) | processor s | peak GB | "
+          "before the call |\n|---|---|---|---|---|")  # fmt: skip
     for who, title in (("neusee", "neusee"), ("learn", "neusee, forward + backward"), ("hcipy", "hcipy ZoomFFT c64")):
-        runs = [subprocess.run([sys.executable, __file__, "--bands", who], capture_output=True, text=True, check=True)
-                .stdout.split()[-3:] for _ in range(3)]  # fmt: skip
-        print(f"| {title} | {', '.join(r[0] for r in runs)} | {max(r[1] for r in runs)} | {runs[0][2]} |", flush=True)
+        command = [sys.executable, __file__, "--bands", who, *["--one-thread"] * ONE]
+        runs = [subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-4:]
+                for _ in range(3)]  # fmt: skip
+        took, worked, peak, before = zip(*runs, strict=True)
+        print(f"| {title} | {', '.join(took)} | {', '.join(worked)} | {max(peak)} | {before[0]} |", flush=True)
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(2)
-    with scipy.fft.set_workers(2):
+    torch.set_num_threads(THREADS)
+    with scipy.fft.set_workers(THREADS):
         if "--bands" in sys.argv:
-            all_bands("hcipy" if sys.argv[-1] == "hcipy" else "neusee", learn=sys.argv[-1] == "learn")
+            who = sys.argv[sys.argv.index("--bands") + 1]
+            all_bands("hcipy" if who == "hcipy" else "neusee", learn=who == "learn")
         else:
-            repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 9
+            repeats = int(sys.argv[1]) if sys.argv[1:] and sys.argv[1].isdigit() else 9
+            if "--size" in sys.argv:
+                SIZES[:] = [tuple(int(n) for n in sys.argv[sys.argv.index("--size") + 1 :][:2])]
+            part = sys.argv[sys.argv.index("--part") + 1] if "--part" in sys.argv else ""
             print(f"load {os.getloadavg()[0]:.1f} at the start, torch {torch.__version__}, {repeats} repeats\n")
-            forward(repeats)
-            methods(repeats)
-            backward(repeats)
-            spectra()
+            for table in (forward, methods, backward):
+                if part in ("", table.__name__):
+                    table(repeats)
+            if part in ("", "spectra"):
+                spectra()
             print(f"\nload {os.getloadavg()[0]:.1f} at the end")

@@ -2,7 +2,8 @@
 
     python tests/benchmarks/ship_demonstration.py mask.safetensors network.safetensors recipes/samples
 
-The relief becomes a grey picture of 12 bits, the weights become half floats.
+The relief becomes a grey picture of 12 bits that states the height of white and the pitch, the weights become half
+floats.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 LEVELS = 4096
+PITCH = "14.96 um"  #: of `optics: small`
 STEP = 16  #: of the 65 536 greys, between two levels
 
 
@@ -26,7 +29,10 @@ def mask(file: Path, out: Path) -> None:
     height = height - height.min()
     depth = float(height.max()) * (65535 / ((LEVELS - 1) * STEP))  # the depth that white stands for
     levels = (height / float(height.max()) * (LEVELS - 1)).round().numpy().astype(np.uint16) * STEP
-    Image.fromarray(levels).save(out / "demonstration_mask.png", optimize=True)
+    stated = PngInfo()
+    stated.add_text("depth", f"{depth * 1e6:.4f} um")
+    stated.add_text("pitch", PITCH)
+    Image.fromarray(levels).save(out / "demonstration_mask.png", optimize=True, pnginfo=stated)
     wrong = torch.from_numpy(levels.astype(np.float64)) * depth / 65535 - height
     print(
         f"doe.depth: {depth * 1e6:.4f} um; levels change the relief by {float(wrong.abs().max()) * 1e9:.2f} nm at most"

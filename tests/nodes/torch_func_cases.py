@@ -10,6 +10,7 @@ from safetensors.torch import save_file
 
 from neusee.nodes import calibrate, doe, optics, spectra
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba
+from neusee.nodes.restore._networks._informed import Informed
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
 from neusee.nodes.restore._networks._unet import UNet
@@ -124,6 +125,11 @@ def _networks(folder):
         "restore.fft_mamba": Case(
             "0", (single,), {"weights": saved(folder, "fft_mamba", partial(FFTMamba, **sizes)), **sizes}
         ),
+        "restore.informed": Case(
+            "0",
+            (WIDE_RAW, PSF, LIGHT, RESPONSES, BANDS, torch.zeros(3, 48, 48, dtype=torch.bool)),
+            {"weights": saved(folder, "informed", partial(Informed, 2)), "width": 2, "read_noise": 5.0},
+        ),
         "restore.nafnet": Case("0", (single,), {"weights": saved(folder, "nafnet", partial(NAFNet, 4)), "width": 4}),
         "restore.network": Case(
             "0",
@@ -187,6 +193,7 @@ CASES = {
     "flare.stray_shares": Case("0.intensity", (PSF, PSF, PUPIL), STRAY),
     "losses.background_loss": Case("0.intensity", (PSF, SCENE)),
     "losses.charbonnier": Case("0", (PICTURE, OTHER)),
+    "losses.log_error": Case("0", (PICTURE, OTHER)),
     "losses.contrast": Case("0.intensity", (WIDE,)),
     "losses.fft_l1": Case("0", (PICTURE, OTHER)),
     "losses.filtered_error": Case("0.intensity", (WIDE, LIGHT, RESPONSES, BANDS), SEEN),
@@ -244,6 +251,12 @@ CASES = {
     ),
     "restore.white_level": Case(
         "0", (RAW, torch.zeros(RAW.shape, dtype=torch.bool), PSF, BANDS, LIGHT, RESPONSES), WELL
+    ),
+    "restore.filter_facts": Case(
+        "0",
+        (WIDE_RAW, PSF, LIGHT, RESPONSES, BANDS, torch.zeros(3, 48, 48, dtype=torch.bool)),
+        {"read_noise": 5.0},
+        to=1e-3,
     ),
     "restore.wiener_problem": Case(
         "0",

@@ -23,6 +23,7 @@ from neusee.nodes.calibrate import (
     reduce,
     refuse_descriptor,
     spatial_series,
+    uncorrected,
 )
 from neusee.nodes.values import Levels
 from neusee.workflows.engine.runner import run
@@ -107,7 +108,7 @@ def _described(step: Step, scatter: Any) -> EmvaFrames:
     found = descriptor(file=files, scatter=scatter)
     series = [spatial_series(*each) for each in descriptor_series(files)]
     stacks = (Stack(name, light, time, scatter, frames) for name, light, time, frames in descriptor_frames(files))
-    return EmvaFrames(found, _nearest_half(series, found), 2, inspect_frames(stacks, exact=False))
+    return EmvaFrames(found, _nearest_half(series, found), 2, [*map(uncorrected, inspect_frames(stacks, exact=False))])
 
 
 def _reduced(recipe: Recipe, store: Store, steps: Sequence[Step], scatter: Any) -> EmvaFrames:
@@ -123,7 +124,7 @@ def _reduced(recipe: Recipe, store: Store, steps: Sequence[Step], scatter: Any) 
     pair = _dark_and_half([_of(step) for step in chosen], found)
     series = (spatial_series(*_of(chosen[i]), _frames(recipe, store, chosen[i])) for i in pair)
     stacks = (Stack(step.name, *_of(step), scatter, _frames(recipe, store, step)) for step in steps)
-    return EmvaFrames(found, _pair(series), min(counts), inspect_frames(stacks, exact=False))
+    return EmvaFrames(found, _pair(series), min(counts), [*map(uncorrected, inspect_frames(stacks, exact=False))])
 
 
 def _of(step: Step) -> tuple[float, float]:

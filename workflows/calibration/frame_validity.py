@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 
-from neusee.nodes.calibrate import FrameTest, Stack, coarse, descriptor_frames, inspect_frames
+from neusee.nodes.calibrate import (
+    Correction,
+    FrameTest,
+    Hidden,
+    Stack,
+    coarse,
+    corrections,
+    descriptor_frames,
+    inspect_frames,
+)
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration.log_posterior import SensorPosterior, only_step
 from neusee.workflows.calibration.model_spread import IntervalEstimate, ModelSpread
@@ -90,16 +98,28 @@ def frame_checks(tests: Sequence[FrameTest], given: bool = True) -> list[Check]:
     return found
 
 
+def hidden_checks(tests: Sequence[FrameTest], may_hide: Container[str]) -> list[Check]:
+    """Return what faults that the frames have or may hide change, as a check that cannot fail; none without frames."""
+    found = hidden_faults(tests, may_hide)
+    if not found:
+        return []
+    words = (f"{name} by {100 * x.mean:+.2g} % ± {100 * x.sd:.2g} %" for name, x in corrections(found).items() if x.sd)
+    faults = " and ".join(sorted({h.fault for h in found}))
+    bar = "more pixels hide less; a fault that the camera cannot have is `none` in the step of the priors"
+    return [Check(f"intervals include {faults}", f"{' and '.join(words)}, as the frames show or may hide", bar, "pass")]
+
+
 def _bar(test: FrameTest) -> str:
     return f"{abs(test.number):.3g}, {'at least' if test.limit < 0 else 'at most'} {abs(test.limit):.3g}"
 
 
 def frame_section(tests: Sequence[FrameTest]) -> Section:
     """Return the section of a calibration's page with the tests of its frames."""
-    text = """Each test asks if the frames are such as the likelihood describes. Modelled: the likelihood describes it.
+    text = """Each test asks if the frames are such as the likelihood describes. Modelled: the likelihood describes it,
+        or the posterior is corrected by what the frames show, with the uncertainty of this correction.
         Widened: the intervals include the error that may follow. Refused: the error may exceed 2 %, or is unknown.
         Numbers and limits of noise and patterns are in standard deviations of chance; all tests together fail for
-        frames without fault in about 1 % of all measurements (2 of 200)."""
+        frames without fault in less than 2 % of all measurements (1 of 400)."""
     if len(tests) < 2:
         text = "Only moments are given, so that noise, patterns and numbers of the frames are not tested."
     rows = [(t.name, abs(t.number), abs(t.limit), t.verdict, t.sentence) for t in tests]
@@ -112,6 +132,11 @@ def as_rows(tests: Iterable[FrameTest]) -> list[dict[str, Any]]:
     return [asdict(test) for test in tests]
 
 
+def hidden_faults(tests: Iterable[FrameTest], may_hide: Container[str]) -> list[Hidden]:
+    """Return the faults that change gain and noise: those that a test found, and those that ``may_hide`` from it."""
+    return [h for test in tests for h in test.hidden if test.verdict != "passed" or h.fault in may_hide]
+
+
 def relative_shifts(tests: Iterable[FrameTest]) -> dict[str, float]:
     """Return the relative standard deviations of gain and of dark noise in DN that the tests of frames leave open."""
     tests = list(tests)
@@ -119,15 +144,18 @@ def relative_shifts(tests: Iterable[FrameTest]) -> dict[str, float]:
 
 
 def widened(problem: SensorPosterior, chains: Chains, tests: Sequence[FrameTest], seed: int) -> Chains:
-    """Return the draws of a posterior with the errors that the tests of frames leave open, as independent noise.
+    """Return the draws of a posterior, changed by the faults that frames have or may hide, as independent draws.
 
-    An error of the gain changes all values in electrons inversely.
+    A change of the gain changes all values in electrons inversely.
     """
-    shifts = relative_shifts(tests)
-    if max(shifts.values()) < _SMALL:
+    hidden, shifts = hidden_faults(tests, problem.coordinates.prior.may_hide), relative_shifts(tests)
+    if not hidden and max(shifts.values()) < _SMALL:
         return chains
-    rng = np.random.default_rng(seed)
-    gain, noise = (torch.from_numpy(shifts[n] * rng.standard_normal(chains.log.shape)) for n in ("gain", "noise"))
+    generator, count = torch.Generator().manual_seed(seed), chains.log.size
+    drawn = [each.draw(count, generator) for each in hidden]
+    normal = torch.randn(2, count, generator=generator, dtype=torch.float64)
+    drawn.append((shifts["gain"] * normal[0], shifts["noise"] * normal[1]))
+    gain, noise = (torch.stack(each).sum(0).view(chains.log.shape) for each in zip(*drawn, strict=True))
     values = problem.parameters(chains.draws)
     if "gain" in values:
         values["gain"] = values["gain"] * gain.exp()
@@ -136,27 +164,30 @@ def widened(problem: SensorPosterior, chains: Chains, tests: Sequence[FrameTest]
     return replace(chains, draws=problem.theta(values))
 
 
-def widened_models(models: Iterable[ModelSpread], tests: Sequence[FrameTest]) -> list[ModelSpread]:
-    """Return the intervals to report with the errors that the tests of frames leave open."""
-    extra = widths_of_tests(tests)
-    return [replace(model, stated=wider(model.stated, extra.get(model.name, 0.0))) for model in models]
+def widened_models(
+    models: Iterable[ModelSpread], tests: Sequence[FrameTest], may_hide: Container[str]
+) -> list[ModelSpread]:
+    """Return the intervals to report with the changes by faults that frames have or may hide."""
+    change = changes_by_faults(tests, may_hide)
+    return [replace(m, stated=wider(m.stated, *reversed(change[m.name]))) if m.name in change else m for m in models]
 
 
-def widths_of_tests(tests: Iterable[FrameTest]) -> Mapping[str, float]:
-    """Return the relative standard deviation that the tests of frames leave open, by the parameter that it moves."""
-    shifts = relative_shifts(tests)
-    return {
-        "gain": shifts["gain"],
-        **{name: shifts["gain"] for name in _IN_ELECTRONS},
-        **{name: math.hypot(shifts["gain"], shifts["noise"]) for name in _NOISES},
-    }
+def changes_by_faults(tests: Iterable[FrameTest], may_hide: Container[str]) -> dict[str, Correction]:
+    """Return the change of the logarithm that faults of the frames cause or may cause, by the parameter."""
+    tests = list(tests)
+    found, shifts = corrections(hidden_faults(tests, may_hide)), relative_shifts(tests)
+    gain, noise = (Correction(found[n].mean, math.hypot(found[n].sd, shifts[n])) for n in ("gain", "noise"))
+    electrons = Correction(-gain.mean, gain.sd)
+    both = Correction(noise.mean - gain.mean, math.hypot(gain.sd, noise.sd))
+    return {"gain": gain, **dict.fromkeys(_IN_ELECTRONS, electrons), **dict.fromkeys(_NOISES, both)}
 
 
-def wider(interval: IntervalEstimate, shift: float) -> IntervalEstimate:
-    """Return an interval of a positive value with a further relative standard deviation."""
+def wider(interval: IntervalEstimate, shift: float, moved: float = 0.0) -> IntervalEstimate:
+    """Return an interval of a positive value with a further relative standard deviation, its logarithm ``moved``."""
     if shift < _SMALL:
         return interval
+    value = interval.value * math.exp(moved)
     factors = [
         math.exp(math.hypot(math.log(interval.value / end), Z_90 * shift)) for end in (interval.low, interval.high)
     ]
-    return IntervalEstimate(interval.value, interval.value / factors[0], interval.value * factors[1])
+    return IntervalEstimate(value, value / factors[0], value * factors[1])

@@ -9,7 +9,7 @@ import numpy as np
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration.importance_sampling import draw_samples, weights
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
+from neusee.workflows.calibration.posterior_mode import initial_theta, search_mode
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.distributions.joint import Z_90
 from neusee.workflows.store.result_store import Store
@@ -99,7 +99,7 @@ def _without(recipe: Recipe, weighing: str, terms: list[str]) -> Recipe:
 
 
 def _posterior(problem: SensorPosterior, rng: np.random.Generator) -> _Posterior:
-    mode = find_mode(problem, initial_theta(problem))
+    mode = search_mode(problem)
     if not mode.settled:
         raise ValueError(f"no posterior mode of {', '.join(problem.names)} was found: give narrower priors")
     samples, log = draw_samples(problem, mode, rng)

@@ -23,6 +23,7 @@ _STEP = 1e-3  #: step of a difference, in standard deviations of the coordinate
 _WIDEST = 1e3  #: standard deviation of a coordinate that nothing determines, so that a step stays a number
 _EDGE = 1e3  #: nats: a step of a difference that costs more crosses an edge
 _NARROWER = 0.5 ** np.arange(1, 12)  #: shares of the way from the middle of the prior to the guess
+_TRIED, _BEST, _HIGHER = 1000, 2, 1.0  #: draws of the prior, the best to start from, nats that count as higher
 _SHORT = 1e-7  #: step before any standard deviation is known: levels may determine a well to a part in a million
 
 
@@ -74,6 +75,41 @@ def _guessed(problem: SensorPosterior, believed: dict[str, float]) -> dict[str, 
     if isinstance(levels, Rings):
         return guess_scatter(levels, believed, params)
     return guess(levels, believed, params)
+
+
+def search_mode(problem: SensorPosterior) -> LaplaceFit:
+    """Search for the mode from the first guess and from draws of the prior, and return the highest that settles.
+
+    A posterior that may be long and bent is also returned without a settled mode: its samples do not start there.
+    Raises: `ValueError` if no search settles.
+    """
+    fits = [find_mode(problem, initial_theta(problem))]
+    for starts in (_TRIED, 4 * _TRIED):
+        drawn = problem.theta(problem.coordinates.draw(starts, torch.Generator().manual_seed(starts)))
+        drawn = drawn[np.isfinite(drawn).all(1)]
+        logs = problem.log_posterior(drawn)
+        best = [at for at in np.argsort(-logs)[:_BEST] if np.isfinite(logs[at])]
+        fits += [find_mode(problem, drawn[at]) for at in best]
+        settled = [fit for fit in fits if fit.settled]
+        if settled and max(fit.log for fit in fits) <= max(fit.log for fit in settled) + _HIGHER:
+            return max(settled, key=lambda fit: fit.log)
+    if problem.coordinates.bent:
+        return max(fits, key=lambda fit: fit.log)
+    raise ValueError(_unsettled(problem, fits))
+
+
+def _unsettled(problem: SensorPosterior, fits: list[LaplaceFit]) -> str:
+    best = max(fits, key=lambda fit: fit.log)
+    values = ", ".join(f"{name} {float(x):.3g}" for name, x in problem.parameters(best.theta).items())
+    well = (
+        ". If the well of this sensor ends the electrons before the read noise is added, set share: 0.7 in the step of "
+        "calibrate.sufficient"
+    )
+    return (
+        f"none of {len(fits)} searches ends at a mode of the posterior (the highest stops at {values}), so the model "
+        "does not describe these levels: run least_squares, and check levels, rounding and bits"
+        f"{well if 'full_well' in problem.coordinates.every else ''}"
+    )
 
 
 def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit:
@@ -139,7 +175,7 @@ def _sides(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> Flo
 def _slopes(problem: SensorPosterior, theta: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return derivatives of light levels and prior by coordinate; their Gram matrix is Fisher's information."""
     rows = _differences(lambda p: problem.likelihood(p).scaled.numpy(), theta, step, _sides(problem, theta, step))
-    rounded = problem.recipe.steps[problem.step].params.get("rounding") == "nearest"
+    rounded = problem.recipe.steps[problem.step].params.get("rounding") in ("nearest", "truncation")
     for name in problem.coordinates.edged.intersection(problem.names) if rounded else ():
         at = problem.names.index(name)  # levels depend on this parameter only at edges, where they have no derivative
         rows[:, at] = 0.0

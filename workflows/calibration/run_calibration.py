@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from neusee.nodes.calibrate import FrameTest, Rings
+from neusee.nodes.calibrate import FrameTest, Laboratory, Rings
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration.budget_page import COLUMNS, budget_document, budget_rows
 from neusee.workflows.calibration.calibration_budget import budgets
@@ -28,6 +28,7 @@ from neusee.workflows.calibration.frame_validity import (
     as_rows,
     frame_checks,
     frame_section,
+    hidden_checks,
     inspect_recipe,
     lines,
     widened,
@@ -45,7 +46,7 @@ from neusee.workflows.calibration.laboratory import (
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import compare_models
 from neusee.workflows.calibration.posterior_checks import arviz, checks, count_failures, importance_samples
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
+from neusee.workflows.calibration.posterior_mode import search_mode
 from neusee.workflows.calibration.standard_fit import compared
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
@@ -108,7 +109,7 @@ def find_posterior(
     laboratory = laboratory_of(recipe)
     tests = _accepted_frames(recipe, store, progress)
     problem = SensorPosterior.of(recipe, store)
-    mode = find_mode(problem, initial_theta(problem))
+    mode = search_mode(problem)
     identifiability = identify(problem, mode)
     if identifiability.refused:
         raise CalibrationRefused(identifiability.refused)
@@ -133,14 +134,26 @@ def find_posterior(
     models = compare_models(recipe, store, recipe.seed) if isinstance(problem.levels, Levels) else []
     tested = [
         *frame_checks(tests, not isinstance(problem.levels, Rings)),
+        *hidden_checks(tests, problem.coordinates.prior.may_hide),
         *checks(problem, mode, identifiability, chains, law),
     ]
-    unwidened = {name: float(x.std()) for name, x in problem.parameters(chains.draws).items()}
-    chains = with_laboratory(problem, widened(problem, chains, tests, recipe.seed), laboratory, recipe.seed)
-    models = with_laboratory_models(widened_models(models, tests), laboratory)
-    if is_relative(recipe):
-        identifiability = without_efficiency(identifiability)
-    result = CalibrationResult(problem, mode, identifiability, chains, tested, models, tests, unwidened)
+    return _widened(CalibrationResult(problem, mode, identifiability, chains, tested, models, tests), laboratory)
+
+
+def _widened(result: CalibrationResult, laboratory: Laboratory) -> CalibrationResult:
+    """Return a calibration with what the frames show or may hide, with what the laboratory states, and its budgets."""
+    problem, tests = result.problem, result.frames
+    told = result.identifiability
+    unwidened = {name: float(x.std()) for name, x in problem.parameters(result.chains.draws).items()}
+    chains = widened(problem, result.chains, tests, problem.recipe.seed)
+    models = widened_models(result.models, tests, problem.coordinates.prior.may_hide)
+    result = replace(
+        result,
+        identifiability=without_efficiency(told) if is_relative(problem.recipe) else told,
+        chains=with_laboratory(problem, chains, laboratory, problem.recipe.seed),
+        models=with_laboratory_models(models, laboratory),
+        unwidened=unwidened,
+    )
     return replace(result, budgets=budgets(result, laboratory))
 
 

@@ -59,6 +59,13 @@ def calibrate(
         folder = verbs.calibrate(
             recipe, store=store, out=out, command=command, progress=FewLines(quiet or as_json), **options
         )
+    _say_results(folder, quiet, as_json)
+    if is_folder:
+        _write_sensor(folder, recipe, store, target, quiet or as_json)
+
+
+def _say_results(folder: Path, quiet: bool, as_json: bool) -> None:
+    """Print a line for each parameter, and the folder; end the command with the reason if a check fails."""
     document = json.loads((folder / "posterior.json").read_text())
     if not quiet and not as_json:
         say(_lines(document["parameters"]))
@@ -66,8 +73,6 @@ def calibrate(
     if count := document["failed"]:
         wrong = "; ".join(f"{c['name']}: {c['found']}" for c in document["checks"] if c["mark"] == "fail")
         fail(f"not fit for use: {count} checks fail ({wrong}); see {folder / 'report.html'}", MISSED)
-    if is_folder:
-        _write_sensor(folder, recipe, store, target, quiet or as_json)
 
 
 def _target(sensor: str) -> Path | None:
@@ -82,12 +87,19 @@ def _target(sensor: str) -> Path | None:
 def _loaded(words: list[str] | None, store: Store) -> tuple[Recipe, list[str], bool]:
     """Return the recipe of a folder of frames or the named recipe, the command line, and True for a folder."""
     name, changes, _ = split(words)
-    if not Path(name).is_dir():
+    if not Path(name).is_dir() or _is_recipe(name):
         return *load(words, "calibrate"), False
     from neusee.workflows.frames.folder_recipe import recipe_of_folder
 
     with failing(ValueError, before="nothing was drawn: "), refusing():
         return recipe_of_folder(Path(name), store, changes), ["neusee", "calibrate", name, *changes], True
+
+
+def _is_recipe(name: str) -> bool:
+    """Return True for the name of a recipe, which counts before a folder of the same name."""
+    from neusee.workflows.recipe.loading import recipes
+
+    return name in {recipe.name for recipe in recipes()}
 
 
 def _write_sensor(results: Path, recipe: Recipe, store: Store, target: Path | None, quiet: bool) -> None:

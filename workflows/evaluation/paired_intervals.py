@@ -21,7 +21,7 @@ from neusee.workflows.evaluation.confidence_intervals import (
 )
 
 _DRAWS = 10_000  #: sets of photographs that the bootstrap draws
-_SMALL = 10  #: photographs below which neither end may lie nearer than that of Student's t distribution
+_SMALL = 30  #: photographs below which neither end may lie nearer than that of Student's t distribution
 _AT_ONCE = 500  #: sets in memory at once
 
 
@@ -30,7 +30,7 @@ def ratio(top: Numbers, bottom: Numbers, photographs: Numbers, seed: int) -> Int
 
     Args: top, bottom: (picture,) values of the same unit, or 1 as ``bottom`` for the mean of ``top``. photographs:
     (picture,) the number of the photograph of each picture. seed: of the draws.
-    The limits are NaN for fewer than five photographs. For fewer than ten each end is that of the bootstrap or of
+    The limits are NaN for fewer than five photographs. For fewer than thirty each end is that of the bootstrap or of
     Student's t distribution, whichever lies farther away, times the root of n/(n - 1), by which drawn sets of n
     photographs scatter too little; skewed photographs need both.
     Source: Davison and Hinkley, Bootstrap Methods and their Application (1997), section 5.2.1, studentized bootstrap.

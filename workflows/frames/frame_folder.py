@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 from neusee.nodes.calibrate import FrameHeader, frame_header
 from neusee.workflows.frames.frame_names import read_name
 from neusee.workflows.frames.frame_table import find_table, read_table
-from neusee.workflows.frames.odd_frames import odd_frames
+from neusee.workflows.frames.odd_frames import misplaced_frames
 
 SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr", ".fits", ".fit", ".fts")
 _SHOWN = 3  #: files that a message names
@@ -73,7 +73,7 @@ def find_levels(folder: Path) -> FolderLevels:
     levels = tuple(_named(groups))
     problems = [*_numbers(groups, levels, folder), *_light_problems(levels, light)]
     if not problems:
-        problems = list(odd_frames([(level.name, level.dark, level.files) for level in levels], folder))
+        problems = list(misplaced_frames([(level.name, level.dark, level.files) for level in levels], folder))
     if problems:
         raise FolderRefused("\n".join(problems))
     return FolderLevels(levels, light, source)

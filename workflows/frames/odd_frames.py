@@ -16,7 +16,7 @@ _CHANCE = 6.0  #: standard errors of a mean, added to the difference
 Files = tuple[str, bool, Sequence[Path]]  #: name of a level, True for a dark one, its files
 
 
-def odd_frames(levels: Sequence[Files], folder: Path) -> Iterator[str]:
+def misplaced_frames(levels: Sequence[Files], folder: Path) -> Iterator[str]:
     """Yield a sentence for each level whose frames differ too much in their means, or one if darks are not dark."""
     means = [[(file, *found) for file in files for found in frame_means(file)] for _, _, files in levels]
     middles = [float(np.median([mean for _, mean, _ in each])) for each in means]

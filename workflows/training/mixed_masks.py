@@ -59,7 +59,7 @@ class MixedMasks:
             number = first + i
             within = number % self._pool if self._pool and stage != HELD_OUT else number
             stream = self._streams[within % self.repeats]
-            yield i, stream(shared.seen, stage, number)
+            yield i, stream.turned(stream(shared.seen, stage, number), stage, number)
 
 
 Samples = TrainingStream | MixedMasks
@@ -96,4 +96,4 @@ def behind_each(recipe: Recipe, settings: Training) -> list[Recipe]:
 
 
 def _height_map(file: Path) -> Mapping[str, Any]:
-    return {"file": file, "scale": 0.1}
+    return {"file": file, "scale": 0.1, "between": "nearest"}  # a map may be wrapped, and has edges

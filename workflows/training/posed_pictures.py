@@ -1,8 +1,9 @@
-"""Training pictures of an unrolled filter: the problem of the filter is posed and solved once for each picture.
+"""Training pictures of a network that needs what the Wiener filter knows: the filter is solved once for each picture.
 
-The network `unrolled` needs the PSF, the glare, the clipped pixels and the noise of a picture. The recipe gives them to
-the step of the filter, whose result `train.picture` converts to colours. In the training the node of this step is
-`restore.wiener_problem`, with the same inputs, so that the answer of the filter is the input of the network.
+The networks `unrolled` and `informed` need the PSF, the glare, the clipped pixels and the noise of a picture. The
+recipe gives them to the step of the filter, whose result `train.picture` converts to colours. In the training the node
+of this step is `restore.wiener_problem` or `restore.filter_facts`, with the same inputs, so that the answer of the
+filter is the input of the network.
 """
 
 from __future__ import annotations
@@ -15,12 +16,15 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import restore
-from neusee.nodes.values import WienerProblem
+from neusee.nodes.scene import symmetry
+from neusee.nodes.values import FilterFacts, WienerProblem
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.recipe.blocks.train_block import KEY, Training
+from neusee.workflows.recipe.blocks.train_block import KEY, POSED, Training
 
-Given = tuple[()] | tuple[WienerProblem, Tensor]  #: nothing, or the problem of the filter and the colour matrix
-_FILTERS = ("restore.wiener", "restore.unrolled")
+Posed = WienerProblem | FilterFacts
+Given = tuple[()] | tuple[Posed, Tensor]  #: nothing, or what the filter poses and knows, and the colour matrix
+_FILTERS = ("restore.wiener", "restore.unrolled", "restore.informed")
+_KNOWN: dict[str, Any] = {"unrolled": restore.wiener_problem, "informed": restore.filter_facts}
 _PARAMETERS = ("balance", "doubt", "least_doubt", "read_noise")
 
 
@@ -30,25 +34,27 @@ class PosedPictures:
 
     filter: str
     matrix: str
+    kind: str = "unrolled"  #: of the network
 
     @classmethod
     def of(cls, recipe: Recipe, settings: Training) -> PosedPictures | None:
-        """Return the steps of a training of the network unrolled, or None for every other network.
+        """Return the steps of a training of such a network, or None for every other network.
 
         Raises ValueError if the picture of the training is not that of the Wiener filter.
         """
-        if settings.network.architecture is not None or settings.network.kind != "unrolled":
+        kind = settings.network.kind
+        if settings.network.architecture is not None or kind not in POSED:
             return None
         shown = recipe.steps[settings.picture]
         channels, matrix = (str(shown.wires.get(name)) for name in ("channels", "matrix"))
         if shown.node.path != "restore.colour" or recipe.steps[channels].node.path not in _FILTERS:
             given = recipe.config.settings.get(f"{KEY}.picture")
             text = (
-                f"{settings.picture} is {shown.node.path}, and the network unrolled starts from the Wiener filter: use "
+                f"{settings.picture} is {shown.node.path}, and the network {kind} starts from the Wiener filter: use "
                 f"restore: wiener and {KEY}.picture: restored"
             )
             raise ValueError(f"{given.source if given else recipe.name}   {KEY}.picture   {text}")
-        return cls(channels, matrix)
+        return cls(channels, matrix, kind)
 
     @property
     def steps(self) -> tuple[str, str]:
@@ -59,29 +65,39 @@ class PosedPictures:
         """Return the recipe whose filter poses the problem and solves it."""
         step = recipe.steps[self.filter]
         params = {name: value for name, value in step.params.items() if name in _PARAMETERS}
-        posed = replace(step, node=restore.wiener_problem, params=params)
+        posed = replace(step, node=_KNOWN[self.kind], params=params)
         return replace(recipe, steps={**recipe.steps, self.filter: posed})
 
-    def read(self, values: Mapping[str, Any], dtype: torch.dtype) -> tuple[Tensor, tuple[WienerProblem, Tensor]]:
+    def read(self, values: Mapping[str, Any], dtype: torch.dtype) -> tuple[Tensor, Given]:
         """Return the picture of the filter (3, y, x), and what the network needs beside it in the given precision.
 
         The filter solves small pictures in float64; the steps of a training take half the time in float32.
         """
-        problem, matrix = values[self.filter], values[self.matrix]
-        told: Tensor = restore.colour(problem.answer * problem.scale + problem.mean, matrix)
-        return told, (WienerProblem._make(part.to(dtype) for part in problem), matrix.to(dtype))
+        posed, matrix = values[self.filter], values[self.matrix]
+        told: Tensor = restore.colour(posed.answer * posed.scale + posed.mean, matrix)
+        return told, (posed._make(part.to(dtype) for part in posed), matrix.to(dtype))
 
 
 def tensors_of(given: Given) -> dict[str, Tensor]:
     """Return the tensors by name of what a network needs beside a picture."""
     if not given:
         return {}
-    problem, matrix = given
-    return {**{f"given.{name}": x for name, x in problem._asdict().items()}, "given.matrix": matrix}
+    posed, matrix = given
+    return {**{f"given.{name}": x for name, x in posed._asdict().items()}, "given.matrix": matrix}
 
 
 def given_of(tensors: Mapping[str, Tensor]) -> Given:
     """Return what a network needs beside a picture, from its tensors by name."""
     if "given.matrix" not in tensors:
         return ()
-    return WienerProblem(**{name: tensors[f"given.{name}"] for name in WienerProblem._fields}), tensors["given.matrix"]
+    kind = FilterFacts if "given.maps" in tensors else WienerProblem
+    return kind(**{name: tensors[f"given.{name}"] for name in kind._fields}), tensors["given.matrix"]
+
+
+def turned(given: Given, seed: tuple[int, ...]) -> Given:
+    """Turn the maps that a network sees beside a picture, as `scene.symmetry` turns the picture with the same seed."""
+    known = given[0] if given else None
+    if not given or not isinstance(known, FilterFacts):
+        return given
+    seen = {name: symmetry(getattr(known, name), seed) for name in ("answer", "deviation", "maps")}
+    return known._replace(**seen), given[1]

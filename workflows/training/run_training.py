@@ -33,8 +33,8 @@ from neusee.workflows.training.training_key import key_of_training
 from neusee.workflows.training.training_page import write_page
 from neusee.workflows.training.warm_start import WarmStart
 
-_COLUMNS = ("stage", "iteration", "LSR", "BSR", "L1", "reconstruction", "adversarial", "critics", "penalty", "slope",
-            "rate", *held_out.COLUMNS, "seconds")  # fmt: skip
+_COLUMNS = ("stage", "iteration", "LSR", "BSR", "L1", "reconstruction", "decibels", "adversarial", "critics", "penalty",
+            "slope", "rate", *held_out.COLUMNS, "seconds")  # fmt: skip
 
 
 def train(

@@ -16,6 +16,7 @@ from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.doe import PARAMETRISATIONS
 from neusee.nodes.restore import (
     FFTMamba,
+    Informed,
     NAFNet,
     OwnNetwork,
     Restorer,
@@ -168,7 +169,7 @@ class Learner:
     def _names(self) -> list[str]:
         """Return the names of the losses in the present training stage, in the same order in every process."""
         weights = {"BSR": self.stage.bsr, "reconstruction": self.stage.reconstruction,
-                   "adversarial": self.stage.adversarial}  # fmt: skip
+                   "decibels": self.stage.decibels, "adversarial": self.stage.adversarial}  # fmt: skip
         return [*(["LSR"] if self.learns else []), "L1", *(name for name, weight in weights.items() if weight)]
 
     def _mask_suppression(self, shared: Shared, samples: Samples) -> Losses:
@@ -206,6 +207,8 @@ class Learner:
             terms["BSR"] = (self.stage.bsr, (1.0 / sample.light.clamp_min(1e-30)).sum())
         if self.stage.reconstruction:
             terms["reconstruction"] = (self.stage.reconstruction, sum(self._errors(estimate, truth), zero))
+        if self.stage.decibels:
+            terms["decibels"] = (self.stage.decibels, losses.log_error(estimate.fine, truth.fine))
         if self.stage.adversarial:
             scores = (-critic(e).mean() for critic, e in zip(self.critics, estimate, strict=True))
             terms["adversarial"] = (self.stage.adversarial, sum(scores, zero))
@@ -269,4 +272,6 @@ def _network_of(network: Network) -> Restorer:
         return FFTMamba(network.width, **network.options)
     if network.kind == "unrolled":
         return Unrolled(network.width, network.steps)
+    if network.kind == "informed":
+        return Informed(network.width)
     return UNet(network.width) if network.kind == "unet" else NAFNet(network.width)

@@ -39,6 +39,9 @@ def key_of_training(
         usual |= {"held_out", "held_out_pictures", "validate_every", "patience"}
     without = {*_WITHOUT_EFFECT, "start", *usual}
     block = settings.model_copy(update={"keep": 1, "show": 1}).model_dump(mode="json", exclude=without)
+    for stage in block["stages"].values():
+        if not stage["decibels"]:
+            del stage["decibels"]
     block["network"] = _identity(settings.network, code)
     if settings.masks:
         block["masks"] = [x if x == FLAT else hashlib.sha256(Path(x).read_bytes()).hexdigest() for x in settings.masks]

@@ -30,7 +30,7 @@ from neusee.workflows.training.parallel.band_shards import Shards
 from neusee.workflows.training.parallel.picture_rounds import Pictures
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.posed_pictures import Given, PosedPictures, given_of, tensors_of
+from neusee.workflows.training.posed_pictures import Given, PosedPictures, given_of, tensors_of, turned
 from neusee.workflows.training.stored_pool import StoredPool
 from neusee.workflows.training.training_recipe import frame_of, in_precision, require_steps
 
@@ -181,19 +181,19 @@ class TrainingStream:
             mine = together[self.mesh.column] if self.mesh.column < len(together) else None
             if not self._each.by_band:
                 if mine is not None:
-                    yield mine, self._turned(self(shared.seen, stage, first + mine), stage, first + mine)
+                    yield mine, self.turned(self(shared.seen, stage, first + mine), stage, first + mine)
                 continue
             key = (stage, *(self._number(stage, first + i) for i in together))
             if key in self._rounds:  # in the memory of all processes, or of none
                 if mine is not None:
-                    yield mine, self._turned(self._rounds[key], stage, first + mine)
+                    yield mine, self.turned(self._rounds[key], stage, first + mine)
                 continue
             begun = {i: self._drawn(stage, number) for i, number in zip(together, key[1:], strict=True)}
             parts = {i: (theta, noise) for i, (theta, noise, _) in begun.items()}
             with self._each.together(shared, parts, mine) as values:
                 sample = _NOTHING if mine is None else self._sample(values, begun[mine][2])
                 if mine is not None:
-                    yield mine, self._turned(sample, stage, first + mine)
+                    yield mine, self.turned(sample, stage, first + mine)
             if self._pool is not None and stage != HELD_OUT:
                 self._rounds[key] = sample
 
@@ -210,12 +210,13 @@ class TrainingStream:
         """Return the number of a picture within its pool; held-out pictures have no pool."""
         return number % (self._pool or _SEEDS) if stage != HELD_OUT else number
 
-    def _turned(self, sample: Sample, stage: int, number: int) -> Sample:
+    def turned(self, sample: Sample, stage: int, number: int) -> Sample:
         """Turn a pooled picture and the true picture together, each time otherwise: as behind a mask that is turned."""
         if self._pool is None or stage == HELD_OUT or self.settings.augment.pooled == "none":
             return sample
         seed = (self.seed, stage, number, 4)
-        return replace(sample, picture=symmetry(sample.picture, seed), truth=symmetry(sample.truth, seed))
+        picture, truth = symmetry(sample.picture, seed), symmetry(sample.truth, seed)
+        return replace(sample, picture=picture, truth=truth, given=turned(sample.given, seed))
 
     def _scene(self, stage: int, number: int) -> Tensor:
         """Return the scene of a picture (3, y, x), with the changes of ``train.augment``."""

@@ -34,6 +34,7 @@ _STEP = 0.1  #: standard uncertainties of an input, half the step of a derivativ
 _SCALE = 1e-4  #: half the step of a derivative by the photons, relative
 _NOTHING = 1e-6  #: share of a value below which a change is rounding
 _HALF = 0.5 * SENSITIVITY  #: share of saturation up to which the second model fits its lines
+_BENT = 2.0  #: change of a slope from 70 % of saturation to no light, over that from 70 to 35 %, if it is proportional
 #: by key of the sheet: the parameter of `camera` whose temperature coefficient counts, and its sign
 _COEFFICIENTS = {
     "K": ("gain", 1.0),
@@ -164,8 +165,10 @@ def sheet_budgets(levels: Levels, sheet: EmvaSheet, laboratory: Laboratory, phot
     """Return the uncertainty budget of each quantity of a sheet that has a value and no mere limit.
 
     Derivatives are central differences of the whole sheet. The sources are the sampling of means and variances, the
-    scatter of the light from level to level, which the deviations from the line of linearity give, the model of the
-    response, by half the distance to the sheet with lines up to 35 % of saturation, and what ``laboratory`` states.
+    scatter of the light from level to level, which the deviations from the line of linearity give, the spacing of the
+    levels, the model of the response, and what ``laboratory`` states. For the model the lines are fitted up to 35 % of
+    saturation too. A slope that changes in proportion to the range changes twice as much down to no light, and the
+    quantity may lie anywhere within that.
 
     Shapes: levels (level,).
     Units:  those of each quantity.
@@ -213,7 +216,7 @@ def _of_levels(q: Quantity, moves: _Propagation) -> Iterator[Contribution]:
     elif abs(other - q.value) <= _NOTHING * abs(q.value):
         yield Contribution(MODEL, "B", reason=NOT_INVOLVED)
     else:
-        yield Contribution(MODEL, "B", "two points", abs(other - q.value) / 2, q.unit)
+        yield Contribution(MODEL, "B", "rectangular", _BENT * abs(other - q.value) / math.sqrt(3), q.unit)
 
 
 def _of_lamp(sensitivity: float, value: float, moves: _Propagation) -> Contribution:

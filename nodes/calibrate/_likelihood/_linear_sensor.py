@@ -9,11 +9,16 @@ import torch
 from torch import Tensor
 from torch.special import log_ndtr, ndtr
 
-from neusee.nodes.calibrate._likelihood._quantised_gaussian import Rounding, log_cell
+from neusee.nodes.calibrate._likelihood._quantised_gaussian import log_cell
 from neusee.nodes.calibrate._likelihood._sufficient_statistics import Sufficient
+from neusee.nodes.sensor._digitization import Rounding
 
 #: for each kind of rounding, the shift of the mean, DN, and the added variance, DN2
-ROUNDED: dict[str, tuple[float, float]] = {"nearest": (0.0, 1.0 / 12.0), "dithered_floor": (-0.5, 1.0 / 6.0)}
+ROUNDED: dict[str, tuple[float, float]] = {
+    "nearest": (0.0, 1.0 / 12.0),
+    "truncation": (-0.5, 1.0 / 12.0),
+    "dithered_floor": (-0.5, 1.0 / 6.0),
+}
 _FEW = 8.0  #: electrons; up to this mean, coarse levels sum over the number of electrons
 _GRAIN = 1e-3  #: share of the variance above which the discreteness of electrons matters
 _MOST = 40  #: electrons; with a mean of _FEW, only 1e-15 of all pixels hold more
@@ -72,7 +77,7 @@ def likelihood(levels: Sufficient, sensor: Sensor, rounding: Rounding, bits: int
     )
     rows = [_scaled(levels, mean, variance).where(measured.repeat(2), 0.0)]
     rows.append(2.0 * (_pixels(levels)[levels.cell_level] * cells.exp()).sqrt())
-    if rounding == "nearest":  # the well lies anywhere within one number, 1 DN wide
+    if rounding != "dithered_floor":  # the well lies anywhere within one number, 1 DN wide
         rows.append(math.sqrt(12.0) * sensor.well * _cut_off(levels, signal, sensor, top))
     return Likelihood(total, deviance, freedom, torch.cat(rows, -1), mean, variance)
 

@@ -6,13 +6,13 @@ Numbers are not treated as continuous, and no quantization variance is added.
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.special import log_ndtr
 
-Rounding = Literal["nearest", "dithered_floor"]
+from neusee.nodes.sensor._digitization import Rounding
+
 _LEAST = 1e-300  #: probability below which a probability counts as 0
 
 
@@ -21,13 +21,17 @@ def log_cell(value: Tensor, mean: Tensor, sd: Tensor, well: Tensor, rounding: Ro
 
     Shapes: all broadcast.
     Units:  DN; ``well`` is the signal of a full pixel, the largest signal; ``top`` the largest number of the converter.
-    Error:  `nearest` 1e-13 of the logarithm; `dithered_floor` 1e-15 sd**2 of the probability.
-    Source: s = round(x) or floor(x + U(-1/2, 1/2)); NeuSee, Eq. (SensorImage).
+    Error:  `nearest` and `truncation` 1e-13 of the logarithm; `dithered_floor` 1e-15 sd**2 of the probability.
+    Source: s = round(x), floor(x), or floor(x + U(-1/2, 1/2)); NeuSee, Eq. (SensorImage).
     """
     if rounding == "nearest":
         low = torch.where(value <= 0, -math.inf, value - 0.5)
         high = torch.where((value >= top) | (value + 0.5 >= well), math.inf, value + 0.5)
         return torch.where(low < well, _between(low, high, mean, sd), -math.inf)
+    if rounding == "truncation":
+        low = torch.where(value <= 0, -math.inf, value)
+        high = torch.where((value >= top) | (value + 1.0 > well), math.inf, value + 1.0)
+        return torch.where(low <= well, _between(low, high, mean, sd), -math.inf)
     probability = _dithered(value, mean, sd, well, top)
     return torch.where(probability > _LEAST, probability.clamp_min(_LEAST).log(), -math.inf)
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
+from neusee.nodes.calibrate._emva_fit import Share
 from neusee.nodes.values import Levels
 
 _EDGE = 4  #: DN from either end that keep a histogram: a full well affects two or three numbers
@@ -30,17 +31,22 @@ class Sufficient(NamedTuple):
 
 
 @node(rtol=1e-9)
-def sufficient(levels: Levels) -> Sufficient:
+def sufficient(levels: Levels, *, share: Share | None = None) -> Sufficient:
     """Replace the middle of each light level's histogram by mean and variance, and keep the counts near both ends.
 
     Between the ends numbers count as continuous, and mean and variance are sufficient; at a full well every single
-    number carries information. A level with a standard deviation below 0.8 DN keeps its whole histogram.
+    number carries information. A level with a standard deviation below 0.8 DN keeps its whole histogram. ``share``
+    leaves out the levels above this share of saturation, which is taken at the lit level of the greatest variance. Give
+    0.7 for a sensor whose well ends the electrons before the read noise is added: `density` ends the sum of both, as
+    the paper prints, and cannot describe its saturated levels.
 
     Shapes: levels (level,), cells (cell,) -> the same, with at most ten cells for a level that is not coarse.
     Units:  those of `Levels`.
     Error:  1e-12 of the moments. The pixels of a histogram are assumed alike.
+    Raises: ValueError for a ``share`` without a lit level.
     Source: Fisher, Phil. Trans. R. Soc. A 222, 309 (1922), sufficiency.
     """
+    levels = levels if share is None else _below(levels, share)
     moments = torch.stack([levels.pixels, levels.mean, levels.variance, levels.degrees_of_freedom], 1)
     kept = torch.ones(len(levels.cell_level), dtype=torch.bool)
     for level in sorted(set(levels.cell_level.tolist())):
@@ -53,7 +59,7 @@ def sufficient(levels: Levels) -> Sufficient:
 
 
 @sufficient.check
-def _(result: Sufficient, *inputs: Levels) -> list[Check]:
+def _(result: Sufficient, *inputs: Levels, **params: Any) -> list[Check]:
     counted = len(set(result.cell_level.tolist()))
     return [
         Check(f"{len(result.mean)} light levels, {counted} with a histogram, {len(result.cell_level)} histogram bins")
@@ -61,7 +67,8 @@ def _(result: Sufficient, *inputs: Levels) -> list[Check]:
 
 
 @sufficient.reference
-def _(levels: Levels) -> Sufficient:
+def _(levels: Levels, *, share: float | None = None) -> Sufficient:
+    levels = levels if share is None else _below(levels, share)
     cells = list(zip(levels.cell_level.tolist(), levels.cell_value.tolist(), levels.cell_count.tolist(), strict=True))
     rows = torch.stack([levels.pixels, levels.mean, levels.variance, levels.degrees_of_freedom], 1).tolist()
     left = []
@@ -81,6 +88,20 @@ def _(levels: Levels) -> Sufficient:
     cell = torch.tensor(left, dtype=torch.float64).reshape(-1, 3).unbind(1)
     numbers, mean, variance, freedom = torch.tensor(rows, dtype=torch.float64).unbind(1)
     return Sufficient(levels.photons, levels.exposure, numbers, mean, variance, freedom, cell[0].long(), *cell[1:])
+
+
+def _below(levels: Levels, share: float) -> Levels:
+    """Return the dark levels, and the lit levels up to a share of saturation."""
+    lit = levels.photons > 0
+    if not bool(lit.any()):
+        raise ValueError("there are no lit levels, so saturation is unknown: leave out share, or give lit levels")
+    dark = float(levels.mean[~lit].min()) if bool((~lit).any()) else 0.0
+    full = float(levels.mean[lit][levels.variance[lit].argmax()]) - dark
+    kept = ~lit | (levels.mean - dark <= share * full)
+    number, cells = kept.cumsum(0) - 1, kept[levels.cell_level]
+    each = [x[kept] for x in levels[:6]]
+    counts = (number[levels.cell_level[cells]], levels.cell_value[cells], levels.cell_count[cells])
+    return Levels._make([*each, *counts])
 
 
 def _inner(value: Tensor, count: Tensor, sd: float) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.calibrate._prior._free_parameters import Factor, Free, Positive, Prior, believed, freed
+from neusee.nodes.calibrate._prior._free_parameters import FAULTS, Factor, Free, Known, Positive, Prior, believed, freed
 from neusee.nodes.sensor._saturation import Efficiency
 from neusee.nodes.units import Electrons, Gain, Real
 
@@ -31,11 +31,15 @@ def camera_prior(
     drift: tuple[Positive, Factor] | None = None,
     bend: tuple[Real, Positive] | None = None,
     twist: tuple[Real, Positive] | None = None,
+    mixing: Known = "unknown",
+    lag: Known = "unknown",
 ) -> Prior:
     """Collect the priors of the free parameters of a camera; a parameter without a prior is held at a fixed value.
 
     A prior is a median and a factor: [0.37, 2] means half to twice the median with a probability of two thirds. The
-    priors of the dark signal and of the two terms of the response are a mean and a standard deviation.
+    priors of the dark signal and of the two terms of the response are a mean and a standard deviation. Mixing of
+    neighbouring pixels and lag between frames are `none` for a camera that is known to have neither; else intervals
+    include what of both may hide in the frames.
 
     Shapes: -> (10,).
     Units:  those of `camera`.
@@ -45,10 +49,11 @@ def camera_prior(
     """
     dark = (dark_signal, temporal_dark_noise, dark_current)
     pairs = (gain, quantum_efficiency, *dark, scatter, lamp, drift, bend, twist)
-    return believed(dict(zip(CAMERA_NAMES, pairs, strict=True)), _LINEAR)
+    return believed(dict(zip(CAMERA_NAMES, pairs, strict=True)), _LINEAR, mixing=mixing, lag=lag)
 
 
-CAMERA_NAMES = tuple(inspect.signature(camera_prior.fn).parameters)  #: the parameters of `camera` that may be free
+#: the parameters of `camera` that may be free
+CAMERA_NAMES = tuple(n for n in inspect.signature(camera_prior.fn).parameters if n not in FAULTS)
 
 
 @camera_prior.check

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, ClassVar, NamedTuple, Self
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import torch
 from pydantic import Field
@@ -15,6 +15,8 @@ from torch import Tensor
 Factor = Annotated[float, Field(gt=1, allow_inf_nan=False)]  #: one standard deviation of the logarithm, as a ratio
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Pair = tuple[float, float]
+Known = Literal["unknown", "none"]  #: what is known of a fault of the frames before any frame
+FAULTS = ("mixing", "lag", "pattern")  #: faults that may hide in frames: each changes the variance in proportion
 
 
 class Ridge(NamedTuple):
@@ -30,18 +32,26 @@ class Prior(NamedTuple):
 
     centre: Tensor  #: (parameter,) float64, mean of the logarithm, or of a linear parameter itself
     width: Tensor  #: (parameter,) float64, standard deviation of the same quantity
+    hidden: Tensor = torch.ones(len(FAULTS), dtype=torch.float64)  #: 1 for each of `FAULTS` that may hide, 0 for none
+
+    @property
+    def may_hide(self) -> tuple[str, ...]:
+        """Return the names of the faults that may hide in the frames."""
+        return tuple(fault for fault, may in zip(FAULTS, self.hidden.tolist(), strict=True) if may)
 
 
-def believed(pairs: Mapping[str, Pair | None], linear: frozenset[str]) -> Prior:
+def believed(pairs: Mapping[str, Pair | None], linear: frozenset[str], **known: Known) -> Prior:
     """Build a prior from a pair of numbers for each free parameter, and None for each fixed parameter.
 
-    The pair is median and factor, or mean and standard deviation for a parameter in ``linear``.
+    The pair is median and factor, or mean and standard deviation for a parameter in ``linear``. A fault of the frames
+    that is ``known`` to be "none" cannot hide in them.
     """
     normals = [_normal(name, pair, name in linear) for name, pair in pairs.items()]
     if all(math.isnan(width) for _, width in normals):
         raise ValueError(f"no parameter is free: give a prior of at least one of {', '.join(pairs)}")
     centre, width = torch.tensor(normals, dtype=torch.float64).unbind(1)
-    return Prior(centre, width)
+    hidden = [float(known.get(fault, "unknown") == "unknown") for fault in FAULTS]
+    return Prior(centre, width, torch.tensor(hidden, dtype=torch.float64))
 
 
 def freed(names: tuple[str, ...], prior: Prior) -> tuple[str, ...]:
@@ -108,4 +118,4 @@ class Free:
     @cached_property
     def _normals(self) -> Prior:
         free = self.prior.width.isfinite()
-        return Prior(self.prior.centre[free], self.prior.width[free])
+        return Prior(self.prior.centre[free], self.prior.width[free], self.prior.hidden)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.calibrate._prior._free_parameters import Factor, Free, Positive, Prior, believed, freed
+from neusee.nodes.calibrate._prior._free_parameters import FAULTS, Factor, Free, Known, Positive, Prior, believed, freed
 from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.units import Electrons, Gain
 
@@ -29,11 +29,16 @@ def prior(
     full_well: tuple[Well, Factor] | None = None,
     quantum_efficiency: tuple[Efficiency, Factor] | None = None,
     spread: tuple[Positive, Factor] | None = None,
+    mixing: Known = "unknown",
+    lag: Known = "unknown",
+    pattern: Known = "unknown",
 ) -> Prior:
     """Collect the priors of the free parameters of a sensor; a parameter without a prior is held at a fixed value.
 
     A prior is a median and a factor: [0.37, 2] means half to twice the median with a probability of two thirds. The
-    prior of the offset is a mean and a standard deviation.
+    prior of the offset is a mean and a standard deviation. Mixing of neighbouring pixels, lag between frames and
+    patterns of unequal pixels are `none` for a sensor that is known to have none of it, such as a simulated one; else
+    intervals include what may hide in the frames.
 
     Shapes: -> (7,).
     Units:  those of `density`.
@@ -42,10 +47,11 @@ def prior(
     Source: log-normal and normal distributions.
     """
     pairs = (gain, offset, read_noise, dark_current, full_well, quantum_efficiency, spread)
-    return believed(dict(zip(NAMES, pairs, strict=True)), frozenset({_LINEAR}))
+    return believed(dict(zip(NAMES, pairs, strict=True)), frozenset({_LINEAR}), mixing=mixing, lag=lag, pattern=pattern)
 
 
-NAMES = tuple(inspect.signature(prior.fn).parameters)  #: the parameters of `density` that may be free
+#: the parameters of `density` that may be free
+NAMES = tuple(n for n in inspect.signature(prior.fn).parameters if n not in FAULTS)
 
 
 @prior.check

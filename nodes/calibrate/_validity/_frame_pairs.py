@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from neusee.nodes.calibrate._frames._frame_statistics import Scatter, histogram
+from neusee.nodes.calibrate._validity._hidden_faults import Correction, Hidden, corrections
 
 Verdict = Literal["passed", "modelled", "widened", "refused"]
 ALARM = 1e-3  #: probability with which chance alone fails one test of a whole measurement
@@ -79,6 +80,7 @@ class FrameTest:
     verdict: Verdict
     sentence: str
     shifts: Mapping[str, float] = field(default_factory=dict)  #: relative errors of "gain" and "noise" that may follow
+    hidden: tuple[Hidden, ...] = ()  #: faults of which the frames tell a size, which corrects gain and noise
 
 
 class Evidence(NamedTuple):
@@ -107,6 +109,11 @@ def prepared(stack: Stack) -> Level:
     return Level(
         stack, first, second, apart, means[1 : 2 * pairs : 2] - means[: 2 * pairs : 2], variance, mean, value, count
     )
+
+
+def without_lines(x: Tensor) -> Tensor:
+    """Return frames (frame, y, x) without the means of their rows and columns."""
+    return x - x.mean(2, keepdim=True) - x.mean(1, keepdim=True) + x.mean((1, 2), keepdim=True)
 
 
 def _window(frames: Tensor) -> Tensor:
@@ -164,3 +171,26 @@ def outcome(
     verdict: Verdict = "refused" if worst > REFUSED else "widened"
     means = f"an error of {100 * worst:.2g} % may follow" if math.isfinite(worst) else "no model describes such frames"
     return FrameTest(name, evidence.strength, evidence.limit, verdict, f"{sentence}: {means}", shifts)
+
+
+def corrected(name: str, evidence: Evidence, hidden: Sequence[Hidden], sentence: str, passed: str) -> FrameTest:
+    """Return the result of a test whose fault is corrected: refused where the correction is uncertain by over 2 %."""
+    change = corrections(hidden)
+    worst = max(change.values(), key=lambda x: x.sd, default=Correction(0.0, 0.0))
+    verdict: Verdict = "passed"
+    text = f"{passed}; the frames may hide {100 * worst.sd:.2g} %" if hidden else passed
+    if evidence.found:
+        verdict = "modelled" if worst.sd <= REFUSED else "refused"
+        words = [f"{what} by {100 * x.mean:+.2g} % ± {100 * x.sd:.2g} %" for what, x in change.items() if x.sd]
+        text = f"{sentence}: corrected, {' and '.join(words)}" if verdict == "modelled" else ""
+        text = text or f"{sentence}: an error of {100 * max(abs(x.mean) for x in change.values()):.2g} % may follow"
+    return FrameTest(name, evidence.strength, evidence.limit, verdict, text, hidden=tuple(hidden))
+
+
+def uncorrected(test: FrameTest) -> FrameTest:
+    """Return the result of a test for a program that corrects no fault: a fault that was found shifts its results."""
+    if not test.hidden or test.verdict != "modelled":
+        return test
+    worst = max(abs(change.mean) + change.sd for change in corrections(test.hidden).values())
+    text = f"{test.sentence.partition(': corrected')[0]}: an error of {100 * worst:.2g} % may follow"
+    return replace(test, verdict="refused" if worst > REFUSED else "widened", sentence=text)

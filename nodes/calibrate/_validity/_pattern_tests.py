@@ -13,35 +13,34 @@ from neusee.nodes.calibrate._validity._frame_pairs import (
     Evidence,
     FrameTest,
     Level,
+    corrected,
     outcome,
     strongest,
     studentised,
 )
+from neusee.nodes.calibrate._validity._hidden_faults import Hidden
+from neusee.nodes.calibrate._validity._lag_test import lag
 
 _BLOCKS = 8  #: blocks of a frame on a side, whose means show how even the light is
 _EVEN = 0.03  #: difference of the largest and least irradiance that EMVA 1288 allows, relative to the mean
-_RARE = 4.5  #: standard deviations beyond which a pixel is defective, and left out of the test of lag
-_FAR = 2.0  #: largest share of a neighbouring level in the pattern of a level
+_UNLIKE = 0.01  #: scale of the prior of the share of the variance that is of patterns
 _NOISE = 8.0  #: standard errors by which the means of the brightest and the darkest block differ by chance
 
 
 def pattern_tests(levels: Sequence[Level]) -> list[FrameTest]:
     """Test frames of the same light for fixed patterns, for lag, and for uneven light.
 
-    The covariance of two frames of a level is that of the patterns that stay. Lag adds to it, in proportion to the
-    temporal variance: the pattern of a level is interpolated from the frames of its two neighbours and subtracted,
-    which leaves independent noise in both frames, unless the first frame persists in the second.
+    The covariance of two frames of a level is that of the patterns that stay.
 
     Shapes: a list of levels -> a list of tests.
     Units:  numbers and limits in standard deviations of chance, and the difference of the light as a share of its mean.
-    Error:  each test fails by chance with a probability of 1e-3. Lag needs three lit levels below saturation, or three
-            dark ones; patterns are taken as linear between neighbouring levels.
+    Error:  each test fails by chance with a probability of 1e-3.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 2.5 (non-uniformity) and 6.4 (homogeneity).
     """
     paired = [level for level in levels if level.paired and not level.high and not level.low]
     if not paired:
         return []
-    return [_pattern(paired), *_lag(paired), *_uneven(paired)]
+    return [_pattern(paired), *lag(paired), *_uneven(paired)]
 
 
 def _pattern(levels: Sequence[Level]) -> FrameTest:
@@ -60,66 +59,33 @@ def _pattern(levels: Sequence[Level]) -> FrameTest:
     if all(level.stack.scatter != "all" for level in levels):
         modelled = "the temporal variance leaves these differences out"
         return outcome("total against temporal variance", evidence, sentence, {"gain": prnu**2}, passed, modelled)
-    shares = [
-        (abs(c) / (c + level.variance) if c + level.variance else 0.0, level.dark)
-        for c, level in zip(common, levels, strict=True)
-    ]
-    shifts = {"noise": max((s / 2 for s, dark in shares if dark), default=0.0)}
-    shifts["gain"] = max((s for s, dark in shares if not dark), default=0.0)
     sentence += ", which `scatter: all` counts as noise; use calibrate.camera with `scatter: steady`"
-    return outcome("total against temporal variance", evidence, sentence, shifts, passed)
+    hidden = list(_counted_as_noise(levels, products))
+    return corrected("total against temporal variance", evidence, hidden, sentence, passed)
 
 
-def _lag(levels: Sequence[Level]) -> Iterator[FrameTest]:
-    """Test if the noise of a frame persists in the next frame."""
-    lit = sorted((level for level in levels if not level.dark), key=lambda level: level.mean)
-    dark = sorted((level for level in levels if level.dark), key=lambda level: level.stack.exposure)
-    rows, shares = [], []
-    for group, at in ((lit, [x.mean for x in lit]), (dark, [x.stack.exposure for x in dark])):
-        found = list(_persistence(group, at)) if _alike(group) else []
-        if not found:
-            continue
-        total = torch.stack([product / product.square().mean().sqrt().clamp_min(1e-12) for product, _ in found]).sum(0)
-        rows.append([studentised(product) for product, _ in found])
-        rows[-1].append(studentised(total))  # levels share neighbours, so that their numbers are not independent
-        shares += [share for _, share in found]
-    if not rows:
-        return
-    every = [z for row in rows for z in row]
-    evidence = strongest([[z] for z in every])
-    share = sum(shares) / len(shares)
-    sentence = f"{share:.1%} of the noise of a frame persists in the next frame, as by lag"
-    kept = min(abs(share), 0.5)
-    lost = math.log((1 + 2 * kept) / (1 - kept))  # of the variance of a pair, where lag takes what it gives
-    shifts = {"gain": lost, "noise": lost / 2}
-    yield outcome("no lag", evidence, sentence, shifts, "the noise of a frame does not persist in the next frame")
+def _counted_as_noise(levels: Sequence[Level], products: Sequence[Tensor]) -> Iterator[Hidden]:
+    """Yield the share of patterns in the slope of the total variance over the mean, and in the total dark variance."""
+    mean = torch.tensor([level.mean for level in levels], dtype=torch.float64)
+    pattern = torch.tensor([float(x.mean()) for x in products], dtype=torch.float64)
+    error = torch.tensor([math.sqrt(float(x.square().sum())) / x.numel() for x in products], dtype=torch.float64)
+    total = pattern + torch.tensor([level.variance for level in levels], dtype=torch.float64)
+    lit = torch.tensor([not level.dark for level in levels])
+    if len(levels) > 2 and float(mean.max()) > float(mean.min()):
+        weight = total.clamp_min(1e-12).reciprocal()
+        design = torch.stack([torch.ones_like(mean), mean], 1) * weight[:, None]
+        slope = torch.linalg.pinv(design)[1] * weight
+        yield _share(float(slope @ pattern), float((slope * error).norm()), float(slope @ total), gain=-1.0)
+    if bool((~lit).any()):
+        part, unsure, whole = pattern[~lit].mean(), error[~lit].norm() / int((~lit).sum()), total[~lit].mean()
+        yield _share(float(part), float(unsure), float(whole), noise=-0.5)
 
 
-def _alike(group: Sequence[Level]) -> bool:
-    return len(group) >= 3 and len({level.apart.shape[1:] for level in group}) == 1
-
-
-def _persistence(group: Sequence[Level], at: Sequence[float]) -> Iterator[tuple[Tensor, float]]:
-    """Yield the product (y, x) of the noise of two frames of each level, and its share of the variance."""
-    for i in range(len(group)):
-        one = max(0, i - 1) if i < len(group) - 1 else i - 2
-        other = one + (2 if 0 < i < len(group) - 1 else 1) if i else 2
-        one = 1 if not i else one
-        gap = at[one] - at[other]
-        weight = (at[i] - at[other]) / gap if gap else 0.5
-        if not -_FAR <= weight <= 1 + _FAR:
-            continue
-        u, v = (
-            frames[i] - weight * frames[one] - (1 - weight) * frames[other]
-            for frames in ([x.first[0] for x in group], [x.second[0] for x in group])
-        )
-        kept = (u.abs() < _RARE * _robust(u)) & (v.abs() < _RARE * _robust(v))
-        u, v = u * kept, v * kept
-        yield u * v, float(2 * (u * v).mean() / (u.square() + v.square()).mean().clamp_min(1e-12))
-
-
-def _robust(x: Tensor) -> float:
-    return 1.4826 * float(x.abs().median()) + 0.5
+def _share(part: float, error: float, whole: float, gain: float = 0.0, noise: float = 0.0) -> Hidden:
+    """Return the fault of a part of the variance that is no noise in time."""
+    left = max(1 - part / max(whole, 1e-12), 1e-3)
+    error = max(error / max(whole, 1e-12) / left, 1e-9)
+    return Hidden("pattern", -math.log(left), error, _UNLIKE, gain, noise, positive=True)
 
 
 def _uneven(levels: Sequence[Level]) -> Iterator[FrameTest]:

@@ -3,11 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from neusee.nodes.optics._transform._fused import FusedPupil, available, operators
 from neusee.nodes.optics._transform._pupil_field import Field, Screens, View, refuse_too_many_turns
 from neusee.nodes.optics._transform._sample_axis import patch_of
 from neusee.nodes.optics._transform._scaled_transform import Method, propagate
@@ -24,7 +25,18 @@ class Sampling:
 
     views: tuple[View, ...]
     dtype: torch.dtype
-    method: Method = "auto"
+    method: Method | Literal["fused"] = "auto"
+
+    @property
+    def by_torch(self) -> Method:
+        """Return the method of torch, for what the fused transform does not compute."""
+        return "auto" if self.method == "fused" else self.method
+
+    def fused(self, device: torch.device) -> bool:
+        """Return True if the C++ computes intensity and gradient; raise NoCompilerError if only C++ may and cannot."""
+        if self.method == "fused":
+            operators()
+        return self.method == "fused" or (self.method == "auto" and available(device))
 
 
 def intensity_of(amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
@@ -129,11 +141,16 @@ def _computed(screens: Screens, sampling: Sampling, keep: bool) -> tuple[Tensor,
     device, fields, done = screens.height.device, list[Tensor | None](), -1
     intensity = torch.empty(views[-1].band + 1, *shape, dtype=sampling.dtype, device=device)
     keep = keep and 2 * len(views) * intensity[0].nbytes <= KEPT_FIELD_BYTES
+    fused = sampling.fused(device)
     with borrowed(sampling.dtype, device) as work:
+        pupil = FusedPupil(screens, sampling.dtype, work) if fused else None
         for view in views:
-            kept = torch.empty(2, *shape[::-1], dtype=sampling.dtype, device=device) if keep else None
-            field = Field(screens, view, sampling.dtype)
-            _power(field, intensity[view.band], view.band == done, kept, sampling.method, work)
+            kept = torch.empty(2, *shape[:: 1 if fused else -1], dtype=sampling.dtype, device=device) if keep else None
+            if pupil is not None:
+                pupil.forward(view, intensity[view.band], view.band == done, kept)
+            else:
+                field = Field(screens, view, sampling.dtype)
+                _power(field, intensity[view.band], view.band == done, kept, sampling.by_torch, work)
             fields.append(kept)
             done = view.band
     return intensity, fields
@@ -152,10 +169,13 @@ def _adjoint(
     """
     grads = [torch.zeros_like(x) if need else None for x, need in zip(screens[:3], needs, strict=True)]
     with borrowed(weight.dtype, weight.device) as work:
+        if sampling.fused(weight.device):
+            FusedPupil(screens, weight.dtype, work).add_gradients(sampling.views, weight, fields, grads)
+            return grads
         for view, kept in zip(sampling.views, fields, strict=True):
             field = Field(screens, view, weight.dtype)
             planes = kept if kept is not None else _focal(field, sampling, work)
-            _add_gradient(field, planes, weight[view.band], grads, sampling.method, work)
+            _add_gradient(field, planes, weight[view.band], grads, sampling.by_torch, work)
     return grads
 
 
@@ -167,7 +187,7 @@ def _pushed(screens: Screens, tangents: Sequence[Tensor], sampling: Sampling) ->
         for view in views:
             field = Field(screens, view, sampling.dtype)
             planes = _focal(field, sampling, work)
-            _add_change(field, tangents, planes, change[view.band], sampling.method, work)
+            _add_change(field, tangents, planes, change[view.band], sampling.by_torch, work)
     return change
 
 
@@ -227,7 +247,7 @@ def _focal(field: Field, sampling: Sampling, work: Workspace) -> Tensor:
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
         _keep(planes, rows, columns, patch)
 
-    propagate(view.rows, view.columns, field.rows(work), sink, work, sampling.method)
+    propagate(view.rows, view.columns, field.rows(work), sink, work, sampling.by_torch)
     return planes
 
 

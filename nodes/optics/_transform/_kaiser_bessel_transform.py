@@ -18,7 +18,7 @@ from neusee.nodes.optics._transform._sample_axis import Axis, Sink, Source, last
 from neusee.nodes.optics._transform._workspace import Workspace
 
 
-class _Kernel(NamedTuple):
+class Kernel(NamedTuple):
     """The Kaiser-Bessel interpolation kernel of ``width`` samples, for a grid that is oversampled ``oversampling``
     times.
     """
@@ -48,7 +48,7 @@ class _Kernel(NamedTuple):
 _BLOCK = 16
 _WIDEST = 8  #: the grid divides the input into at least this many parts, however few the window needs
 _COLUMN_BLOCKS = 8
-_SINGLE, _DOUBLE = _Kernel(9, 1.75), _Kernel(18, 2.0)
+SINGLE, DOUBLE = Kernel(9, 1.75), Kernel(18, 2.0)
 _LAST = 10.0  #: work along the last axis for each independent sample of the result, where a pupil sample has work 1
 
 
@@ -79,9 +79,9 @@ def plan(axis: Axis, dtype: torch.dtype, device: torch.device, kind: torch.dtype
 
     The field is interpolated to the grid of the FFT in the type ``kind``, by default ``dtype``.
     """
-    kernel = _SINGLE if dtype == torch.float32 else _DOUBLE
+    kernel = SINGLE if dtype == torch.float32 else DOUBLE
     pitch = min(1 / (axis.alpha * axis.n_out * kernel.oversampling), max(axis.n_in, _WIDEST) / _WIDEST)
-    points = _odd(math.ceil((axis.n_in - 1) / pitch) + kernel.width)
+    points = odd(math.ceil((axis.n_in - 1) / pitch) + kernel.width)
     length = smooth(math.ceil(max(points, 2 * _BLOCK) * kernel.oversampling), even=True)
     spread = _spread(axis, kernel, pitch, length)
     while spread.n_columns + 2 * spread.margin > length:
@@ -92,7 +92,7 @@ def plan(axis: Axis, dtype: torch.dtype, device: torch.device, kind: torch.dtype
     return Plan(gather, spread.to(dtype, device), points, length, kept, axis.sign)
 
 
-def _gather(axis: Axis, kernel: _Kernel, pitch: float, points: int, length: int) -> Banded:
+def _gather(axis: Axis, kernel: Kernel, pitch: float, points: int, length: int) -> Banded:
     """Return the matrix that interpolates the field to the grid of the FFT, corrected for the interpolation after the
     FFT.
     """
@@ -101,34 +101,34 @@ def _gather(axis: Axis, kernel: _Kernel, pitch: float, points: int, length: int)
 
     def weigh(row: Tensor, column: Tensor) -> Tensor:
         at = (row - l0).clamp_(max=l0)
-        scale = _alternating(at + length // 2) * (kernel.peak / kernel.transform(at / length))
+        scale = alternating(at + length // 2) * (kernel.peak / kernel.transform(at / length))
         return kernel((column - j0) / pitch - at) / kernel.peak * scale
 
     return band.fill(weigh)
 
 
-def _spread(axis: Axis, kernel: _Kernel, pitch: float, length: int) -> Banded:
+def _spread(axis: Axis, kernel: Kernel, pitch: float, length: int) -> Banded:
     """Return the matrix that interpolates the FFT to the output samples, corrected for the interpolation before the
     FFT.
     """
     k0, fine = (axis.n_out - 1) / 2, axis.alpha * pitch * length
-    kept = _odd(math.ceil((axis.n_out - 1) * fine) + kernel.width)
+    kept = odd(math.ceil((axis.n_out - 1) * fine) + kernel.width)
     q0 = (kept - 1) // 2
     band = Banded(axis.n_out, kept, q0 - fine * k0, fine, kernel.width / 2, 2 * _BLOCK)
 
     def weigh(row: Tensor, column: Tensor) -> Tensor:
         at = (row - k0).clamp_(max=k0)
-        return _alternating(column - q0) * kernel(fine * at - (column - q0)) / kernel.transform(axis.alpha * pitch * at)
+        return alternating(column - q0) * kernel(fine * at - (column - q0)) / kernel.transform(axis.alpha * pitch * at)
 
     return band.fill(weigh)
 
 
-def _alternating(index: Tensor) -> Tensor:
+def alternating(index: Tensor) -> Tensor:
     """Return (-1)^index, which moves the origin of an FFT to the middle of its grid."""
     return 1 - 2 * index.remainder(2)
 
 
-def _odd(n: int) -> int:
+def odd(n: int) -> int:
     return n + 1 - n % 2
 
 
@@ -136,11 +136,16 @@ def kaiser_bessel(rows: Axis, columns: Axis, source: Source, sink: Sink, work: W
     """Compute the scaled Fourier transform by interpolation, a short FFT and interpolation, in chunks that fit in a
     cache.
     """
-    last = last_type(rows.n_in * columns.n_in, _LAST * rows.bandwidth * columns.bandwidth, work.dtype)
+    last = last_type(*last_work(rows, columns), work.dtype)
     along_x, along_y = plan(columns, work.dtype, work.device), plan(rows, work.dtype, work.device, last)
     half = _rows_to_frequencies(along_x, along_y.gather.margin, rows.n_in, source, work)
     spectrum = _columns_to_frequencies(along_y, half, work)
     _interpolate(along_x, along_y, (rows.n_out, columns.n_out), spectrum, sink, work)
+
+
+def last_work(rows: Axis, columns: Axis) -> tuple[float, float]:
+    """Return the work along the first and along the last axis, where that of a sample of the pupil is 1."""
+    return rows.n_in * columns.n_in, _LAST * rows.bandwidth * columns.bandwidth
 
 
 def _rows_to_frequencies(x: Plan, margin: int, n_rows: int, source: Source, work: Workspace) -> Tensor:

@@ -13,7 +13,7 @@ Source = Callable[
 Sink = Callable[[slice, slice, Tensor], None]
 #: takes a patch (2, ..., columns) of the result, re and im; the dimensions between are the rows, unflattened
 
-_LITTLE = 1 / 10  #: share of the work of the first axis, up to which the last axis is transformed in float64
+LITTLE = 1 / 10  #: share of the work of the first axis, up to which the last axis is transformed in float64
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,14 +51,14 @@ def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
     return torch.complex(angle.cos(), angle.sin())
 
 
-def last_type(first: float, last: float, dtype: torch.dtype) -> torch.dtype:
+def last_type(first: float, last: float, dtype: torch.dtype, little: float = LITTLE) -> torch.dtype:
     """Return the number type of the transform along the last axis, given the work along the first and the last axis.
 
     The type is float64 where this costs little. The round-off of the first axis averages out along the last axis; that
     of the last axis does not. In float32 the last axis errs by about 2^-24 of the brightest field, which is 1.2e-3 of
     an intensity that is 1e-8 of the brightest pixel.
     """
-    return torch.float64 if last <= _LITTLE * first else dtype
+    return torch.float64 if last <= little * first else dtype
 
 
 def patch_of(x: Tensor, rows: slice, columns: slice, like: Tensor) -> Tensor:

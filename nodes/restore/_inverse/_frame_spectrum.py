@@ -1,53 +1,112 @@
 """The power spectrum of a scene, fitted to a blurred and noisy frame of it: how fast it falls, and how strong it is."""
 
+from __future__ import annotations
+
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from neusee.nodes.restore._inverse._masked_blur import Blurred, Size
 
-_SLOPES = (1.5, 4.5, 13)  #: first, last and number of the exponents that are tried
-_POWERS = (-4.0, 4.0, 49)  #: of e, times the variance of the frame
+_SLOPES = (2.0, 4.0, 9)  #: first, last and number of the exponents that are tried; scenes have 2 to 4
+_POWERS = (-7.0, 1.0, 25)  #: of e, times the variance that explains the whole frame
+_NOISES = tuple(2.0**n for n in range(8))  #: times the variance of the noise that the filter assumes
 _MOST = 20_000  #: frequencies that count, at most
 _LOWEST = 3.0  #: cycles in the picture, below which the window mixes frequencies
+_SURE = 0.75  #: quantile of the weights of pixels, above which a pixel counts fully
+_SAMPLE = 1 << 20  #: pixels from which this quantile is taken, at most
 
 
-def fitted_power(problem: Blurred, kernels: Tensor) -> Tensor:
-    """Return the power spectrum of the scene, half a spectrum of the torus, of the highest Whittle likelihood.
+class FrameLaw(NamedTuple):
+    """The law of a frame: the power spectrum of its scene, and its noise."""
 
-    The law is A (f^2 + 1 / pixels)^(-b / 2), as the prior of the filter, whose b is 3. Unseen pixels count as the mean.
+    power: Tensor  #: half a spectrum of the torus
+    noise: float  #: variance of the noise over the variance that the filter assumes
+
+
+def fitted_law(problem: Blurred) -> FrameLaw:
+    """Return the law of a frame of the highest debiased Whittle likelihood.
+
+    The power of the scene is A (f^2 + 1 / pixels)^(-b / 2), as the prior of the filter, whose b is 3. The likelihood
+    compares the periodogram of the frame with its exact expectation: the correlation of the blurred scene times that of
+    the window. So light that the window or a hole moves to other frequencies, such as the zeros of a PSF, is expected
+    there. The window falls to the edges and, with the weight of a pixel, near glare that is not known.
+    Source: Sykulski, Olhede, Guillaumin, Lilly and Early, Biometrika 106, 251 (2019).
     """
-    y, x = problem.picture.shape[-2:]
-    window = (torch.hann_window(y)[:, None] * torch.hann_window(x)).to(problem.picture)
-    seen = problem.picture.detach() * (problem.weight > 0)
-    found = torch.fft.rfft2(seen * window).abs().square() / window.square().sum()
-    through = torch.fft.rfft2(kernels.detach()).abs().square()
-    squared = _squared((y, x)).to(found)
-    noise = _noise(problem)
-    far = (squared > (_LOWEST / min(y, x)) ** 2).expand_as(found)
-    step = max(1, int(far.sum()) // _MOST)
-    frequency, power, passed, level = (
-        part.expand_as(found)[far][::step].double()
-        for part in (squared + 1.0 / (y * x), found, through, noise[:, None, None])
-    )
-    least, slope, strength = float("inf"), 3.0, 0.0
+    window = _window(problem)
+    size = (window.shape[-2], window.shape[-1])
+    area = window.square().sum((-2, -1), keepdim=True)
+    picture = problem.picture.detach()
+    contrast = picture - (picture * window).sum((-2, -1), keepdim=True) / window.sum((-2, -1), keepdim=True)
+    far = _squared(size).to(window) > (_LOWEST / min(size)) ** 2
+    step = max(1, int(far.sum()) * len(window) // _MOST)
+    found = _sampled(torch.fft.rfft2(contrast * window).abs().square() / area, far, step)
+    variance = torch.where(problem.weight > 0, 1.0 / problem.weight.clamp_min(1e-30), 0.0).detach()
+    noise = (window.square() * variance).sum((-2, -1), keepdim=True) / area
+    level = _sampled(noise.expand(-1, *far.shape), far, step)
+    twice = (2 * size[0], 2 * size[1])
+    lags = torch.fft.irfft2(torch.fft.rfft2(window, s=twice).abs().square(), s=twice) / area
+    best, slope, strength, factor = float("inf"), 3.0, 0.0, 1.0
     for exponent in torch.linspace(*_SLOPES[:2], int(_SLOPES[2])).tolist():
-        law = frequency ** (-exponent / 2) * passed
-        unit = float(seen.square().mean()) / float((frequency ** (-exponent / 2)).mean())
-        for log in torch.linspace(*_POWERS[:2], int(_POWERS[2])).tolist():
-            expected = unit * 2.718281828459045**log * law + level
-            loss = float((expected.log() + power / expected).mean())
-            if loss < least:
-                least, slope, strength = loss, exponent, unit * 2.718281828459045**log
-    whole: Tensor = strength * (_squared(problem.torus).to(found) + 1.0 / (y * x)) ** (-slope / 2)
-    return whole
+        law = _sampled(_expected(problem, exponent, lags), far, step)
+        unit = float(found.sum() / law.sum().clamp_min(1e-30))
+        loss, times, extra = _likeliest(found, unit * law, level)
+        if loss < best:
+            best, slope, strength, factor = loss, exponent, unit * times, extra
+    return FrameLaw(strength * _law(problem, slope), factor)
 
 
-def _noise(problem: Blurred) -> Tensor:
-    """Return the mean variance of the noise in the seen pixels of each channel."""
-    seen = problem.weight > 0
-    variance = torch.where(seen, 1.0 / problem.weight.where(seen, 1.0), 0.0).detach()
-    total: Tensor = variance.sum((-2, -1)) / seen.sum((-2, -1)).clamp_min(1)
-    return total
+def _window(problem: Blurred) -> Tensor:
+    """Return the window (channel, y, x) of the periodogram."""
+    y, x = problem.picture.shape[-2:]
+    weight = problem.weight.detach()
+    falling = (torch.hann_window(n + 2, periodic=False)[1:-1].to(weight) for n in (y, x))
+    sure = []
+    for each in weight:
+        seen = each[each > 0]
+        sure.append(torch.quantile(seen[:: max(1, len(seen) // _SAMPLE)], _SURE))
+    own = weight / torch.stack(sure)[:, None, None]
+    rows, columns = falling
+    return rows[:, None] * columns * own / (1.0 + own)
+
+
+def _expected(problem: Blurred, slope: float, lags: Tensor) -> Tensor:
+    """Return the expected periodogram of a blurred scene of power 1 / f^slope, given the correlation of the window."""
+    through = problem.transfer.detach().abs().square()
+    correlation = torch.fft.irfft2(_law(problem, slope) * through, s=problem.torus)
+    down, right = (_lags(n).to(lags.device) % side for n, side in zip(lags.shape[-2:], problem.torus, strict=True))
+    whole: Tensor = torch.fft.rfft2(correlation[:, down[:, None], right] * lags).real
+    return whole[:, ::2, ::2].clamp_min(0.0)
+
+
+def _lags(size: int) -> Tensor:
+    return (torch.arange(size) + size // 2) % size - size // 2
+
+
+def _law(problem: Blurred, slope: float) -> Tensor:
+    y, x = problem.picture.shape[-2:]
+    law: Tensor = (_squared(problem.torus).to(problem.picture) + 1.0 / (y * x)) ** (-slope / 2)
+    return law
+
+
+def _sampled(spectrum: Tensor, far: Tensor, step: int) -> Tensor:
+    sampled: Tensor = spectrum[:, far].flatten()[::step].double()
+    return sampled
+
+
+def _likeliest(found: Tensor, law: Tensor, noise: Tensor) -> tuple[float, float, float]:
+    """Return the least loss of a law, its strength, and the factor of the noise, which grows while the loss falls."""
+    best = (float("inf"), 0.0, 1.0)
+    for factor in _NOISES:
+        here = (float("inf"), 0.0, factor)
+        for strength in torch.linspace(*_POWERS[:2], int(_POWERS[2])).exp().tolist():
+            expected = strength * law + factor * noise
+            here = min(here, (float((expected.log() + found / expected).mean()), strength, factor))
+        if here[0] >= best[0]:
+            break
+        best = here
+    return best
 
 
 def _squared(size: Size) -> Tensor:

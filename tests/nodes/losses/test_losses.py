@@ -2,12 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.losses import background_loss, charbonnier, fft_l1, mrae, suppression_loss
+from neusee.nodes.losses import background_loss, charbonnier, fft_l1, log_error, mrae, suppression_loss
 from neusee.nodes.values import Psf
 
 
@@ -85,7 +86,24 @@ def test_fft_l1_does_not_grow_with_the_picture(y, x):
     assert float(fft_l1(point, nothing)) == pytest.approx(1 / math.sqrt(x * y))
 
 
-@pytest.mark.parametrize("loss", [charbonnier, fft_l1])
+def test_a_decibel_of_the_log_error_is_one_of_the_psnr_in_every_picture():
+    """Against scikit-image, for pictures within the range of a display; beyond it the loss has a slope of its own."""
+    from skimage.metrics import peak_signal_noise_ratio
+
+    def shown(x):
+        x = x.numpy()
+        return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+
+    truth = rand(2, 3, 8, 9)
+    estimate = (truth + torch.tensor([0.1, 1e-2])[:, None, None, None] * (rand(2, 3, 8, 9).flip(1) - 0.5)).clamp(0, 1)
+    each = [peak_signal_noise_ratio(shown(t), shown(e), data_range=1) for t, e in zip(truth, estimate, strict=True)]
+    assert float(log_error(estimate, truth)) == pytest.approx(-math.log(10) / 10 * np.mean(each), abs=0.02)
+    dark = torch.full((3, 4, 4), -0.5, dtype=torch.float64, requires_grad=True)
+    log_error(dark, torch.zeros(3, 4, 4, dtype=torch.float64)).backward()
+    assert bool((dark.grad < 0).all())
+
+
+@pytest.mark.parametrize("loss", [charbonnier, fft_l1, log_error])
 def test_gradients_of_the_restoration_losses(loss):
     a, b = rand(3, 4, 5).requires_grad_(), rand(1, 3, 4, 5)[0].flip(1)
     assert torch.autograd.gradcheck(lambda x: loss(x, b), (a,))

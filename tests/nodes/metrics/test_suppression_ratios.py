@@ -37,7 +37,7 @@ def test_lsr_check_names_the_floor():
     assert not lsr.hooks.check(torch.tensor([1.2]), psf)[0].ok
 
 
-@pytest.mark.parametrize("rounding", ["nearest", "dithered_floor"])
+@pytest.mark.parametrize("rounding", ["nearest", "truncation", "dithered_floor"])
 @pytest.mark.parametrize(
     ("gain", "unit", "bits"), [(0.37, "e-/DN", 16), (0.37, "DN/e-", 16), (7.0, "e-/DN", 12), (1e4, "e-/DN", 1)]
 )

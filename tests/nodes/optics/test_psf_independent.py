@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from neusee.nodes import doe, optics, spectra
+from neusee.nodes.optics._transform import _intensity
 
 sys.path.insert(0, str(Path(__file__).parent))
 from independent_psf import round_stop, window
@@ -73,6 +74,13 @@ sizes = pytest.mark.parametrize("samples", [540, pytest.param(2160, marks=pytest
 def test_the_error_is_as_stated_from_the_height_map_to_the_intensity(mask, precision, limit, samples):
     found, expected, _ = both(mask, samples, precision)
     assert np.abs(found - expected).max() <= limit * expected.max()
+
+
+@pytest.mark.parametrize("mask", ["rough", "10 mm plate"])
+def test_without_a_compiler_the_error_is_as_stated_too(mask, monkeypatch):
+    monkeypatch.setattr(_intensity, "available", lambda device: False)
+    found, expected, _ = both(mask, 540, "single")
+    assert np.abs(found - expected).max() <= 2e-6 * expected.max()
 
 
 @sizes

@@ -22,7 +22,7 @@ def seeded():
     st.lists(st.floats(-1e6, 999999995904.0, width=32), min_size=1, max_size=6),
     st.floats(1e-3, 1e3),
     st.sampled_from(["e-/DN", "DN/e-"]),
-    st.sampled_from(["nearest", "dithered_floor"]),
+    st.sampled_from(["nearest", "truncation", "dithered_floor"]),
     st.integers(1, 16),
 )
 def test_digitize_agrees_with_its_reference(values, gain, unit, rounding, bits):
@@ -60,7 +60,7 @@ def test_the_numbers_are_the_same_with_a_gradient():
     assert torch.equal(learnt, digitize(electrons, gain=1 / 0.37))
 
 
-@pytest.mark.parametrize("rounding", ["nearest", "dithered_floor"])
+@pytest.mark.parametrize("rounding", ["nearest", "truncation", "dithered_floor"])
 def test_blocks_of_pixels_leave_no_trace(rounding, monkeypatch):
     electrons = torch.rand(3, 7, 11, generator=torch.Generator().manual_seed(5)).transpose(0, 2) * 26000
     whole = digitize(electrons, gain=1 / 0.37, rounding=rounding, rng=seeded())
@@ -88,6 +88,9 @@ def test_dithered_floor_lies_half_a_number_low_and_is_noisier():
     line = torch.rand(400_000, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 50 + 10
     near = digitize(line, gain=1.0) - line
     floor = digitize(line, gain=1.0, rounding="dithered_floor", rng=seeded()) - line
+    cut = digitize(line, gain=1.0, rounding="truncation") - line
+    assert float(cut.mean()) == pytest.approx(-0.5, abs=3e-3)
+    assert float(cut.var()) == pytest.approx(1 / 12, rel=0.01)
     assert float(near.mean()) == pytest.approx(0.0, abs=3e-3)
     assert float(near.var()) == pytest.approx(1 / 12, rel=0.01)
     assert float(floor.mean()) == pytest.approx(-0.5, abs=3e-3)
@@ -99,7 +102,7 @@ def test_dither_needs_a_generator():
         digitize(torch.ones(1), gain=1.0, rounding="dithered_floor")
 
 
-@pytest.mark.parametrize("rounding", ["nearest", "dithered_floor"])
+@pytest.mark.parametrize("rounding", ["nearest", "truncation", "dithered_floor"])
 def test_gradient_is_the_line_and_nothing_where_it_clips(rounding):
     electrons = torch.tensor([-5.0, 10.2, 1e9]).requires_grad_()
     digitize(electrons, gain=2.0, rounding=rounding, bits=8, rng=seeded()).sum().backward()

@@ -28,7 +28,12 @@ def fit(points):
 @pytest.mark.parametrize("distribution", ["gaussian", "poisson"])
 @pytest.mark.parametrize(
     ("gain", "unit", "rounding"),
-    [(0.37, "e-/DN", "nearest"), (0.37, "DN/e-", "nearest"), (2.0, "e-/DN", "dithered_floor")],
+    [
+        (0.37, "e-/DN", "nearest"),
+        (0.37, "DN/e-", "nearest"),
+        (2.0, "e-/DN", "truncation"),
+        (2.0, "e-/DN", "dithered_floor"),
+    ],
 )
 def test_slope_is_the_gain_and_intercept_the_read_noise(gain, unit, rounding, distribution):
     slope = read_quantity(f"{gain} {unit}", "DN/e-")
@@ -36,13 +41,13 @@ def test_slope_is_the_gain_and_intercept_the_read_noise(gain, unit, rounding, di
     below = points[:, 0] < 0.8 * min(25110 * slope, 65535 - 390 * slope)
     bright = below & (points[:, 0] / slope > 20) | (points[:, 0] == 0)  # under 20 e- a Gaussian is cut at 0
     best, error = fit(points[bright])
-    floor = slope**2 * (10.5**2 + 0.002) + (1 / 12 if rounding == "nearest" else 1 / 6)
+    floor = slope**2 * (10.5**2 + 0.002) + (1 / 6 if rounding == "dithered_floor" else 1 / 12)
     assert abs(float(best[0]) - slope) < 4 * float(error[0])
     assert abs(float(best[1]) - floor) < 4 * float(error[1])
     assert float(error[0]) < 0.005 * slope
 
 
-@pytest.mark.parametrize("rounding", ["nearest", "dithered_floor"])
+@pytest.mark.parametrize("rounding", ["nearest", "truncation", "dithered_floor"])
 def test_what_is_predicted_in_the_dark_is_measured_where_rounding_is_most_of_the_noise(rounding):
     points = curve(gain=1.0, read_noise=0.8, rounding=rounding, levels=2, pixels=1_000_000)
     assert float(points[0, 1]) == pytest.approx(float(points[0, 2]), abs=0.01)

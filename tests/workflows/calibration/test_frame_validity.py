@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes.calibrate import FrameTest
+from neusee.nodes.calibrate import FrameTest, Hidden, corrections
 from neusee.workflows.calibration.emcee_sampler import Chains
 from neusee.workflows.calibration.frame_validity import (
     frame_checks,
+    hidden_checks,
+    hidden_faults,
     inspect_recipe,
     lines,
     relative_shifts,
@@ -106,6 +108,10 @@ def test_clean_frames_pass_and_a_table_says_what_is_not_tested(tmp_path):
     assert {test.verdict for test in tests} == {"passed"}
     assert list(lines(tests)) == [f"frames: {len(tests)} of {len(tests)} tests passed"]
     assert {check.mark for check in frame_checks(tests)} == {"pass"}
+    (check,) = hidden_checks(tests, ("mixing", "lag"))
+    assert (check.name, check.mark) == ("intervals include lag and mixing", "pass")
+    assert "gain by " in check.found
+    assert hidden_checks(tests, ("pattern",)) == []  # the temporal variance leaves patterns out
     alone = inspect_recipe(load("calibrate_camera"), Store(tmp_path / "store"))
     assert [test.name for test in alone] == ["the dark noise exceeds rounding"]
     assert [check.mark for check in frame_checks(alone)] == ["pass", "warn"]
@@ -132,12 +138,30 @@ def test_intervals_grow_by_the_errors_that_may_follow(tmp_path):
     torch.testing.assert_close(logs["gain"], -logs["quantum_efficiency"])  # their product is measured
     assert float(logs["noise"].std()) == pytest.approx(math.hypot(0.013, 0.008), rel=0.03)
     assert float(after["dark_signal"].std()) < 1e-9  # DN
+    mixed = FrameTest("c", 1.0, 4.0, "passed", "", hidden=(Hidden("mixing", 0.03, 0.004, 0.02, gain=1.0),))
+    moved = problem.parameters(widened(problem, chains, [mixed], 1).draws)["gain"].log() - math.log(params["gain"])
+    assert float(moved.mean()) == pytest.approx(corrections(mixed.hidden)["gain"].mean, rel=0.02)
+    assert float(moved.std()) == pytest.approx(corrections(mixed.hidden)["gain"].sd, rel=0.03)
+
+
+def test_a_camera_that_is_known_to_have_no_mixing_hides_none(tmp_path):
+    known = SensorPosterior.of(load("calibrate_camera", ["steps.prior.with.mixing=none"]), Store(tmp_path / "store"))
+    assert known.coordinates.prior.may_hide == ("lag", "pattern")
+    hidden = Hidden("mixing", 0.01, 0.004, 0.02, gain=1.0), Hidden("lag", 0.01, 0.004, 0.02, gain=1.0, positive=True)
+    passed = [FrameTest(h.fault, 1.0, 4.0, "passed", "", hidden=(h,)) for h in hidden]
+    assert hidden_faults(passed, known.coordinates.prior.may_hide) == [hidden[1]]
+    found = replace(passed[0], verdict="modelled")  # what the frames show counts, whatever is known
+    assert hidden_faults([found], known.coordinates.prior.may_hide) == [hidden[0]]
 
 
 def test_stated_intervals_grow_as_the_draws_do():
     one = IntervalEstimate(2.0, 2.0 * math.exp(-0.02), 2.0 * math.exp(0.02))
     models = [ModelSpread(name, (one,), one) for name in ("gain", "temporal_dark_noise", "bend")]
-    gain, noise, bend = (model.stated for model in widened_models(models, WIDER))
+    gain, noise, bend = (model.stated for model in widened_models(models, WIDER, ()))
     assert math.log(gain.high / 2) == pytest.approx(math.hypot(0.02, Z_90 * 0.013))
     assert math.log(2 / noise.low) == pytest.approx(math.hypot(0.02, Z_90 * math.hypot(0.013, 0.008)))
     assert bend == one
+    mixed = FrameTest("c", 1.0, 4.0, "passed", "", hidden=(Hidden("mixing", 0.03, 0.004, 0.02, gain=1.0),))
+    gain = widened_models(models, [mixed], ("mixing",))[0].stated
+    assert math.log(gain.value / 2) == pytest.approx(corrections(mixed.hidden)["gain"].mean)
+    assert widened_models(models, [mixed], ())[0].stated == one

@@ -306,4 +306,4 @@ def test_the_settings_of_trainings_are_imported_for_recipes_that_have_one():
     ]
     assert "neusee.workflows.recipe.wiring" in tops
     assert not [name for name in tops if ".blocks" in name]
-    assert loading.BLOCKS == (train_block.KEY, train_lift_block.KEY, evaluate_block.KEY)
+    assert loading.BLOCKS == (train_block.KEY, train_lift_block.KEY, evaluate_block.KEY, loading.TRACED)

@@ -93,3 +93,20 @@ def test_a_training_behind_two_masks_validates_and_is_not_that_behind_one(tmp_pa
     assert len(rows) == 2
     assert all(float(row["held_out_PSNR"]) > 0 for row in rows)
     assert trained(words, tmp_path) != found
+
+
+def test_pooled_pictures_are_turned_behind_several_masks_too():
+    class Stream:
+        def __init__(self, mask):
+            self.mask = mask
+
+        def __call__(self, seen, stage, number):
+            return f"picture {number} behind {self.mask}"
+
+        def turned(self, sample, stage, number):
+            return f"turned {sample}"
+
+    mixed = MixedMasks.__new__(MixedMasks)
+    mixed.repeats, mixed._pool, mixed._streams = 2, 3, [Stream("ring"), Stream("flat")]
+    found = [sample for _, sample in mixed.batch(Shared.of({}), 2, 2, 2)]
+    assert found == ["turned picture 2 behind ring", "turned picture 3 behind ring"]

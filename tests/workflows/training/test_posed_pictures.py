@@ -46,6 +46,23 @@ def test_the_picture_is_that_of_any_network_behind_the_filter_and_the_problem_ha
     assert torch.allclose(told, one.picture[0], rtol=0, atol=1e-4)
 
 
+INFORMED = [*OTHER, "train.network={kind: informed, width: 2}"]
+
+
+def test_what_the_informed_network_sees_is_turned_with_the_picture(photograph, store):
+    one = stream([*INFORMED, "train.augment.pooled=turned_mask"], photograph, store)
+    sample = one({}, 2, 0)
+    known, matrix = sample.given
+    assert torch.allclose(restore.colour(known.answer * known.scale + known.mean, matrix), sample.picture[0], atol=1e-4)
+    number = next(n for n in range(2, 99, 2) if not torch.equal(one.turned(sample, 2, n).truth, sample.truth))
+    other = one.turned(sample, 2, number)
+    seen, own = other.given
+    assert torch.equal(own, matrix)
+    assert torch.allclose(restore.colour(seen.answer * seen.scale + seen.mean, own), other.picture[0], atol=1e-4)
+    assert torch.equal(seen.maps[:3], seen.answer)
+    assert torch.allclose(seen.deviation.sum((1, 2)), known.deviation.sum((1, 2)), rtol=1e-5)
+
+
 @pytest.mark.slow
 def test_the_store_gives_back_the_bits_of_picture_and_problem(photograph, store):
     first, again = (stream(POSED, photograph, store)({}, 2, 1) for _ in range(2))

@@ -27,6 +27,7 @@ from neusee.workflows.recipe.text.option_groups import packaged
 from neusee.workflows.recipe.text.yaml_values import Value
 
 KEY = "train"  #: key of the block in a recipe
+POSED = ("unrolled", "informed")  #: kinds of networks that need what the Wiener filter knows of a picture
 FLAT = "flat"  #: in place of the file of a mask: a plane plate
 _OF_CLASS = ("architecture", "parameters", "multiple")  #: settings of a network class of the user
 
@@ -34,7 +35,7 @@ _OF_CLASS = ("architecture", "parameters", "multiple")  #: settings of a network
 class Network(SettingsBlock):
     """Settings of the restoration network: its kind, width and options."""
 
-    kind: Literal["fft_mamba", "unet", "nafnet", "unrolled"] = "fft_mamba"
+    kind: Literal["fft_mamba", "unet", "nafnet", "unrolled", "informed"] = "fft_mamba"
     width: Annotated[int, Field(ge=2)] = 64
     shuffle: Annotated[int, Field(ge=1, le=8)] = 2  #: of fft_mamba: pixels along an axis that are scanned as one
     directions: Literal[2, 4] = 2  #: of fft_mamba, like the next two
@@ -104,6 +105,7 @@ class Stage(SettingsBlock):
     adversarial: Weight = 0.1
     penalty: Weight = 1.0
     reconstruction: Weight = 1.0
+    decibels: Weight = 0.0  #: of the PSNR of each picture, with the sign of a loss
 
 
 class Training(SettingsBlock):
@@ -160,16 +162,17 @@ class Training(SettingsBlock):
 
     @model_validator(mode="after")
     def _unrolls(self) -> Training:
-        if self.network.architecture is not None or self.network.kind != "unrolled":
+        kind = self.network.kind
+        if self.network.architecture is not None or kind not in POSED:
             return self
         if self.export:
-            raise ValueError("export: the filter within the network unrolled is in no graph of torch.export or ONNX")
+            raise ValueError(f"export: the filter before the network {kind} is in no graph of torch.export or ONNX")
         given = {"learn": self.learn, "size": self.size, "patch": self.patch}
-        if self.augment.pooled != "none":
+        if self.augment.pooled != "none" and kind == "unrolled":
             given["augment.pooled"] = "none"
         wrong = next((name for name, value in given.items() if value is not None), None)
         if wrong:
-            text = "the network unrolled restores a whole picture behind a fixed mask"
+            text = f"the network {kind} restores a whole picture behind a fixed mask"
             raise ValueError(f"{wrong}: {text}: write {wrong}: {given[wrong] if wrong == 'augment.pooled' else 'null'}")
         return self
 

@@ -12,13 +12,14 @@ from neusee.workflows.report.figures.style import ORANGE, VERMILION, canvas, dra
 
 BRIGHT = 1.5  #: times white, which nothing that is lit by the light of the scene exceeds by much
 _LEVEL = 0.95  #: of the quantile of Student's t that ends an interval of 90 %
+_EACH = 4  #: degrees of freedom of a draw, whose errors are averaged over 7 x 7 pixels and alike in a few of them
 
 
 def half_width(spread: Tensor, draws: int) -> Tensor:
     """Return half the width of the 90 % interval, from the standard deviation that was estimated from ``draws``."""
     from scipy.stats import t
 
-    return spread * float(t.ppf(_LEVEL, draws))
+    return spread * float(t.ppf(_LEVEL, _EACH * draws))
 
 
 def unexplained(restored: Tensor, half: Tensor, invented: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ PAPER = {
     "full_well": 25500.0,
 }
 LIGHT = [(0.0, 0.1), (0.0, 10.0), (200.0, 0.1), (3000.0, 0.1), (30000.0, 0.1), (43000.0, 0.1), (90000.0, 0.1)]
-KINDS = ["nearest", "dithered_floor"]
+KINDS = ["nearest", "truncation", "dithered_floor"]
 
 
 def frames(light=LIGHT, size=48, seed=0, rounding="nearest", distribution="gaussian", **other):

@@ -14,7 +14,7 @@ from scipy.stats import norm
 from neusee.nodes.calibrate._likelihood._quantised_gaussian import log_cell
 from neusee.nodes.sensor import digitize, full_well
 
-KINDS = ["nearest", "dithered_floor"]
+KINDS = ["nearest", "truncation", "dithered_floor"]
 
 
 def log_p(values, mean, sd, well, kind, top=4095):
@@ -26,6 +26,8 @@ def share(x, k, kind, top):
     """How often a signal gives the number k."""
     if kind == "nearest":
         return float(min(max(round(x), 0), top) == k)
+    if kind == "truncation":
+        return float(min(max(math.floor(x), 0), top) == k)
     low, high = math.floor(x - 0.5), math.floor(x - 0.5) + 1
     part = x - 0.5 - low
     clip = [min(max(n, 0), top) for n in (low, high)]
@@ -33,7 +35,7 @@ def share(x, k, kind, top):
 
 
 def by_quadrature(k, mean, sd, well, kind, top):
-    corners = sorted({k - 0.5, k + 0.5, k + 1.5, min(max(well, k - 1), k + 2), mean})
+    corners = sorted({k - 0.5, k, k + 0.5, k + 1, k + 1.5, min(max(well, k - 1), k + 2), mean})
     ends = [max(-60 * sd + mean, corners[0] - 400 * sd), *corners, corners[-1] + 60 * sd]
     ends = [*sorted(x for x in {*ends, mean - 8 * sd, mean + 8 * sd} if x < well), well]
     total = norm.sf(well, mean, sd) * share(well, k, kind, top)

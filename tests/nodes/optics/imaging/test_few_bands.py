@@ -59,7 +59,7 @@ def test_the_weights_interpolate_between_the_bands_in_use():
     assert share_of_bands(torch.tensor([2]), 3).tolist() == [[1.0]] * 3
 
 
-@pytest.mark.parametrize("within", [3e-3, 3e-4])
+@pytest.mark.parametrize("within", [3e-3, pytest.param(3e-4, marks=pytest.mark.slow)])
 def test_the_image_is_within_the_estimate_and_the_estimate_within_what_is_allowed(camera, within):
     """An error is not estimated far too large either."""
     clear, scene = camera

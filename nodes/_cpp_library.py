@@ -1,0 +1,115 @@
+"""C++ sources compiled for the processor of this machine on first use and then reused.
+
+The sources need only a compiler, no headers of torch or Python. They compile in seconds, and a library works with any
+version of both. A library is compiled in a temporary folder and moved by an atomic rename: two processes that compile
+at once both get a valid library, and a process that is killed leaves no lock behind.
+"""
+
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+import warnings
+from pathlib import Path
+
+#: compiler and processor change a result within rounding; the module that takes a source declares the source
+__depends__ = (
+    "unaffected:file",
+    "unaffected:CXX",
+    "unaffected:XDG_CACHE_HOME",
+    "unaffected:ctypes",
+    "unaffected:subprocess",
+    "unaffected:platform",
+    "unaffected:pathlib.Path.home",
+)
+FLAGS = (
+    *("-std=c++17", "-O3", "-march=native", "-fopenmp", "-fPIC", "-shared", "-w"),
+    *("-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
+)
+
+
+class NoCompilerError(RuntimeError):
+    """The error of a machine on which a C++ source cannot be compiled; the message gives the reason in one line."""
+
+
+def folder() -> Path:
+    """Return the folder of the compiled libraries: ``$XDG_CACHE_HOME/neusee/build``, else ``~/.cache/neusee/build``.
+
+    The folder must outlive the process, or each process would compile. No result is kept there or depends on it.
+    """
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "neusee" / "build"
+
+
+def _processor() -> str:
+    """Return a text that identifies the processor, because different machines may share a home folder."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    facts = [next((x for x in lines if x.startswith(word)), "") for word in ("model name", "flags", "Features")]
+    return "\n".join([platform.platform(), platform.machine(), platform.processor(), *facts])
+
+
+def _compile(code: Path, where: Path) -> None:
+    """Compile the C++ source to the file ``where``; raise `NoCompilerError` if that fails."""
+    compiler = os.environ.get("CXX") or shutil.which("g++") or shutil.which("c++") or shutil.which("clang++")
+    if compiler is None:
+        raise NoCompilerError("no C++ compiler is installed: install g++, or set CXX to a compiler")
+    try:
+        where.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=where.parent) as aside:
+            library = Path(aside) / where.name
+            command = [*compiler.split(), *FLAGS, str(code), "-o", str(library)]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+            if done.returncode:
+                reason = next((x for x in done.stderr.splitlines() if "error" in x), f"exit status {done.returncode}")
+                raise NoCompilerError(f"{compiler} failed: {reason.strip()}")
+            os.replace(library, where)
+    except (OSError, subprocess.SubprocessError) as error:
+        raise NoCompilerError(f"{compiler} could not be run: {error}") from error
+
+
+@functools.cache
+def _library(sources: tuple[Path, ...], build: Path, compiler: str | None) -> ctypes.CDLL | NoCompilerError:
+    """Return the compiled library, or the error of the single attempt to compile for this folder and compiler."""
+    words = [*(source.read_text(encoding="utf-8") for source in sources), *FLAGS, compiler or "", _processor()]
+    name = f"{sources[0].stem.strip('_')}_{hashlib.sha256(chr(0).join(words).encode()).hexdigest()[:32]}.so"
+    try:
+        if not (build / name).is_file():
+            _compile(sources[0], build / name)
+        return ctypes.CDLL(str(build / name))
+    except NoCompilerError as error:
+        return error
+    except OSError as error:
+        return NoCompilerError(f"{build / name} cannot be loaded: {error}")
+
+
+def library(*sources: Path) -> ctypes.CDLL:
+    """Return the library of the first source, compiled if needed, with the other sources as its headers.
+
+    Raises `NoCompilerError` if the source cannot be compiled.
+    """
+    found = _library(sources, folder(), os.environ.get("CXX"))
+    if isinstance(found, NoCompilerError):
+        raise found
+    return found
+
+
+def compiled(what: str, *sources: Path) -> bool:
+    """Return True if the library of ``what`` is available, compiled if needed; otherwise warn once and return False."""
+    try:
+        library(*sources)
+    except NoCompilerError as error:
+        _say_once(what, str(error))
+        return False
+    return True
+
+
+@functools.cache
+def _say_once(what: str, why: str) -> None:
+    text = f"the C++ of the {what} is not compiled and torch computes the {what} more slowly: {why}"
+    warnings.warn(text, stacklevel=5)
