@@ -108,8 +108,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/sensor/_photon_transfer.py",
-        "else 1.0 / 6.0",
-        "else 1.0 / 12.0",
+        "(1.0 / 6.0 if rounding",
+        "(1.0 / 12.0 if rounding",
         within(
             "nodes/sensor",
             "photon_transfer.py::test_what_is_predicted_in_the_dark_is_measured_where_rounding_is_most_of_the_noise",

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import tomllib
 import zlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -100,13 +101,19 @@ def carry_out(words: str, place: Path, monkeypatch) -> None:
         patch.setattr(simulate_recipe, "timeline", lambda result: None)  # no page shows it
         patch.setattr(run_pictures, "FIGURES", [f for f in run_pictures.FIGURES if f.name in asked])
         if "graph" not in asked:
-            patch.setattr(run_pictures, "_graph", lambda *_: place / "no_graph.png")
+            for module in (run_pictures, simulate_recipe):
+                patch.setattr(module, "GRAPH_DRAWING", partial(no_picture, place))
         arguments = [address if word == "LOCAL" else word for word in typed(words, found)]
         if found and found.processes > 1:
             return together(arguments, found.processes)
         with pytest.raises(SystemExit) as end:
             app.main([*arguments, *(["--out", str(shown_by(own, place))] if asked else [])])
         assert end.value.code == (found.code if found else 0)
+
+
+def no_picture(place: Path, file: Path, **_) -> None:
+    """Write a picture of nothing, where no page shows it."""
+    shutil.copy(place / "no_graph.png", file)
 
 
 def shown_by(words: tuple[str, ...], place: Path) -> Path:

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
+import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
 
 import xxhash
@@ -32,22 +34,22 @@ class DerivedFiles:
     def __init__(self, store: Store) -> None:
         self.store = store
         self.folder = store.root / "files"
-        self._spare: TemporaryDirectory[str] | None = None
-        self._fresh: set[Path] = set()
+        self._spare = ""  # a temporary folder, which goes with this object
+        self._fresh: dict[Path, tuple[int, ...]] = {}  # what the system said of each file when it was right
 
     def find(self, key: str, suffix: str) -> Path | None:
         """Return the path of the derived file ``key``, or None if the file is missing or has a wrong checksum.
 
-        A file that this object has written or compared is not compared again.
+        A file that this object has written or compared is not compared again while it is the same to the system.
         """
         from torch import Tensor
 
         path = self._path(key, suffix)
-        if path in self._fresh and path.is_file():
-            return path
         with suppress(KeyError, OSError):
+            if path in self._fresh and self._fresh[path] == _state(path):
+                return path
             if path.is_file() and self.store.has(key) and _is_right(path, self.store.get(key, Tensor)):
-                self._fresh.add(path)
+                self._fresh[path] = _state(path)
                 return path
         return None
 
@@ -60,8 +62,10 @@ class DerivedFiles:
             path = self._written(key, suffix, write)
         except OSError as error:
             self.store.report_failure(error)
-            self._spare = self._spare or TemporaryDirectory(prefix="neusee-")
-            self.folder = Path(self._spare.name)
+            if not self._spare:
+                self._spare = mkdtemp(prefix="neusee-")
+                weakref.finalize(self, _remove, self._spare, os.getpid())
+            self.folder = Path(self._spare)
             path = self._written(key, suffix, write)
         about = {
             "step": what,
@@ -71,7 +75,7 @@ class DerivedFiles:
             "file_bytes": path.stat().st_size,
         }
         self.store.put(key, _digest(path, "sha256" if secrets() else _FAST), about)
-        self._fresh.add(path)
+        self._fresh[path] = _state(path)
         return path
 
     def _path(self, key: str, suffix: str) -> Path:
@@ -88,6 +92,17 @@ class DerivedFiles:
         finally:
             part.unlink(missing_ok=True)
         return path
+
+
+def _remove(folder: str, process: int) -> None:
+    """Remove a folder in the process that made it, and not in a fork of it."""
+    if os.getpid() == process:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _state(path: Path) -> tuple[int, ...]:
+    about = path.stat()
+    return about.st_ino, about.st_size, about.st_mtime_ns
 
 
 def _is_right(path: Path, kept: Tensor) -> bool:

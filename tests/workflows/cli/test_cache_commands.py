@@ -45,13 +45,13 @@ def test_an_empty_store_is_listed(tmp_path):
 
 
 def test_a_sound_store_is_verified(store):
-    DerivedFiles(store).keep("ef" * 16, ".png", "picture", b"x" * 980_000)
+    DerivedFiles(store).keep("ef" * 16, ".png", "picture", lambda path: path.write_bytes(b"x" * 980_000))
     assert cache_commands.verify_lines(store) == (["3 results, 1.02 MB, as written"], 0)
 
 
 @pytest.mark.parametrize("mode", ["always", "never"])
 def test_what_is_damaged_is_named_and_put_aside(store, mode):
-    picture = DerivedFiles(store).keep("ef" * 16, ".png", "picture", b"x" * 1000)
+    picture = DerivedFiles(store).keep("ef" * 16, ".png", "picture", lambda path: path.write_bytes(b"x" * 1000))
     picture.chmod(0o644)
     picture.write_bytes(b"y" * 1000)
     for key, suffix, at in ((KEYS[0], "safetensors", -1), (KEYS[2], "json", 20)):

@@ -112,7 +112,7 @@ def test_8_a_number_out_of_range(refused):
 
 def test_9_a_wrong_type(refused):
     assert refused("sensor.bits=twelve") == ["argument 1 | sensor.bits = twelve | must be a whole number"]
-    assert refused("reading.rounding=down")[0].startswith("argument 1 | reading.rounding = down | must be 'nearest' or")
+    assert refused("reading.rounding=down")[0].startswith("argument 1 | reading.rounding = down | must be 'nearest',")
 
 
 def test_10_a_missing_file(refused, tmp_path):

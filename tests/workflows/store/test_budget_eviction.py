@@ -397,7 +397,7 @@ def test_damaged_entries_go_after_a_week(tmp_path, monkeypatch):
 
 def test_pictures_go_with_their_entry_and_count(tmp_path, monkeypatch):
     store = Store(tmp_path)
-    path = DerivedFiles(store).keep(key_of(1), ".png", "picture", b"x" * 50_000)
+    path = DerivedFiles(store).keep(key_of(1), ".png", "picture", lambda path: path.write_bytes(b"x" * 50_000))
     stray = path.with_name(f"{key_of(257)}.png")
     stray.write_bytes(b"y")
     half = path.with_name(f".{key_of(257)}.77.png")

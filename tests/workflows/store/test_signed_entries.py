@@ -176,7 +176,7 @@ def test_the_journal_and_small_results_are_signed_too(tmp_path, secret):
 def test_a_derived_file_is_bound_by_its_sha256(tmp_path, secret):
     secret("one")
     files = DerivedFiles(Store(tmp_path))
-    path = files.keep(KEY, ".png", "picture", b"picture")
+    path = files.keep(KEY, ".png", "picture", lambda path: path.write_bytes(b"picture"))
     assert files.find(KEY, ".png") == path
     assert bytes(Store(tmp_path).get(KEY).tolist()) == hashlib.sha256(b"picture").digest()
     path.unlink()
@@ -187,7 +187,7 @@ def test_a_derived_file_is_bound_by_its_sha256(tmp_path, secret):
 def test_a_store_of_a_forged_value_type_is_no_file(tmp_path):
     store = Store(tmp_path)
     files = DerivedFiles(store)
-    files.keep(KEY, ".png", "picture", b"picture")
+    files.keep(KEY, ".png", "picture", lambda path: path.write_bytes(b"picture"))
     store.put(KEY, ["text"], ABOUT)
     with pytest.warns(UserWarning, match="is damaged"):
         assert DerivedFiles(Store(tmp_path)).find(KEY, ".png") is None

@@ -148,7 +148,7 @@ class SensorSimulator:
 def with_narrow_prior(recipe: Recipe, changed: Mapping[str, Mapping[str, Any]]) -> Recipe:
     """Return the recipe with the parameters of each step in ``changed``, and with a prior no wider than `WIDEST`."""
     prior = only_step(recipe, "calibrate.prior")
-    capped = {name: _capped(name, law) for name, law in prior.params.items()}
+    capped = {name: _capped(name, law) for name, law in prior.params.items() if name in WIDEST or name == "offset"}
     both = {**changed, prior.name: capped}
     steps = {n: replace(recipe.steps[n], params={**recipe.steps[n].params, **new}) for n, new in both.items()}
     return replace(recipe, steps={**recipe.steps, **steps})
