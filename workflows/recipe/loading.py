@@ -134,7 +134,9 @@ def check(composed: Composed) -> Recipe:
     uncertain = _with_mismatch(composed, uncertain, blocks[0] if training else None, diagnostics)
     root, references = composed.root, References(composed.root, diagnostics, dict(composed.replaced))
     checker = Checker([], own=own.modules)
-    checker.files |= {(KEY,): own.places, **({("train", "masks"): [*training.masks]} if training else {})}
+    checker.files[(KEY,)] = own.places
+    if training:
+        checker.files["train", "masks"] = [*training.masks]
     graph = cached_graph(root, own.modules)
     steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, diagnostics, own)
     wiring, checked = Wiring(root, steps, absent, references, diagnostics), list[CheckedStep]()

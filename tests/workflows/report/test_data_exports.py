@@ -114,4 +114,5 @@ def test_a_full_disk_leaves_the_file_in_a_temporary_folder(tmp_path):
     assert path.read_bytes() == b"whole"
     assert not path.is_relative_to(tmp_path)
     assert shelf.keep("cd" * 16, ".exr", "x", full).parent.parent == path.parent.parent
-    shelf._spare.cleanup()
+    del shelf
+    assert not path.exists()  # the folder goes with it
