@@ -1,0 +1,51 @@
+"""The density of a posterior whose parameter is hardly told from 0, beside the integral over a grid in NumPy."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from neusee.workflows.calibration.importance_sampling import weights
+from neusee.workflows.calibration.mode_mixture import fit_about_mode
+
+FOUND, ERROR, WIDTH = 0.7, 0.25, 2.3  #: a dark current and its standard error; the width of its prior, a logarithm
+
+
+def log_posterior(theta):
+    """A dark current, as a logarithm, and an offset that frames tell together with it."""
+    current = np.exp(theta[..., 0])
+    told = ((current - FOUND) / ERROR) ** 2 + ((theta[..., 1] + 0.5 * current - 2.0) / 0.1) ** 2
+    return -0.5 * (told + (theta[..., 0] / WIDTH) ** 2)
+
+
+def quantile(values, weight, share):
+    order = np.argsort(values)
+    return values[order][np.searchsorted(np.cumsum(weight[order]), share)]
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Samples of the fitted density, and their weights."""
+    jacobian = np.array([[FOUND / ERROR, 0.0], [5 * FOUND, 10.0]])  # at the mode, in whitened numbers
+    covariance = np.linalg.inv(jacobian.T @ jacobian + np.diag([WIDTH**-2, 0.0]))
+    mode = SimpleNamespace(theta=np.array([np.log(FOUND), 2.0 - 0.5 * FOUND]), covariance=covariance)
+    coordinates = SimpleNamespace(widths=frozenset(), linear=frozenset({"offset"}), bent=False)
+    problem = SimpleNamespace(names=("dark_current", "offset"), coordinates=coordinates, log_posterior=log_posterior)
+    _, samples, log = fit_about_mode(problem, mode, 4000, np.random.default_rng(5))
+    return samples, weights(log)
+
+
+@pytest.mark.parametrize("share", [0.005, 0.02, 0.1, 0.5, 0.9])
+def test_the_long_lower_tail_has_its_weight(drawn, share):
+    grid = np.linspace(-12, 2, 4001)
+    offsets = np.linspace(0.5, 3.0, 801)
+    cells = np.exp(log_posterior(np.stack(np.meshgrid(grid, offsets, indexing="ij"), -1)))
+    density = cells.sum(1) / cells.sum()
+    error = np.sqrt(2 * share * (1 - share) / len(drawn[0]))  # of the share, for weights that are not equal
+    below = drawn[1][drawn[0][:, 0] < quantile(grid, density, share)].sum()
+    assert below == pytest.approx(share, abs=4 * error)
+
+
+def test_no_sample_has_a_large_weight(drawn):
+    """Without a component for the tail the largest of 4000 weights is 0.0021, eight times the mean."""
+    assert drawn[1].max() < 1e-3
