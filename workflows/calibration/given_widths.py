@@ -7,6 +7,7 @@ of all parameters together cannot follow how a wide drift makes the dark signal 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -76,9 +77,15 @@ class GivenWidths:
         step, root = law
         away = (samples[:, ~self.at] - self.theta[~self.at]) / self._unit - step
         square = (np.einsum("nij,ni->nj", root, away) ** 2).sum(1)
-        level = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
+        level = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1) + self._constant(away.shape[1])
         log: FloatArray = level - 0.5 * (_TAIL + away.shape[1]) * np.log1p(square / _TAIL)
         return log
+
+    def _constant(self, others: int) -> float:
+        """Return what the degrees of freedom and the units add to the log density, as `Mixture` counts it."""
+        half = 0.5 * _TAIL
+        gammas = math.lgamma(half + 0.5 * others) - math.lgamma(half)
+        return gammas - 0.5 * others * math.log(_TAIL) - float(np.log(np.abs(self._unit)).sum())
 
 
 @dataclass(frozen=True)

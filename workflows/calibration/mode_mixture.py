@@ -24,6 +24,7 @@ from neusee.workflows.calibration.posterior_mixture import (
     softened,
     weighed,
 )
+from neusee.workflows.calibration.tail_density import with_tails
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import FloatArray, SensorPosterior
@@ -34,7 +35,6 @@ _ROUNDS, _LEAST, _ENOUGH = 8, 3, 0.6  #: most and fewest rounds; effective sampl
 _PARTS, _STEPS, _BORROWED = 6, 8, 0.1  #: components of a fit, its steps, and the share of samples added to each
 _START = 6.0  #: degrees of freedom about the mode
 _TAIL = 30.0  #: degrees of freedom of the components that are like the posterior
-_DOUBT, _SHELF, _LOW = 0.12, 0.05, 2.5  #: least deviation of a logarithm with a long lower tail; its share; its reach
 _SAFE, _POWER, _SAFE_TAIL = 0.2, 0.5, 10.0  #: share, power of the posterior, and degrees of freedom of the wide part
 
 
@@ -45,15 +45,13 @@ def fit_about_mode(
 
     The density is a mixture; for a real camera, whose noise has widths that are free, a mixture of these widths, with
     all other parameters as the widths imply. A fifth of the mixture is fitted to the square root of the posterior,
-    which has the same shape and wider tails, so that no sample far out gets a large weight. A positive parameter that
-    is hardly told from 0 has a long lower tail in its logarithm, for which a component stands. The density with the
-    largest effective sample size is kept, and new samples are drawn from it, whose own effective sample size the caller
-    must check.
+    which has the same shape and wider tails, so that no sample far out gets a large weight. The density with the
+    largest effective sample size is kept, with parts for long lower tails (`tail_density`), and new samples are drawn
+    from it, whose own effective sample size the caller must check.
     """
     others = GivenWidths(problem, mode) if problem.coordinates.widths.intersection(problem.names) else None
     at = others.at if others else np.ones(len(mode.theta), dtype=bool)
     mixture = Mixture(np.ones(1), mode.theta[None, at], _root(mode.covariance[at][:, at])[None], np.array([_START]))
-    mixture = _joined(mixture, None if others else _shelves(problem, mode))
     mixtures: list[Mixture] = []
     samples: list[FloatArray] = []
     logs: list[FloatArray] = []
@@ -70,45 +68,8 @@ def fit_about_mode(
         if number >= _LEAST and best >= _ENOUGH:
             break
         mixture = _next(mixtures, np.concatenate(samples), np.concatenate(logs), rng)
-        mixture = _joined(mixture, None if others else _shelves(problem, mode))
+    kept = with_tails(kept, problem, mode)
     return kept, *weighed(problem, kept, count, rng)
-
-
-def _shelves(problem: SensorPosterior, mode: LaplaceFit) -> Mixture | None:
-    """Return a component for each positive parameter that is hardly told from 0, where its logarithm falls.
-
-    The data see such a parameter as 0 there, so that all others lie where a line through the mode leads them, with
-    the deviations that they have for a known value, and the logarithm has its prior alone.
-    """
-    covariance, linear = mode.covariance, problem.coordinates.linear
-    spread = np.sqrt(np.diagonal(covariance))
-    found = [i for i, name in enumerate(problem.names) if name not in linear and spread[i] > _DOUBT]
-    if not found:
-        return None
-    centres, roots = [], []
-    for i in found:
-        slope = covariance[:, i] / covariance[i, i]
-        centre = mode.theta - slope
-        centre[i] = mode.theta[i] - _LOW
-        given = covariance - np.outer(slope, covariance[i])
-        given[i], given[:, i] = 0.0, 0.0
-        given[i, i] = _LOW**2 / 2
-        centres.append(centre)
-        roots.append(_root(given))
-    return Mixture(np.full(len(found), 1 / len(found)), np.stack(centres), np.stack(roots), np.full(len(found), 6.0))
-
-
-def _joined(mixture: Mixture, more: Mixture | None) -> Mixture:
-    """Return a mixture in which the components ``more`` have a fixed share."""
-    if more is None:
-        return mixture
-    tails = [np.broadcast_to(m.tails, m.shares.shape) for m in (mixture, more)]
-    return Mixture(
-        np.concatenate([(1 - _SHELF) * mixture.shares, _SHELF * more.shares]),
-        np.concatenate([mixture.centres, more.centres]),
-        np.concatenate([mixture.roots, more.roots]),
-        np.concatenate(tails),
-    )
 
 
 def _whole(mixture: Mixture, others: GivenWidths | None) -> Density:
