@@ -52,7 +52,10 @@ def test_the_width_at_the_peak_is_that_of_the_posterior(store):
     p = problem(store, "reading=as_printed")
     law = importance_samples(p, mode(p), 1)
     assert law.tail < 0.7
-    np.testing.assert_allclose(np.sqrt(mode(p).covariance.diagonal()), law.sd(), rtol=0.15)
+    dark = p.names.index("dark_current")  # hardly told from 0, so that its logarithm has a long lower tail
+    peak, whole = np.sqrt(mode(p).covariance.diagonal()), law.sd()
+    np.testing.assert_allclose(np.delete(peak, dark), np.delete(whole, dark), rtol=0.15)
+    assert 1.1 < whole[dark] / peak[dark] < 2.0
 
 
 def test_what_no_frame_tells_is_said_in_words(store):

@@ -63,7 +63,8 @@ def test_the_shapes_of_the_first_recipe_are_those_of_its_run(tmp_path):
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", ["first_light", *CAMERA])
 def test_the_shapes_of_a_recipe_are_those_of_its_run(name, size, tmp_path):
-    recipe = load(name, [*SIZES[size], PITCH[size], "tolerance=0" if name == "hdr_night" else "seed=7"])
+    exact = name == "hdr_night" or (name, size) == ("first_light", "larger")  # whose values ask for a second attempt
+    recipe = load(name, [*SIZES[size], PITCH[size], "tolerance=0" if exact else "seed=7"])
     compare(recipe, wanted(recipe), Store(tmp_path))
 
 
