@@ -23,8 +23,10 @@ from neusee.workflows.handbook import command_pictures
 from neusee.workflows.handbook.guide_pages import pictures_of, read_pages
 from neusee.workflows.handbook.site_build import build_handbook
 from neusee.workflows.recipe import node_families
+from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report import run_pictures
 from neusee.workflows.report.figures import style
+from neusee.workflows.report.run_pictures import graphs
 from neusee.workflows.simulation import simulate_recipe
 from tests.guide_commands import (
     GUIDE,
@@ -103,6 +105,7 @@ def carry_out(words: str, place: Path, monkeypatch) -> None:
         if "graph" not in asked:
             for module in (run_pictures, simulate_recipe):
                 patch.setattr(module, "GRAPH_DRAWING", partial(no_picture, place))
+                patch.setattr(module, "graphs", other_graphs)
         arguments = [address if word == "LOCAL" else word for word in typed(words, found)]
         if found and found.processes > 1:
             return together(arguments, found.processes)
@@ -114,6 +117,11 @@ def carry_out(words: str, place: Path, monkeypatch) -> None:
 def no_picture(place: Path, file: Path, **_) -> None:
     """Write a picture of nothing, where no page shows it."""
     shutil.copy(place / "no_graph.png", file)
+
+
+def other_graphs(result) -> list:
+    """Return the graphs of a run under keys of their own, so that a page that shows one finds no picture of nothing."""
+    return [(digest("no picture", key), arguments) for key, arguments in graphs(result)]
 
 
 def shown_by(words: tuple[str, ...], place: Path) -> Path:
