@@ -88,7 +88,7 @@ def _library(sources: tuple[Path, ...], build: Path, compiler: str | None) -> ct
         return NoCompilerError(f"{build / name} cannot be loaded: {error}")
 
 
-def library(*sources: Path) -> ctypes.CDLL:
+def load(*sources: Path) -> ctypes.CDLL:
     """Return the library of the first source, compiled if needed, with the other sources as its headers.
 
     Raises `NoCompilerError` if the source cannot be compiled.
@@ -102,7 +102,7 @@ def library(*sources: Path) -> ctypes.CDLL:
 def compiled(what: str, *sources: Path) -> bool:
     """Return True if the library of ``what`` is available, compiled if needed; otherwise warn once and return False."""
     try:
-        library(*sources)
+        load(*sources)
     except NoCompilerError as error:
         _say_once(what, str(error))
         return False

@@ -62,7 +62,7 @@ class _Gradients(ctypes.Structure):
 
 def operators() -> ctypes.CDLL:
     """Return the library of the C++, compiled if needed; raise `NoCompilerError` if it cannot be compiled."""
-    return _cpp_library.library(*SOURCES)
+    return _cpp_library.load(*SOURCES)
 
 
 def available(device: torch.device) -> bool:

@@ -20,7 +20,7 @@ NAMES = {torch.float32: "f32", torch.float64: "f64"}
 
 def operators() -> ctypes.CDLL:
     """Return the library of the C++ scan, compiled if needed; raise `NoCompilerError` if it cannot be compiled."""
-    return _cpp_library.library(CODE)
+    return _cpp_library.load(CODE)
 
 
 def compiled() -> bool:

@@ -4,9 +4,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.special import logsumexp
+from scipy.stats import multivariate_t
 
 from neusee.workflows.calibration.importance_sampling import weights
 from neusee.workflows.calibration.mode_mixture import fit_about_mode
+from neusee.workflows.calibration.posterior_mixture import Mixture
+from neusee.workflows.calibration.tail_density import TailDensity
 
 FOUND, ERROR, WIDTH = 0.7, 0.25, 2.3  #: a dark current and its standard error; the width of its prior, a logarithm
 
@@ -49,3 +53,17 @@ def test_the_long_lower_tail_has_its_weight(drawn, share):
 def test_no_sample_has_a_large_weight(drawn):
     """Without a component for the tail the largest of 4000 weights is 0.0021, eight times the mean."""
     assert drawn[1].max() < 1e-3
+
+
+def test_body_and_tails_are_one_density():
+    """By another library: two mixtures of other shares and degrees of freedom, of which one counts for a twentieth."""
+    body = Mixture(np.array([0.3, 0.7]), np.array([[0.0, 1.0], [2.0, 0.0]]), np.stack([np.eye(2), 3 * np.eye(2)]), 20.0)
+    tails = Mixture(np.ones(1), np.array([[-4.0, 1.0]]), np.array([[[2.0, 0.0], [0.5, 1.0]]]), np.array([6.0]))
+    samples = np.random.default_rng(3).normal(0.0, 3.0, (20, 2))
+    logs = [
+        np.log(share * part) + multivariate_t(centre, root @ root.T, df=df).logpdf(samples)
+        for share, mixture, df in ((0.95, body, 20.0), (0.05, tails, 6.0))
+        for part, centre, root in zip(mixture.shares, mixture.centres, mixture.roots, strict=True)
+    ]
+    found = TailDensity(body, tails).log_density(samples)
+    assert found - logsumexp(logs, axis=0) == pytest.approx(np.full(20, np.log(np.pi)), abs=1e-9)
