@@ -181,11 +181,12 @@ STAND_INS = {
         "ten minutes", more=(*TRAINING, *ONE)),
     'train my/train_smallnet.yaml "train.export=[pt2]"': StandIn("minutes", more=SMALLNET),
     "train train_informed train.photographs=my_photographs +mismatch=usual": StandIn("half an hour", more=(
-        *TRAINING[:-2], "train.network.width=2", "train.pool=2", "train.masks=[flat]", "train.stages.2.iterations=1",
-        "train.stages.2.batch=2")),
+        *TRAINING[:-2], "train.network.width=2", "train.pool=2", "train.cameras=[[doe=flat]]",
+        "train.stages.2.iterations=1", "train.stages.2.batch=2")),
     "train train_unrolled train.photographs=my_photographs": StandIn("half an hour", more=(
         *TRAINING[:-2], "train.network.width=2", "train.pool=2", "train.stages.2.iterations=1",
-        "train.stages.2.batch=2")),
+        "train.stages.2.batch=2",
+    )),
     "evaluate train_informed --data photographs --scenes 8 --strengths 0,1e3,1e5 "
     '--pipelines "half_ring+wiener_uncertain, half_ring+informed@best.safetensors"': StandIn(
         "8 scenes", instead={"8": "1", "0,1e3,1e5": "30"}, more=("+evaluate={mismatch: null}",), constants=WEAK),

@@ -50,7 +50,7 @@ def peak_irradiance(
     sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency}
     if len(spots or ()) != len(lines or ()):
         raise ValueError(f"{len(spots or ())} spots and {len(lines or ())} laser lines: give one line for each spot")
-    total = _in_wells(image, saturation(bands, **sensor, pixel_pitch=pixel_pitch, exposure=exposure) / level.cpu())
+    total = _in_wells(image, saturation(bands, **sensor, pixel_pitch=pixel_pitch, exposure=exposure) / level)
     for spot, line in zip(spots or (), lines or (), strict=True):
         total = total + _in_wells(spot, saturation(line, **sensor, pixel_pitch=pixel_pitch, exposure=exposure))
     top = total.max().double()

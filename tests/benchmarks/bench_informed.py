@@ -8,7 +8,8 @@ recipe by the laws of `mismatch: usual`, and exposure, read noise and laser are 
 simulated frame is restored by the filter that believes the recipe (`wiener`, doubt 0), with the likeliest doubt
 (null), by the filter with drawn patterns (`wiener_uncertain`), and by the network. Each photograph has a frame behind
 each mask, with strengths in turn; a third of them have a strong laser also behind a grey filter and behind a smaller
-stop that protect the sensor as much as the designed mask. Intervals are bootstrap-t over photographs. The folder
+stop that protect the sensor as much as the designed mask, and frames of a second camera (other lens, pixels, well and
+colours) and of a larger sensor, which no training knows. Intervals are bootstrap-t over photographs. The folder
 keeps the frames, so that a run that was stopped goes on, and other weights are judged in a minute.
 """
 
@@ -35,6 +36,16 @@ IN_TURN = (0.0, 1e4, 1e1, 1e5, 1e2, 1e6, 0.0, 1e3)  #: strengths of the frames
 WEAK, STRONG = (0.0, 1e1, 1e2), (1e3, 1e4, 1e5, 1e6)
 MASKS = ("plain", "half_ring", "designed")
 RIVALS = ("grey", "stop")  #: of the designed mask: the plain lens with as low a peak
+SECOND = (  #: lens, sensor and colours of a camera that no training knows
+    "optics.focal_length=0.08 m", "sensor.pixel_pitch=3 um", "sensor.camera=Nikon 5100", "sensor.full_well=15000 e-",
+    "sensor.gain=0.25 e-/DN", "sensor.read_noise=uniform(4 e-, 6 e-)", "sensor.quantum_efficiency=0.65",
+)  # fmt: skip
+FINER = ("optics.samples=384", "optics.pitch=21.037 um")  #: so that the PSF of a larger frame repeats outside
+OTHERS = {  #: cameras beside that of the training, by name: the mask, and what differs
+    "second plain": ("plain", SECOND),
+    "second half_ring": ("half_ring", SECOND),
+    "larger half_ring": ("half_ring", ("scene.shape=[352, 352]", "sensor.shape=[288, 288]", *FINER)),
+}
 STOP = PEAK**0.25  #: the peak falls with the fourth power of the diameter, the light with its square
 BACKGROUND, DIAMETER = 0.7, 11.0
 EACH = 3  #: photographs, of which one stands behind the rivals too
@@ -106,6 +117,7 @@ class OfRival(Judged):
 
 def words(mask):
     """What turns the recipe into that of a mask, or of a rival of the designed mask."""
+    mask, more = OTHERS.get(mask, (mask, ()))
     doe = {
         "half_ring": ["doe=half_ring"],
         "designed": ["doe=pixelwise", f"doe.file={DESIGNED}", "doe.between=nearest"],
@@ -113,7 +125,7 @@ def words(mask):
     light = {"grey": PEAK, "stop": STOP**2}.get(mask, 1.0)
     size = DIAMETER * (STOP if mask == "stop" else 1.0)
     light = [f"sensor.background={BACKGROUND * light}", f"optics.diameter={size} mm"]
-    return [*doe, *light, "train.masks=[]", "train.network={kind: nafnet, width: 16}", *NO_POOL]
+    return [*doe, *light, *more, "train.cameras=[]", "train.network={kind: nafnet, width: 16}", *NO_POOL]
 
 
 def run(folder, pictures, count):
@@ -128,16 +140,17 @@ def run(folder, pictures, count):
         frames = {mask: IN_TURN[(3 * number + m) % len(IN_TURN)] for m, mask in enumerate(MASKS)}
         if number % EACH == 0:
             frames |= dict.fromkeys(RIVALS, STRONG[number // EACH % len(STRONG)])
+            frames |= {name: IN_TURN[(number // EACH + m) % len(IN_TURN)] for m, name in enumerate(OTHERS)}
         for mask, strength in frames.items():
             if (photograph.name, mask, strength) in done:
                 continue
             if mask not in streams:
                 recipe = load(recipe_file, words(mask))
-                kind = Judged if mask in MASKS else OfRival
+                kind = OfRival if mask in RIVALS else Judged
                 streams[mask] = kind(recipe, recipe.training, photographs, store, "cpu", recipe, held_out=held_out)
             streams[mask].strength, streams[mask].factor = strength, PEAK if mask in RIVALS else 1.0
             found, kept = streams[mask]({}, HELD_OUT, number)
-            name = f"{number:03d}_{mask}_{strength:g}"
+            name = f"{number:03d}_{mask.replace(' ', '_')}_{strength:g}"
             save_file(kept, folder / f"{name}.safetensors")
             each = {"photograph": photograph.name, "mask": mask, "strength": strength, "file": name, **found}
             with (folder / "frames.jsonl").open("a") as out:
@@ -152,7 +165,7 @@ def rows(folder):
 def judged(folder, weights, width):
     """Return the frames of the folder with the score of the network."""
     net = Informed(width).eval()
-    net.load_state_dict(load_file(weights))
+    net.load_state_dict({name: x.float() for name, x in load_file(weights).items()})
     found = rows(folder)
     for row in found:
         kept = load_file(folder / f"{row['file']}.safetensors")
@@ -179,7 +192,7 @@ def report(found):
     print(f"| mask | strength | frames | {' | '.join(METHODS)} | over likeliest | over uncertain |")
     print("|---" * (len(METHODS) + 5) + "|")
     groups = [*((f"{s:g}", (s,)) for s in (*WEAK, *STRONG)), ("0 to 100", WEAK), ("1e3 to 1e6", STRONG)]
-    for mask in (*MASKS, *RIVALS):
+    for mask in (*MASKS, *RIVALS, *OTHERS):
         for name, strengths in [*groups, ("all", (*WEAK, *STRONG))]:
             some = [r for r in found if r["mask"] == mask and r["strength"] in strengths]
             if some:

@@ -54,6 +54,17 @@ class Config:
         return "".join(f"{line}\n" for line in _lines(tree, 0))
 
 
+def changes(base: Config, other: Config, apart: str) -> list[str]:
+    """Return the overrides that turn the values of one recipe into those of another, but for the block ``apart``."""
+    own, was = (
+        {path: s.value for path, s in config.settings.items() if not s.default and s.path[0] != apart}
+        for config in (other, base)
+    )
+    gone = [f"~{path}" for path in was if path not in own]
+    put = [f"{path}={flow(x)}" if path in was else f"+{path}={flow(x)}" for path, x in own.items()]
+    return gone + [text for text, (path, x) in zip(put, own.items(), strict=True) if path not in was or was[path] != x]
+
+
 def _lines(tree: Mapping[str | int, Any], depth: int) -> Iterator[str]:
     indent = "  " * depth
     for key, value in tree.items():

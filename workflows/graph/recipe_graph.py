@@ -93,6 +93,7 @@ class Recipe:
     unsubstituted: Recipe | None = field(default=None, compare=False)  #: the recipe before substitutions, if any
     uncertain: Uncertain | None = field(default=None, compare=False)  #: distributions for the study of uncertainty
     training: Training | None = field(default=None, compare=False)  #: settings of the training of a network
+    cameras: tuple[Recipe, ...] = field(default=(), compare=False)  #: of `train.cameras`, one recipe each
     lifting: LiftTraining | None = field(default=None, compare=False)  #: settings of the training of a lift
     safety: Safety | None = field(default=None, compare=False)  #: settings of the estimate of damage and dazzle
     evaluation: EvaluateSettings | None = field(default=None, compare=False)  #: settings of an evaluation

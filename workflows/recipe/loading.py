@@ -20,6 +20,7 @@ from neusee.workflows.recipe.global_settings import estimates_of, expectations, 
 from neusee.workflows.recipe.graph_cache import CachedGraph, cache_graph, cached_graph
 from neusee.workflows.recipe.known_before_run import CheckedStep, check_steps, refuse_indices
 from neusee.workflows.recipe.node_families import NO_FAMILY, Own, class_context
+from neusee.workflows.recipe.other_cameras import with_cameras
 from neusee.workflows.recipe.own_families import KEY, OwnFamilies, read_own_families
 from neusee.workflows.recipe.parameters import Checker
 from neusee.workflows.recipe.step_declarations import Declared, declare, device_of
@@ -74,7 +75,10 @@ def load(
     """
     name, beside = os.fspath(name_or_path), Path(folder or ".").absolute()
     changes: tuple[str | Override, ...] = (*overrides, *overrides_of(values, beside))
-    recipe = check(compose(name, changes, beside, first))
+    composed = compose(name, changes, beside, first)
+    recipe = check(composed)
+    if recipe.training and recipe.training.cameras:
+        recipe = with_cameras(recipe, composed, lambda words: check(compose(name, [*changes, *words], beside, first)))
     if recipe.expect and changes:
         recipe = unaffected_expectations(recipe, _as_written(name, beside))
     if recipe.expect and (problems := list(refuse_indices(recipe))):
@@ -135,8 +139,6 @@ def check(composed: Composed) -> Recipe:
     root, references = composed.root, References(composed.root, diagnostics, dict(composed.replaced))
     checker = Checker([], own=own.modules)
     checker.files[(KEY,)] = own.places
-    if training:
-        checker.files["train", "masks"] = [*training.masks]
     graph = cached_graph(root, own.modules)
     steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, diagnostics, own)
     wiring, checked = Wiring(root, steps, absent, references, diagnostics), list[CheckedStep]()

@@ -18,9 +18,9 @@ from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.blocks.train_block import KEY, Training
 from neusee.workflows.training.loop.resumable_loop import Losses
-from neusee.workflows.training.mixed_masks import Samples
 from neusee.workflows.training.parallel.process_mesh import Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
+from neusee.workflows.training.several_cameras import Samples
 from neusee.workflows.training.training_pictures import HELD_OUT, Sample
 
 CONFIDENCE = 0.9  #: of the interval of a mean over photographs

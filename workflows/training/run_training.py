@@ -24,8 +24,8 @@ from neusee.workflows.training.held_out import Best, Split, Validation
 from neusee.workflows.training.loop.checkpoint import export
 from neusee.workflows.training.loop.resumable_loop import Losses, Progress, ResumableLoop, Watch
 from neusee.workflows.training.mask_design.design_run import MASK, design_in, designed
-from neusee.workflows.training.mixed_masks import require_masks, samples_of
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh, MeshError
+from neusee.workflows.training.several_cameras import require_alone, samples_of
 from neusee.workflows.training.tensorboard_log import open_board
 from neusee.workflows.training.training_figures import curves, png, strip
 from neusee.workflows.training.training_iteration import Learner
@@ -66,7 +66,7 @@ def train(
     if MASK in stages and mesh.size > 1:
         raise MeshError("--stage mask runs in a single process: start the training without torchrun")
     _require_equal_shares(recipe, settings, mesh)
-    require_masks(recipe, settings, mesh)
+    require_alone(recipe, mesh)
     CameraMismatch.of(recipe, settings)  # raises its mistakes before any work
     photographs = _photographs(recipe, settings, bool(with_pictures))
     parts = held_out.split(recipe, settings, photographs)

@@ -37,9 +37,10 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import device_kind, stream_seed
 from neusee.workflows.recipe.blocks.train_block import Network, Stage, Training
 from neusee.workflows.training.loop.resumable_loop import Losses, averaged, require_finite
-from neusee.workflows.training.mixed_masks import Samples
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
+from neusee.workflows.training.picture_batches import together
+from neusee.workflows.training.several_cameras import Samples
 from neusee.workflows.training.training_pictures import Sample
 from neusee.workflows.training.warm_start import WarmStart
 
@@ -141,13 +142,14 @@ class Learner:
         shared = samples.begin(self.height()) if samples.shared else Shared.of({})
         found = self._mask_suppression(shared, samples) if self.learns else {}
         batch, seen, pairs = self.stage.batch, list[Sample](), dict[int, tuple[Scales, Scales]]()
-        for i, sample in samples.batch(shared, stage, iteration * batch, batch):
+        pictures = _noted(samples.batch(shared, stage, iteration * batch, batch), seen)
+        for numbers, sample in together(pictures, self._whole):
             terms, truth, estimate = self._restoration_terms(sample)
-            pairs[i] = (truth, estimate)
-            _backward([weight * term / batch for weight, term in terms.values() if weight])
+            pairs |= _apart(numbers, truth, estimate)
+            share = len(numbers) / batch
+            _backward([weight * term * share for weight, term in terms.values() if weight])
             for name, (_, term) in terms.items():
-                found[name] = found.get(name, 0.0) + float(term.detach()) / batch
-            seen.append(sample)
+                found[name] = found.get(name, 0.0) + float(term.detach()) * share
         shared.back()
         found = self.mesh.numbers(found, self._names(), self.device)
         found["slope"] = self._move(
@@ -160,6 +162,15 @@ class Learner:
         if self.stage.adversarial:
             found |= self._train_critics(pairs, self._rng("between", stage, iteration))
         return found, seen
+
+    @property
+    def _whole(self) -> bool:
+        """Return True where the pictures of a batch go through the network together: on a GPU, behind a fixed mask.
+
+        A class of the user has random numbers of its own for each picture, and sums over pixels are of one picture.
+        """
+        gpu = device_kind(self.device) != "cpu" and not self.learns and not self.stage.bsr
+        return gpu and self.settings.reduction == "mean" and not isinstance(self.net, OwnNetwork)
 
     @torch.no_grad()
     def shared(self, samples: Samples) -> Shared:
@@ -260,6 +271,18 @@ class Learner:
         require_finite({**found, "norm of the gradient": norm})
         optimiser.step()
         return norm
+
+
+def _noted(pictures: Iterator[tuple[int, Sample]], seen: list[Sample]) -> Iterator[tuple[int, Sample]]:
+    for number, sample in pictures:
+        seen.append(sample)
+        yield number, sample
+
+
+def _apart(numbers: Sequence[int], truth: Scales, estimate: Scales) -> dict[int, tuple[Scales, Scales]]:
+    """Return the true and the restored picture of each number, of pictures that went through the network together."""
+    each = [[x.chunk(len(numbers)) for x in scales] for scales in (truth, estimate)]
+    return {n: (Scales(*(x[i] for x in each[0])), Scales(*(x[i] for x in each[1]))) for i, n in enumerate(numbers)}
 
 
 def _backward(terms: Sequence[Tensor]) -> None:

@@ -34,28 +34,29 @@ class Informed(Restorer):
         self.body.last.weight.zero_()
 
     def pyramid(self, picture: Tensor, *given: Any) -> tuple[Tensor, Tensor]:
-        """Return the restored picture at half and at full size: ``picture`` (1, 3, y, x) and what the network changes.
+        """Return the restored picture at half and at full size: ``picture`` (n, 3, y, x) and what the network changes.
 
         ``picture`` is what the filter restores; ``given`` are its `FilterFacts`, and the matrix (3, channel) from
-        electrons to colours.
+        electrons to colours, of a single picture or of n pictures along a first axis.
         """
         value, matrix = given
         change = self.change(value.answer, value.deviation, value.maps) * value.scale
-        fine = picture + torch.tensordot(matrix.to(change), change, 1).to(picture)
+        fine = picture + torch.einsum("...oc,...cyx->...oyx", matrix.to(change), change).to(picture)
         return resize(fine, -(-picture.shape[-2] // 2), -(-picture.shape[-1] // 2)), fine
 
     def change(self, answer: Tensor, deviation: Tensor, maps: Tensor) -> Tensor:
-        """Return what the network adds to the answer of the filter (3, y, x), in units of its scale.
+        """Return what the network adds to the answer of the filter (3, y, x), or to n of them, in units of its scale.
 
         It is the sum of three parts, each with a map of the network for each channel: a change, multiplied by the root
         of the predicted error, so that what is certain hardly changes; a share of the answer, which draws it to the
         mean of the scene; and a share of the mean of its channels, which draws it to grey.
         """
         rows, columns = maps.shape[-2:]
-        whole = mirrored(maps.to(self.body.last.weight)[None], -rows % self.multiple, -columns % self.multiple)
-        told: Tensor = self.body.change(whole)[0, :, :rows, :columns].to(answer)
-        free, share, grey = told[:3], told[3:6], told[6:]
-        return free * deviation.sqrt() + share * answer + grey * answer.mean(0)
+        each = maps.to(self.body.last.weight).reshape(-1, *maps.shape[-3:])
+        whole = mirrored(each, -rows % self.multiple, -columns % self.multiple)
+        told: Tensor = self.body.change(whole)[..., :rows, :columns].to(answer)
+        free, share, grey = told.reshape(*answer.shape[:-3], -1, rows, columns).split(3, -3)
+        return free * deviation.sqrt() + share * answer + grey * answer.mean(-3, keepdim=True)
 
 
 @node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])

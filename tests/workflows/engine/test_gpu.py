@@ -11,11 +11,20 @@ pytestmark = [
     pytest.mark.gpu,
     pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
 ]
-SMALL = ["optics.samples=256", "optics.pitch=30 um", "optics.window=[128, 128]", "sensor.shape=[96, 96]"]
+SMALL = [
+    "optics.samples=256",
+    "optics.pitch=30 um",
+    "optics.window=[128, 128]",
+    "sensor.shape=[96, 96]",
+    "scene.shape=[128, 128]",
+    "restore=null",
+    "steps.restored_quality=null",
+    "outputs=[raw, lsr]",
+]
 
 
 def small(*more):
-    return load("first_light", [*SMALL, "scene.shape=[128, 128]", "restore=null", "steps.restored_quality=null", *more])
+    return load("first_light", [*SMALL, *more])
 
 
 def test_the_optics_agree_with_those_of_the_cpu(tmp_path):
@@ -44,3 +53,15 @@ def test_a_step_goes_where_its_hint_says(tmp_path):
     result = run(small("steps.image.device=cpu"), Store(tmp_path), ("image[mask]",), device="cuda:0,cpu")
     assert result.done["image[mask]"].device == "cpu"
     assert result.done["psf[mask]"].device == "cuda:0"
+
+
+def test_every_output_of_a_whole_recipe_is_computed_there(tmp_path):
+    """Also the numbers at its end, such as the brightest pixel, which once mixed both devices."""
+    words = [word for word in SMALL if not word.startswith(("restore", "steps.restored", "outputs"))]
+    there = run(load("first_light", words), Store(tmp_path / "gpu"), device="cuda:0")
+    here = run(load("first_light", words), Store(tmp_path / "cpu"))
+    assert there.values.keys() == here.values.keys()
+    one, other = (float(x.values["peak[mask]"].irradiance) for x in (there, here))
+    assert abs(one / other - 1) < 1e-4
+    psnr = [float(x.values["restored_quality"].psnr) for x in (there, here)]
+    assert abs(psnr[0] - psnr[1]) < 0.2, "the noise is another one"

@@ -109,6 +109,10 @@ def test_every_packaged_recipe_says_itself_again(tmp_path):
         assert {n: (s.params, s.wires) for n, s in again.steps.items()} == {
             n: (s.params, s.wires) for n, s in first.steps.items()
         }
+        for one, other in zip(again.cameras, first.cameras, strict=True):
+            assert {n: (s.params, s.wires) for n, s in one.steps.items()} == {
+                n: (s.params, s.wires) for n, s in other.steps.items()
+            }
 
 
 def test_references_keep_their_type_nest_and_paste(read):

@@ -28,7 +28,6 @@ from neusee.workflows.recipe.text.yaml_values import Value
 
 KEY = "train"  #: key of the block in a recipe
 POSED = ("unrolled", "informed")  #: kinds of networks that need what the Wiener filter knows of a picture
-FLAT = "flat"  #: in place of the file of a mask: a plane plate
 _OF_CLASS = ("architecture", "parameters", "multiple")  #: settings of a network class of the user
 
 
@@ -126,7 +125,7 @@ class Training(SettingsBlock):
     pool: Number | None = None  #: images that are reused while the mask is fixed; None: always new images
     keep_pool: bool = True  #: keep the pictures of the pool in the cache, for later trainings
     augment: Augment = Augment()
-    masks: tuple[str, ...] = ()  #: height maps in m on the grid of the pupil, or flat: pictures behind each in turn
+    cameras: tuple[tuple[str, ...], ...] = ()  #: overrides, each list for one more camera: pictures of each in turn
     mismatch: dict[str, Any] | None = None  #: by path, laws of how the camera differs from what its restorer is told
     critics: Critics = Critics()
     betas: tuple[Beta, Beta] = (0.9, 0.999)
@@ -178,8 +177,8 @@ class Training(SettingsBlock):
 
     @model_validator(mode="after")
     def _mixes(self) -> Training:
-        if self.masks and self.learn is not None:
-            raise ValueError("masks: pictures stand behind several masks where none is trained: write learn: null")
+        if self.cameras and self.learn is not None:
+            raise ValueError("cameras: pictures are of several cameras where no mask is trained: write learn: null")
         return self
 
     @model_validator(mode="after")
@@ -228,10 +227,6 @@ def _missing(block: Value, training: Training) -> Iterator[Diagnostic]:
     if training.start is not None and not training.start.exists():
         value = block.items["start"]
         yield Diagnostic(value.mark, value.name, f"there is neither a file nor a folder {training.start}")
-    for mask in training.masks:
-        if mask != FLAT and not Path(mask).is_file():
-            value = block.items["masks"]
-            yield Diagnostic(value.mark, value.name, f"there is no file {mask}: give height maps in m, or {FLAT}")
 
 
 def _wrong_network(given: Value, training: Training) -> Iterator[Diagnostic]:
@@ -266,7 +261,4 @@ def _plain(block: Value) -> Any:
         value = outer.items.get(key) if outer else None
         if value is not None and isinstance(value.data, str):
             (plain if outer is block else plain["mask"])[key] = Path(value.mark.folder) / Path(value.data).expanduser()
-    if (masks := block.items.get("masks")) is not None and isinstance(plain.get("masks"), list):
-        folder = Path(masks.mark.folder)
-        plain["masks"] = [x if x == FLAT else str(folder / Path(x).expanduser()) for x in map(str, plain["masks"])]
     return plain

@@ -1,29 +1,25 @@
-"""Training pictures behind several fixed masks in turn, so that one network learns to restore behind all of them."""
+"""Training pictures of several cameras in turn, so that one network learns to restore the pictures of all of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from neusee.nodes import doe
 from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.recipe.blocks.train_block import FLAT, KEY, Training
+from neusee.workflows.recipe.blocks.train_block import KEY, Training
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.parallel.process_mesh import Mesh, MeshError
 from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.training_pictures import HELD_OUT, Sample, TrainingStream
 
-_HEIGHT = "height"  #: the step that an option of the group `doe` sets
 
+class SeveralCameras:
+    """The pictures of a training with the camera of its recipe and with each of ``train.cameras``.
 
-class MixedMasks:
-    """The pictures of a training behind the mask of its recipe and behind each of ``train.masks``.
-
-    The picture with the number n, or its number n in the pool, stands behind mask n modulo their count. A held-out
-    photograph is seen behind every mask.
+    The picture with the number n, or its number n in the pool, is of camera n modulo their count. A held-out photograph
+    is seen by every camera.
     """
 
     shared = None  #: no mask is trained, so that no result depends on one
@@ -32,11 +28,11 @@ class MixedMasks:
         self, recipe: Recipe, settings: Training, photographs: Photographs, store: Store, device: str,
         held_out: Sequence[Path],
     ) -> None:  # fmt: skip
-        recipes = behind_each(recipe, settings)
+        recipes = (recipe, *recipe.cameras)
         self.repeats, self._pool = len(recipes), settings.pool
         seen = [path for path in held_out for _ in recipes]
         parts = settings, photographs, store, device
-        self._streams = [TrainingStream(recipe, *parts, each, held_out=seen) for each in recipes]
+        self._streams = [TrainingStream(each, *parts, each, held_out=seen) for each in recipes]
         self.psf = self._streams[0].psf
 
     @property
@@ -62,38 +58,20 @@ class MixedMasks:
             yield i, stream.turned(stream(shared.seen, stage, number), stage, number)
 
 
-Samples = TrainingStream | MixedMasks
+Samples = TrainingStream | SeveralCameras
 
 
 def samples_of(
     recipe: Recipe, settings: Training, photographs: Photographs, store: Store, device: str, frozen: Recipe | None,
     mesh: Mesh, held_out: Sequence[Path],
 ) -> Samples:  # fmt: skip
-    """Return the pictures of a training, behind one mask or behind several in turn."""
-    if settings.masks and frozen is not None:
-        return MixedMasks(frozen, settings, photographs, store, device, held_out)
+    """Return the pictures of a training, of one camera or of several in turn."""
+    if frozen is not None and frozen.cameras:
+        return SeveralCameras(frozen, settings, photographs, store, device, held_out)
     return TrainingStream(recipe, settings, photographs, store, device, frozen, mesh, held_out)
 
 
-def require_masks(recipe: Recipe, settings: Training, mesh: Mesh) -> None:
-    """Raise an error for several masks in a recipe without a mask, or in a training of several processes."""
-    if settings.masks and mesh.size > 1:
-        raise MeshError(f"{KEY}.masks: a training behind several masks runs in a single process, without torchrun")
-    if settings.masks and (_HEIGHT not in recipe.steps or "stop" not in recipe.steps[_HEIGHT].wires):
-        raise ValueError(f"{KEY}.masks: {recipe.name} has no mask: add an option of the group doe to its defaults")
-
-
-def behind_each(recipe: Recipe, settings: Training) -> list[Recipe]:
-    """Return the recipe with its own mask, and with each mask of ``train.masks`` in place of it."""
-    step = recipe.steps[_HEIGHT]
-    wires = {"stop": step.wires["stop"]}
-    found = [recipe]
-    for mask in settings.masks:
-        node, params = (doe.flat, dict[str, Any]()) if mask == FLAT else (doe.pixelwise, _height_map(Path(mask)))
-        other = replace(step, node=node, params=params, wires=wires)
-        found.append(replace(recipe, steps={**recipe.steps, _HEIGHT: other}))
-    return found
-
-
-def _height_map(file: Path) -> Mapping[str, Any]:
-    return {"file": file, "scale": 0.1, "between": "nearest"}  # a map may be wrapped, and has edges
+def require_alone(recipe: Recipe, mesh: Mesh) -> None:
+    """Raise an error for a training with several cameras in several processes."""
+    if recipe.cameras and mesh.size > 1:
+        raise MeshError(f"{KEY}.cameras: a training with several cameras runs in a single process, without torchrun")

@@ -1,18 +1,23 @@
-"""Pictures behind several masks in turn: those of recipes that have one of the masks each."""
+"""Pictures of several cameras in turn: those of recipes that have one of the cameras each."""
 
 import csv
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from neusee import recipes
 from neusee.nodes.scene import Photographs
 from neusee.workflows import RecipeError, Store, load
-from neusee.workflows.training.held_out import _by_photograph
-from neusee.workflows.training.mixed_masks import MixedMasks, require_masks
+from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.training.held_out import Split, _by_photograph
 from neusee.workflows.training.parallel.process_mesh import Mesh, MeshError
 from neusee.workflows.training.parallel.shared_graph import Shared
+from neusee.workflows.training.several_cameras import SeveralCameras, require_alone
+from neusee.workflows.training.training_key import key_of_training
 from neusee.workflows.training.training_pictures import HELD_OUT, TrainingStream
 from tests.workflows.training.test_posed_pictures import POSED
 from tests.workflows.training.test_warm_start import trained
@@ -30,11 +35,13 @@ def files(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_picture_n_stands_behind_mask_n_and_a_held_out_photograph_behind_every_mask(files, tmp_path):
-    """The references are recipes with `doe=flat` and `doe=pixelwise`, and a stream that knows one mask."""
+def test_picture_n_is_of_camera_n_and_a_held_out_photograph_is_seen_by_every_camera(files, tmp_path):
+    """The references are recipes with the words of a camera as arguments, and a stream that knows one camera."""
     store, photographs = Store(tmp_path), Photographs((files / "one.png",))
-    recipe = load("train_small", [*WORDS, f"train.masks=[flat, {files / 'mask.npy'}]"])
-    mixed = MixedMasks(recipe, recipe.training, photographs, store, "cpu", photographs.paths)
+    masked = ["doe=pixelwise", f"doe.file={files / 'mask.npy'}"]
+    others = [["doe=flat", "sensor.background=loguniform(0.02, 0.5)"], masked]
+    recipe = load("train_small", [*WORDS, f"train.cameras={json.dumps(others)}"])
+    mixed = SeveralCameras(recipe, recipe.training, photographs, store, "cpu", photographs.paths)
 
     def alone(words, stage, number):
         other = load("train_small", [*WORDS, *words])
@@ -44,8 +51,7 @@ def test_picture_n_stands_behind_mask_n_and_a_held_out_photograph_behind_every_m
 
     found = dict(mixed.batch(Shared.of({}), 2, 1, 3))  # the last is the first of the pool again
     judged = dict(mixed.batch(Shared.of({}), HELD_OUT, 0, 3))
-    file = [f"doe.file={files / 'mask.npy'}"]
-    for number, words in enumerate([[], ["doe=flat"], ["doe=pixelwise", *file]]):
+    for number, words in enumerate([[], *others]):
         for sample, stage in ((found[(number - 1) % 3], 2), (judged[number], HELD_OUT)):
             expected = alone(words, stage, number)
             assert sample.drawn == expected.drawn
@@ -65,37 +71,63 @@ def test_a_photograph_counts_once_whatever_the_number_of_its_pictures():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["train.masks=[no.npy]"], r"there is no file .*no\.npy: give height maps in m, or flat"),
-        (["train.masks=[flat]", "train.learn=height"], "where none is trained: write learn: null"),
+        (["train.cameras=[[doe=nothing]]"], r"argument \d+.*nothing"),
+        (["train.cameras=[[sensor.well=3]]"], r"argument \d+.*unknown"),
+        (
+            ["train.cameras=[[doe=flat, train.pool=3]]"],
+            r"train\.cameras\.0.*train\.pool=3 is no setting of a camera",
+        ),
+        (["train.cameras=[[doe=flat]]", "train.learn=height"], "where no mask is trained: write learn: null"),
     ],
 )
-def test_masks_that_cannot_be_are_refused(words, message):
+def test_cameras_that_cannot_be_are_refused(words, message):
     kind = ["train.network={kind: unet, width: 4}", "train.picture=developed[mask]"]
     with pytest.raises(RecipeError, match=message):
         load("train_small", [*POSED, *kind, *words])
 
 
+def test_a_file_of_a_camera_is_sought_beside_the_recipe_and_counts_by_its_content(files, tmp_path):
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "mine.npy").write_bytes((files / "mask.npy").read_bytes())
+    text = (Path(recipes.__file__).parent / "train_small.yaml").read_text()
+    block = "train:\n  cameras:\n    - [doe=pixelwise, doe.file=masks/mine.npy]\n"
+    (tmp_path / "mine.yaml").write_text(text.replace("train:\n", block, 1))
+    recipe = load(tmp_path / "mine.yaml", POSED)
+    assert recipe.cameras[0].steps["height"].params["file"] == tmp_path / "masks" / "mine.npy"
+    assert recipe.cameras[0].cameras == ()
+
+    def key():
+        photographs = Photographs((files / "one.png",))
+        return key_of_training(
+            recipe, recipe.training, photographs, Split(photographs), None, Code(Store(tmp_path / "store").code_memo)
+        )
+
+    before = key()
+    np.save(tmp_path / "masks" / "mine.npy", np.zeros((48, 48)))
+    assert key() != before
+
+
 def test_several_processes_are_refused():
-    recipe = load("train_small", [*POSED, "train.masks=[flat]"])
+    recipe = load("train_small", [*POSED, "train.cameras=[[doe=flat]]"])
     with pytest.raises(MeshError, match="runs in a single process"):
-        require_masks(recipe, recipe.training, Mesh(data=2))
+        require_alone(recipe, Mesh(data=2))
 
 
 @pytest.mark.slow
-def test_a_training_behind_two_masks_validates_and_is_not_that_behind_one(tmp_path):
+def test_a_training_of_two_cameras_validates_and_is_not_that_of_one(tmp_path):
     folder = tmp_path / "photographs"
     folder.mkdir()
     for i in range(2):
         Image.effect_noise((60, 50), 40 + 20 * i).convert("RGB").save(folder / f"{i}.png")
     words = [*POSED, f"train.photographs={folder}", "train.held_out=0.5", "train.validate_every=1"]
-    found = trained([*words, "train.masks=[flat]"], tmp_path)
+    found = trained([*words, "train.cameras=[[doe=flat]]"], tmp_path)
     rows = list(csv.DictReader((found / "losses.csv").read_text().splitlines()))
     assert len(rows) == 2
     assert all(float(row["held_out_PSNR"]) > 0 for row in rows)
     assert trained(words, tmp_path) != found
 
 
-def test_pooled_pictures_are_turned_behind_several_masks_too():
+def test_pooled_pictures_of_several_cameras_are_turned_too():
     class Stream:
         def __init__(self, mask):
             self.mask = mask
@@ -106,7 +138,7 @@ def test_pooled_pictures_are_turned_behind_several_masks_too():
         def turned(self, sample, stage, number):
             return f"turned {sample}"
 
-    mixed = MixedMasks.__new__(MixedMasks)
+    mixed = SeveralCameras.__new__(SeveralCameras)
     mixed.repeats, mixed._pool, mixed._streams = 2, 3, [Stream("ring"), Stream("flat")]
     found = [sample for _, sample in mixed.batch(Shared.of({}), 2, 2, 2)]
     assert found == ["turned picture 2 behind ring", "turned picture 3 behind ring"]
