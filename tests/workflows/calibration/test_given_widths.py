@@ -38,10 +38,10 @@ def test_the_density_given_the_widths_is_that_of_another_library(camera):
     off = []
     for i in range(2):
         law = multivariate_t(step[i], np.linalg.inv(root[i] @ root[i].T), df=20)
-        z = (samples[i, ~others.at] - others.theta[~others.at]) / others._unit
+        z = (samples[i, ~others.at] - others.theta[~others.at]) / others.unit
         off.append(law.logpdf(z) - others.log_density(samples[[i]], (step[[i]], root[[i]]))[0])
     # what `Mixture` leaves out as well, so that a mixture of both is one density; and the units of the coordinates
-    constant = np.log(np.abs(others._unit)).sum() - 0.5 * len(others._unit) * np.log(np.pi)
+    constant = np.log(np.abs(others.unit)).sum() - 0.5 * len(others.unit) * np.log(np.pi)
     assert off == pytest.approx([constant, constant], abs=1e-9)
 
 
