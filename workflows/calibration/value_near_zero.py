@@ -8,6 +8,7 @@ widths. All others are nearly normal given the widths and the parameter, with a 
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -83,7 +84,7 @@ class NearZero:
         cell, share = self._cell(place)
         draw = np.arange(len(place))
         height = (1 - share) * density[draw, cell] + share * density[draw, cell + 1]
-        own = np.log(np.where((share >= 0) & (share <= 1), height, 0.0).clip(_BARE)) + 0.5 * np.log(np.pi)
+        own = np.log(np.where((share >= 0) & (share <= 1), height, 0.0).clip(_BARE)) + math.lgamma(0.5)  # as `Mixture`
         away = (
             (samples[:, self._rest] - self._theta[self._rest]) / self._units
             - steps

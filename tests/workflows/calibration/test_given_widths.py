@@ -116,6 +116,24 @@ def test_a_well_before_the_read_noise_is_refused_in_a_sentence_and_described_wit
     assert identify(problem, mode).kinds["full_well"] == "lower"
 
 
+def test_hot_pixels_do_not_end_the_search(tmp_path):
+    """A coarse dark level had a variance of 0 between its ends, and the search ended with `SVD did not converge`."""
+    stacks = []
+
+    class Hot(plain.PlainCamera):
+        def frames(self, rng, photons, exposure, size=96, count=2):
+            stack = super().frames(rng, photons, exposure, size, count)
+            if photons == 0 and exposure > 0.03:
+                stack = np.clip(stack, 56, 64)
+                stack[:, 0, :30], stack[0, 1, 0] = 65, 55
+                stacks.append(stack)
+            return stack
+
+    found, _ = of_mode(pixels_alike(tmp_path, Hot(temporal_dark_noise=4.2)))
+    assert stacks
+    assert found["gain"] == pytest.approx(0.25, rel=0.1)
+
+
 def test_a_converter_that_cuts_is_calibrated_right_and_the_wrong_choice_moves_the_offset_alone(tmp_path):
     camera = plain.PlainCamera(truncates=True)
     right, mode = of_mode(pixels_alike(tmp_path, camera, "rounding=truncation"))
