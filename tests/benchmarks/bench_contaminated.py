@@ -1,8 +1,10 @@
 """What `neusee calibrate` says of frames with planted faults.
 
-    python tests/benchmarks/bench_contaminated.py FILE [options]
+    python tests/benchmarks/bench_contaminated.py FILE [FILE ...] [options]
 
-    FILE             JSON lines, one a camera; cameras that are there are not computed again
+    FILE             JSON lines, one a camera; cameras that are in any FILE are not computed again, and new lines go to
+                     the first
+    --shard K/N      of N equal parts of the cameras the K-th alone, 1 to N: each with a first FILE of its own
     --cameras N      cameras of each row (20)
     --clean N        clean cameras through the whole calibration (20)
     --minutes M      stop after M minutes
@@ -19,6 +21,7 @@ stated standard deviations, and by the interval between the 0.5 % and the 99.5 %
 
 import argparse
 import json
+import random
 import sys
 import time
 from collections import defaultdict
@@ -237,9 +240,31 @@ def told(result, known):
     }
 
 
-def lines_of(file):
-    found = map(json.loads, file.read_text().splitlines()) if file.exists() else ()
-    return list({(line["mode"], line["row"], line["seed"], line["quick"]): line for line in found}.values())
+def key(line):
+    return line["mode"], line["row"], line["seed"], line["quick"]
+
+
+def lines_of(files):
+    """All cameras of the files, each once; a line that was cut off is left out."""
+    text = "\n".join(file.read_text() for file in files if file.exists())
+    found = [json.loads(line) for line in text.splitlines() if line.endswith("}")]
+    return list({key(line): line for line in found}.values())
+
+
+def cameras(given):
+    """The cameras (mode, row, seed, quick) of one shard, by their seeds; rows in another order for each seed.
+
+    So each row gets its cameras at the same pace, and all shards take about the same time.
+    """
+    counts = {row: given.clean if row in ("clean", "unequal pixels") else given.cameras for row in ROWS}
+    rows = [row for row in ROWS if row in given.only.split(",")]
+    number, of = map(int, given.shard.split("/"))
+    every = []
+    for seed in range(max(counts.values())):
+        own = [(mode, row, seed, given.quick) for row in rows for mode in given.modes.split(",")]
+        own = [one for one in own if seed < (given.cameras if one[:2] == _UNTRUE else counts[one[1]])]
+        every += random.Random(seed).sample(own, len(own))
+    return every[number - 1 :: of]
 
 
 def table(lines):
@@ -285,27 +310,25 @@ _UNTRUE = ("density", "unequal pixels")  #: pixels that differ are no clean came
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("file", type=Path)
+    parser.add_argument("files", type=Path, nargs="+")
     for name, kind, default in (("cameras", int, 20), ("clean", int, 20), ("minutes", float, 1e9)):
         parser.add_argument(f"--{name}", type=kind, default=default)
     parser.add_argument("--only", default=",".join(ROWS))
     parser.add_argument("--modes", default="density,camera")
+    parser.add_argument("--shard", default="1/1")
     for name in ("quick", "table"):
         parser.add_argument(f"--{name}", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    done = {(line["mode"], line["row"], line["seed"], line["quick"]) for line in lines_of(given.file)}
+    done = {key(line) for line in lines_of(given.files)}
     until = time.monotonic() + (0 if given.table else 60 * given.minutes)
-    counts = {row: given.clean if row in ("clean", "unequal pixels") else given.cameras for row in ROWS}
-    for seed in range(max(counts.values())):
-        for row in (row for row in ROWS if row in given.only.split(",") and seed < counts[row]):
-            for mode in given.modes.split(","):
-                if (mode, row, seed, given.quick) not in done and time.monotonic() < until:
-                    line = calibrated(mode, row, seed, given.quick)
-                    with given.file.open("a") as opened:
-                        opened.write(json.dumps(line) + "\n")
+    for one in cameras(given):
+        if one not in done and time.monotonic() < until:
+            line = calibrated(*one)
+            with given.files[0].open("a") as opened:
+                opened.write(json.dumps(line) + "\n")
     for quick in (False, True):
-        if chosen := [line for line in lines_of(given.file) if line["quick"] == quick]:
+        if chosen := [line for line in lines_of(given.files) if line["quick"] == quick]:
             print(f"\n{'Importance samples' if quick else 'Chains'}:\n")
             table(chosen)
 

@@ -8,14 +8,14 @@ of all parameters together cannot follow how a wide drift makes the dark signal 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neusee.workflows.calibration.posterior_mixture import Mixture, Random
+from neusee.workflows.calibration.posterior_mixture import Random
 
 if TYPE_CHECKING:
+    from neusee.workflows.calibration.camera_density import Law
     from neusee.workflows.calibration.log_posterior import FloatArray, SensorPosterior
     from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
@@ -30,23 +30,29 @@ class GivenWidths:
     def __init__(self, problem: SensorPosterior, mode: LaplaceFit) -> None:
         self.theta = mode.theta
         self.at = np.array([name in problem.coordinates.widths for name in problem.names])  #: (free,) True for a width
-        self._middle = problem.whitened(mode.theta[None])[0]
-        steps = problem.whitened(mode.theta + np.eye(len(mode.theta))) - self._middle
-        self._unit = 1 / steps.diagonal()[~self.at]  #: coordinates of one standard deviation of the prior
+        middle = problem.whitened(mode.theta[None])[0]
+        steps = problem.whitened(mode.theta + np.eye(len(mode.theta))) - middle
+        self.middle = middle[~self.at]  #: (other,) the mode in standard deviations of the prior, from its middle
+        self.unit = 1 / steps.diagonal()[~self.at]  #: (other,) coordinates of one standard deviation of the prior
         away, _ = _parts(problem.likelihood(mode.theta[None]).scaled.numpy())
         slopes = _parts(mode.scaled_slopes.T)[0].T[:, ~self.at]
         self._pull = slopes * away[0][:, None]
         self._noise, self._shares = self._variances(problem)
         self._squares = (slopes[:, :, None] * slopes[:, None]).reshape(len(slopes), -1)
 
-    def law(self, widths: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def law(self, widths: FloatArray) -> Law:
         """Return mean (draw, other) and root of the precision (draw, other, other), in units of the prior."""
+        slope, precision = self.information(widths)
+        step: FloatArray = np.linalg.solve(precision, slope[..., None])[..., 0].astype(np.float64)
+        return step, np.linalg.cholesky(precision).astype(np.float64)
+
+    def information(self, widths: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return slope (draw, other) of the log density at the mode, and precision (draw, other, other)."""
         squares = np.exp((2 * (widths - self.theta[self.at])).clip(-_FARTHEST, _FARTHEST))
         weight = 1 / (self._noise + squares @ self._shares)
         others = self._pull.shape[1]
         precision = (weight @ self._squares).reshape(-1, others, others) + np.eye(others)
-        step = -np.linalg.solve(precision, (weight @ self._pull + self._middle[~self.at])[..., None])[..., 0]
-        return step, np.linalg.cholesky(precision)
+        return -(weight @ self._pull + self.middle), precision
 
     def _variances(self, problem: SensorPosterior) -> tuple[FloatArray, FloatArray]:
         """Return the part of the variance of each residual that no width adds, and the part (width, residual) of each.
@@ -62,58 +68,36 @@ class GivenWidths:
         variance = np.exp(2 * (log - log[0]))
         return variance[1], (variance[2:] - variance[1]).clip(0) * np.exp(-2 * _MORE)
 
-    def draw(self, widths: FloatArray, law: tuple[FloatArray, FloatArray], rng: Random) -> FloatArray:
+    def draw(self, widths: FloatArray, law: Law, rng: Random) -> FloatArray:
         """Return samples (draw, free) with the given ``widths`` and their ``law``."""
         step, root = law
-        normal = rng.standard_normal(step.shape) / np.sqrt(rng.chisquare(_TAIL, (len(step), 1)) / _TAIL)
-        off = np.linalg.solve(np.swapaxes(root, 1, 2), normal[..., None])[..., 0]
         samples = np.empty((len(step), len(self.at)))
         samples[:, self.at] = widths
-        samples[:, ~self.at] = self.theta[~self.at] + (step + off) * self._unit
+        samples[:, ~self.at] = self.theta[~self.at] + (step + draw_student(root, rng)) * self.unit
         return samples
 
-    def log_density(self, samples: FloatArray, law: tuple[FloatArray, FloatArray]) -> FloatArray:
+    def log_density(self, samples: FloatArray, law: Law) -> FloatArray:
         """Return the log density of the other parameters at ``samples`` given the widths, up to a constant."""
         step, root = law
-        away = (samples[:, ~self.at] - self.theta[~self.at]) / self._unit - step
-        square = (np.einsum("nij,ni->nj", root, away) ** 2).sum(1)
-        level = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1) + self._constant(away.shape[1])
-        log: FloatArray = level - 0.5 * (_TAIL + away.shape[1]) * np.log1p(square / _TAIL)
-        return log
-
-    def _constant(self, others: int) -> float:
-        """Return what the degrees of freedom and the units add to the log density, as `Mixture` counts it."""
-        half = 0.5 * _TAIL
-        gammas = math.lgamma(half + 0.5 * others) - math.lgamma(half)
-        return gammas - 0.5 * others * math.log(_TAIL) - float(np.log(np.abs(self._unit)).sum())
+        away = (samples[:, ~self.at] - self.theta[~self.at]) / self.unit - step
+        return student_density(away, root) - float(np.log(np.abs(self.unit)).sum())
 
 
-@dataclass(frozen=True)
-class CameraDensity:
-    """A density of all parameters: a mixture of the widths, and the distribution of all others given the widths."""
+def draw_student(root: FloatArray, rng: Random) -> FloatArray:
+    """Return distances (draw, other) from the mean, with the ``root`` (draw, other, other) of their precision."""
+    normal = rng.standard_normal(root.shape[:2]) / np.sqrt(rng.chisquare(_TAIL, (len(root), 1)) / _TAIL)
+    away: FloatArray = np.linalg.solve(np.swapaxes(root, 1, 2), normal[..., None])[..., 0].astype(np.float64)
+    return away
 
-    widths: Mixture
-    others: GivenWidths
 
-    def draw(self, count: int, rng: Random) -> FloatArray:
-        """Draw samples (count, free)."""
-        widths = self.widths.draw(count, rng)
-        return self.others.draw(widths, self.others.law(widths), rng)
-
-    def log_density(self, samples: FloatArray) -> FloatArray:
-        """Return the logarithm of the density at samples (draw, free), up to a constant."""
-        widths = samples[:, self.others.at]
-        return self.widths.log_density(widths) + self.others.log_density(samples, self.others.law(widths))
-
-    def propose(self, own: FloatArray, rng: Random) -> tuple[FloatArray, FloatArray]:
-        """Return new samples like ``own`` (draw, free), and the logarithm of the density at ``own`` over that there."""
-        widths = np.concatenate([own[:, self.others.at], self.widths.draw(len(own), rng)])
-        step, root = self.others.law(widths)
-        here, there = slice(None, len(own)), slice(len(own), None)
-        drawn = self.others.draw(widths[there], (step[there], root[there]), rng)
-        both = np.concatenate([own, drawn])
-        log = self.widths.log_density(widths) + self.others.log_density(both, (step, root))
-        return drawn, log[here] - log[there]
+def student_density(away: FloatArray, root: FloatArray) -> FloatArray:
+    """Return the log density at distances from the mean, up to the constant that `Mixture` leaves out too."""
+    half, others = 0.5 * _TAIL, away.shape[1]
+    square = (np.einsum("nij,ni->nj", root, away) ** 2).sum(1)
+    level = math.lgamma(half + 0.5 * others) - math.lgamma(half) - 0.5 * others * math.log(_TAIL)
+    level += np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
+    log: FloatArray = level - (half + 0.5 * others) * np.log1p(square / _TAIL)
+    return log
 
 
 def _parts(rows: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -6,11 +6,13 @@ Scand. J. Stat. 39, 798 (2012), adaptive multiple importance sampling). The firs
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neusee.workflows.calibration.given_widths import CameraDensity, GivenWidths
+from neusee.workflows.calibration.camera_density import CameraDensity, Others
+from neusee.workflows.calibration.given_widths import GivenWidths
 from neusee.workflows.calibration.posterior_mixture import (
     Density,
     Mixture,
@@ -24,7 +26,8 @@ from neusee.workflows.calibration.posterior_mixture import (
     softened,
     weighed,
 )
-from neusee.workflows.calibration.tail_density import with_tails
+from neusee.workflows.calibration.tail_density import hardly_told, with_tails
+from neusee.workflows.calibration.value_near_zero import NearZero
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import FloatArray, SensorPosterior
@@ -44,12 +47,14 @@ def fit_about_mode(
     """Return a density like the posterior, samples of it (count, free), and the log of posterior over density of each.
 
     The density is a mixture; for a real camera, whose noise has widths that are free, a mixture of these widths, with
-    all other parameters as the widths imply. A fifth of the mixture is fitted to the square root of the posterior,
-    which has the same shape and wider tails, so that no sample far out gets a large weight. The density with the
-    largest effective sample size is kept, with parts for long lower tails (`tail_density`), and new samples are drawn
-    from it, whose own effective sample size the caller must check.
+    all other parameters as the widths imply: with a long lower tail of one that is hardly told from 0
+    (`value_near_zero`). A fifth of the mixture is fitted to the square root of the posterior, which has the same shape
+    and wider tails, so that no sample far out gets a large weight. The density with the largest effective sample size
+    is kept, with parts for the lower tails of further parameters (`tail_density`), and new samples are drawn from it,
+    whose own effective sample size the caller must check.
     """
-    others = GivenWidths(problem, mode) if problem.coordinates.widths.intersection(problem.names) else None
+    tailed = hardly_told(problem, mode)
+    others = _given_widths(problem, mode, tailed) if problem.coordinates.widths.intersection(problem.names) else None
     at = others.at if others else np.ones(len(mode.theta), dtype=bool)
     mixture = Mixture(np.ones(1), mode.theta[None, at], _root(mode.covariance[at][:, at])[None], np.array([_START]))
     mixtures: list[Mixture] = []
@@ -68,11 +73,17 @@ def fit_about_mode(
         if number >= _LEAST and best >= _ENOUGH:
             break
         mixture = _next(mixtures, np.concatenate(samples), np.concatenate(logs), rng)
-    kept = with_tails(kept, problem, mode)
+    kept = with_tails(kept, tailed[1:] if others else tailed, mode)
     return kept, *weighed(problem, kept, count, rng)
 
 
-def _whole(mixture: Mixture, others: GivenWidths | None) -> Density:
+def _given_widths(problem: SensorPosterior, mode: LaplaceFit, tailed: Sequence[int]) -> Others:
+    """Return the distribution of all others given the widths, with a long tail of the first parameter in ``tailed``."""
+    others = GivenWidths(problem, mode)
+    return NearZero(others, tailed[0], float(mode.covariance[tailed[0], tailed[0]] ** 0.5)) if tailed else others
+
+
+def _whole(mixture: Mixture, others: Others | None) -> Density:
     return CameraDensity(mixture, others) if others else mixture
 
 

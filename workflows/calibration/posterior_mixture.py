@@ -205,6 +205,11 @@ def firm(covariance: FloatArray) -> FloatArray:
     return firm
 
 
+def uniform(count: int, rng: Random) -> FloatArray:
+    """Return ``count`` numbers between 0 and 1 from either kind of generator."""
+    return rng.random_sample(count) if isinstance(rng, np.random.RandomState) else rng.random(count)
+
+
 def softened(log: FloatArray) -> FloatArray:
     """Return ``log`` times the largest factor, up to 1, whose weights leave enough effective samples for a fit."""
     if effective(log) >= _SOFT:

@@ -6,12 +6,13 @@ units. A density that is fitted about the mode seldom proposes from the tail, in
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neusee.workflows.calibration.posterior_mixture import Density, Mixture, Random, firm, log_sum
+from neusee.workflows.calibration.posterior_mixture import Density, Mixture, Random, firm, log_sum, uniform
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import FloatArray, SensorPosterior
@@ -30,10 +31,8 @@ class TailDensity:
 
     def draw(self, count: int, rng: Random) -> FloatArray:
         """Draw samples (count, free)."""
-        from_tails = rng.random_sample(count) if isinstance(rng, np.random.RandomState) else rng.random(count)
-        samples: FloatArray = np.where(
-            (from_tails < _SHARE)[:, None], self.tails.draw(count, rng), self.body.draw(count, rng)
-        )
+        from_tails = uniform(count, rng) < _SHARE
+        samples: FloatArray = np.where(from_tails[:, None], self.tails.draw(count, rng), self.body.draw(count, rng))
         return samples
 
     def log_density(self, samples: FloatArray) -> FloatArray:
@@ -47,15 +46,20 @@ class TailDensity:
         return drawn, self.log_density(own) - self.log_density(drawn)
 
 
-def with_tails(body: Density, problem: SensorPosterior, mode: LaplaceFit) -> Density:
-    """Return a density with a part for each positive parameter that is hardly told from 0, or ``body`` without one.
+def hardly_told(problem: SensorPosterior, mode: LaplaceFit) -> list[int]:
+    """Return the numbers of the positive parameters that are hardly told from 0, the least certain one first."""
+    spread = np.sqrt(np.diagonal(mode.covariance))
+    other = problem.coordinates.linear | problem.coordinates.widths
+    found = [i for i, name in enumerate(problem.names) if name not in other and spread[i] > _DOUBT]
+    return sorted(found, key=lambda i: -spread[i])
+
+
+def with_tails(body: Density, found: Sequence[int], mode: LaplaceFit) -> Density:
+    """Return a density with a part for the tail of each parameter in ``found``, or ``body`` without one.
 
     In such a part all other parameters lie where a line through the mode leads them, with the deviations that they have
     for a known value, because the levels depend on the parameter itself and not on its logarithm.
     """
-    spread = np.sqrt(np.diagonal(mode.covariance))
-    other = problem.coordinates.linear | problem.coordinates.widths
-    found = [i for i, name in enumerate(problem.names) if name not in other and spread[i] > _DOUBT]
     if not found:
         return body
     centres, roots = zip(*(_tail(mode.theta, mode.covariance, i) for i in found), strict=True)

@@ -35,10 +35,10 @@ def sufficient(levels: Levels, *, share: Share | None = None) -> Sufficient:
     """Replace the middle of each light level's histogram by mean and variance, and keep the counts near both ends.
 
     Between the ends numbers count as continuous, and mean and variance are sufficient; at a full well every single
-    number carries information. A level with a standard deviation below 0.8 DN keeps its whole histogram. ``share``
-    leaves out the levels above this share of saturation, which is taken at the lit level of the greatest variance. Give
-    0.7 for a sensor whose well ends the electrons before the read noise is added: `density` ends the sum of both, as
-    the paper prints, and cannot describe its saturated levels.
+    number carries information. A level keeps its whole histogram if its numbers, or its numbers between the ends, have
+    a standard deviation below 0.8 DN. ``share`` leaves out the levels above this share of saturation, which is taken at
+    the lit level of the greatest variance. Give 0.7 for a sensor whose well ends the electrons before the read noise is
+    added: `density` ends the sum of both, as the paper prints, and cannot describe its saturated levels.
 
     Shapes: levels (level,), cells (cell,) -> the same, with at most ten cells for a level that is not coarse.
     Units:  those of `Levels`.
@@ -79,10 +79,10 @@ def _(levels: Levels, *, share: float | None = None) -> Sufficient:
         low, high = own[0][0] + _EDGE, own[-1][0] - _EDGE
         inside = [(v, n) for v, n in own if low < v < high and rows[level][2] ** 0.5 >= _COARSE]
         count: float = math.fsum(n for _, n in inside)
-        if count < 2:
-            inside, count = [], 0.0
         middle: float = math.fsum(v * n for v, n in inside) / count if count else 0.0
         square = math.fsum((v - middle) ** 2 * n for v, n in inside)
+        if count < 2 or square < _COARSE**2 * (count - 1):
+            inside, count, middle, square = [], 0.0, 0.0, 0.0
         rows[level] = [count, middle, square / (count - 1) if count else 0.0, count - 1 if count else 0.0]
         left += [(level, v, n) for v, n in own if (v, n) not in inside]
     cell = torch.tensor(left, dtype=torch.float64).reshape(-1, 3).unbind(1)
@@ -108,8 +108,8 @@ def _inner(value: Tensor, count: Tensor, sd: float) -> tuple[Tensor, Tensor]:
     """Return a mask of the digital numbers away from both ends of the range, and the statistics of these numbers."""
     inner = (value > value[0] + _EDGE) & (value < value[-1] - _EDGE)
     total = float(count[inner].sum())
-    if sd < _COARSE or total < 2:
+    mean = (value[inner] * count[inner]).sum() / max(total, 1.0)
+    variance = ((value[inner] - mean).square() * count[inner]).sum() / max(total - 1, 1.0)
+    if min(sd, math.sqrt(float(variance))) < _COARSE:
         return torch.zeros_like(inner), torch.zeros(4, dtype=torch.float64)
-    mean = (value[inner] * count[inner]).sum() / total
-    variance = ((value[inner] - mean).square() * count[inner]).sum() / (total - 1)
     return inner, torch.stack([torch.tensor(total, dtype=torch.float64), mean, variance, torch.tensor(total - 1.0)])

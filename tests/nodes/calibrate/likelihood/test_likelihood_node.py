@@ -182,4 +182,17 @@ def test_levels_are_taken_apart_and_nothing_is_lost():
         torch.testing.assert_close(one, other, rtol=1e-9, atol=0)
 
 
+@pytest.mark.parametrize("reach", [5, 6])
+def test_a_level_whose_numbers_between_the_ends_are_coarse_keeps_all_of_them(reach):
+    """Before, eleven numbers left one between the ends: a variance of 0, and derivatives of infinity."""
+    normal = torch.randn(2, 48, 48, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    stack = (144 + 1.05 * normal).round().clamp(144 - reach, 144 + reach)
+    stack[0, 0, 0], stack[0, 1, :40] = 144 - reach, 144 + reach  # a few hot pixels pile up at the end
+    whole = measured([stack], LIGHT[:1])
+    for data in (sufficient(whole), sufficient.hooks.reference(whole)):
+        assert data.cell_count.sum() == stack.numel()
+        assert data.pixels.tolist() == data.variance.tolist() == [0.0]
+        assert weigh(data, read_noise=2.8).scaled.isfinite().all()
+
+
 SMALL = sufficient(measured(frames(size=8)))
