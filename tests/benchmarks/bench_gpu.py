@@ -27,7 +27,7 @@ from neusee.workflows import Store, load  # noqa: E402
 from neusee.workflows.engine.runner import run  # noqa: E402
 
 DEVICE = "cuda:0"
-RECIPES = ("first_light", "six_lasers", "dirty_windshield", "paper_table1")
+RECIPES = ("first_light", "six_lasers", "paper_table1")
 COMPARED = ("psf", "image", "lsr", "deconvolved", "restored", "developed_quality", "restored_quality")
 
 

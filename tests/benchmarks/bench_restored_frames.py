@@ -6,7 +6,8 @@
 The frames come from `tests/nodes/restore/lasers/own_camera.py`, a camera in NumPy alone, with an error that nobody is
 told of: 0.1 wave of defocus at the rim, half a pixel of tilt, grains of dirt in the pupil, and another illuminant. Each
 frame is restored by `neusee restore` with the recipe of the clean camera: by the filter that knows of no laser, by the
-filter that is told direction and wavelength, and by the search. Beside them stands the frame as developed, without a
+filter that is told direction and wavelength, by the search, and by the network of this package after the search. Beside
+them stands the frame as developed, without a
 restoration. A picture is scored after a shift and one gain for each channel, which no frame can tell, as PSNR of the
 encoded picture away from its border. A frame that stands in the file is not computed again.
 """
@@ -39,7 +40,7 @@ from tests.nodes.restore.lasers import own_camera as own  # noqa: E402
 SIDE, RIM = 128, 8
 MASKS = ("plain", "half_ring", "designed")
 STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
-METHODS = ("nothing", "blind", "told", "search")
+METHODS = ("nothing", "blind", "told", "search", "network")
 DESIGNED, DEPTH = ROOT / "recipes" / "samples" / "demonstration_mask.png", 33.9189e-6  #: of recipes/doe/demonstration
 
 CAMERA = """\
@@ -179,13 +180,14 @@ def written_camera(folder):
 def restored(numbers, mask, method, laser, folder):
     """What `neusee restore` returns for a frame, linear sRGB (3, y, x), its numbers of lasers, and processor time."""
     np.save(folder / "frame.npy", numbers)
-    words = [f"restore={'wiener_blind' if method in ('blind', 'nothing') else method}"]
+    options = {"blind": "wiener_blind", "nothing": "wiener_blind", "network": "neusee_search"}
+    words = [f"restore={options.get(method, method)}"]
     if method == "told":
         y, x = (1e3 * s * own.PITCH / own.FOCAL for s in laser.spot)
         line = f"wavelength: {laser.wavelength * 1e9} nm, fwhm: {laser.fwhm * 1e9} nm, strength: 1"
         words = ["restore=wiener", f"lasers={{it: {{{line}, angle: [{y} mrad, {x} mrad]}}}}"]
         words = words if laser.strength else ["restore=wiener"]
-    outputs = ["restored", "developed[mask]", *(["search"] if method == "search" else [])]
+    outputs = ["restored", "developed[mask]", *(["search"] if method in ("search", "network") else [])]
     start = time.process_time()
     told = io.StringIO()
     with tempfile.TemporaryDirectory() as out, contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
@@ -263,7 +265,7 @@ def rows(path):
 def report(found):
     """Print the means, and the paired gains of the search with their 95 % intervals."""
     by = {(r["seed"], r["mask"], r["strength"], r["method"]): r["psnr"] for r in found}
-    print("mask, strength: frames, PSNR of nothing, blind, told, search; search over nothing, over blind (dB)")
+    print(f"mask, strength: frames, PSNR of {', '.join(METHODS)}; search over nothing, over blind; network so (dB)")
     for mask in MASKS:
         for strength in STRENGTHS:
             seeds = [
@@ -271,7 +273,7 @@ def report(found):
             ]
             if seeds:
                 table = np.array([[by[s, mask, strength, m] for m in METHODS] for s in seeds])
-                gains = [interval(table[:, 3] - table[:, k]) for k in (0, 1)]
+                gains = [interval(table[:, own] - table[:, k]) for own in (3, 4) for k in (0, 1)]
                 means = " ".join(f"{v:6.2f}" for v in table.mean(0))
                 print(f"{mask:9} {strength:7g}: {len(seeds):3}  {means}   {'  '.join(gains)}")
 

@@ -223,8 +223,9 @@ class TrainingStream:
         if stage == HELD_OUT:
             return Photographs((self.held_out[number],)).crop(self.shape, self.seed, (stage, number))
         how = self.settings.augment
-        change = Change.drawn((self.seed, stage, number, 3), how.symmetries == "all", how.exposure, how.colour)
-        return change.of(self.photographs.crop(change.frame(self.shape), self.seed, (stage, number)))
+        much = how.exposure, how.colour, how.enlarge
+        change = Change.drawn((self.seed, stage, number, 3), how.symmetries == "all", *much)
+        return change.of(self.photographs.crop(change.frame(self.shape), self.seed, (stage, number)), self.shape)
 
     def _alone(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
         theta, noise, drawn = self._drawn(stage, number)

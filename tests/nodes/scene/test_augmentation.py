@@ -1,12 +1,16 @@
 """Changes of photographs: the eight symmetries of NumPy, stops of light, and a saturation by its formula."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from neusee.nodes.scene import Change, symmetry
 
 PICTURE = torch.rand(3, 5, 5, generator=torch.Generator().manual_seed(3))
+SIZE = (5, 5)
 
 
 def eight(array):
@@ -29,17 +33,17 @@ def test_a_picture_with_two_sizes_keeps_them():
     assert {symmetry(wide, (number,)).shape for number in range(40)} == {wide.shape}
     for quarters in range(4):
         change = Change(quarters=quarters)
-        assert change.of(torch.zeros(3, *change.frame((3, 5)))).shape == (3, 3, 5)
+        assert change.of(torch.zeros(3, *change.frame((3, 5))), (3, 5)).shape == (3, 3, 5)
 
 
 def test_light_and_colours_follow_their_formulas():
-    assert torch.equal(Change(stops=-1.5).of(PICTURE), PICTURE * 2**-1.5)
+    assert torch.equal(Change(stops=-1.5).of(PICTURE, SIZE), PICTURE * 2**-1.5)
     linear = PICTURE.double().numpy()
     code = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     grey = np.tensordot([0.299, 0.587, 0.114], code, 1)
     code = np.clip(grey + 0.6 * (code - grey), 0, 1)
     expected = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
-    assert Change(saturation=0.6).of(PICTURE).numpy() == pytest.approx(expected, abs=2e-6)
+    assert Change(saturation=0.6).of(PICTURE, SIZE).numpy() == pytest.approx(expected, abs=2e-6)
 
 
 def test_what_is_drawn_stays_in_its_limits_and_nothing_changes_nothing():
@@ -50,4 +54,26 @@ def test_what_is_drawn_stays_in_its_limits_and_nothing_changes_nothing():
     assert Change.drawn((1, 5), True, 2.0, 0.3) == drawn[5]
     none = Change.drawn((1, 5), False, 0.0, 0.0)
     assert none == Change()
-    assert none.of(PICTURE) is PICTURE
+    assert none.of(PICTURE, SIZE) is PICTURE
+
+
+@pytest.mark.parametrize("quarters", range(4))
+def test_an_enlarged_part_is_that_of_pillow_and_has_no_detail_of_one_pixel(quarters):
+    rng = np.random.default_rng(3)
+    part = torch.from_numpy(rng.uniform(0.2, 1.0, (3, 20, 12)).astype(np.float32))
+    change = Change(quarters=quarters, enlarged=2.5)
+    shape = (50, 30) if quarters % 2 == 0 else (30, 50)
+    assert change.frame(shape) == (20, 12)
+    found = change.of(part, shape)
+    turned = np.rot90(part[0].numpy(), quarters)
+    with Image.fromarray(np.ascontiguousarray(turned)) as small:
+        expected = np.asarray(small.resize(shape[::-1], Image.Resampling.BICUBIC))
+    np.testing.assert_allclose(found[0].numpy(), np.maximum(expected, 0), atol=2e-3)
+
+
+def test_the_factor_of_size_is_drawn_by_its_logarithm_and_changes_no_other_value():
+    drawn = [Change.drawn((1, n), True, 2.0, 0.3, 4.0) for n in range(400)]
+    logs = np.log([x.enlarged for x in drawn]) / np.log(4.0)
+    assert 0 <= logs.min() < 0.02 < 0.98 < logs.max() <= 1
+    assert abs(logs.mean() - 0.5) < 0.06  # 0.014 is its deviation
+    assert [replace(x, enlarged=1.0) for x in drawn] == [Change.drawn((1, n), True, 2.0, 0.3) for n in range(400)]

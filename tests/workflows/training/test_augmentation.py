@@ -39,7 +39,7 @@ def test_the_camera_sees_the_changed_scene_and_held_out_ones_as_they_are(tmp_pat
         theta, noise, drawn = changed._drawn(2, number)
         change = Change.drawn((7, 2, number, 3), True, 2.0, 0.3)
         crop = Photographs((photograph,)).crop((32, 32), 7, (2, number))
-        assert torch.equal(theta["scene"], change.of(crop))
+        assert torch.equal(theta["scene"], change.of(crop, (32, 32)))
         other, same_noise, same = plain._drawn(2, number)
         assert torch.equal(other["scene"], crop)
         assert (noise, drawn) == (same_noise, same), "laser, sensor and noise are those without changes"

@@ -91,6 +91,7 @@ class Augment(SettingsBlock):
     symmetries: Literal["mirror", "all"] = "mirror"  #: mirror: half of the scenes left to right; all: quarter turns too
     exposure: Annotated[float, Field(ge=0, le=10)] = 0.0  #: stops by which a scene is darker, at most
     colour: Share = 0.0  #: largest change of the saturation of colours
+    enlarge: Annotated[float, Field(ge=1, le=8)] = 1.0  #: largest factor of size: what is enlarged is less sharp
     pooled: Literal["none", "turned_mask"] = "none"  #: turned_mask: turn pooled pictures, as behind a turned mask
 
 
