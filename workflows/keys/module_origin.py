@@ -45,14 +45,28 @@ def origin_of(module: str, packages: frozenset[str]) -> Origin:
     if module != top and top not in packages and (above := origin_of(top, packages)).kind == "distribution":
         return above
     file = getattr(sys.modules.get(module), "__file__", None) if module == top else None
-    if file is None or _INSTALLED.isdisjoint(Path(file).parts):
+    if file is None or not _is_installed(file):
         file = module_path(module)
     if file is None:
         return _without_file(module, top, packages)
-    if top not in packages and not _INSTALLED.isdisjoint(Path(file).parts) and (version := version_of(top)):
+    if top not in packages and _is_installed(file) and (version := version_of(top)):
         return _fixed.setdefault(top, Origin("distribution", None, version))
     path = Path(file)
     return Origin("source" if path.suffix == ".py" else "binary", path)
+
+
+def _is_installed(file: str) -> bool:
+    """Return True if a file is in a folder of distributions, such as one that ``pip install --target`` filled."""
+    return any(_holds_distributions(str(folder)) for folder in Path(file).parents if str(folder) in sys.path) or (
+        not _INSTALLED.isdisjoint(Path(file).parts)
+    )
+
+
+@functools.cache
+def _holds_distributions(folder: str) -> bool:
+    if not _INSTALLED.isdisjoint(Path(folder).parts):
+        return True
+    return os.path.isdir(folder) and any(name.endswith(".dist-info") for name in os.listdir(folder))
 
 
 def module_path(module: str) -> str | None:
@@ -116,7 +130,7 @@ def _releases() -> dict[str, str]:
 def _metadata() -> Iterator[str]:
     """Yield the folder with the metadata of each installed distribution."""
     for folder in filter(os.path.isdir, sys.path):
-        if not _INSTALLED.isdisjoint(Path(folder).parts):
+        if _holds_distributions(folder):
             yield from (os.path.join(folder, name) for name in os.listdir(folder) if name.endswith(".dist-info"))
 
 
@@ -206,7 +220,7 @@ def look_again() -> None:
 def _shadowed(top: str) -> bool:
     """Return True if a loaded module with a name of the standard library is a file of somebody else."""
     file = getattr(sys.modules.get(top), "__file__", None)
-    return bool(file) and (not str(file).startswith(_STANDARD) or not _INSTALLED.isdisjoint(Path(str(file)).parts))
+    return bool(file) and (not str(file).startswith(_STANDARD) or _is_installed(str(file)))
 
 
 _releases()  # now, because a process may lose the right to read the folders later
