@@ -1,4 +1,4 @@
-"""Where a module is from: a folder that `pip install --target` filled holds distributions, and own modules beside them."""
+"""Where a module is from: what `pip install --target` put into a folder is a distribution, own modules are not."""
 
 import os
 import subprocess
