@@ -14,6 +14,7 @@ keeps the frames, so that a run that was stopped goes on, and other weights are 
 """
 
 import argparse
+import functools
 import json
 from pathlib import Path
 
@@ -164,15 +165,25 @@ def rows(folder):
 
 def judged(folder, weights, width):
     """Return the frames of the folder with the score of the network."""
-    net = Informed(width).eval()
-    net.load_state_dict({name: x.float() for name, x in load_file(weights).items()})
     found = rows(folder)
     for row in found:
-        kept = load_file(folder / f"{row['file']}.safetensors")
-        facts = FilterFacts._make(kept[name].float() for name in FilterFacts._fields)
-        with torch.no_grad():
-            row["network"] = scored(net(kept["picture"][None], facts, kept["matrix"])[0], kept["truth"])
+        row["network"] = judged_frame(weights, width, load_file(folder / f"{row['file']}.safetensors"))
     return found
+
+
+def judged_frame(weights, width, kept):
+    """Return the score of a network on a frame that `Judged` kept."""
+    net = network(weights, width)
+    facts = FilterFacts._make(kept[name].float() for name in FilterFacts._fields)
+    with torch.no_grad():
+        return scored(net(kept["picture"][None], facts, kept["matrix"])[0], kept["truth"])
+
+
+@functools.cache
+def network(weights, width):
+    net = Informed(width).eval()
+    net.load_state_dict({name: x.float() for name, x in load_file(weights).items()})
+    return net
 
 
 # --- the tables -------------------------------------------------------------------------------------------------------

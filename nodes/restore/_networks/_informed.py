@@ -55,8 +55,9 @@ class Informed(Restorer):
         each = maps.to(self.body.last.weight).reshape(-1, *maps.shape[-3:])
         whole = mirrored(each, -rows % self.multiple, -columns % self.multiple)
         told: Tensor = self.body.change(whole)[..., :rows, :columns].to(answer)
-        free, share, grey = told.reshape(*answer.shape[:-3], -1, rows, columns).split(3, -3)
-        return free * deviation.sqrt() + share * answer + grey * answer.mean(-3, keepdim=True)
+        free, share, grey = torch.tensor_split(told.reshape(*answer.shape[:-3], -1, rows, columns), 3, -3)
+        result: Tensor = free * deviation.sqrt() + share * answer + grey * answer.mean(-3, keepdim=True)
+        return result
 
 
 @node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])

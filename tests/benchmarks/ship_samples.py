@@ -1,9 +1,10 @@
-"""Write the demonstration's mask and network as they ship, and say what that changes.
+"""Write the designed mask and the trained network as they ship, and say what that changes.
 
-    python tests/benchmarks/ship_demonstration.py mask.safetensors network.safetensors recipes/samples
+    python tests/benchmarks/ship_samples.py mask mask.safetensors recipes/samples
+    python tests/benchmarks/ship_samples.py network best.safetensors later/best.safetensors recipes/samples
 
-The relief becomes a grey picture of 12 bits that states the height of white and the pitch, the weights become half
-floats.
+The relief becomes a grey picture of 12 bits that states the height of white and the pitch. The weights become half
+floats, of several files their mean.
 """
 
 from __future__ import annotations
@@ -39,20 +40,20 @@ def mask(file: Path, out: Path) -> None:
     )
 
 
-def network(file: Path, out: Path) -> None:
-    """The weights in half precision."""
-    with safe_open(file, framework="pt") as tensors:
+def network(files: list[Path], out: Path) -> None:
+    """The mean of the weights in half precision."""
+    with safe_open(files[0], framework="pt") as tensors:
         said = tensors.metadata()
-    weights = load_file(file)
+    each = [load_file(file) for file in files]
+    weights = {name: torch.stack([one[name] for one in each]).mean(0) for name in each[0]}
     half = {name: x.to(torch.float16) for name, x in weights.items()}
     worst = max(float((half[n].float() - x).norm() / x.norm().clamp_min(1e-30)) for n, x in weights.items())
-    save_file(half, out / "demonstration_network.safetensors", said)
+    save_file(half, out / "neusee_network.safetensors", said)
     print(f"{sum(x.numel() for x in half.values())} numbers; halving changes a tensor by {worst:.1e} at most")
 
 
 if __name__ == "__main__":
-    relief, weights, out = map(Path, sys.argv[1:])
-    mask(relief, out)
-    network(weights, out)
-    for path in out.glob("demonstration_*"):
+    what, (*given, to) = sys.argv[1], map(Path, sys.argv[2:])
+    mask(*given, to) if what == "mask" else network(given, to)
+    for path in to.glob("*.png" if what == "mask" else "*.safetensors"):
         print(f"{path.name}: {path.stat().st_size} bytes")
