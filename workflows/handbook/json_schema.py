@@ -97,10 +97,14 @@ def _exported() -> list[str]:
 
 
 def _defaults() -> Schema:
-    """Return the JSON schema of an entry in ``defaults``, which suggests packaged options and allows other names."""
+    """Return the JSON schema of an entry in ``defaults``, which suggests packaged options and allows other names.
+
+    In the file of an option an entry is the name of another option of the same group.
+    """
     offered = {group: {"enum": [option.name for option in options]} for group, options in groups().items()}
     options = {group: {"anyOf": [names, {"type": ["string", "null"]}]} for group, names in offered.items()}
-    return {"type": "object", "properties": options, "minProperties": 1, "maxProperties": 1}
+    one: Schema = {"type": "object", "properties": options, "minProperties": 1, "maxProperties": 1}
+    return {"anyOf": [one, {"type": "string"}]}
 
 
 def _step(nodes: Mapping[str, Node]) -> Schema:

@@ -72,6 +72,11 @@ def test_a_right_recipe_has_no_error(errors):
     assert errors(f"defaults: [doe: axicon]\nsteps: {{a: {step}, b: null}}") == []
 
 
+def test_an_option_names_the_option_that_it_changes(errors):
+    assert errors("defaults: [small]\noptics: {bands: 5}") == []
+    assert len(errors("defaults: [3]")) == 1
+
+
 @pytest.mark.parametrize(
     "step",
     [
