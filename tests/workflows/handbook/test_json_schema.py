@@ -51,7 +51,7 @@ def test_a_step_is_told_by_its_node(of_toys):
 
 
 def test_the_packaged_options_are_offered():
-    options = schema()["properties"]["defaults"]["items"]["properties"]
+    options = schema()["properties"]["defaults"]["items"]["anyOf"][0]["properties"]
     assert options["reading"]["anyOf"][0] == {"enum": ["as_printed", "coherent"]}
 
 
