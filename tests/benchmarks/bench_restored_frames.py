@@ -232,7 +232,7 @@ def score(picture, truth):
 # --- runs and tables --------------------------------------------------------------------------------------------------
 
 
-def run(path, first, count, picture, kinds, masks, strengths):
+def run(path, first, count, picture, kinds, masks, strengths, methods=METHODS):
     """Append the frames that the file lacks."""
     done = {(r["seed"], r["mask"], r["strength"], r["method"]) for r in rows(path)}
     with tempfile.TemporaryDirectory() as place:
@@ -241,7 +241,7 @@ def run(path, first, count, picture, kinds, masks, strengths):
         for seed in range(first, first + count):
             for mask in masks:
                 for strength in strengths:
-                    todo = [m for m in METHODS if (seed, mask, strength, m) not in done]
+                    todo = [m for m in methods if (seed, mask, strength, m) not in done]
                     if not todo:
                         continue
                     kind = kinds[seed % len(kinds)]
@@ -289,6 +289,7 @@ if __name__ == "__main__":
     parser.add_argument("--pictures", type=Path, help="folder of photographs in place of the three made kinds")
     parser.add_argument("--masks", nargs="+", default=MASKS)
     parser.add_argument("--strengths", type=float, nargs="+", default=STRENGTHS)
+    parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS)
     parser.add_argument("--report", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
@@ -298,6 +299,6 @@ if __name__ == "__main__":
             if given.pictures
             else (own.picture, ("sample", "leaves", "noise"))
         )
-        run(given.file, *given.seeds, *shots, given.masks, given.strengths)
+        run(given.file, *given.seeds, *shots, given.masks, given.strengths, given.methods)
     if given.report:
         report(rows(given.file))
