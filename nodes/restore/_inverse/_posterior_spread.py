@@ -62,9 +62,9 @@ def wiener_spread(
     Error:  with `law` filter a relative standard deviation of 1 / sqrt(2 draws) in each pixel, independent of the
             picture; with `law` frame less, because variances are averaged over 7 x 7 pixels. The interval of 90 % is
             the deviation times the 95 % quantile of Student's t of four degrees of freedom for each draw. The deviation
-            holds under the model of the filter: not for light that the filter is not told of, such as a laser, not for a
-            wrong PSF, and not for the colour of paints. Too narrow for an even scene onto which a mask spreads light from
-            beyond the frame, and where a laser leaves few pixels. The iteration adds what `restore.wiener` says.
+            holds under the model of the filter: not for light that the filter is not told of, such as a laser, nor for
+            a wrong PSF, and not for the colour of paints. Too narrow for an even scene onto which a mask spreads light
+            from beyond the frame, and where a laser leaves few pixels. The iteration adds what `restore.wiener` says.
             Nine frames of 44 x 44 pixels: intervals of 90 % hold 88 % of the pixels, 85 to 94 % in eight, 66 % in one.
             The result has a derivative with respect to ``matrix`` alone; draws and fitted power count as constants.
     Raises: ValueError as `restore.wiener`.
