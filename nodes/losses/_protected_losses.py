@@ -22,7 +22,7 @@ from neusee.nodes.losses._filtered_picture import (
     quanta,
     round_mtf,
 )  # fmt: skip
-from neusee.nodes.restore._inverse._wiener import effective_psf, grey_shares
+from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_shares
 from neusee.nodes.units import Electrons, Fraction
 from neusee.nodes.values import Bands, Psf
 

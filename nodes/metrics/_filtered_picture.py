@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.restore._inverse._wiener import grey_shares
+from neusee.nodes.restore._inverse._grey_psf import grey_shares
 from neusee.nodes.units import Electrons, Fraction
 from neusee.nodes.values import Bands, Psf
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
-from neusee.nodes.restore._inverse._wiener import effective_psf
+from neusee.nodes.restore._inverse._grey_psf import effective_psf
 from neusee.nodes.sensor._exposure import channel_weights
 from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.units import PositiveLength, Time

@@ -234,7 +234,7 @@ def score(picture, truth):
 # --- runs and tables --------------------------------------------------------------------------------------------------
 
 
-def run(path, first, count, picture, kinds, masks, strengths, methods):
+def run(path, first, count, picture, kinds, masks, strengths, methods=METHODS):
     """Append the frames that the file lacks."""
     done = {(r["seed"], r["mask"], r["strength"], r["method"]) for r in rows(path)}
     with tempfile.TemporaryDirectory() as place:
@@ -291,7 +291,7 @@ if __name__ == "__main__":
     parser.add_argument("--pictures", type=Path, help="folder of photographs in place of the three made kinds")
     parser.add_argument("--masks", nargs="+", default=MASKS)
     parser.add_argument("--strengths", type=float, nargs="+", default=STRENGTHS)
-    parser.add_argument("--methods", nargs="+", default=METHODS)
+    parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS)
     parser.add_argument("--report", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)

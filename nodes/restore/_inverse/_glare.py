@@ -18,6 +18,8 @@ class Glare(NamedTuple):
     patterns: list[Tensor]  #: (channel, y, x), of maximum 1
     nearby: list[Tensor | None]  #: (pattern, channel, y, x), in the same unit
     around: list[Tensor] | None = None  #: (channel, y, x), of each pattern; by `with_light_around`, for a doubt
+    peaks: Sequence[float] = ()  #: by which patterns were divided
+    smooth: list[list[Tensor]] | None = None  #: (channel, y, x), of each pattern spread over each radius that is tried
 
 
 class Light(NamedTuple):
@@ -34,7 +36,7 @@ def visible(patterns: Sequence[Tensor], nearby: Sequence[Tensor | None], known: 
     seen = [
         (p / peak, n if n is None else n / peak) for p, n, peak in zip(patterns, nearby, peaks, strict=True) if peak
     ]
-    return Glare([p for p, _ in seen], [n for _, n in seen])
+    return Glare([p for p, _ in seen], [n for _, n in seen], peaks=[peak for peak in peaks if peak])
 
 
 def with_light_around(glare: Glare) -> Glare:
@@ -50,11 +52,11 @@ def light_around(pattern: Tensor) -> Tensor:
     no light.
     """
     exact = pattern.double()
-    total = sum((_square_mean(exact, radius) / radius for radius in _REACH), torch.zeros_like(exact))
+    total = sum((square_mean(exact, radius) / radius for radius in _REACH), torch.zeros_like(exact))
     return total.to(pattern)
 
 
-def _square_mean(picture: Tensor, radius: int) -> Tensor:
+def square_mean(picture: Tensor, radius: int) -> Tensor:
     """Return the mean over a square around each pixel, by running sums."""
     for dim in (-2, -1):
         size = picture.shape[dim]

@@ -11,15 +11,9 @@ from torch import Generator, Tensor
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.restore._inverse._frame_deviation import drawn_noise, drawn_scene, frame_deviation
+from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_white
 from neusee.nodes.restore._inverse._hidden_pixels import Inverses, most_likely
-from neusee.nodes.restore._inverse._wiener import (
-    Doubt,
-    LeastDoubt,
-    Scaled,
-    effective_psf,
-    known_and_light,
-    posed,
-)
+from neusee.nodes.restore._inverse._wiener import Doubt, LeastDoubt, Scaled, known_and_light, posed
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf, Shading
 
@@ -44,6 +38,7 @@ def wiener_spread(
     balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     doubt: Doubt = 0.0,
     least_doubt: LeastDoubt = 0.0,
+    scatter: bool = False,
     draws: Draws = 8,
     law: Literal["filter", "frame"] = "frame",
     read_noise: Electrons,
@@ -67,9 +62,9 @@ def wiener_spread(
     Error:  with `law` filter a relative standard deviation of 1 / sqrt(2 draws) in each pixel, independent of the
             picture; with `law` frame less, because variances are averaged over 7 x 7 pixels. The interval of 90 % is
             the deviation times the 95 % quantile of Student's t of four degrees of freedom for each draw. The deviation
-            holds under the model of the filter: not for light that the filter is not told of, such as a laser or the
-            halo of a laser behind dirt, not for a wrong PSF, and not for the colour of paints. Too narrow for an even
-            scene onto which a mask spreads light from beyond the frame. The iteration adds what `restore.wiener` says.
+            holds under the model of the filter: not for light that the filter is not told of, such as a laser, nor for
+            a wrong PSF, and not for the colour of paints. Too narrow for an even scene onto which a mask spreads light
+            from beyond the frame, and where a laser leaves few pixels. The iteration adds what `restore.wiener` says.
             Nine frames of 44 x 44 pixels: intervals of 90 % hold 88 % of the pixels, 85 to 94 % in eight, 66 % in one.
             The result has a derivative with respect to ``matrix`` alone; draws and fitted power count as constants.
     Raises: ValueError as `restore.wiener`.
@@ -79,7 +74,9 @@ def wiener_spread(
     with torch.no_grad():
         fine, known, light = known_and_light(psf, responses, single(electrons), clipped, glare, nearby, ghosts)
         kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
-        scaled = posed(fine, known, kernels, light, (balance, read_noise, doubt, least_doubt))
+        white = grey_white(illuminant, responses, bands).to(fine)
+        settings = (balance, read_noise, doubt, least_doubt)
+        scaled = posed(fine, known, kernels, light, settings, scatter, white)
     drawn = drawn_deviation if law == "filter" else frame_deviation
     return with_shading(drawn(scaled, matrix, draws, rng).to(single(electrons)), restored, shading)
 

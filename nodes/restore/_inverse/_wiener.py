@@ -1,27 +1,29 @@
 """Wiener deconvolution with a known PSF, a baseline that needs no training."""
 
 import math
+from collections.abc import Callable
 from typing import Annotated, Any, NamedTuple
 
 import torch
 from pydantic import Field
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, pad
+from torch.nn.functional import pad
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_not_finite, single
-from neusee.nodes.restore._inverse._conjugate_gradients import pieces
 from neusee.nodes.restore._inverse._fft_grid import torus
-from neusee.nodes.restore._inverse._glare import Glare, average, doubted, visible, with_light_around
+from neusee.nodes.restore._inverse._glare import Glare, Light, average, doubted, visible, with_light_around
 from neusee.nodes.restore._inverse._glare_doubt import likeliest_doubt
+from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_white
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred, variance
+from neusee.nodes.restore._inverse._picture_scale import expected_variance, picture_noise, power_of_two, shared_level
+from neusee.nodes.restore._inverse._scattered_glare import scattered
 from neusee.nodes.sensor._digitization import crop
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf
 
 _FALL = 3.0  #: the power spectrum of pictures falls with frequency to this power, like that of edges
-_NO_LIGHT = 1e-12  #: share of the light below which a PSF counts as one without light
 GREY = 0.95  #: correlation between the channels of pictures
 PRECISE = 256  #: pixels a side, up to which all is computed in float64: the dense float64 algebra takes most time there
 _LIGHT = 0.999  #: share of the light that the unknown border around the picture is wide enough for
@@ -48,6 +50,7 @@ def wiener(
     balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     doubt: Doubt = 0.0,
     least_doubt: LeastDoubt = 0.0,
+    scatter: bool = False,
     coarser_grids: bool = True,
     read_noise: Electrons,
 ) -> Tensor:
@@ -63,7 +66,10 @@ def wiener(
     number (null) it is the likeliest of 0, 0.01, 0.03, 0.1, 0.3, 1 and 3 for this picture that is not below
     `least_doubt`. `nearby` has other possible patterns of each glare, as `restore.nearby_glare` computes them: their
     differences from the glare, averaged over the patterns, are its covariance. The glare in a variance is a
-    least-squares estimate, in which uncertain pixels count less. The iteration starts from the answer on
+    least-squares estimate, in which uncertain pixels count less. With `scatter`, patterns are in e- and nearly of the
+    strength told, and `doubt` does not count: dirt and defocus scatter part of their light over 4, 16 and 64 pixels,
+    as much as speckle and clipped pixels of this picture tell, and channels that glare covers take mean and contrast of
+    others, as of a grey scene. The iteration starts from the answer on
     `coarser_grids`; without these it starts from a picture without contrast: faster, and right for a plain lens alone.
 
     Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses (channel, band),
@@ -80,13 +86,22 @@ def wiener(
             doubt that is found counts as constant. Up to 256 pixels a side all is float64, and rounding adds 1e-6 to
             both (`rtol` holds there); in wider pictures float32 adds 3e-4 to the result and up to 2e-3 to the
             gradients; in pictures of 1e7 e-, 2e-2 and 8e-2.
+            With `scatter`, the light that is scattered over 4 and 64 pixels is found to a factor of 2 to 3.
     Raises: ValueError where shapes or bands differ, and for pictures and PSFs that are not finite.
     Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; as least squares with a
             prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.
     """
     electrons, light = single(electrons), (glare, nearby, ghosts)
     scaled = pose(
-        electrons, psf, illuminant, responses, bands, clipped, *light, (balance, read_noise, doubt, least_doubt)
+        electrons,
+        psf,
+        illuminant,
+        responses,
+        bands,
+        clipped,
+        *light,
+        (balance, read_noise, doubt, least_doubt),
+        scatter,
     )
     return (scaled.pixels(most_likely(scaled.problem, coarser=coarser_grids)) + scaled.mean).to(electrons)
 
@@ -151,35 +166,6 @@ def refuse_other_pictures(
             refuse_not_finite("the picture cannot be restored", **{name: x.sum(-1).sum(dtype=torch.float64)})
 
 
-def effective_psf(
-    psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, dtype: torch.dtype = torch.float32
-) -> Tensor:
-    """Return the PSF of each channel of the sensor for a grey scene, (channel, y, x), in the more precise of the types
-    of the PSF and ``dtype``.
-    """
-    lengths = {len(psf.intensity), len(illuminant), responses.shape[-1], len(bands.centres)}
-    if len(lengths) > 1:
-        raise ValueError(f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: use one `bands` step")
-    intensity = single(psf.intensity)
-    shares = grey_shares(illuminant, responses, bands).to(intensity.device)
-    if torch.promote_types(intensity.dtype, dtype) == intensity.dtype:
-        whole: Tensor = torch.tensordot(shares.to(intensity), intensity, 1)
-        return whole
-    planes = zip(shares.to(dtype).T, intensity, strict=True)  # band by band, without a copy of all bands
-    seen = torch.zeros(len(shares), *intensity.shape[-2:], dtype=dtype, device=intensity.device)
-    for share, plane in planes:
-        seen = seen + share[:, None, None] * plane.to(dtype)
-    return seen
-
-
-def grey_shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """Return the share of each band in the signal of each channel from a grey scene: (channel, band), float64."""
-    share = responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()
-    blind = share.sum(-1, keepdim=True) <= 0  # a channel without response gets equal shares
-    share = share.where(~blind, 1.0)
-    return share / share.sum(-1, keepdim=True)
-
-
 class Scaled(NamedTuple):
     """A deconvolution whose scene has mean 0 and variance 1, and what gives the result its scale and mean back."""
 
@@ -205,63 +191,74 @@ def pose(
     nearby: list[Tensor] | None,
     ghosts: list[Tensor] | None,
     settings: Settings,
+    scatter: bool = False,
 ) -> Scaled:
     """Return the inputs of `wiener` as a linear problem, unsolved; ``settings`` as `Settings` says."""
     fine, known, light = known_and_light(psf, responses, electrons, clipped, glare, nearby, ghosts)
     kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
-    return posed(fine, known, kernels, light, settings)
+    return posed(fine, known, kernels, light, settings, scatter, grey_white(illuminant, responses, bands).to(fine))
 
 
-def posed(electrons: Tensor, known: Tensor, kernels: Tensor, glare: Glare, settings: Settings) -> Scaled:
-    """Return the deconvolution of a picture as a linear problem; ``settings`` as `Settings` says."""
+def posed(
+    electrons: Tensor,
+    known: Tensor,
+    kernels: Tensor,
+    glare: Glare,
+    settings: Settings,
+    scatter: bool = False,
+    white: Tensor | None = None,
+) -> Scaled:
+    """Return the deconvolution of a picture as a linear problem; ``settings`` as `Settings` says.
+
+    With ``scatter`` and ``white``, what the channels (channel, 1, 1) see of a grey scene, channels that glare covers
+    take mean and contrast of others.
+    """
     y, x = electrons.shape[-2:]
     balance, read, doubt, least = settings
-    known = torch.where(known.amax((-2, -1), keepdim=True) > 0, known, 1.0)
-    share = _power_of_two(kernels.sum((-2, -1), keepdim=True).detach())
+    seen, some = known, known.amax((-2, -1), keepdim=True)
+    known = torch.where(some > 0, known, 1.0)
+    share = power_of_two(kernels.sum((-2, -1), keepdim=True).detach())
     kernels = kernels / share  # the same bits, and the floors below concern the shape of the PSF, not a grey filter
 
     def own_noise(mean: Tensor) -> Tensor:
-        return _noise(electrons, mean, read)
+        return picture_noise(electrons, mean, read)
 
-    if doubt != 0 and glare.around is None:
-        glare = with_light_around(glare)
-    doubt = likeliest_doubt(electrons, known, glare, own_noise, least) if doubt is None else doubt
-    trusted, light, wrong = doubted(electrons, known, glare, doubt, own_noise)
+    if scatter and glare.patterns:
+        trusted, light, wrong = scattered(electrons, seen, glare, own_noise)
+        glare = glare._replace(patterns=[])
+    else:
+        trusted, light, wrong = _doubted(electrons, known, glare, (doubt, least), own_noise)
     picture = electrons - light.sum
     mean = average(picture, trusted)
-    noise = balance * _noise(electrons, mean, read) + light.variance
     size = torus((y, x), edge(kernels, (y, x)))
     transfer, power = torch.fft.rfft2(wrapped(kernels, size)), fall(size).to(kernels)
-    seen = average((picture - mean).square(), trusted)
-    passed = _passed(transfer, power, size)
-    scale = (torch.maximum(seen - mean - read**2 - wrong, 0.01 * seen) / passed.clamp_min(1e-6)).clamp_min(1e-6).sqrt()
+    found = average((picture - mean).square(), trusted)
+    passed = expected_variance(transfer, power, size)
+    contrast = torch.maximum(found - mean - read**2 - wrong, 0.01 * found) / passed.clamp_min(1e-6)
+    scale = contrast.clamp_min(1e-6).sqrt()
+    if scatter and white is not None and light.modes:
+        trust = trusted.sum((-2, -1), keepdim=True) / known.sum((-2, -1), keepdim=True) * some
+        mean, scale = (shared_level(x, trust.detach(), white) for x in (mean.clamp_min(1.0), scale))
+    noise = balance * picture_noise(electrons, mean, read) + light.variance
     weight = known * (scale / noise.sqrt()).square()
     scaled = tuple(pattern / scale for pattern in (*glare.patterns, *light.modes))
-    centred = (picture - mean) / scale
-    problem = Blurred(centred, weight, transfer, power, size, GREY, scaled, bounded=len(light.modes))
+    problem = Blurred((picture - mean) / scale, weight, transfer, power, size, GREY, scaled, bounded=len(light.modes))
     return Scaled(problem, scale, mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None] / share, share, kernels)
 
 
-def _power_of_two(x: Tensor) -> Tensor:
-    """Return the powers of two nearest to ``x`` by ratio; 1 for a PSF without light, whose slopes overflow."""
-    return torch.where(x > _NO_LIGHT, x, 1.0).log2().round().exp2()
-
-
-def _passed(transfer: Tensor, power: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return the expected variance (channel, 1, 1) of a blurred picture, summed over a few spectrum rows at a time."""
-    total = power.new_zeros(len(transfer))
-    for rows in pieces(transfer):
-        through = transfer[:, rows]
-        total = total + variance((through.real.square() + through.imag.square()) * power[rows], size)
-    return total[:, None, None]
-
-
-def _noise(electrons: Tensor, mean: Tensor, read: float) -> Tensor:
-    """Return the noise variance of each pixel, from the larger of the local mean and the mean of the picture."""
-    around = electrons[None]
-    for window, rim in (((9, 1), (4, 0)), ((1, 9), (0, 4))):
-        around = avg_pool2d(around, window, stride=1, padding=rim, count_include_pad=False)
-    return (torch.maximum(around[0], mean) + read**2).clamp_min(1e-3)
+def _doubted(
+    electrons: Tensor,
+    known: Tensor,
+    glare: Glare,
+    doubts: tuple[float | None, float],
+    noise: Callable[[Tensor], Tensor],
+) -> tuple[Tensor, Light, Tensor]:
+    """Return what `doubted` returns, for a doubt, or None and the least doubt that is found."""
+    doubt, least = doubts
+    if doubt != 0 and glare.around is None:
+        glare = with_light_around(glare)
+    doubt = likeliest_doubt(electrons, known, glare, noise, least) if doubt is None else doubt
+    return doubted(electrons, known, glare, doubt, noise)
 
 
 def fall(size: tuple[int, int]) -> Tensor:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes.restore._inverse._wiener import grey_shares
+from neusee.nodes.restore._inverse._grey_psf import grey_shares
 from neusee.nodes.restore._lasers._line_pattern import Lens, deviation, line_moves, line_pattern, response_at
 from neusee.nodes.restore._lasers._whitening import fast_size
 from neusee.nodes.values import Bands, Psf, Pupil

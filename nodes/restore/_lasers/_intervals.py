@@ -11,7 +11,7 @@ from neusee.nodes.restore._lasers._joint_fit import Fit, products, solved
 
 NORMAL = 1.6448536269514722  #: standard deviations on each side of a 90 % interval
 _BLOCK = 8  #: pixels a side of blocks whose residuals count as independent of one another
-_MODEL = (0.002, 0.002, 0.02)  #: pixels, pixels and nm, standard deviations of what the model neglects
+_MODEL = (0.007, 0.007, 0.07)  #: pixels, pixels and nm, standard deviations of what dirt and defocus change
 _SHAPE = 0.03  #: standard deviation of the wavelength from the unknown shape of a line, over the width of the line
 _AMOUNT = 0.0015  #: the same of the electrons of each channel, relative
 

@@ -16,6 +16,7 @@ from neusee.nodes.restore._inverse._frame_deviation import frame_deviation
 from neusee.nodes.restore._inverse._glare import Glare, with_light_around
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._posterior_spread import Draws, with_shading
+from neusee.nodes.restore._inverse._scattered_glare import with_smooth
 from neusee.nodes.restore._inverse._wiener import (
     PRECISE,
     Doubt,
@@ -37,15 +38,16 @@ Balance = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 def wiener_by_field(
     electrons: Tensor, measured: MeasuredPsf, clipped: Tensor, glare: list[Tensor] | None = None,
     nearby: list[Tensor] | None = None, *, balance: Balance = 1.0, doubt: Doubt = 0.0,
-    least_doubt: LeastDoubt = 0.0, read_noise: Electrons,
+    least_doubt: LeastDoubt = 0.0, scatter: bool = False, read_noise: Electrons,
 ) -> Tensor:  # fmt: skip
     """Deconvolve a picture with a PSF that was measured by field: `restore.wiener` around each node, blended.
 
     The picture around each node of the grid is deconvolved with the PSF of the node, up to where its bilinear weight is
     0 and by the radius that holds 99.9 % of the PSF beyond. The results are added with these weights, whose sum is 1.
-    The patterns of ``glare`` are removed, with ``nearby``, ``doubt`` and ``least_doubt`` as in `restore.wiener`. They
-    come from a model of the lens, because a PSF that white points gave does not tell the pattern of one wavelength.
-    Their strengths, and a doubt that is found, are those around each node.
+    The patterns of ``glare`` are removed, with ``nearby``, ``doubt``, ``least_doubt`` and ``scatter`` as in
+    `restore.wiener`, but that channels share no level. They come from a model of the lens, because a PSF that white
+    points gave does not tell the pattern of one wavelength. Strengths, a doubt that is found and the light that is
+    scattered are those around each node.
 
     Shapes: electrons and clipped (channel, y, x), measured.kernels (row, column, channel, any, any), each glare
             (channel, y, x), each nearby (pattern, channel, y, x) -> (channel, y, x).
@@ -59,9 +61,9 @@ def wiener_by_field(
     """
     _refuse_other(electrons, measured)
     total = torch.zeros_like(single(electrons))
-    light = _glare(electrons, measured, clipped, (glare, nearby), doubt)
+    light = _glare(electrons, measured, clipped, (glare, nearby), doubt, scatter)
     for part in _parts(electrons, measured):
-        scaled = _problem(electrons, clipped, part, light, (balance, read_noise, doubt, least_doubt))
+        scaled = _problem(electrons, clipped, part, light, (balance, read_noise, doubt, least_doubt), scatter)
         found = scaled.pixels(most_likely(scaled.problem, coarser=True)) + scaled.mean
         total[:, part.rows, part.columns] += (part.weight.to(found) * found).to(total)
     return total
@@ -71,8 +73,8 @@ def wiener_by_field(
 def spread_by_field(
     electrons: Tensor, measured: MeasuredPsf, clipped: Tensor, matrix: Tensor, glare: list[Tensor] | None = None,
     nearby: list[Tensor] | None = None, restored: Tensor | None = None, shading: Shading | None = None, *,
-    balance: Balance = 1.0, doubt: Doubt = 0.0, least_doubt: LeastDoubt = 0.0, draws: Draws = 8, read_noise: Electrons,
-    rng: Generator,
+    balance: Balance = 1.0, doubt: Doubt = 0.0, least_doubt: LeastDoubt = 0.0, scatter: bool = False,
+    draws: Draws = 8, read_noise: Electrons, rng: Generator,
 ) -> Tensor:  # fmt: skip
     """Compute the standard deviation of each pixel of `restore.wiener_by_field`, the error of the PSF included.
 
@@ -92,10 +94,10 @@ def spread_by_field(
     _refuse_other(electrons, measured)
     total = torch.zeros(len(matrix), *electrons.shape[-2:], dtype=single(electrons).dtype, device=electrons.device)
     with torch.no_grad():
-        light = _glare(electrons, measured, clipped, (glare, nearby), doubt)
+        light = _glare(electrons, measured, clipped, (glare, nearby), doubt, scatter)
     for part in _parts(electrons, measured):
         with torch.no_grad():
-            scaled = _problem(electrons, clipped, part, light, (balance, read_noise, doubt, least_doubt))
+            scaled = _problem(electrons, clipped, part, light, (balance, read_noise, doubt, least_doubt), scatter)
         found = frame_deviation(scaled, matrix, draws, rng, part.draws)
         total[:, part.rows, part.columns] += part.weight.to(total) * found.to(total)
     return with_shading(total, restored, shading)
@@ -141,14 +143,18 @@ def _glare(
     clipped: Tensor,
     lights: tuple[list[Tensor] | None, list[Tensor] | None],
     doubt: float | None,
+    scatter: bool,
 ) -> Glare:
-    """Return the glare of the whole frame, with the light around each pixel of it where a doubt needs that."""
+    """Return the glare of the whole frame, with what a doubt and ``scatter`` need of it."""
     kernel = _channelwise(measured.kernels[0, 0])
     light = known_and_light(kernel[0], kernel[2], single(electrons), clipped, *lights, None)[2]
-    return light if doubt == 0 else with_light_around(light)
+    light = light if doubt == 0 else with_light_around(light)
+    return with_smooth(light) if scatter else light
 
 
-def _problem(electrons: Tensor, clipped: Tensor, part: _Part, light: Glare, settings: Settings) -> Scaled:
+def _problem(
+    electrons: Tensor, clipped: Tensor, part: _Part, light: Glare, settings: Settings, scatter: bool
+) -> Scaled:
     """Return the deconvolution of a part of a frame."""
     inside = (slice(None), part.rows, part.columns)
     fine = single(electrons)[inside]
@@ -159,8 +165,9 @@ def _problem(electrons: Tensor, clipped: Tensor, part: _Part, light: Glare, sett
         return [x[..., part.rows, part.columns].to(fine) for x in pictures]
 
     nearby = [None if x is None else cut([x])[0] for x in light.nearby]
-    here = Glare(cut(light.patterns), nearby, None if light.around is None else cut(light.around))
-    return posed(fine, known, kernels, here, settings)
+    around, smooth = light.around and cut(light.around), light.smooth and [cut(each) for each in light.smooth]
+    here = Glare(cut(light.patterns), nearby, around, light.peaks, smooth)
+    return posed(fine, known, kernels, here, settings, scatter)
 
 
 def _around(weight: Tensor, reach: int) -> slice:
