@@ -167,7 +167,7 @@ def report(rows):
         old, new = (np.array([r[k] for r in some]) for k in ("before", "now"))
         half = student.ppf(0.975, len(some) - 1) * (new - old).std(ddof=1) / len(some) ** 0.5
         inside = [np.array([r[f"{k} inside"] for r in some]) for k in ("before", "now")]
-        held = [f"{x.mean():.0%} ({x.min():.0%} to {x.max():.0%})" for x in inside]
+        held = ["-" if np.isnan(x).any() else f"{x.mean():.0%} ({x.min():.0%} to {x.max():.0%})" for x in inside]
         right = " and ".join(str(int(((x >= 0.85) & (x <= 0.95)).sum())) for x in inside)
         name = "all" if strength is None else f"{strength:g}"
         print(

@@ -77,6 +77,7 @@ def informed(
     balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
     doubt: Doubt = 0.0,
     least_doubt: LeastDoubt = 0.0,
+    scatter: bool = False,
     read_noise: Electrons,
 ) -> Tensor:
     """Deconvolve a picture by `restore.wiener`, and correct the answer by a network that sees what the filter knows.
@@ -98,9 +99,8 @@ def informed(
     electrons, light = single(electrons), (glare, nearby, ghosts)
     if len(electrons) != 3:
         raise ValueError(f"electrons {tuple(electrons.shape)} have {len(electrons)} channels, and the network needs 3")
-    found = facts(
-        pose(electrons, psf, illuminant, responses, bands, clipped, *light, (balance, read_noise, doubt, least_doubt))
-    )
+    settings = balance, read_noise, doubt, least_doubt
+    found = facts(pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings, scatter))
     result = found.answer * found.scale
     if weights is not None:
         net = loaded(partial(Informed, width), weights).requires_grad_(False).eval().to(electrons.device)

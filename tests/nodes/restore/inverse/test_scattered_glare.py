@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes.restore import wiener, wiener_spread
+from neusee.nodes.restore import wiener, wiener_by_field, wiener_spread
 from neusee.nodes.restore._inverse._glare import visible
 from neusee.nodes.restore._inverse._picture_scale import shared_level
 from neusee.nodes.restore._inverse._scattered_glare import RADII, _likeliest, with_smooth
-from neusee.nodes.values import Bands, Psf
+from neusee.nodes.values import Bands, MeasuredPsf, Psf
 
 SIDE, READ, WELL = 96, 5.0, 25000.0
 ONE = torch.ones(1, dtype=torch.float64)
@@ -137,3 +137,16 @@ def test_the_result_has_a_derivative_with_respect_to_the_glare():
     (slope,) = torch.autograd.grad(found.sum(), told)
     assert bool(slope.isfinite().all())
     assert bool((slope != 0).any())
+
+
+def test_a_measured_psf_takes_scattered_light_too():
+    true, seen, told = frame(1e7, (0.2, 0.01, 0.02), 3)
+    one = torch.ones(1, 1, 3, 1, 1, dtype=torch.float64)
+    rest = torch.zeros(1, 4, dtype=torch.float64)
+    measured = MeasuredPsf(one, 0 * one, one[None].float(), rest, rest[0, :3], rest[0, :3], one[:, :, 0, 0, 0], one)
+    seen, told = torch.from_numpy(seen), torch.from_numpy(told)
+    errors = []
+    for how in ({"scatter": True}, {"doubt": None, "least_doubt": 0.3}):
+        found = wiener_by_field(seen, measured, seen >= WELL, [told], read_noise=READ, **how)
+        errors.append(rms(found.numpy(), true, seen.numpy() >= WELL))
+    assert errors[0] < errors[1]
