@@ -85,7 +85,7 @@ def informed(
     A small NAFNet sees the maps of `restore.filter_facts`: the answer and its brightness, the residual, which pixels
     are clipped and how certain they are, the glare and what is not known of it, and what the frame tells of each pixel
     and each octave of frequency. So one network serves several masks, lasers and noises. Without ``weights`` the
-    restorer is the filter.
+    restorer is the filter. ``scatter`` as `restore.wiener`; the weights that ship were trained without it.
 
     Shapes: as `restore.wiener`, of three channels -> (channel, y, x).
     Units:  as `restore.wiener`.
