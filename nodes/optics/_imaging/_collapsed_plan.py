@@ -40,14 +40,14 @@ class Plan(NamedTuple):
     kernels: Tensor | None  #: (kernel, bands used); None: each PSF is a kernel
     mix: Mix
     off: Tensor  #: (row,) upper bound of the omitted light
-    count: int  #: number of kernels
+    number: int  #: of kernels
     cost: float  #: estimated seconds on two cores
     whole: bool  #: nothing but zeros is omitted
 
     @property
     def kept(self) -> list[int]:
         """Return the numbers of planes, kernels and bands, and the PSF window's size, as in `Channels.kept`."""
-        return [self.planes, self.count, len(self.bands), *self.window]
+        return [self.planes, self.number, len(self.bands), *self.window]
 
 
 class Fewer(NamedTuple):

@@ -49,7 +49,7 @@ def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:
 def _kernels(intensity: Tensor, given: Given, plan: Plan) -> Tensor:
     stack = centred(intensity, plan.window)
     if plan.kernels is None:
-        return stack if plan.count == len(stack) else stack[plan.bands.to(stack.device)]
+        return stack if plan.number == len(stack) else stack[plan.bands.to(stack.device)]
     weights = plan.kernels.new_zeros(len(plan.kernels), len(given.basis))
     weights = weights.index_copy_(1, plan.bands, plan.kernels)
     weights = weights if given.share is None else weights @ given.share
