@@ -89,27 +89,29 @@ def row(name, cases):
 
 
 def main(side="48", file=None):
-    store, every = Store(), []
-    known = {}
+    store, known = Store(), {}
     if file and Path(file).exists():
         known = {tuple(key): rest for key, rest in map(json.loads, Path(file).read_text().splitlines())}
-    print(
-        "| mask | cases | error before | now | now in float32 | 300 more steps | s before | now | in float32 | ", end=""
-    )
-    print("PSNR now - exact |\n|---|---|---|---|---|---|---|---|---|---|", flush=True)
-    for mask in MASKS.split(","):
-        cases = []
-        for n, (scene, strength) in enumerate((s, x) for s in SCENES.split(",") for x in STRENGTHS.split(",")):
-            key = (mask, scene, strength)
+    wanted = [(scene, float(strength)) for scene in SCENES.split(",") for strength in STRENGTHS.split(",")]
+    masks = MASKS.split(",")
+    for n, each in enumerate(wanted):  # all masks in turn: a table that was stopped has cases of each
+        for mask in masks:
+            key = (mask, *each)
             if key not in known:
-                known[key] = case(values(int(side), mask, scene, float(strength), 107 + n, store))
+                known[key] = case(values(int(side), *key, 107 + n, store))
                 if file:
                     with Path(file).open("a") as out:
                         out.write(json.dumps([key, known[key]]) + "\n")
-            cases.append(known[key])
-        row(mask, cases)
-        every += cases
-    row("all", every)
+    table({mask: [known[mask, *each] for each in wanted] for mask in masks})
+
+
+def table(cases):
+    columns = ("mask", "cases", "error before", "now", "now in float32", "300 more steps")
+    columns += ("s before", "now", "in float32", "PSNR now - exact")
+    print(f"| {' | '.join(columns)} |\n|{'---|' * len(columns)}")
+    for mask, each in cases.items():
+        row(mask, each)
+    row("all", [one for each in cases.values() for one in each])
 
 
 if __name__ == "__main__":
