@@ -12,13 +12,12 @@ from neusee.nodes.optics._laser_direction import direction
 from neusee.nodes.optics._laser_spot import laser_irradiance
 from neusee.nodes.optics._psf import _nodes, psf
 from neusee.nodes.optics._pupil import pupil
+from neusee.nodes.optics._transform._fused_plan import expected_seconds
 from neusee.nodes.optics._transform._sample_axis import Axis
-from neusee.nodes.optics._transform._scaled_transform import _expected_seconds
 from neusee.nodes.optics._white_irradiance import white_irradiance
 from neusee.nodes.shape_rules import at_least_single, blank, double, known, transform_operations
 from neusee.nodes.values import Bands, Channels, FewBands, LowRankCube, Psf, Pupil, Stop, Wavefront
 
-_WAVE, _SQUARE = 10.0, 8.0  #: operations for the wave at a sample of the pupil, and for its square at a pixel
 _SHORT, _FINE = 400e-9, 4e-6  #: m, wavelength and pupil pitch where no value is known
 
 
@@ -51,6 +50,7 @@ def _(pupil: Pupil, *direction: Any, shape: tuple[int, int], precision: str = "s
 
 @psf.work
 def _(result: Psf, pupil: Pupil, *direction: Any, focal_length: float, pixel_pitch: float, **params: Any) -> Any:
+    """Return the operations of the C++; where there is no compiler, torch takes about three times as long."""
     wavelength = float(pupil.wavelengths.min()) if known(pupil.wavelengths) else _SHORT
     pitch = float(pupil.pitch) if known(pupil.pitch) else _FINE
     alpha = pitch * pixel_pitch / (wavelength * focal_length)
@@ -59,8 +59,7 @@ def _(result: Psf, pupil: Pupil, *direction: Any, focal_length: float, pixel_pit
     integrated = params.get("sensor") == "integrated"
     views = len(_nodes(max(pupil.height.shape) * alpha)[0]) ** 2 if integrated else 1
     field = 8.0 * (pupil.height.numel() + axes[0].n_in * axes[1].n_out)
-    waves = _WAVE * axes[0].n_in * axes[1].n_in + _SQUARE * axes[0].n_out * axes[1].n_out
-    return field, bands * views * (waves + 1e9 * min(_expected_seconds(*axes).values()))
+    return field, bands * views * 1e9 * expected_seconds(*axes)
 
 
 @image.shape

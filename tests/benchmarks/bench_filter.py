@@ -81,7 +81,7 @@ def converged(problem, coarser=True):
 
 def filtered(seen, solve):
     """The restored picture in float64 and the seconds of processor time."""
-    exact = {(_wiener, "_PRECISE"): 10**9} if solve is converged else {}
+    exact = {(_wiener, "PRECISE"): 10**9} if solve is converged else {}
     with numbers({(_wiener, "most_likely"): solve, **exact}):
         began = time.process_time()
         found = restore.wiener(

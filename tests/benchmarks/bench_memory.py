@@ -92,7 +92,7 @@ def forecast(run):
         ):
             stack.enter_context(mock.patch(target, value))
         lanes = lanes_for(recipe, "cpu", 10**12)
-        plan = planned(recipe, Store(Path(place)), lanes)
+        plan = planned(recipe, Store(Path(place)), lanes, 10**12)
     return lanes["cpu"].held, plan.running, plan.reporting, shown[0]
 
 

@@ -27,6 +27,7 @@ def at(scene, sensor, samples, window):
 N, S, T = at(96, 64, 128, 96), at(160, 128, 180, 160), at(224, 192, 225, 192)
 A, U = at(288, 240, 270, 256), at(320, 256, 300, 256)
 B, C, E = at(384, 320, 360, 320), at(512, 448, 432, 416), at(1152, 960, 900, 896)
+P = ["outputs=[raw, developed]"]  # pictures alone, for which PSFs of few bands may do
 FIT = {  # small ones first
     "calibrate_camera (as shipped)": ["calibrate_camera"],
     "calibrate, 128 px": ["calibrate", "flats.shape=[128,128]"],
@@ -46,6 +47,10 @@ FIT = {  # small ones first
     "first_light, 768 px (as shipped)": ["first_light"],
     "first_light --exact, 384 px": ["first_light", *B, "--exact"],
     "paper_table1, 1024 px": ["paper_table1", *at(1024, 1024, 1080, 1024)],
+    "first_light, pictures, 384 px": ["first_light", *B, *P],
+    "dirty_windshield, pictures, 512 px": ["dirty_windshield", *C, *P, "tolerance=1e-2"],
+    "first_light, pictures, 768 px (as shipped)": ["first_light", *P, "tolerance=1e-2"],
+    "paper_table1, pictures, 1024 px": ["paper_table1", *at(1024, 1024, 1080, 1024), *P, "tolerance=1e-2"],
 }
 HELD_OUT = {
     "calibrate, 256 px (as shipped)": ["calibrate"],
@@ -85,6 +90,12 @@ HELD_OUT = {
     "axicon, 768 px (as shipped)": ["axicon"],
     "first_light, 1152 px": ["first_light", *E],
     "paper_table1, 2048 px (as shipped)": ["paper_table1"],
+    "first_light, pictures, 512 px": ["first_light", *C, *P],
+    "dirty_windshield, pictures, 768 px (as shipped)": ["dirty_windshield", *P],
+    "six_lasers, pictures, 768 px (as shipped)": ["six_lasers", *P, "tolerance=1e-2"],
+    "first_light, pictures, 1152 px": ["first_light", *E, *P, "tolerance=1e-2"],
+    "paper_table1, pictures, 768 px": ["paper_table1", *at(768, 640, 720, 704), *P],
+    "paper_table1, pictures, 2048 px (as shipped)": ["paper_table1", *P, "tolerance=1e-2"],
 }
 RUNS = FIT | HELD_OUT
 

@@ -1,4 +1,7 @@
-"""Memory of the report of a run: the results that its pictures and data files show, and the copies that are written."""
+"""Memory of the report of a run: the results that its pictures and data files show, and the copies that are written.
+
+Also of the results that files hold which are made beside the run.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,8 @@ from neusee.workflows.engine.local_executor import program_memory
 from neusee.workflows.engine.placement_inputs import prepare
 from neusee.workflows.engine.step_job import Lane, StepJob
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.report.contents import FIGURES, files_of
+from neusee.workflows.report.contents import FIGURES, files_of, wanted
+from neusee.workflows.report.files_beside import LARGE, ROOM
 
 #: Three numbers that tests/benchmarks/bench_memory.py fits to the measured memory of the reports of shipped recipes.
 DRAWING = 74.3e6  #: bytes of the libraries that draw pictures and write files
@@ -24,6 +28,18 @@ def shown_steps(recipe: Recipe) -> list[str]:
     """Return the steps whose results the pictures and data files of a run show, as far as the recipe has them."""
     groups = [recipe.outputs, *(group for job in _jobs(recipe) for group in job)]
     return list(dict.fromkeys(name for group in groups for name in group if name in recipe.steps))
+
+
+def held_beside(recipe: Recipe, costs: Costs, limit: float) -> float:
+    """Return the most bytes of results that files hold which are made beside a run, as `FilesBeside` holds them.
+
+    The values that the run returns are not counted, because they stay in memory with or without files. ``limit`` is the
+    memory (bytes) that the process may use; with 0 no file is made beside the run.
+    """
+    large, room, most = min(LARGE, limit / 32), min(ROOM, limit / 16), limit / 16
+    sizes = [costs.size_of(name) for name in shown_steps(recipe) if name not in wanted(recipe)]
+    small = sum(size for size in sizes if size <= large)
+    return min(small, room) + max((size for size in sizes if large < size <= most), default=0.0)
 
 
 def report_peak(

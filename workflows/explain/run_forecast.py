@@ -9,13 +9,13 @@ from typing import Any
 
 from neusee.workflows.engine.cost_laws import sizes_of
 from neusee.workflows.engine.cost_model import Costs, Estimate
-from neusee.workflows.engine.local_executor import lanes_of
+from neusee.workflows.engine.local_executor import lanes_of, memory_limit
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import past_costs, prepare, running_peak
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.step_job import Lane, StepJob
 from neusee.workflows.explain.forecast_table import forecast_rows, seconds_text, table_lines
-from neusee.workflows.explain.report_memory import report_peak, shown_steps
+from neusee.workflows.explain.report_memory import held_beside, report_peak, shown_steps
 from neusee.workflows.graph.recipe_graph import Recipe, needed, nodes_of
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.keys.code_digest import Code
@@ -50,8 +50,11 @@ def lanes_for(recipe: Recipe, device: str, memory: int | None) -> dict[str, Lane
     return lanes_of(device.split(","), memory, nodes_of(cheaper, wanted(recipe)))
 
 
-def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
-    """Return the forecast of a run: the steps to compute and to read, their costs and their schedule."""
+def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane], beside: float = 0.0) -> Plan:
+    """Return the forecast of a run: the steps to compute and to read, their costs and their schedule.
+
+    ``beside`` is the memory (bytes) of a run that makes files beside its steps, and 0 for one that makes them later.
+    """
     recipe = with_substitutions(recipe, wanted(recipe))
     order = steps_of(recipe)
     devices = [lane.device for lane in lanes.values()]
@@ -74,7 +77,8 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane]) -> Plan:
     except TooLarge as error:
         return replace(empty, refused=str(error))
     where = {w.step.name: w.lane for w in found.works}
-    plan = replace(empty, lanes=where, schedule=found.schedule, running=running_peak(found.schedule, lanes))
+    running = running_peak(found.schedule, lanes) + (held_beside(recipe, costs, beside) if works else 0.0)
+    plan = replace(empty, lanes=where, schedule=found.schedule, running=running)
     return _with_report(plan, store, costs, lanes, code)
 
 
@@ -116,7 +120,7 @@ class Forecast:
 def forecast(recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None) -> Forecast:
     """Return the forecast of a run with the table of its steps, its totals, and whether it would lack memory."""
     lanes = lanes_for(recipe, device, memory)
-    plan = planned(recipe, store, lanes)
+    plan = planned(recipe, store, lanes, memory_limit(None) if memory is None else 0.0)
     rows, totals = forecast_rows(plan, store), _totals(plan)
     return Forecast([*table_lines(rows), *_sums(plan, lanes, totals)], rows, totals, bool(plan.refused))
 

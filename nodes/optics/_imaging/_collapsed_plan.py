@@ -37,17 +37,17 @@ class Plan(NamedTuple):
     planes: int
     bands: Tensor  #: indices of the bands that are not omitted
     window: tuple[int, int]
-    kernels: Tensor | None  #: (kernel, bands used); None: the PSF of each band is a kernel
+    kernels: Tensor | None  #: (kernel, bands used); None: each PSF is a kernel
     mix: Mix
     off: Tensor  #: (row,) upper bound of the omitted light
+    number: int  #: of kernels
     cost: float  #: estimated seconds on two cores
     whole: bool  #: nothing but zeros is omitted
 
     @property
     def kept(self) -> list[int]:
         """Return the numbers of planes, kernels and bands, and the PSF window's size, as in `Channels.kept`."""
-        count = len(self.bands) if self.kernels is None else len(self.kernels)
-        return [self.planes, count, len(self.bands), *self.window]
+        return [self.planes, self.number, len(self.bands), *self.window]
 
 
 class Fewer(NamedTuple):
@@ -115,7 +115,7 @@ def _plans(
 ) -> Iterator[Plan]:
     """Yield up to three convolution plans that use the first ``k`` basis images and the PSF window number ``j``.
 
-    The kernels of the three plans are one for each plane and row, one for each band, and fewer kernels to mix.
+    The kernels of the three plans are one for each plane and row, one for each PSF, and fewer kernels to mix.
     """
     rows, basis, through = given.rows[:, bands], given.basis[bands, :k], given.passed.total[bands]
     off = lost + rows.abs() @ (given.rest[k, bands] * through) + rows.abs() @ _tail(given, bands, k, j)
@@ -129,11 +129,14 @@ def _plans(
     def plan(kernels: Tensor | None, mix: Mix, off: Tensor) -> Plan:
         window = given.passed.windows[j]
         each = len(bands) if given.share is None else given.share.shape[1]
-        return Plan(k, bands, window, kernels, mix, off, _cost(given, window, k, each, kernels, mix), False)
+        cost = _cost(given, window, k, each, kernels, mix)
+        return Plan(k, bands, window, kernels, mix, off, each if kernels is None else len(kernels), cost, False)
 
     yield plan(sums, Mix(u, x, None, count), off)
     if given.share is None:
         yield plan(None, Mix(rows, basis, None), off)
+    else:
+        yield plan(None, Mix(u, x, sums @ given.share[bands], count), off)
     if within is not None:
         limit, few = within
         for q in (few.off + off <= limit).all(1).nonzero()[:1, 0].tolist():

@@ -49,7 +49,7 @@ def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:
 def _kernels(intensity: Tensor, given: Given, plan: Plan) -> Tensor:
     stack = centred(intensity, plan.window)
     if plan.kernels is None:
-        return stack if len(plan.bands) == len(stack) else stack[plan.bands.to(stack.device)]
+        return stack if plan.number == len(stack) else stack[plan.bands.to(stack.device)]
     weights = plan.kernels.new_zeros(len(plan.kernels), len(given.basis))
     weights = weights.index_copy_(1, plan.bands, plan.kernels)
     weights = weights if given.share is None else weights @ given.share
@@ -97,8 +97,11 @@ def rounding(given: Given, plan: Plan, found: Tensor, eps: float) -> Tensor:
     count = math.prod(transform(given, plan.window))
     u, x, y, _ = plan.mix
     plane = given.gram.diagonal()[: plan.planes].clamp_min(0).sqrt() * math.sqrt(given.copies)
-    kernel = (given.passed.total * given.passed.peak).sqrt()[plan.bands]
-    kernel = kernel if plan.kernels is None else plan.kernels.abs() @ kernel
+    kernel = (given.passed.total * given.passed.peak).sqrt()
+    if plan.kernels is not None:
+        kernel = plan.kernels.abs() @ kernel[plan.bands]
+    else:  # the band of each PSF, or the band in which a PSF has the weight 1
+        kernel = kernel[plan.bands if given.share is None else given.share.argmax(0)]
     terms = (plane if x is None else x.abs() @ plane) * (kernel if y is None else y.abs() @ kernel)
     white = terms[None].sum(1) if u is None else u.abs() @ terms
     return eps * (8 * math.sqrt(math.log2(count + 1)) * white / math.sqrt(count) + 10 * found)

@@ -16,6 +16,7 @@ from neusee.nodes.torch_func import one_by_one
 Corner = tuple[int, int]
 
 _COLUMNS = 16  #: columns of each spectrum at a time; on a GPU all columns
+_SOME = 64  #: rows of a picture at a time: whole pictures would take new memory, which costs more than their FFTs
 
 
 class Mix(NamedTuple):
@@ -105,8 +106,7 @@ def _summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
         found = torch.fft.ifft(_mixed(mix, x, y.conj() if where.conjugate else y))
         found = found[:, : columns - c, where.at[0] : where.at[0] + where.size[0]]
         result[:, :, c : c + step] = found.transpose(1, 2)
-    pixels: Tensor = torch.fft.irfft(result, n=wide)
-    return pixels[..., where.at[1] : where.at[1] + where.size[1]].contiguous()
+    return _pixels(result, wide, slice(where.at[1], where.at[1] + where.size[1]))
 
 
 def _results(mix: Mix, a: Tensor) -> int:
@@ -131,17 +131,36 @@ def _rows(x: Tensor, left: int, wide: int, step: int) -> Tensor:
     """
     count, tall, broad = x.shape
     whole, more = divmod(wide // 2 + 1, step)
-    room = x.new_zeros(tall, wide)
-    spectrum: Tensor = torch.fft.rfft(room)
-    blocks = spectrum.new_empty(count, whole + (more > 0), tall, step)
+    some = _few_rows(x, tall)
+    room = x.new_zeros(some, wide)
+    blocks = room.new_empty(count, whole + (more > 0), tall, step, dtype=x.dtype.to_complex())
     if more:
         blocks[:, whole, :, more:] = 0.0
     for plane, block in zip(x, blocks, strict=True):
-        room[:, left : left + broad] = plane
-        torch.fft.rfft(room, out=spectrum)
-        block[:whole] = spectrum[:, : whole * step].view(tall, whole, step).transpose(0, 1)
-        block[whole:, :, :more] = spectrum[:, whole * step :]
+        for y in range(0, tall, some):
+            rows = slice(y, min(y + some, tall))
+            inside = room[: rows.stop - y]
+            inside[:, left : left + broad] = plane[rows]
+            spectrum: Tensor = torch.fft.rfft(inside)
+            block[:whole, rows] = spectrum[:, : whole * step].view(len(inside), whole, step).transpose(0, 1)
+            block[whole:, rows, :more] = spectrum[:, whole * step :]
     return blocks
+
+
+def _pixels(spectrum: Tensor, wide: int, columns: slice) -> Tensor:
+    """Return the wanted columns of pictures, given the spectrum of each row."""
+    size = spectrum.shape[1]
+    pixels = spectrum.real.new_empty(*spectrum.shape[:2], columns.stop - columns.start)
+    some = _few_rows(spectrum, size)
+    for plane, rows in zip(pixels, spectrum, strict=True):
+        for y in range(0, size, some):
+            plane[y : y + some] = torch.fft.irfft(rows[y : y + some], n=wide)[:, columns]
+    return pixels
+
+
+def _few_rows(x: Tensor, count: int) -> int:
+    """Return how many rows are transformed at a time: as many as fit in the cache; on a GPU all."""
+    return count if x.is_cuda else min(count, _SOME)
 
 
 class _Columns:

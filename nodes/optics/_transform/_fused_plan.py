@@ -40,9 +40,7 @@ def fused_axis(axis: Axis, dtype: torch.dtype, gathered: torch.dtype, kind: torc
     The weights in front of the FFT are of the type ``gathered``, all else of the type ``kind``.
     """
     kernel = SINGLE if dtype == torch.float32 else DOUBLE
-    pitch = min(1 / (axis.alpha * axis.n_out * kernel.oversampling), max(axis.n_in, _WIDEST) / _WIDEST)
-    points = odd(math.ceil((axis.n_in - 1) / pitch) + kernel.width)
-    length, fine, kept = _length(axis, kernel, pitch, math.ceil(points * kernel.oversampling))
+    pitch, points, length, fine, kept = _grids(axis, kernel)
     j0, k0, l0, q0 = (axis.n_in - 1) / 2, (axis.n_out - 1) / 2, (points - 1) // 2, (kept - 1) // 2
 
     def gather(row: Tensor, column: Tensor) -> Tensor:
@@ -64,6 +62,29 @@ def fused_axis(axis: Axis, dtype: torch.dtype, gathered: torch.dtype, kind: torc
     plan = CAxis(*sizes, *widths, *(x.data_ptr() for x in held))
     plan.held = held
     return plan
+
+
+def expected_seconds(rows: Axis, columns: Axis) -> float:
+    """Return the expected seconds of one PSF in single precision on one thread, without a large fixed cost.
+
+    Measured for 128 to 2160 samples and 96 to 2048 pixels a side: within 20 %. The terms are the samples of the pupil
+    with their phase, the FFTs along both axes, and the interpolation behind the FFTs.
+    """
+    transforms = columns.n_in * _fft_steps(rows) + rows.n_out * _fft_steps(columns)
+    behind = rows.n_out * (columns.n_in + columns.n_out)
+    return 0.11e-3 + 2.3e-9 * rows.n_in * columns.n_in + 0.108e-9 * transforms + 0.41e-9 * behind
+
+
+def _fft_steps(axis: Axis) -> float:
+    length = _grids(axis, SINGLE)[2]
+    return length * math.log2(length)
+
+
+def _grids(axis: Axis, kernel: Kernel) -> tuple[float, int, int, float, int]:
+    """Return the pitch and the number of the points before the FFT, and what `_length` returns."""
+    pitch = min(1 / (axis.alpha * axis.n_out * kernel.oversampling), max(axis.n_in, _WIDEST) / _WIDEST)
+    points = odd(math.ceil((axis.n_in - 1) / pitch) + kernel.width)
+    return pitch, points, *_length(axis, kernel, pitch, math.ceil(points * kernel.oversampling))
 
 
 def _length(axis: Axis, kernel: Kernel, pitch: float, least: int) -> tuple[int, float, int]:

@@ -51,3 +51,12 @@ def test_the_program_holds_the_libraries_of_the_nodes_that_run():
     assert held[1] == pytest.approx(
         process_memory() + libraries_of(["scene.photograph", "spectra.lift_lmmse"]), rel=0.1
     )
+
+
+def test_results_that_files_hold_beside_a_run_count_in_its_memory(tmp_path):
+    """Both PSFs of 31 bands and 256 x 256 pixels (8.1 MB), and the spots; with a limit of memory, nothing."""
+    small = ["scene.shape=[320,320]", "sensor.shape=[240,240]", "optics.window=[256,256]"]
+    recipe, lanes = load("first_light", [*small, "exports=all"]), lanes_of(["cpu"], 10**11)
+    later, beside = (planned(recipe, Store(tmp_path), lanes, limit).running for limit in (0.0, 1e11))
+    assert 2 * 31 * 256**2 * 4 <= beside - later <= 2**27 + 31 * 320**2 * 4
+    assert planned(recipe, Store(tmp_path), lanes, 16e6).running - later <= 2e6  # an eighth of the limit

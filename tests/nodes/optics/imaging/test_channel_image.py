@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.optics import image, image_channels
+from neusee.nodes.optics._imaging._band_thumbnail import share_of_bands
 from neusee.nodes.optics._imaging._summed_convolution import Mix, Where, summed
 from neusee.nodes.spectra import bands, compress, illuminant, illuminate, lift_lmmse, responses, rows
-from neusee.nodes.values import Channels, LowRankCube, Psf
+from neusee.nodes.values import Channels, FewBands, LowRankCube, Psf
 
 SCENE = bands(start=400e-9, stop=700e-9, count=31)
 ROWS = rows(SCENE, responses(SCENE))
@@ -197,6 +198,18 @@ def test_fewer_kernels_where_the_rows_are_alike():
     found = image_channels(scene, psf, weights, within=1e-2)
     assert int(found.kept[1]) == 3
     assert off(found.planes, of_mixture(scene, psf, weights)) <= float(found.bound) <= 1e-2
+
+
+@pytest.mark.parametrize("largest", [False, True])
+def test_psfs_of_few_bands_are_transformed_once_each_where_sums_of_them_are_more(largest):
+    scene, few, weights = mixed(rand(3, 64, 64), rand(31, 3)), as_psf(rand(4, 60, 60)), rand(3, 31)
+    share = share_of_bands(torch.tensor([0, 9, 22, 30]), 31)
+    none = torch.tensor(0.0, dtype=torch.float64)
+    chosen = FewBands(share, torch.tensor([0, 9, 22, 30]), none, none)
+    found = image_channels(scene, few, weights, chosen, largest=largest)
+    assert int(found.kept[1]) == 4  # in place of three rows times three planes
+    every = as_psf(torch.einsum("bj,jyx->byx", share, few.intensity.double()))
+    assert off(found.planes, of_mixture(scene, every, weights)) <= float(found.bound) < 2e-6
 
 
 def test_a_scene_of_full_rank_costs_no_more_kernels_than_bands():

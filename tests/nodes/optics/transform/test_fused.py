@@ -7,7 +7,8 @@ import shutil
 import pytest
 import torch
 
-from neusee.nodes import _cpp_library
+from neusee.nodes import _cpp_library, doe
+from neusee.nodes.optics import psf, pupil, stop
 from neusee.nodes.optics._psf import _Camera, _focus
 from neusee.nodes.optics._psf_definition import by_definition
 from neusee.nodes.optics._transform import _fused
@@ -15,7 +16,8 @@ from neusee.nodes.optics._transform._fused_plan import fused_axis
 from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
 from neusee.nodes.optics._transform._pupil_field import View
 from neusee.nodes.optics._transform._sample_axis import Axis
-from neusee.nodes.values import Pupil
+from neusee.nodes.spectra import bands
+from neusee.nodes.values import Psf, Pupil
 
 CPU = torch.device("cpu")
 
@@ -128,9 +130,9 @@ def test_not_a_number_in_the_amplitude_is_seen():
 
 def test_every_factor_of_the_fft_is_used_by_the_cases():
     used = set()
-    for pupil, shape, *_ in CASES:
-        for n, k in zip(pupil, shape, strict=True):
-            alpha = 8e-3 / max(pupil) * 2.9e-6 / (450e-9 * 0.11)
+    for samples, shape, *_ in CASES:
+        for n, k in zip(samples, shape, strict=True):
+            alpha = 8e-3 / max(samples) * 2.9e-6 / (450e-9 * 0.11)
             used |= set(fused_axis(Axis(n, k, alpha), torch.float32, torch.float32, torch.float32).held[0].tolist())
     assert used == {2, 3, 4, 5, 8}
 
@@ -153,3 +155,18 @@ def test_the_digest_of_the_sources_is_that_of_the_sources():
     sources = b"".join(path.read_bytes() for path in _fused.SOURCES)
     assert hashlib.sha256(sources).hexdigest().startswith(_fused.DIGEST)
     assert len(_fused.DIGEST) == 16
+
+
+@pytest.mark.parametrize(
+    ("samples", "pixels", "milliseconds"),
+    [(256, 128, 0.37), (540, 160, 1.03), (540, 512, 1.79), (540, 768, 2.59), (1080, 240, 3.56), (1080, 1080, 7.0),
+     (2160, 480, 12.8), (2160, 2048, 32.0)],
+)  # fmt: skip
+def test_the_work_of_a_psf_is_what_the_compiled_code_took(samples, pixels, milliseconds):
+    """Milliseconds of one thread (AVX-512), measured for a round stop of 8.08 mm at 540 nm."""
+    light, pitch = bands(start=540e-9, stop=540e-9, count=1), 8.0784e-3 / samples
+    shape = stop(samples=samples, pitch=pitch, diameter=8.0784e-3)
+    lens = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
+    clear = pupil(doe.flat(shape), doe.material(light), light, shape)
+    result = Psf(torch.empty(1, pixels, pixels, device="meta"), torch.ones(1))
+    assert psf.hooks.work(result, clear, **lens)[1] == pytest.approx(1e6 * milliseconds, rel=0.2)
