@@ -100,7 +100,7 @@ def camera_target(problem):
     used &= ~np.isin(np.arange(len(lit)), problem.levels.cell_level.numpy())
     top, first = signal[used].max(), levels[1][~lit].min()
     photons, exposure, n, mean, variance, nu = (jnp.asarray(x[used]) for x in levels)
-    centre, width = (jnp.asarray(x.numpy()) for x in problem.coordinates.prior)
+    centre, width = (jnp.asarray(x.numpy()) for x in problem.coordinates.prior[:2])
 
     def log(theta):
         k, q, noise, current, scatter, lamp, drift = (jnp.exp(theta[i]) for i in (0, 1, 3, 4, 5, 6, 7))

@@ -37,7 +37,7 @@ _ROUNDS, _LEAST, _ENOUGH = 8, 3, 0.6  #: most and fewest rounds; effective sampl
 _PARTS, _STEPS, _BORROWED = 6, 8, 0.1  #: components of a fit, its steps, and the share of samples added to each
 _START = 6.0  #: degrees of freedom about the mode
 _TAIL = 30.0  #: degrees of freedom of the components that are like the posterior
-_DOUBT = 0.01  #: least deviation of a logarithm at the mode, which is many times larger where the widths are
+_DOUBT = 0.05  #: least deviation of a logarithm at the mode, which is many times larger where the widths are
 _SAFE, _POWER, _SAFE_TAIL = 0.2, 0.5, 10.0  #: share, power of the posterior, and degrees of freedom of the wide part
 
 

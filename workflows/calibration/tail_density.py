@@ -27,22 +27,21 @@ _SHARE, _REACH, _TAIL = 0.05, 2.5, 6.0  #: share of the parts, their distance be
 
 @dataclass(frozen=True)
 class TailDensity:
-    """A density of which a share comes from a mixture for the tails; both are normalised alike."""
+    """A density of which a fixed share comes from a mixture for the tails; both are normalised alike."""
 
     body: Density
     tails: Mixture
-    share: float = _SHARE
 
     def draw(self, count: int, rng: Random) -> FloatArray:
         """Draw samples (count, free)."""
-        from_tails = uniform(count, rng) < self.share
+        from_tails = uniform(count, rng) < _SHARE
         samples: FloatArray = np.where(from_tails[:, None], self.tails.draw(count, rng), self.body.draw(count, rng))
         return samples
 
     def log_density(self, samples: FloatArray) -> FloatArray:
         """Return the logarithm of the density at samples (draw, free), up to a constant."""
         body, tails = self.body.log_density(samples), self.tails.log_density(samples)
-        return log_sum(np.stack([body + np.log1p(-self.share), tails + np.log(self.share)], -1))
+        return log_sum(np.stack([body + np.log1p(-_SHARE), tails + np.log(_SHARE)], -1))
 
     def propose(self, own: FloatArray, rng: Random) -> tuple[FloatArray, FloatArray]:
         """Return new samples like ``own`` (draw, free), and the logarithm of the density at ``own`` over that there."""
@@ -76,7 +75,7 @@ def with_tails(body: Density, found: Sequence[int], mode: LaplaceFit) -> Density
 
 def with_prior_tails(
     body: Mixture, problem: SensorPosterior, mode: LaplaceFit, at: NDArray[np.bool_], known: tuple[FloatArray, ...]
-) -> TailDensity:
+) -> Mixture:
     """Return a density of the widths ``at`` (free,) with a part for each width, in which this width has its prior.
 
     Below some width the levels see none, and the prior alone decides. All other widths lie as in ``body``. The shares
@@ -94,8 +93,14 @@ def with_prior_tails(
         centres[i, i] = mode.theta[at][i] - middle[at][i] * unit
         roots.append(_root(_given(covariance, i), i, unit))
     parts = [Mixture(np.ones(1), centre[None], root[None], _TAIL) for centre, root in zip(centres, roots, strict=True)]
-    shares = _shares([body, *parts], *known)[1:]
-    return TailDensity(body, Mixture(shares / shares.sum(), centres, np.stack(roots), _TAIL), float(shares.sum()))
+    first, *shares = _shares([body, *parts], *known)
+    tails = np.broadcast_to(body.tails, body.shares.shape)
+    return Mixture(
+        np.concatenate([first * body.shares, shares]),
+        np.concatenate([body.centres, centres]),
+        np.concatenate([body.roots, np.stack(roots)]),
+        np.concatenate([tails, np.full(len(shares), _TAIL)]),
+    )
 
 
 def _shares(parts: Sequence[Mixture], samples: FloatArray, weight: FloatArray) -> FloatArray:

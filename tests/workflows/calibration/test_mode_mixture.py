@@ -79,7 +79,7 @@ def test_each_width_has_a_part_with_its_prior():
     samples = body.draw(20000, rng)
     samples[:3000, 0] = prior.rvs(3000, rng)[:, 0]  # 15 % have the prior of the first width
     found = with_prior_tails(body, problem, mode, np.array([False, True, True]), (samples, np.full(20000, 1 / 20000)))
-    share = found.share * found.tails.shares
+    share = found.shares[1:]
     assert share == pytest.approx([0.15, 0.03], abs=0.03)
     covariance = np.array([[0.09, 0.03], [0.03, 0.17]])
     first = np.diag([1.1**2, covariance[1, 1] - 0.03**2 / 0.09])
@@ -87,7 +87,7 @@ def test_each_width_has_a_part_with_its_prior():
     places = rng.normal(-5.0, 1.5, (20, 2))
     known = logsumexp(
         [
-            np.log(1 - found.share) + multivariate_t([-5.0, -4.0], covariance, df=30).logpdf(places),
+            np.log(found.shares[0]) + multivariate_t([-5.0, -4.0], covariance, df=30).logpdf(places),
             np.log(share[0]) + multivariate_t([-6.0, -4.0], first, df=6).logpdf(places),
             np.log(share[1]) + multivariate_t([-5.0, -4.5], second, df=6).logpdf(places),
         ],
