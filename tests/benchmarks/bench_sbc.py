@@ -42,6 +42,7 @@ UNITS = {"gain": "DN/e-", "offset": "e-"} | dict.fromkeys(
 )
 LINEAR = ("offset", "dark_signal", "bend", "twist")
 GUIDED = {"de": True, "stretch": True, "snooker": False}
+TOP = 1900.0  #: DN, signal at which the response of the camera bends by bend and twist
 STEPS = 60  #: of 4 x 64 walkers, of which 99 draws are taken; `neusee calibrate` walks at least 250
 
 
@@ -61,7 +62,7 @@ def measured(mode, truth, number, folder):
         for name, (a, b) in PRIORS[mode].items()
     ]
     if mode == "camera":
-        camera = PlainCamera(**truth, top=1900.0)
+        camera = PlainCamera(**truth, top=TOP)
         file = table(camera, [number, 2], folder / "levels.csv", size=64, lit=15, beyond=1.5)
         return load("calibrate_camera", [f"table.file={file}", *prior])
     camera = PlainCamera(
@@ -72,11 +73,24 @@ def measured(mode, truth, number, folder):
     return load(str(frames_recipe(camera, [number, 2], folder, size=48, lit=10, darks=4)), prior)
 
 
+def at_the_top(problem, truth):
+    """Return the truth with bend and twist at the brightest level that the calibration uses, and not at TOP."""
+    lit, mean, variance = (
+        problem.levels.photons.numpy() > 0,
+        problem.levels.mean.numpy(),
+        problem.levels.variance.numpy(),
+    )
+    signal = mean - mean[0]  # the first level is the shortest dark
+    share = signal[signal <= 0.7 * signal[lit][variance[lit].argmax()]].max() / TOP
+    return truth | {"bend": truth["bend"] * share, "twist": truth["twist"] * share**2}
+
+
 def simulated(mode, number, move):
     truth = drawn_from(mode, np.random.default_rng([number, 1]))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         problem = SensorPosterior.of(measured(mode, truth, number, folder), Store(folder / "store"))
+        truth = at_the_top(problem, truth) if mode == "camera" else truth
         began = time.process_time()
         best = search_mode(problem)
         if GUIDED[move]:

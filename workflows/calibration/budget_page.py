@@ -172,6 +172,11 @@ def _finite(freedom: float) -> float | str:
     return freedom if math.isfinite(freedom) else "infinite"
 
 
+def two_digits(uncertainty: float) -> str:
+    """Return an uncertainty as text of two significant digits, of large numbers without an exponent: 1000, 710."""
+    return f"{float(f'{uncertainty:.2g}'):.6g}"
+
+
 def budget_figure(budgets: Sequence[Budget]) -> Any:
     """Draw the share of each source in the variance of each quantity, as bars that add up to 100 %."""
     sources = list(dict.fromkeys(c.source for b in budgets for c in b.contributions if c.share))
@@ -187,7 +192,7 @@ def budget_figure(budgets: Sequence[Budget]) -> Any:
                 shown.add(c.source)
                 ax.barh(i, part, left=left, color=colours[c.source], label=label, height=0.7)
                 left += part
-        ax.text(101, i, f"U = {b.expanded:.2g} {b.unit}".rstrip(), va="center", fontsize=9)
+        ax.text(101, i, f"U = {two_digits(b.expanded)} {b.unit}".rstrip(), va="center", fontsize=9)
     ax.set_yticks(range(len(budgets)), [b.symbol or b.name for b in budgets])
     ax.set(xlim=(0, 100), xlabel="share of the variance (%)", title="Sources of uncertainty")
     ax.invert_yaxis()

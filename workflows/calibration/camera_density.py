@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from neusee.workflows.calibration.posterior_mixture import Mixture, Random
+from neusee.workflows.calibration.posterior_mixture import Density, Random
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,7 +36,7 @@ class Others(Protocol):
 class CameraDensity:
     """A density of all parameters: a mixture of the widths, and the distribution of all others given the widths."""
 
-    widths: Mixture
+    widths: Density
     others: Others
 
     def draw(self, count: int, rng: Random) -> FloatArray:

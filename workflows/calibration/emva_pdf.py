@@ -9,7 +9,7 @@ from typing import Any
 
 from neusee.nodes.calibrate import COVERAGE, Budget, EmvaSheet
 from neusee.workflows.calibration import emva_figures
-from neusee.workflows.calibration.budget_page import BUDGETED, budget_figure
+from neusee.workflows.calibration.budget_page import BUDGETED, budget_figure, two_digits
 from neusee.workflows.report.figures.style import canvas, styled
 
 _LINE = 105  #: characters of a line of the summary
@@ -46,13 +46,13 @@ def _summary(sheet: EmvaSheet, title: str, lines: list[str], budgets: Mapping[st
     axes[0, 0].text(0, 0.86, shown, fontsize=9, va="top", linespacing=1.4, transform=axes[0, 0].transAxes)
     rows = [(q.symbol, q.name, q.text, _expanded(budgets.get(q.key))) for q in sheet.quantities]
     table = axes[1, 0].table(
-        rows, colLabels=_COLUMNS, colWidths=(0.24, 0.42, 0.22, 0.12), cellLoc="left", loc="upper center"
+        rows, colLabels=_COLUMNS, colWidths=(0.22, 0.46, 0.2, 0.12), cellLoc="left", loc="upper center"
     )
     table.auto_set_font_size(False)
     table.set_fontsize(9)
     for cell in table.get_celld().values():
         cell.set_linewidth(0.3)
-        cell.PAD = 0.04
+        cell.PAD = 0.03
     return figure
 
 
@@ -60,4 +60,4 @@ def _expanded(budget: Budget | None) -> str:
     """Return the expanded uncertainty in the unit of the value as text; + says that a source is not stated."""
     if budget is None:
         return "–"
-    return f"{budget.expanded:.2g}" + " +" * bool(budget.missing)
+    return two_digits(budget.expanded) + " +" * bool(budget.missing)

@@ -6,7 +6,6 @@ Scand. J. Stat. 39, 798 (2012), adaptive multiple importance sampling). The firs
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +25,7 @@ from neusee.workflows.calibration.posterior_mixture import (
     softened,
     weighed,
 )
-from neusee.workflows.calibration.tail_density import hardly_told, with_tails
+from neusee.workflows.calibration.tail_density import hardly_told, with_prior_tails, with_tails
 from neusee.workflows.calibration.value_near_zero import NearZero
 
 if TYPE_CHECKING:
@@ -38,6 +37,7 @@ _ROUNDS, _LEAST, _ENOUGH = 8, 3, 0.6  #: most and fewest rounds; effective sampl
 _PARTS, _STEPS, _BORROWED = 6, 8, 0.1  #: components of a fit, its steps, and the share of samples added to each
 _START = 6.0  #: degrees of freedom about the mode
 _TAIL = 30.0  #: degrees of freedom of the components that are like the posterior
+_DOUBT = 0.05  #: least deviation of a logarithm at the mode, which is many times larger where the widths are
 _SAFE, _POWER, _SAFE_TAIL = 0.2, 0.5, 10.0  #: share, power of the posterior, and degrees of freedom of the wide part
 
 
@@ -54,44 +54,43 @@ def fit_about_mode(
     whose own effective sample size the caller must check.
     """
     tailed = hardly_told(problem, mode)
-    others = _given_widths(problem, mode, tailed) if problem.coordinates.widths.intersection(problem.names) else None
+    others = _given_widths(problem, mode) if problem.coordinates.widths.intersection(problem.names) else None
     at = others.at if others else np.ones(len(mode.theta), dtype=bool)
     mixture = Mixture(np.ones(1), mode.theta[None, at], _root(mode.covariance[at][:, at])[None], np.array([_START]))
     mixtures: list[Mixture] = []
     samples: list[FloatArray] = []
     logs: list[FloatArray] = []
-    best, kept = -1.0, _whole(mixture, others)
+    best, kept = -1.0, mixture
     for number in range(1, _ROUNDS + 1):
-        density = _whole(mixture, others)
-        drawn, log = weighed(problem, density, _TRIED, rng)
+        drawn, log = weighed(problem, CameraDensity(mixture, others) if others else mixture, _TRIED, rng)
         mixtures.append(mixture)
         samples.append(drawn[:, at])
         logs.append(log + mixture.log_density(drawn[:, at]))
         fraction = effective(log)
         if fraction > best:
-            best, kept = fraction, density
+            best, kept = fraction, mixture
         if number >= _LEAST and best >= _ENOUGH:
             break
         mixture = _next(mixtures, np.concatenate(samples), np.concatenate(logs), rng)
-    kept = with_tails(kept, tailed[1:] if others else tailed, mode)
-    return kept, *weighed(problem, kept, count, rng)
+    if others:
+        known = np.concatenate(samples), normalised(_logs(mixtures, np.concatenate(samples), np.concatenate(logs)))
+        widths = with_prior_tails(kept, problem, mode, at, known)
+        whole = with_tails(CameraDensity(widths, others), tailed[1:], mode)
+    else:
+        whole = with_tails(kept, tailed, mode)
+    return whole, *weighed(problem, whole, count, rng)
 
 
-def _given_widths(problem: SensorPosterior, mode: LaplaceFit, tailed: Sequence[int]) -> Others:
-    """Return the distribution of all others given the widths, with a long tail of the first parameter in ``tailed``."""
-    others = GivenWidths(problem, mode)
+def _given_widths(problem: SensorPosterior, mode: LaplaceFit) -> Others:
+    """Return the distribution of all others given the widths, with a long lower tail of the least certain one."""
+    others, tailed = GivenWidths(problem, mode), hardly_told(problem, mode, _DOUBT)
     return NearZero(others, tailed[0], float(mode.covariance[tailed[0], tailed[0]] ** 0.5)) if tailed else others
-
-
-def _whole(mixture: Mixture, others: Others | None) -> Density:
-    return CameraDensity(mixture, others) if others else mixture
 
 
 def _next(mixtures: list[Mixture], samples: FloatArray, log: FloatArray, rng: np.random.Generator) -> Mixture:
     """Return the mixture for the next round from the ``samples`` of all rounds and their log density ``log``."""
-    drawn_from = log_sum(np.stack([mixture.log_density(samples) for mixture in mixtures], -1))
     like, wide = (
-        _fitted(samples, normalised(softened(finite(power * log - drawn_from))), rng) for power in (1.0, _POWER)
+        _fitted(samples, normalised(softened(_logs(mixtures, samples, power * log))), rng) for power in (1.0, _POWER)
     )
     return Mixture(
         np.concatenate([(1 - _SAFE) * like.shares, _SAFE * wide.shares]),
@@ -99,6 +98,11 @@ def _next(mixtures: list[Mixture], samples: FloatArray, log: FloatArray, rng: np
         np.concatenate([like.roots, wide.roots]),
         np.repeat([_TAIL, _SAFE_TAIL], _PARTS),
     )
+
+
+def _logs(mixtures: list[Mixture], samples: FloatArray, log: FloatArray) -> FloatArray:
+    """Return the logarithms of the weights of samples of all mixtures, of a density with the logarithm ``log``."""
+    return finite(log - log_sum(np.stack([mixture.log_density(samples) for mixture in mixtures], -1)))
 
 
 def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -> Mixture:

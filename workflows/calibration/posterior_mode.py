@@ -14,6 +14,8 @@ from neusee.nodes.values import Levels
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from neusee.workflows.calibration.log_posterior import FloatArray
 
 _ROUNDS = 60
@@ -127,27 +129,32 @@ def find_mode(problem: SensorPosterior, initial_theta: FloatArray) -> LaplaceFit
         covariance = _covariance(rows, prior)
         step_of = np.sqrt(covariance.diagonal()).clip(max=_WIDEST) * _STEP
         gradient = _gradient(problem, theta, step_of)
-        step = covariance @ gradient
-        if gradient @ step < _CLOSE:
+        free = _free(problem, theta, step_of, gradient)
+        within = _within(covariance, free != gradient) @ free
+        if free @ within < _CLOSE:
             break
-        theta, log, moved = _climb(problem, theta, log, step)
+        theta, log, moved = _climb(problem, theta, log, covariance @ gradient, within)
         if not moved:
             break
     rows, prior = _slopes(problem, theta, step_of)
     covariance = _covariance(rows, prior)
-    free = _free(problem, theta, step_of, _gradient(problem, theta, step_of))
-    settled = bool(free @ covariance @ free < _NEXT)
+    gradient = _gradient(problem, theta, step_of)
+    free = _free(problem, theta, step_of, gradient)
+    settled = bool(free @ _within(covariance, free != gradient) @ free < _NEXT)
     scaled_slopes = rows @ np.linalg.inv(prior)
     shares = np.sqrt((prior @ covariance @ prior.T).diagonal())
     return LaplaceFit(theta, log, covariance, scaled_slopes, shares, settled)
 
 
-def _climb(problem: SensorPosterior, theta: FloatArray, log: float, step: FloatArray) -> tuple[FloatArray, float, bool]:
+def _climb(
+    problem: SensorPosterior, theta: FloatArray, log: float, step: FloatArray, within: FloatArray
+) -> tuple[FloatArray, float, bool]:
     """Return the most probable point along ``step``, its log posterior, and True if this is higher than at ``theta``.
 
-    The points change all coordinates, or all except one, which may be at an edge.
+    The points change all coordinates, or all except one, which may be at an edge; or they lie along ``within``, which
+    leaves each coordinate that is at an edge.
     """
-    ways = np.concatenate([step[None], step * (1 - np.eye(len(step)))])
+    ways = np.concatenate([step[None], within[None], step * (1 - np.eye(len(step)))])
     tries = (theta + ways[:, None] * 0.5 ** np.arange(24)[:, None]).reshape(-1, len(theta))
     logs = problem.log_posterior(tries)
     best = int(logs.argmax())
@@ -194,6 +201,15 @@ def _free(problem: SensorPosterior, theta: FloatArray, step: FloatArray, gradien
     """Return the gradient, with 0 for each component that leads to parameters where the posterior is zero."""
     up, down = _sides(problem, theta, step) == 0
     return np.where((up & (gradient > 0)) | (down & (gradient < 0)), 0.0, gradient)
+
+
+def _within(covariance: FloatArray, held: NDArray[np.bool_]) -> FloatArray:
+    """Return the covariance of all coordinates where those that are ``held`` stay as they are."""
+    if not held.any():
+        return covariance
+    across = covariance[:, held]
+    within: FloatArray = covariance - across @ np.linalg.solve(across[held], across.T)
+    return within
 
 
 def _covariance(rows: FloatArray, prior: FloatArray) -> FloatArray:

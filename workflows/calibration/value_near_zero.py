@@ -41,6 +41,8 @@ class NearZero:
         narrow = abs(spread / self._unit)
         low, high = np.arcsinh((np.array([-_REACH, _REACH]) - self._middle) / narrow)
         self._points = narrow * np.sinh(np.linspace(low, high, _CELLS + 1))  #: from the mode, in units of the prior
+        self._sizes = np.diff(self._points)
+        self._counts = 0.5 * (np.append(self._sizes, 0.0) + np.append(0.0, self._sizes))  #: of the trapezoidal rule
         self._value = self._value_at(self._points)
         self._prior = -0.5 * (self._points + self._middle) ** 2
 
@@ -99,18 +101,17 @@ class NearZero:
         return value
 
     def _normalised(self, density: FloatArray) -> FloatArray:
-        cells = 0.5 * (density[:, 1:] + density[:, :-1]) * np.diff(self._points)
-        normalised: FloatArray = density / cells.sum(1, keepdims=True)
+        normalised: FloatArray = density / (density @ self._counts)[:, None]
         return normalised
 
     def _cell(self, place: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
         """Return the cell of each place, and the share of the cell that lies below the place."""
         cell = np.searchsorted(self._points, place).clip(1, _CELLS) - 1
-        return cell, (place - self._points[cell]) / np.diff(self._points)[cell]
+        return cell, (place - self._points[cell]) / self._sizes[cell]
 
     def _place(self, density: FloatArray, chance: FloatArray) -> FloatArray:
         """Return the place below which lies the probability ``chance`` of each draw."""
-        size = np.diff(self._points)
+        size = self._sizes
         below = np.cumsum(0.5 * (density[:, 1:] + density[:, :-1]) * size, 1)
         cell = (below < (chance * below[:, -1])[:, None]).sum(1).clip(max=_CELLS - 1)
         draw = np.arange(len(chance))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from neusee.nodes.calibrate import STATISTICS, Laboratory
+from neusee.workflows.calibration.budget_page import two_digits
 from neusee.workflows.calibration.calibration_budget import budgets
 from neusee.workflows.calibration.calibration_page import CalibrationResult
 from neusee.workflows.calibration.emcee_sampler import Chains
@@ -61,3 +62,7 @@ def test_the_statistics_of_the_frames_are_the_scatter_under_the_same_lamp(tmp_pa
     assert lines["dark_signal"][STATISTICS] < 3 * np.std([each["dark_signal"] for each in found], ddof=1)
     of_lamp = lines["quantum_efficiency"]["lamp, from level to level"]
     assert of_lamp == pytest.approx(ETA * LAMP / np.sqrt(LIT), rel=0.5)  # 24 levels tell the lamp to 15 %
+
+
+def test_an_expanded_uncertainty_has_two_digits_and_no_exponent_of_a_large_number():
+    assert [two_digits(x) for x in (1043.0, 708.0, 0.0148, 2.96)] == ["1000", "710", "0.015", "3"]

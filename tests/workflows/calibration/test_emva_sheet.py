@@ -278,6 +278,17 @@ def test_pictures_that_frames_do_not_allow_are_not_drawn():
     assert drawn == ["photon_transfer", "sensitivity", "snr", "general_model", "linearity"]
 
 
+def test_no_text_of_the_summary_leaves_its_cell(sheet):
+    """`absolute sensitivity threshold, no linear model` was cut off at the next column."""
+    figure = emva_pdf._summary(sheet, "a camera", ["temperature: 25 °C"], {})
+    figure.canvas.draw()
+    (table,) = figure.axes[1].tables
+    for cell in table.get_celld().values():
+        text, box = cell.get_text().get_window_extent(), cell.get_window_extent()
+        assert box.x0 < text.x0, cell.get_text().get_text()
+        assert text.x1 < box.x1, cell.get_text().get_text()
+
+
 @pytest.mark.slow
 def test_the_pdf_has_the_summary_and_every_picture(sheet):
     pages = emva_pdf.pdf(sheet, "a camera", ["temperature: 25 °C"])

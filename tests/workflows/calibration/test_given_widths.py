@@ -116,6 +116,35 @@ def test_a_well_before_the_read_noise_is_refused_in_a_sentence_and_described_wit
     assert identify(problem, mode).kinds["full_well"] == "lower"
 
 
+def test_a_well_at_the_edge_of_what_a_number_allows_is_a_mode(tmp_path):
+    """A number of the highest level needs a well above 4094.5 DN; the search stopped beside the mode, five times.
+
+    All coordinates but the well climb as a normal distribution does in which the well is known.
+    """
+    camera = plain.PlainCamera(
+        gain=0.28060026336017463, quantum_efficiency=0.4869228126458359, temporal_dark_noise=12.654416007552552,
+        dark_current=40.76179425444259, dark_signal=0.28060026336017463 * 228.42966898792622,
+        full=14880.76151056754 - 228.42966898792622, first=0.0,
+    )  # fmt: skip
+    recipe = plain.frames_recipe(camera, [46, 2], tmp_path, size=48, lit=10, darks=4)
+    priors = {
+        "gain": "[0.25 DN/e-, 1.1]",
+        "offset": "[240 e-, 20 e-]",
+        "read_noise": "[12 e-, 1.1]",
+        "dark_current": "[40 e-, 1.5]",
+        "full_well": "[14000 e-, 1.05]",
+        "quantum_efficiency": "[0.5, 1.05]",
+    }
+    changes = [f"steps.prior.with.{name}={prior}" for name, prior in priors.items()]
+    problem = SensorPosterior.of(load(str(recipe), changes), Store(tmp_path / "store"))
+    mode = search_mode(problem)
+    assert mode.settled
+    at = problem.names.index("full_well")
+    nearby = mode.theta + 1e-2 * np.sqrt(mode.covariance.diagonal()) * np.eye(6) * np.array([[[1]], [[-1]]])
+    assert (problem.log_posterior(nearby.reshape(-1, 6)) < mode.log).all()
+    assert problem.log_posterior(mode.theta[None] - 1e-4 * np.eye(6)[[at]]) == -np.inf
+
+
 def test_hot_pixels_do_not_end_the_search(tmp_path):
     """A coarse dark level had a variance of 0 between its ends, and the search ended with `SVD did not converge`."""
     stacks = []

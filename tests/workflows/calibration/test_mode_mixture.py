@@ -10,7 +10,7 @@ from scipy.stats import multivariate_t
 from neusee.workflows.calibration.importance_sampling import weights
 from neusee.workflows.calibration.mode_mixture import fit_about_mode
 from neusee.workflows.calibration.posterior_mixture import Mixture
-from neusee.workflows.calibration.tail_density import TailDensity
+from neusee.workflows.calibration.tail_density import TailDensity, with_prior_tails
 
 FOUND, ERROR, WIDTH = 0.7, 0.25, 2.3  #: a dark current and its standard error; the width of its prior, a logarithm
 
@@ -67,3 +67,30 @@ def test_body_and_tails_are_one_density():
     ]
     found = TailDensity(body, tails).log_density(samples)
     assert found - logsumexp(logs, axis=0) == pytest.approx(np.full(20, np.log(np.pi)), abs=1e-9)
+
+
+def test_each_width_has_a_part_with_its_prior():
+    """By SciPy: body and parts as one density; the shares are those of samples with known parts in the tails."""
+    rng = np.random.default_rng(6)
+    body = Mixture(np.ones(1), np.array([[-5.0, -4.0]]), np.array([[[0.3, 0.0], [0.1, 0.4]]]), 30.0)
+    prior = multivariate_t([-6.0, -4.5], np.diag([1.1**2, 0.9**2]), df=6)
+    coordinates = SimpleNamespace(whitened=lambda x: (x - [0.0, -6.0, -4.5]) / [1.0, 1.1, 0.9])
+    problem, mode = SimpleNamespace(whitened=coordinates.whitened), SimpleNamespace(theta=np.array([1.0, -5.0, -4.0]))
+    samples = body.draw(20000, rng)
+    samples[:3000, 0] = prior.rvs(3000, rng)[:, 0]  # 15 % have the prior of the first width
+    found = with_prior_tails(body, problem, mode, np.array([False, True, True]), (samples, np.full(20000, 1 / 20000)))
+    share = found.shares[1:]
+    assert share == pytest.approx([0.15, 0.03], abs=0.03)
+    covariance = np.array([[0.09, 0.03], [0.03, 0.17]])
+    first = np.diag([1.1**2, covariance[1, 1] - 0.03**2 / 0.09])
+    second = np.diag([covariance[0, 0] - 0.03**2 / 0.17, 0.9**2])
+    places = rng.normal(-5.0, 1.5, (20, 2))
+    known = logsumexp(
+        [
+            np.log(found.shares[0]) + multivariate_t([-5.0, -4.0], covariance, df=30).logpdf(places),
+            np.log(share[0]) + multivariate_t([-6.0, -4.0], first, df=6).logpdf(places),
+            np.log(share[1]) + multivariate_t([-5.0, -4.5], second, df=6).logpdf(places),
+        ],
+        axis=0,
+    )
+    assert found.log_density(places) - known == pytest.approx(np.full(20, np.log(np.pi)), abs=1e-6)

