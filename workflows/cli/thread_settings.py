@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import MutableMapping
 
-from neusee.workflows.engine.free_processors import free_processors
+from neusee.workflows.engine.processors import free_processors
 
 _WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")  #: variables that say how a thread waits
 _NUMBER = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")

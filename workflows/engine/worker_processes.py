@@ -24,7 +24,7 @@ from typing import Generic, TypeVar
 
 import torch
 
-from neusee.workflows.engine.free_processors import free_processors
+from neusee.workflows.engine.processors import free_processors
 from neusee.workflows.store.lease import retire
 
 T = TypeVar("T")

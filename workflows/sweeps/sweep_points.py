@@ -70,6 +70,7 @@ class SweepPlan:
     costs: dict[str, float]  #: seconds by step, of steps that ran before
     work: tuple[float, ...]  #: work of each point without stored results, in seconds, or in steps if no step ran before
     notes: tuple[str, ...]
+    code: Code  #: digests of the code of all nodes, the same for all points
 
     @property
     def jobs(self) -> list[PointJob]:
@@ -90,7 +91,7 @@ def plan_sweep(
     costs = _costs(store)
     in_turn = [checked[i] for i in best_order([c.job for c in checked], costs, paired)]
     work = work_left([c.job for c in in_turn], costs, store.has)
-    return SweepPlan(checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes))
+    return SweepPlan(checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes), checker.code)
 
 
 def outcomes(
@@ -112,7 +113,7 @@ def outcomes(
     memory = partial(memory_limit, None, workers)
 
     def alone(number: int) -> _Found:
-        return _found(plan.checked[number], store, None, device, int(memory()))
+        return _found(plan, number, store, None, device, int(memory()))
 
     with closing(shared(alone, range(len(plan.checked)), workers, apart=True)) as ended:
         for number, given in ended:
@@ -120,7 +121,7 @@ def outcomes(
             if given is None:
                 started(checked.point)
             try:
-                found = given[0] if given else _found(checked, store, watch, device)
+                found = given[0] if given else _found(plan, number, store, watch, device)
             except Exception as error:
                 seconds = time.perf_counter() - began
                 error.add_note(f"at point {checked.point.number}: {checked.point.shown}")
@@ -143,14 +144,16 @@ class _Found(NamedTuple):
 
 
 def _found(
-    checked: CheckedPoint,
+    plan: SweepPlan,
+    number: int,
     store: Store,
     watch: Callable[[Event], None] | None,
     device: str,
     memory: int | None = None,
 ) -> _Found:
     began = time.perf_counter()
-    result = run(check(checked.composed), store, watch=watch, device=device, memory=memory)
+    recipe = check(plan.checked[number].composed)
+    result = run(recipe, store, watch=watch, device=device, memory=memory, code=plan.code)
     rows = (row for step, value in result.values.items() for row in numbers_of(step, value))
     ran = any(step.state == "run" for step in result.done.values())
     numbers = tuple((step, field, index, number) for step, field, index, number in rows)
