@@ -21,7 +21,7 @@ from pathlib import Path
 
 import torch
 from claims import CLAIMS
-from paired_times import OURS, Comparison
+from paired_times import OURS, Comparison, Figures
 
 PAGE = Path(__file__).parents[2] / "recipes" / "guide" / "benchmarks.md"
 ABOUT = """# Speed beside peers
@@ -39,8 +39,11 @@ _PEERS = ("joblib", "apache-hamilton", "hcipy", "prysm", "scipy", "finufft", "po
 _SECTION = re.compile(r"<!-- claim (\w+) -->\n(.*?)<!-- end -->\n", re.S)
 
 
-def table(found: Comparison) -> str:
+def table(found: Comparison | Figures) -> str:
     """Return one claim as a table in Markdown."""
+    if isinstance(found, Figures):
+        head = [f"| {found.what} | {' | '.join(found.columns)} |", f"|---{'|---' * len(found.columns)}|"]
+        return "\n".join([*head, *(f"| {' | '.join(row)} |" for row in found.rows)]) + _load(found)
     ours, turns = found.seconds[OURS], len(found.seconds[OURS])
     remarks = any(found.remarks.values())
     last = (" |", "---|") if remarks else ("", "")
@@ -52,10 +55,15 @@ def table(found: Comparison) -> str:
         note = f" {found.remarks.get(peer, '').removeprefix('error ')} |" if remarks else ""
         milliseconds = 1e3 * statistics.median(found.seconds[peer])
         lines.append(f"| {peer} | {milliseconds:.4g} | {middle:.2f} ({low:.2f} to {high:.2f}) |{note}")
-    return "\n".join(lines) + f"\n\n{turns} turns; load of the machine {found.load:.1f}.\n\n"
+    return "\n".join(lines) + _load(found, f"{turns} turns; ")
 
 
-def section(name: str, found: Iterable[Comparison]) -> str:
+def _load(found: Comparison | Figures, turns: str = "") -> str:
+    text = f"{turns}load of the machine {found.load:.1f}."
+    return f"\n\n{text[0].upper()}{text[1:]}\n\n"
+
+
+def section(name: str, found: Iterable[Comparison | Figures]) -> str:
     """Return the part of the page that one claim fills."""
     where = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
     head = f"Measured on {date.today().isoformat()}; {where}.\n\n"

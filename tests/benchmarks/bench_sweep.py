@@ -10,21 +10,27 @@ for each fifth of the points. One thread; the load of the machine is recorded.
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
+import shutil
 
 os.environ.update({name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")})
 
 import statistics
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
+from neusee.workflows import load
 from neusee.workflows.engine import node_call, step_job
+from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.studies.uncertainty.output_draws import OutputDraws
 from neusee.workflows.sweeps.axes import read_axes, read_words
 from neusee.workflows.sweeps.sweep_points import outcomes
 from neusee.workflows.sweeps.sweep_run import Sweeping
@@ -65,6 +71,11 @@ SMALL = [
     "sensor.shape=[24, 24]", "outputs=[saturated]",
 ]  # fmt: skip
 FIFTHS = 5
+RECIPES = {"three": "three trivial steps", "first_light": "first_light with small pictures, 58 steps"}
+LAWS = (
+    "sensor.quantum_efficiency=lognormal(0.56, 1.01)", "sensor.read_noise=lognormal(10.5 e-, 1.01)",
+    "sensor.full_well=lognormal(25500 e-, 1.01)", "outputs=[saturated, lsr, transfer]",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -88,7 +99,7 @@ def _sweeping(recipe: str, axis: str, values: str, words: list[str], folder: Pat
 
 def overhead(which: str, points: int) -> Overhead:
     """Return the overhead of the points of a sweep of ``three`` steps or of ``first_light``, in an empty store."""
-    load = os.getloadavg()[0]
+    busy = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as place, _nodes_timed() as within:
         folder, store = Path(place), Store(Path(place) / "cache")
         (folder / "own_nodes.py").write_text(NODES, encoding="utf-8")
@@ -103,7 +114,7 @@ def overhead(which: str, points: int) -> Overhead:
             now = time.process_time()
             spent.append(now - began - (within[0] - nodes))
             began, nodes = now, within[0]
-    return Overhead(1e3 * plan / points, _fifths(spent[1:]), load)
+    return Overhead(1e3 * plan / points, _fifths(spent[1:]), busy)
 
 
 LARGE = ("first_light", "sensor.read_noise", SMALL)
@@ -135,16 +146,46 @@ class _nodes_timed:
         step_job.call = self._call
 
 
-def rows(points: int) -> Iterator[tuple[str, Overhead]]:
-    """Yield both recipes with their overhead."""
-    yield "three trivial steps", overhead("three", points)
-    yield "first_light with small pictures", overhead("first_light", points)
+@contextmanager
+def draws(count: int = 64) -> Iterator[Callable[[int], object]]:
+    """Yield a function that computes draws of first_light for a study with a number of workers."""
+    inputs = Inputs.of(load("first_light", LAWS))
+    values = inputs.independent(count, 1).values
+    with tempfile.TemporaryDirectory() as place:
+        OutputDraws(inputs, Store(Path(place) / "fixed")).ready()
+        copies = itertools.count()
+
+        def once(workers: int) -> None:
+            store = Path(place) / str(next(copies))
+            shutil.copytree(Path(place) / "fixed", store)
+            OutputDraws(inputs, Store(store), "cpu", workers).numbers(values)
+
+        yield once
+
+
+@contextmanager
+def sweep_of(points: int) -> Iterator[Callable[[int], object]]:
+    """Yield a function that runs a sweep of first_light in an empty store with a number of workers."""
+    with tempfile.TemporaryDirectory() as place:
+        copies, axis = itertools.count(), ("sensor.read_noise", f"linspace(5 e-, 20 e-, {points})")
+
+        def once(workers: int) -> None:
+            store = Store(Path(place) / str(next(copies)))
+            work = _sweeping("first_light", *axis, ["outputs=[saturated]"], Path(place), store)
+            list(outcomes(work.plan, store, workers=workers))
+
+        yield once
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", type=int, default=1000)
     torch.set_num_threads(1)
-    for what, found in rows(parser.parse_args().points):
+    points = parser.parse_args().points
+    for which, what in RECIPES.items():
+        found = overhead(which, points)
         fifths = ", ".join(f"{each:.2f}" for each in found.run)
-        print(f"{what}: {found.point:.2f} ms a point; plan {found.plan:.2f}, run {fifths}; load {found.load:.1f}")
+        print(
+            f"{what}: {found.point:.2f} ms a point; plan {found.plan:.2f}, run {fifths}; load {found.load:.1f}",
+            flush=True,
+        )
