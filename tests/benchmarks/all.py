@@ -1,8 +1,8 @@
 """The claims of speed, each beside its peers in one run: `python tests/benchmarks/all.py [NAME ...] [--turns 10]`.
 
-Writes the page `recipes/guide/benchmarks.md` of the handbook. With names, such as `scan`, only these claims are
-measured again, and the other parts of the page stay. One thread; processor seconds, so that other work on the machine
-changes little; the load is recorded.
+Writes the page `recipes/guide/benchmarks.md` of the handbook, and the same tables in `RESULTS.md`. With names, such as
+`scan`, only these claims are measured again, and the other parts stay; `--page` measures none, and writes both files
+from the page. One thread; processor seconds, so that other work on the machine changes little; the load is recorded.
 """
 
 import argparse
@@ -14,7 +14,7 @@ import platform
 import re
 import statistics
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
@@ -24,6 +24,13 @@ from claims import CLAIMS
 from paired_times import OURS, Comparison, Figures
 
 PAGE = Path(__file__).parents[2] / "recipes" / "guide" / "benchmarks.md"
+RESULTS = Path(__file__).with_name("RESULTS.md")
+TITLE = "## Claims of speed beside peers (`all.py`)"
+HEAD = f"""{TITLE}
+
+Written by `python tests/benchmarks/all.py`; the page `recipes/guide/benchmarks.md` has the same tables, and says how
+to read them.
+"""
 ABOUT = """# Speed beside peers
 
 Each table is one claim. neusee and its peers do the same work in turns, in one run of
@@ -75,21 +82,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", choices=[*CLAIMS, []])
     parser.add_argument("--turns", type=int, default=10)
+    parser.add_argument("--page", action="store_true", help="Measure nothing, and write both files from the page.")
     args = parser.parse_args()
+    if args.page:
+        return write({})
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     for name in args.names or CLAIMS:
         print(name, flush=True)
-        write(name, section(name, CLAIMS[name](args.turns)))
+        write({name: section(name, CLAIMS[name](args.turns))})
 
 
-def write(name: str, text: str) -> None:
-    """Write one part of the page anew, and keep the others."""
+def write(new: Mapping[str, str]) -> None:
+    """Write the parts ``new`` of the page anew and keep the others, and write the same parts in `RESULTS.md`."""
     old = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
-    parts = {found[1]: found[0] for found in _SECTION.finditer(old)} | {name: text}
+    parts = {found[1]: found[0] for found in _SECTION.finditer(old)} | new
     peers = ", ".join(f"{peer} {version(peer)}" for peer in _PEERS)
     body = "".join(f"\n## {heading(name)}\n\n{parts[name]}" for name in CLAIMS if name in parts)
     PAGE.write_text(ABOUT.format(peers=peers) + body, encoding="utf-8")
+    before, mark, rest = RESULTS.read_text(encoding="utf-8").partition(TITLE)
+    after = rest[found.start() :] if mark and (found := re.search(r"^## ", rest, re.M)) else ""
+    text = f"{before.rstrip()}\n\n{HEAD}{_SECTION.sub(lambda part: part[2], body).replace('## ', '### ')}\n{after}"
+    RESULTS.write_text(text.replace("\n\n\n", "\n\n"), encoding="utf-8")
 
 
 def heading(name: str) -> str:
