@@ -14,7 +14,7 @@ from typing import Any
 
 from neusee.nodes import Check, TensorStats
 from neusee.workflows.engine.cost_laws import sizes_of
-from neusee.workflows.engine.cost_model import Estimate
+from neusee.workflows.engine.cost_model import Costs, Estimate
 from neusee.workflows.engine.dispatch import Loop, chains_of
 from neusee.workflows.engine.finished_step import error_in, facts_in, ran
 from neusee.workflows.engine.load_or_recompute import Upstream, cheaper_to_recompute, uses_of, worth_solving
@@ -27,7 +27,7 @@ from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key, key_of
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.placement.heft_schedule import TooLarge
+from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.error_budget import ErrorBudget
 from neusee.workflows.tolerance.skip_decision import SkipDecision
@@ -55,8 +55,7 @@ class Execution:
         self.wanted = frozenset(wanted)
         self.own = Local(devices, store, self._fetch, memory, nodes_of(recipe, self.wanted))
         self.executor = executor or self.own
-        self.code = code or Code(store.code_memo)
-        self.began = time.time()
+        self.code, self.began = code or Code(store.code_memo), time.time()
         self.keys: dict[str, Key] = {}
         self.makers: dict[Key, Step] = {}  # the first step of each key
         self.origins: dict[Key, dict[str, Any]] = {}  # the parts of each key
@@ -67,7 +66,8 @@ class Execution:
         self.verdicts, self.ledger = dict[str, SkipDecision](), ErrorBudget(recipe)
         self.done: dict[str, StepRecord] = {}
         self.receipts: dict[Key, dict[str, Any]] = {}  # metadata of values that were not kept
-        self.costs, self.schedule = None, None  # type: Costs | None, Schedule | None
+        self.costs: Costs | None = None
+        self.schedule: Schedule | None = None
 
     def resolve(self, order: list[str]) -> None:
         """Compute the cache key of every step; leave out each step whose effect is within the tolerance."""

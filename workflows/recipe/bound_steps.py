@@ -6,7 +6,7 @@ is the same object at two points is equal at both, with all that it holds. Steps
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -66,8 +66,9 @@ class Attempt:
 
     def _state(self) -> tuple[int, ...]:
         references, checker = self._references, self._checker
-        lists = references.diagnostics, references.lacking, references.notes, checker.diagnostics, checker.notes
-        return tuple(map(len, lists))
+        told: tuple[Sized, ...] = (references.diagnostics, references.lacking, references.notes)
+        lists = (*told, checker.diagnostics, checker.notes)
+        return tuple(len(each) for each in lists)
 
 
 def _has_path(value: Any) -> bool:

@@ -31,23 +31,34 @@ def test_results_come_in_order_and_with_the_bits_of_this_process(workers):
     assert torch.equal(torch.cat(found), torch.cat([work(n) for n in range(9)]))
 
 
-def test_neighbours_stay_with_one_worker_where_they_are_apart():
+def test_neighbours_stay_with_one_worker_where_they_are_apart(tmp_path):
     def work(number):
-        time.sleep(0.05)
+        (tmp_path / str(number)).touch()
+        _wait(tmp_path / str((number + 4) % 8))  # so that no worker is ahead of the other
         return os.getpid()
 
-    first = [each[0] for _, each in sorted(shared(work, range(8), 2, apart=True))]
-    assert len({*first[:3]}) == len({*first[-3:]}) == 1  # the middle may be done by the worker that is ready first
-    assert first[0] != first[-1]
+    found = [each[0] for _, each in sorted(shared(work, range(8), 2, apart=True))]
+    assert found == [found[0]] * 4 + [found[4]] * 4
+    assert found[0] != found[4]
 
 
-def test_a_worker_that_is_ready_helps_the_other():
+def test_a_worker_that_is_ready_helps_the_other(tmp_path):
     def work(number):
-        time.sleep(0.4 if number == 0 else 0.0)
+        for other in range(1, 20) if number == 0 else ():
+            _wait(tmp_path / str(other))
+        (tmp_path / str(number)).touch()
         return os.getpid()
 
     found = [each[0] for _, each in sorted(shared(work, range(20), 2, apart=True))]
     assert found[1:] == [found[-1]] * 19
+    assert found[0] != found[1]
+
+
+def _wait(path):
+    ends = time.monotonic() + 60.0
+    while not path.exists():
+        assert time.monotonic() < ends
+        time.sleep(0.001)
 
 
 def test_a_piece_that_fails_is_left_to_the_caller():
