@@ -15,6 +15,7 @@ import os
 import pickle
 import signal
 import sys
+import threading
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -28,17 +29,20 @@ from neusee.workflows.engine.processors import free_processors
 from neusee.workflows.store.lease import retire
 
 T = TypeVar("T")
+_OWN = ("MainThread", "neusee")  #: how the names of threads of this program begin
 _PARENT_DIES = 1  #: PR_SET_PDEATHSIG of Linux
 
 
 def workers_for(pieces: int, asked: int = 0) -> int:
     """Return how many workers share a number of pieces of work: ``asked``, or by default one for each free processor.
 
-    1 means that this process works alone, as where a fork is not possible.
+    1 means that this process works alone, as where a fork is not possible, or by default beside threads of others, such
+    as those of a notebook: a lock that such a thread holds stays locked in a fork.
     """
     if sys.platform != "linux":
         return 1
-    return max(1, min(pieces, asked or free_processors() or 1))
+    alone = all(thread.name.startswith(_OWN) for thread in threading.enumerate())
+    return max(1, min(pieces, asked or (free_processors() or 1 if alone else 1)))
 
 
 def shared(

@@ -98,7 +98,8 @@ def sweep(
     as ``"linspace(450 nm, 650 nm, 5)"``. overrides: changes that are the same at every point.
     on_error: ``"stop"`` raises the error of the first failed point, ``"continue"`` writes each error into its row.
     folder: the folder to which relative paths refer, by default the current folder. workers: the number of processes
-    that run points at the same time; 0 means one for each processor that other work leaves free.
+    that run points at the same time; 0 means one for each processor that other work leaves free, and none beside
+    threads of others, as in a notebook.
 
     Raises: RecipeError with every mistake of every point, before anything runs.
     """

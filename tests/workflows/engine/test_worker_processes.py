@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import warnings
 
@@ -159,6 +160,16 @@ def _runs(pid):
 
 def test_workers_are_as_many_as_free_processors_pieces_and_wishes_allow(monkeypatch):
     monkeypatch.setattr(worker_processes, "free_processors", lambda: 4)
+    monkeypatch.setattr(threading, "enumerate", lambda: [threading.main_thread()])
     assert [workers_for(9), workers_for(3), workers_for(9, 2), workers_for(0)] == [4, 3, 2, 1]
     monkeypatch.setattr(worker_processes, "free_processors", lambda: None)
     assert workers_for(9) == 1
+
+
+def test_beside_threads_of_others_there_are_workers_only_where_they_are_asked_for(monkeypatch):
+    monkeypatch.setattr(worker_processes, "free_processors", lambda: 4)
+    own, others = threading.Thread(name="neusee store"), threading.Thread(name="kernel")
+    monkeypatch.setattr(threading, "enumerate", lambda: [threading.main_thread(), own])
+    assert workers_for(9) == 4
+    monkeypatch.setattr(threading, "enumerate", lambda: [threading.main_thread(), own, others])
+    assert [workers_for(9), workers_for(9, 3)] == [1, 3]
