@@ -38,7 +38,7 @@ Each table is one claim. neusee and its peers do the same work in turns, in one 
 turns), because other work on the machine changes them little. The ratio is the peer's seconds over those of neusee in
 the same turn: its median and, in brackets, the interval of the sign test that holds this median with a probability of
 95 % (of fewer than six turns: the least and the largest). A ratio above 1 means that neusee is faster. Where a result
-has an error, it is that from a reference in double precision.
+has an error, it is that from a reference in double precision. A table without peers has the milliseconds of neusee.
 
 Peers: {peers}.
 """

@@ -14,10 +14,11 @@ import pytest
 import torch
 
 from neusee.workflows.cli.sweep_screen import run_sweep
+from neusee.workflows.engine import local_executor
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.sweeps import sweep_files
+from neusee.workflows.sweeps import sweep_files, sweep_points
 from neusee.workflows.sweeps.sweep_run import sweep
 from tests.workflows.crate_rules import faults
 
@@ -273,6 +274,20 @@ def test_points_of_a_killed_worker_are_run(recipe, store, nodes, monkeypatch):
 
     monkeypatch.setattr(torch.Tensor, "sum", deadly)
     assert of_numbers(sweep(recipe, AXES, store=store, workers=2)) == wanted
+
+
+def test_workers_divide_the_memory_and_a_point_that_has_too_little_runs_here(recipe, store, nodes, monkeypatch):
+    asked = []
+    monkeypatch.setattr(sweep_points, "memory_limit", lambda memory, workers: asked.append(workers) or 1.0)
+    wanted = of_numbers(sweep(recipe, AXES, store=Store(store.root.parent / "alone")))
+    assert asked == []
+    nodes.CALLS.clear()
+    assert of_numbers(sweep(recipe, AXES, store=store, workers=2)) == wanted
+    assert nodes.CALLS.count("noted") == 6  # one byte is too little for any step
+    free = local_executor.free_memory()
+    monkeypatch.setattr(local_executor, "free_memory", lambda: free)
+    monkeypatch.setattr(local_executor, "process_memory", lambda: 0)
+    assert local_executor.memory_limit(None, 2) == pytest.approx(local_executor.memory_limit(None) / 2)
 
 
 def test_a_command_with_workers_that_is_interrupted_keeps_what_is_done(command, nodes):
