@@ -13,6 +13,7 @@ sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from paired_times import Comparison, median_ranks
 
 PAGE = Path(recipes.__file__).parent / "guide" / "benchmarks.md"
+RESULTS = Path(__file__).parent / "benchmarks" / "RESULTS.md"
 
 
 @pytest.mark.parametrize("count", [6, 9, 10, 20, 101])
@@ -36,3 +37,13 @@ def test_every_ratio_of_the_page_lies_in_its_interval():
     for row in rows:
         middle, low, high = map(float, row)
         assert low <= middle <= high
+
+
+def test_the_results_have_the_tables_of_the_page():
+    """One writer makes both, so that neither is edited by hand."""
+    results = RESULTS.read_text(encoding="utf-8")
+    part = re.compile(r"^## ([^\n]+)\n\n<!-- claim \w+ -->\n(.*?)<!-- end -->", re.M | re.S)
+    sections = part.findall(PAGE.read_text(encoding="utf-8"))
+    assert len(sections) >= 2
+    for title, text in sections:
+        assert f"### {title}\n\n{text.strip()}\n" in results

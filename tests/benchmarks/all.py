@@ -1,8 +1,8 @@
 """The claims of speed, each beside its peers in one run: `python tests/benchmarks/all.py [NAME ...] [--turns 10]`.
 
-Writes the page `recipes/guide/benchmarks.md` of the handbook. With names, such as `scan`, only these claims are
-measured again, and the other parts of the page stay. One thread; processor seconds, so that other work on the machine
-changes little; the load is recorded.
+Writes the page `recipes/guide/benchmarks.md` of the handbook, and the same tables in `RESULTS.md`. With names, such as
+`scan`, only these claims are measured again, and the other parts stay; `--page` measures none, and writes both files
+from the page. One thread; processor seconds, so that other work on the machine changes little; the load is recorded.
 """
 
 import argparse
@@ -14,16 +14,23 @@ import platform
 import re
 import statistics
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 
 import torch
 from claims import CLAIMS
-from paired_times import OURS, Comparison
+from paired_times import OURS, Comparison, Figures
 
 PAGE = Path(__file__).parents[2] / "recipes" / "guide" / "benchmarks.md"
+RESULTS = Path(__file__).with_name("RESULTS.md")
+TITLE = "## Claims of speed beside peers (`all.py`)"
+HEAD = f"""{TITLE}
+
+Written by `python tests/benchmarks/all.py`; the page `recipes/guide/benchmarks.md` has the same tables, and says how
+to read them.
+"""
 ABOUT = """# Speed beside peers
 
 Each table is one claim. neusee and its peers do the same work in turns, in one run of
@@ -31,7 +38,7 @@ Each table is one claim. neusee and its peers do the same work in turns, in one 
 turns), because other work on the machine changes them little. The ratio is the peer's seconds over those of neusee in
 the same turn: its median and, in brackets, the interval of the sign test that holds this median with a probability of
 95 % (of fewer than six turns: the least and the largest). A ratio above 1 means that neusee is faster. Where a result
-has an error, it is that from a reference in double precision.
+has an error, it is that from a reference in double precision. A table without peers has the milliseconds of neusee.
 
 Peers: {peers}.
 """
@@ -39,8 +46,11 @@ _PEERS = ("joblib", "apache-hamilton", "hcipy", "prysm", "scipy", "finufft", "po
 _SECTION = re.compile(r"<!-- claim (\w+) -->\n(.*?)<!-- end -->\n", re.S)
 
 
-def table(found: Comparison) -> str:
+def table(found: Comparison | Figures) -> str:
     """Return one claim as a table in Markdown."""
+    if isinstance(found, Figures):
+        head = [f"| {found.what} | {' | '.join(found.columns)} |", f"|---{'|---' * len(found.columns)}|"]
+        return "\n".join([*head, *(f"| {' | '.join(row)} |" for row in found.rows)]) + _load(found)
     ours, turns = found.seconds[OURS], len(found.seconds[OURS])
     remarks = any(found.remarks.values())
     last = (" |", "---|") if remarks else ("", "")
@@ -52,10 +62,15 @@ def table(found: Comparison) -> str:
         note = f" {found.remarks.get(peer, '').removeprefix('error ')} |" if remarks else ""
         milliseconds = 1e3 * statistics.median(found.seconds[peer])
         lines.append(f"| {peer} | {milliseconds:.4g} | {middle:.2f} ({low:.2f} to {high:.2f}) |{note}")
-    return "\n".join(lines) + f"\n\n{turns} turns; load of the machine {found.load:.1f}.\n\n"
+    return "\n".join(lines) + _load(found, f"{turns} turns; ")
 
 
-def section(name: str, found: Iterable[Comparison]) -> str:
+def _load(found: Comparison | Figures, turns: str = "") -> str:
+    text = f"{turns}load of the machine {found.load:.1f}."
+    return f"\n\n{text[0].upper()}{text[1:]}\n\n"
+
+
+def section(name: str, found: Iterable[Comparison | Figures]) -> str:
     """Return the part of the page that one claim fills."""
     where = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
     head = f"Measured on {date.today().isoformat()}; {where}.\n\n"
@@ -67,21 +82,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", choices=[*CLAIMS, []])
     parser.add_argument("--turns", type=int, default=10)
+    parser.add_argument("--page", action="store_true", help="Measure nothing, and write both files from the page.")
     args = parser.parse_args()
+    if args.page:
+        return write({})
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     for name in args.names or CLAIMS:
         print(name, flush=True)
-        write(name, section(name, CLAIMS[name](args.turns)))
+        write({name: section(name, CLAIMS[name](args.turns))})
 
 
-def write(name: str, text: str) -> None:
-    """Write one part of the page anew, and keep the others."""
+def write(new: Mapping[str, str]) -> None:
+    """Write the parts ``new`` of the page anew and keep the others, and write the same parts in `RESULTS.md`."""
     old = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
-    parts = {found[1]: found[0] for found in _SECTION.finditer(old)} | {name: text}
+    parts = {found[1]: found[0] for found in _SECTION.finditer(old)} | new
     peers = ", ".join(f"{peer} {version(peer)}" for peer in _PEERS)
     body = "".join(f"\n## {heading(name)}\n\n{parts[name]}" for name in CLAIMS if name in parts)
     PAGE.write_text(ABOUT.format(peers=peers) + body, encoding="utf-8")
+    before, mark, rest = RESULTS.read_text(encoding="utf-8").partition(TITLE)
+    after = rest[found.start() :] if mark and (found := re.search(r"^## ", rest, re.M)) else ""
+    text = f"{before.rstrip()}\n\n{HEAD}{_SECTION.sub(lambda part: part[2], body).replace('## ', '### ')}\n{after}"
+    RESULTS.write_text(text.replace("\n\n\n", "\n\n"), encoding="utf-8")
 
 
 def heading(name: str) -> str:

@@ -4,6 +4,7 @@ Each function yields comparisons. One thread each, and processor time, so that o
 Errors are against references in double precision that share no code with either.
 """
 
+import os
 import shutil
 import sys
 import tempfile
@@ -14,8 +15,9 @@ from pathlib import Path
 import bench_peers
 import bench_psf
 import bench_scan
+import bench_sweep
 from bench_engine import chain, new_run, wide
-from paired_times import OURS, Comparison, compared, process
+from paired_times import OURS, Comparison, Figures, compared, process
 
 _ACCURATE = 2e-6  #: largest error, of the peak, of a peer of the PSF
 _PROGRAM = [sys.executable, "-m", "neusee"]
@@ -133,6 +135,25 @@ def repeated_commands(turns: int) -> Iterator[Comparison]:
             yield compared(what, {OURS: ours, "`import torch` alone": torch_alone}, turns)
 
 
+def long_sweeps(turns: int) -> Iterator[Figures]:
+    """Yield the overhead of a point of a sweep of 1000 points, in milliseconds of the processor beside its nodes."""
+    points, load = 100 * turns, os.getloadavg()[0]
+    rows = []
+    for which, what in bench_sweep.RECIPES.items():
+        found = bench_sweep.overhead(which, points)
+        rows.append([what, *(f"{each:.1f}" for each in (found.point, found.plan, *found.run))])
+    fifths = [f"fifth {n}" for n in range(1, 1 + bench_sweep.FIFTHS)]
+    yield Figures(f"{points} points, ms a point", ["in all", "planning", *fifths], rows, load)
+
+
+def workers(turns: int) -> Iterator[Comparison]:
+    """Yield two worker processes beside one, by the clock: 64 draws of a study, and a sweep of 32 points."""
+    with bench_sweep.draws() as draw, bench_sweep.sweep_of(32) as sweep:
+        for what, work in (("64 draws of an uncertainty study", draw), ("32 points of a sweep", sweep)):
+            works = {OURS: partial(work, 2), "one worker": partial(work, 1)}
+            yield compared(f"{what}, two workers, by the clock", works, max(3, turns // 3), by_clock=True)
+
+
 CLAIMS = {
     "point_spread": point_spread,
     "bands": bands,
@@ -140,4 +161,6 @@ CLAIMS = {
     "cached_steps": cached_steps,
     "large_values": large_values,
     "repeated_commands": repeated_commands,
+    "long_sweeps": long_sweeps,
+    "workers": workers,
 }

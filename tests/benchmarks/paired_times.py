@@ -47,12 +47,28 @@ def median_ranks(count: int, level: float = 0.95) -> tuple[int, int]:
     return max(rank - 1, 0), count - 1 - max(rank - 1, 0)
 
 
-def compared(what: str, works: Mapping[str, Work], turns: int, remarks: Mapping[str, str] | None = None) -> Comparison:
-    """Time works that take turns, after a turn that does not count."""
+@dataclass(frozen=True)
+class Figures:
+    """A table of numbers that have no peer: its columns, its rows as text, and the load of the machine."""
+
+    what: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    load: float
+
+
+def compared(
+    what: str,
+    works: Mapping[str, Work],
+    turns: int,
+    remarks: Mapping[str, str] | None = None,
+    by_clock: bool = False,
+) -> Comparison:
+    """Time works that take turns, after a turn that does not count: processor seconds, or those of the clock."""
     load, seconds = os.getloadavg()[0], {name: list[float]() for name in works}
     for turn in range(turns + 1):
         for name, work in works.items():
-            taken = _processor_seconds(work)
+            taken = _seconds_by_clock(work) if by_clock else _processor_seconds(work)
             if turn:
                 seconds[name].append(taken)
     return Comparison(what, seconds, remarks or {}, load)
@@ -65,6 +81,12 @@ def _processor_seconds(work: Work) -> float:
     work()
     fine, after = time.process_time() - fine, os.times()
     return fine + after.children_user - before.children_user + after.children_system - before.children_system
+
+
+def _seconds_by_clock(work: Work) -> float:
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began
 
 
 def process(command: Sequence[str], environment: Mapping[str, str], folder: str) -> None:

@@ -60,6 +60,14 @@ def one_thread():
 
 
 @pytest.fixture(autouse=True)
+def one_worker(monkeypatch):
+    """A test computes in its own process unless it asks for several workers, whatever the load of the machine."""
+    from neusee.workflows.engine import worker_processes
+
+    monkeypatch.setattr(worker_processes, "free_processors", lambda: 1)
+
+
+@pytest.fixture(autouse=True)
 def no_fault_in_any_figure(monkeypatch):
     """Every figure that the program draws in a test has panels with content, and texts that can be read."""
     from neusee.workflows.report import drawing_process

@@ -15,7 +15,7 @@ import typer
 from neusee.workflows.cli.command_frame import failing, refusing, say
 from neusee.workflows.cli.command_options import Debug
 from neusee.workflows.graph.diagnostics import nearest
-from neusee.workflows.recipe.paper_readings import READINGS, SETTLED
+from neusee.workflows.report.paper_readings import READINGS, SETTLED
 from neusee.workflows.report.text_table import columns
 
 if TYPE_CHECKING:

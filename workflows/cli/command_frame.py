@@ -74,8 +74,7 @@ def load(words: list[str] | None, *command: str, before: int = 0, exact: bool = 
 
     with refusing():
         recipe = read(name, changes, first=first)
-    gc.freeze()
-    gc.enable()
+    gc.freeze()  # what was imported is no garbage
     again = ["neusee", *command, name, *changes]
     return (replace(recipe, exact=True), [*again, "--exact"]) if exact else (recipe, again)
 

@@ -140,7 +140,7 @@ def uncertainty(
         typer.Option("--until", metavar="NAME", help="Output or quantity that decides when to stop; may be repeated."),
     ] = None,
     workers: Annotated[
-        int, typer.Option("--workers", min=0, help="Number of draws computed at the same time; 0: one for each core.")
+        int, typer.Option("--workers", min=0, help="Number of draws computed at the same time; 0: by free processors.")
     ] = 0,
     device: OneDevice = "cpu",
     quiet: Quiet = False,

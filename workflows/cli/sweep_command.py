@@ -20,6 +20,9 @@ def sweep(
     on_error: Annotated[
         str, typer.Option("--on-error", help="After a failed point: stop, or continue with the next.")
     ] = "stop",
+    workers: Annotated[
+        int, typer.Option("--workers", min=0, help="Number of points that run at the same time; 0: by free processors.")
+    ] = 0,
     netcdf: Annotated[bool, typer.Option("--netcdf", help="Write sweep.nc too (needs neusee[xarray]).")] = False,
     as_json: AsJson = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the table.")] = False,
@@ -52,6 +55,7 @@ def sweep(
             store=store,
             quiet=quiet,
             as_json=as_json,
+            workers=workers,
         )
     if code:
         raise typer.Exit(code)

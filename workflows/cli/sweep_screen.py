@@ -43,6 +43,7 @@ def run_sweep(
     store: Store | None = None,
     quiet: bool = False,
     as_json: bool = False,
+    workers: int = 0,
 ) -> int:
     """Run, show and write a sweep to ``out/sweeps/<date>_<recipe>_<key>/``; return the exit code of the command.
 
@@ -58,7 +59,7 @@ def run_sweep(
     silent = quiet or as_json
     if not silent:
         print(*_opening(work), sep="\n", flush=True)
-    done, state, error = _run_points(work, on_error, silent)
+    done, state, error = _run_points(work, on_error, silent, work.workers(workers))
     if error is not None and not (on_error == "stop" and done and done[-1].state == "failed"):
         raise error
     result = work.sweep(done, state)
@@ -100,11 +101,11 @@ def _opening(work: Sweeping) -> Iterator[str]:
 
 
 def _run_points(
-    work: Sweeping, on_error: OnError, quiet: bool
+    work: Sweeping, on_error: OnError, quiet: bool, workers: int
 ) -> tuple[list[PointOutcome], SweepState, Exception | None]:
     """Run a sweep and show its progress; return the outcome of each parameter set, also after Ctrl-C or a failure."""
     table = SweepTable(work.columns, len(work.plan.checked), mode_for(quiet))
-    running = outcomes(work.plan, work.store, on_error, work.device, table.started, table.watch)
+    running = outcomes(work.plan, work.store, on_error, work.device, table.started, table.watch, workers)
     try:
         with table, closing(running):
             for outcome in running:

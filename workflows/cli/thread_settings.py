@@ -10,6 +10,8 @@ import os
 import sys
 from collections.abc import MutableMapping
 
+from neusee.workflows.engine.processors import free_processors
+
 _WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")  #: variables that say how a thread waits
 _NUMBER = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _TIMED = ("study",)  #: commands whose stored times belong to a number of threads
@@ -27,23 +29,3 @@ def settle_threads(command: str, environ: MutableMapping[str, str] = os.environ)
     threads = free_processors()
     if command not in _TIMED and not any(name in environ for name in _NUMBER) and threads is not None:
         environ["OMP_NUM_THREADS"] = str(threads)
-
-
-def free_processors() -> int | None:
-    """Return the number of processors that no other work needs, at least one; None where the system tells no load.
-
-    Work that has only begun, or that has just ended, does not count: both the last minute and this moment must be busy.
-    """
-    try:
-        mine, all_of_them = len(os.sched_getaffinity(0)), os.cpu_count() or 1
-        with open("/proc/loadavg", encoding="ascii") as file:
-            words = file.read().split()
-        minute, now = float(words[0]), int(words[3].partition("/")[0]) - 1  # less this process
-    except (OSError, AttributeError, ValueError, IndexError):  # not Linux
-        return None
-    return threads_for(mine, min(minute, now) * mine / all_of_them)
-
-
-def threads_for(processors: int, load: float) -> int:
-    """Return the number of threads that fit beside ``load`` busy processes on a number of processors, at least one."""
-    return max(1, min(processors, round(processors - load)))

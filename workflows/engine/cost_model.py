@@ -22,6 +22,7 @@ from neusee.workflows.recipe.known_before_run import machine_memory
 
 _FASTER = 10.0  #: speed of another kind of device relative to the CPU, until both are measured
 _NEWEST = 5  #: number of earlier results that are used
+_MOST = 100  #: earlier results of a step or a node among which those of its size are searched
 _LEAST = 1 << 25  #: bytes of a peak below which the memory of the process is mostly noise
 _FARTHEST = 8  #: how much larger a step of a node without a law may be than the largest one that was measured
 _SHORT = 1e-3  #: s of a step below which its time is mostly overhead
@@ -56,11 +57,19 @@ class Costs:
         self._sizes = sizes
         self._steps: dict[str, list[Row]] = {}
         self._nodes: dict[str, list[Row]] = {}
+        self._ratio = {"cpu": 1.0}
+        self.learn(rows)
+
+    def learn(self, rows: Iterable[Row]) -> None:
+        """Add measured costs of later runs; of each step and node only the newest are kept."""
+        others = False
         for row in rows:
             if row.get("node") and row.get("step") and _is_measured(row):
-                self._steps.setdefault(f"{row['step']} {row['node']}", []).append(row)
-                self._nodes.setdefault(row["node"], []).append(row)
-        self._ratio = {"cpu": 1.0, **self._measured_ratios()}
+                _append(self._steps.setdefault(f"{row['step']} {row['node']}", []), row)
+                _append(self._nodes.setdefault(row["node"], []), row)
+                others |= _kind(row) != "cpu"
+        if others:
+            self._ratio = {"cpu": 1.0, **self._measured_ratios()}
 
     def of(self, step: Step, kinds: Sequence[str], exact: Row | None = None) -> Estimate:
         """Predict the cost of ``step`` on each kind of device; ``exact`` holds measured costs of the same result."""
@@ -170,6 +179,13 @@ class Costs:
                 if cpu > 0 and median(seconds) > 0:
                     found.setdefault(kind, []).append(cpu / median(seconds))
         return {kind: median(ratios) for kind, ratios in found.items()}
+
+
+def _append(rows: list[Row], row: Row) -> None:
+    """Append a row to the newest ones, of which at most twice `_MOST` are there at any time."""
+    rows.append(row)
+    if len(rows) > 2 * _MOST:
+        del rows[:_MOST]
 
 
 def _loading(cost: Estimate, loads: Loading) -> Estimate:

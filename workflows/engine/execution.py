@@ -49,13 +49,13 @@ class Execution:
         executor: Executor | None,
         memory: int | None,
         show: Show = lambda *_: None,
+        code: Code | None = None,
     ) -> None:
         self.recipe, self.store, self.devices, self.watch, self.show = recipe, store, devices, watch, show
         self.wanted = frozenset(wanted)
         self.own = Local(devices, store, self._fetch, memory, nodes_of(recipe, self.wanted))
         self.executor = executor or self.own
-        self.code = Code(store.code_memo)
-        self.began = time.time()
+        self.code, self.began = code or Code(store.code_memo), time.time()
         self.keys: dict[str, Key] = {}
         self.makers: dict[Key, Step] = {}  # the first step of each key
         self.origins: dict[Key, dict[str, Any]] = {}  # the parts of each key

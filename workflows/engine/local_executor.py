@@ -39,9 +39,12 @@ def lanes_of(devices: Sequence[str], memory: int | None = None, nodes: Iterable[
     return found
 
 
-def memory_limit(memory: int | None) -> float:
-    """Return the largest memory of this process in bytes: ``memory``, or most of what is free beside the process."""
-    return memory or process_memory() + _SHARE * free_memory()
+def memory_limit(memory: int | None, workers: int = 1) -> float:
+    """Return the largest memory of this process in bytes: ``memory``, or most of what is free beside the process.
+
+    Several processes, ``workers``, divide what is free.
+    """
+    return memory or process_memory() + _SHARE * free_memory() / workers
 
 
 def program_memory(nodes: Iterable[str] = ()) -> float:

@@ -8,6 +8,7 @@ before the run alone.
 from __future__ import annotations
 
 import ctypes
+import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -117,3 +118,15 @@ def _stop(now: float, limit: float) -> None:
             _last[:] = [now, limit]
             _inside[thread] = True
             _raise_in(ctypes.c_ulong(thread), ctypes.py_object(MemoryLimit))
+
+
+def _forked() -> None:
+    """Begin anew in a forked child process, which has neither the thread that looks nor threads that are watched."""
+    global _guard, _wake
+    _guard, _wake = threading.RLock(), threading.Event()
+    _limits.clear()
+    _inside.clear()
+    _thread.clear()
+
+
+os.register_at_fork(after_in_child=_forked)

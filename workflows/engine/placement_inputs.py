@@ -6,6 +6,7 @@ import math
 from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from neusee.workflows.engine.cost_laws import Size
 from neusee.workflows.engine.cost_model import Costs, Estimate
@@ -16,6 +17,7 @@ from neusee.workflows.engine.step_job import Executor, Lane, StepJob
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import Key, device_kind
 from neusee.workflows.placement.heft_schedule import Cluster, Device, Schedule, Slot, Task, TooLarge, heft
+from neusee.workflows.store.journal import Journal, Row
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in
 
@@ -177,5 +179,18 @@ def _one_after_another(
 
 
 def past_costs(store: Store, sizes: Mapping[str, Size]) -> Costs:
-    """Return the costs of steps with the given sizes, from the newest lines of the journal of a result store."""
-    return Costs(store.journal.latest(), sizes)
+    """Return the costs of steps with the given sizes, from the newest lines of the journal of a result store.
+
+    Each line is read once in a process, so that the time that a run takes does not grow with the runs before it.
+    """
+    rows = store.journal.latest()
+    read, count, costs = _read.get(store.journal, (rows, 0, Costs([])))
+    if read is not rows or count > len(rows):  # the journal began anew
+        count, costs = 0, Costs([])
+    costs.learn(rows[count:])
+    _read[store.journal] = rows, len(rows), costs
+    return costs.with_sizes(sizes)
+
+
+#: the lines of each journal that were read, their number, and the costs that they tell
+_read: WeakKeyDictionary[Journal, tuple[list[Row], int, Costs]] = WeakKeyDictionary()

@@ -20,6 +20,7 @@ from neusee.workflows.engine.step_job import Executor, Show
 from neusee.workflows.graph.recipe_graph import Recipe, needed, unknown_step
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.code_memo import Parts
 from neusee.workflows.placement.heft_schedule import Schedule
 from neusee.workflows.store.remote_store import open_store
@@ -92,13 +93,15 @@ def run(
     executor: Executor | None = None,
     memory: int | None = None,
     show: Show | None = None,
+    code: Code | None = None,
 ) -> Result:
     """Return the values of the steps ``outputs``; compute the values that are not in ``store``.
 
     Args: outputs: if None, the outputs of the recipe. device: one or several devices, such as
     ``cuda:0,cuda:1,cpu``, the preferred device first. executor: computes the steps in place of this process.
     memory: bytes that this process, and each GPU, may use; if None, most of the memory that is free.
-    show: is told each computed result, while later steps wait.
+    show: is told each computed result, while later steps wait. code: digests of the code of nodes, which runs that
+    belong together share.
     Raises `RunError`, which names the step, and ValueError for a device that this machine does not have.
     """
     began = time.perf_counter()
@@ -108,8 +111,9 @@ def run(
         if name not in recipe.steps:
             raise ValueError(unknown_step(name, recipe.steps))
     recipe, store, watch = with_substitutions(recipe, wanted), store or open_store(), watch or (lambda event: None)
+    how = (executor, memory, show or (lambda *_: None), code)
     while True:
-        work = Execution(recipe, store, device.split(","), watch, wanted, executor, memory, show or (lambda *_: None))
+        work = Execution(recipe, store, device.split(","), watch, wanted, *how)
         try:
             with limited(memory_limit(memory)):
                 return _attempt(work, wanted, began)

@@ -1,15 +1,18 @@
 """Cache of the step graphs of recipes; a graph is valid while the steps, their copies and nodes are unchanged.
 
 The node and the wires of a step depend on no other values, so that the points of a sweep share one graph. Parameters
-and files are checked for each point.
+are checked again where they have changed, and files for each point.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
+from neusee.nodes import Node
 from neusee.workflows.graph.recipe_graph import Wire
+from neusee.workflows.recipe.bound_steps import GraphMemory
 from neusee.workflows.recipe.node_families import Own, nodes_of
 from neusee.workflows.recipe.step_declarations import Declared
 from neusee.workflows.recipe.text.yaml_values import Value
@@ -27,6 +30,7 @@ class CachedGraph:
     steps: dict[str, Declared]
     absent: dict[str, Value]
     wires: Mapping[str, Mapping[str, Wire]]  #: by step, for the steps whose wires are not references
+    memory: GraphMemory = field(default_factory=GraphMemory)
 
 
 def cached_graph(root: Value, own: Own) -> CachedGraph | None:
@@ -35,7 +39,8 @@ def cached_graph(root: Value, own: Own) -> CachedGraph | None:
     ``own`` has the families of nodes that the recipe names.
     """
     graph = _graphs.get(_key(root))
-    return graph if graph is not None and all(_is_current(step, own) for step in graph.steps.values()) else None
+    families = functools.cache(functools.partial(nodes_of, own=own))
+    return graph if graph is not None and all(_is_current(step, families) for step in graph.steps.values()) else None
 
 
 def cache_graph(
@@ -66,11 +71,11 @@ def _key(root: Value) -> tuple[Value | None, Value | None, Names]:
     return root.items.get("steps"), root.items.get("nodes"), _names(root)
 
 
-def _is_current(step: Declared, own: Own) -> bool:
+def _is_current(step: Declared, families: Callable[[str], Mapping[str, Node]]) -> bool:
     """Return True if the node of a cached step has not been replaced by another node of the same name."""
     family, _, name = str(step.value.items["node"].data).partition(".")
     try:
-        return nodes_of(family, own).get(name) is step.node
+        return families(family).get(name) is step.node
     except LookupError:
         return False
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step, Wire, in_order
 from neusee.workflows.recipe.parameters import Checker
-from neusee.workflows.recipe.step_shapes import Form, bytes_of, form_of, inputs_of, tensors_of
+from neusee.workflows.recipe.step_shapes import Form, alike, bytes_of, form_of, inputs_of, tensors_of
 from neusee.workflows.recipe.text.yaml_values import Value
 
 if TYPE_CHECKING:
@@ -29,10 +29,30 @@ class CheckedStep:
     value: Value
 
 
-def check_steps(checked: Iterable[CheckedStep], checker: Checker, outputs: Iterable[str] | None) -> None:
+class KnownForm(NamedTuple):
+    """What the check of a step with its inputs gave."""
+
+    checked: CheckedStep
+    inputs: Sequence[Any]
+    computed: bool
+    notes: Sequence[str]
+    form: Any
+
+    def holds(self, checked: CheckedStep, inputs: Sequence[Any], computed: bool) -> bool:
+        """Return True if the step and what is known of its inputs are the same objects."""
+        return checked is self.checked and computed == self.computed and all(map(_same, inputs, self.inputs))
+
+
+def check_steps(
+    checked: Iterable[CheckedStep],
+    checker: Checker,
+    outputs: Iterable[str] | None,
+    before: dict[str, KnownForm] | None = None,
+) -> None:
     """Check each step with its node's own check and with the shapes of its inputs; collect notes and diagnostics.
 
     ``outputs`` are the steps whose results the recipe returns; None means a cycle of steps, so that no shape is known.
+    ``before`` has what earlier checks of the same graph found, and is brought up to date.
     """
     by_name = {each.step.name: each for each in checked}
     sources = {name: [s for s in each.step.sources if s in by_name] for name, each in by_name.items()}
@@ -41,15 +61,20 @@ def check_steps(checked: Iterable[CheckedStep], checker: Checker, outputs: Itera
     memory = machine_memory()
     computed = set(in_order(sources, [name for name in outputs or () if name in by_name]))
     for name in by_name if outputs is None else in_order(sources, by_name):
-        each = by_name[name]
-        inputs = dict(zip(each.step.node.inputs, inputs_of(each.step, known), strict=True))
+        each, forms = by_name[name], inputs_of(by_name[name].step, known)
+        if before is not None and name in before and before[name].holds(each, forms, name in computed):
+            notes[name], known[name] = before[name].notes, before[name].form
+            continue
+        inputs = dict(zip(each.step.node.inputs, forms, strict=True))
         found = checker.preflight(each.step, inputs, lambda wire: _params(by_name, wire), each.params, each.value)
         if found is None:
             notes[name] = [] if outputs is None or name in computed else _set_aside(each.step, inputs, checker)
             continue
         notes[name] = found
         try:
-            known[name] = _form(each.step, known)
+            known[name] = form = _form(each.step, known)
+            if before is not None and name in before and alike(form, before[name].form):
+                known[name] = before[name].form  # the same object, so that later steps need no new check
         except (ValueError, OverflowError) as error:
             checker.diagnostics.append(Diagnostic(each.value.key, each.value.name, str(error)))
         if name in computed and (problem := _too_large(each.step, inputs, known.get(name), memory)):
@@ -59,8 +84,16 @@ def check_steps(checked: Iterable[CheckedStep], checker: Checker, outputs: Itera
                 (each.value.key, each.value.name) if shape is None else (shape.mark, f"{shape.name} = {shape.plain}")
             )
             checker.diagnostics.append(Diagnostic(*place, problem))
+        elif before is not None and name in known:
+            before[name] = KnownForm(each, forms, name in computed, found, known[name])
     for name in by_name:
         checker.notes.update(dict.fromkeys(notes.get(name, ())))
+
+
+def _same(one: Any, other: Any) -> bool:
+    if type(one) is list and type(other) is list:
+        return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
+    return one is other
 
 
 def _set_aside(step: Step, inputs: Mapping[str, Any], checker: Checker) -> list[str]:

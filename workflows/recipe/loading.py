@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
-from neusee.workflows.graph.final_values import Config, Setting
-from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
+from neusee.workflows.graph.final_values import Config
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.recipe.bound_steps import Attempt
 from neusee.workflows.recipe.distributions.mismatch_laws import read_mismatch
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
 from neusee.workflows.recipe.expected_numbers import unaffected_expectations
@@ -23,10 +24,11 @@ from neusee.workflows.recipe.node_families import NO_FAMILY, Own, class_context
 from neusee.workflows.recipe.other_cameras import with_cameras
 from neusee.workflows.recipe.own_families import KEY, OwnFamilies, read_own_families
 from neusee.workflows.recipe.parameters import Checker
-from neusee.workflows.recipe.step_declarations import Declared, declare, device_of
+from neusee.workflows.recipe.recipe_settings import final_values, settings_of
+from neusee.workflows.recipe.step_declarations import declare, device_of
 from neusee.workflows.recipe.text.composition import Composed, compose
 from neusee.workflows.recipe.text.option_groups import groups_of, shared_folders
-from neusee.workflows.recipe.text.overrides import Override, arguments_in
+from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.recipe.text.python_overrides import overrides_of
 from neusee.workflows.recipe.text.references import References
 from neusee.workflows.recipe.text.yaml_values import Value, Where
@@ -142,12 +144,12 @@ def check(composed: Composed) -> Recipe:
     graph = cached_graph(root, own.modules)
     steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, diagnostics, own)
     wiring, checked = Wiring(root, steps, absent, references, diagnostics), list[CheckedStep]()
-    bound = {step.name: step for step in _bind(wiring, checker, graph.wires if graph else {}, checked)}
+    bound = {step.name: step for step in _bind(wiring, checker, graph, checked)}
     loops = list(cycles(bound, {name: step.value.key for name, step in steps.items()}))
     diagnostics += loops
     seed, tolerance = seed_and_tolerance(root, references, checker.diagnostics)
     estimates, outputs = estimates_of(root, references, checker.diagnostics), outputs_of(root, wiring)
-    check_steps(checked, checker, None if loops else outputs)
+    check_steps(checked, checker, None if loops else outputs, graph.memory.forms if graph else None)
     expect, exports = expectations(root, wiring), exports_of(root, wiring)
     safety = _safety(root, references, diagnostics, checker.files)
     references.finish()
@@ -157,7 +159,8 @@ def check(composed: Composed) -> Recipe:
         raise RecipeError(problems)
     if graph is None:
         cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
-    config = Config(_final_values(wiring, bound, checker, uncertain) | dict(_settings(blocks, checker)))
+    memory = graph.memory if graph else None
+    config = Config(final_values(wiring, bound, checker, uncertain, memory) | dict(settings_of(blocks, checker)))
     gone = {name: f"null ({value.mark})" for name, value in absent.items()}
     notes = (*composed.notes, *own.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
     args = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, gone, False, estimates
@@ -191,21 +194,24 @@ def _causes(problems: list[Diagnostic], own: OwnFamilies) -> list[Diagnostic]:
     return [each for each in problems if own.is_whole or not each.message.startswith(NO_FAMILY)]
 
 
-def _bind(
-    wiring: Wiring, checker: Checker, known: Mapping[str, Mapping[str, Wire]], checked: list[CheckedStep]
-) -> Iterator[Step]:
+def _bind(wiring: Wiring, checker: Checker, graph: CachedGraph | None, checked: list[CheckedStep]) -> Iterator[Step]:
     """Yield every copy of every step with its parameters and inputs, and add each valid copy to ``checked``.
 
-    ``known`` contains the cached inputs by copy.
+    ``graph`` has the inputs of each copy, and the copies that were checked with the same values before.
     """
+    known, memory = (graph.wires, graph.memory) if graph else ({}, None)
     for step in wiring.steps.values():
         if not step.items:
             for part in ("from", "with", "device"):
                 wiring.references.touch(step.part(part), step.dims)
         for items in step.items:
-            scope = step.scope(wiring.root, items)
-            given = wiring.references.resolve(step.part("with"), scope)
             name = step.instance(items)
+            if memory and (same := memory.find(name, wiring.references)):
+                checked.append(same)
+                yield same.step
+                continue
+            attempt, scope = Attempt(wiring.references, checker), step.scope(wiring.root, items)
+            given = wiring.references.resolve(step.part("with"), scope)
             wires = known[name] if name in known else wiring.wires(step, items)
             device = device_of(step, wiring.references, scope, checker.diagnostics)
             if step.node is None:
@@ -215,43 +221,8 @@ def _bind(
             found = Step(name, step.node, params or {}, wires, step.value.key, marks, device)
             if params is not None:
                 checked.append(CheckedStep(found, given, step.value))
+                attempt.remember(name, checked[-1], memory)
             yield found
-
-
-def _final_values(
-    wiring: Wiring, bound: dict[str, Step], checker: Checker, uncertain: Uncertain | None
-) -> dict[str, Setting]:
-    """Return the final values of a recipe by path: the written values and the default values of the steps' nodes."""
-    settings: dict[str, Setting] = {}
-    spare = wiring.references.spare
-    for key, block in wiring.root.items.items():
-        if key != "steps":
-            settings |= {name: value for name, value in _settings([block], checker) if value.path not in spare}
-            continue
-        for name, step in block.items.items():
-            settings |= dict(_settings([step], checker))
-            if str(name) in wiring.steps:
-                settings |= _defaults(wiring.steps[str(name)], bound)
-    for name, law in uncertain.laws.items() if uncertain else ():
-        if name in settings:
-            settings[name] = replace(settings[name], value=law.text)
-    return settings
-
-
-def _settings(blocks: Iterable[Value], checker: Checker) -> Iterator[tuple[str, Setting]]:
-    for leaf in (leaf for block in blocks for leaf in block.leaves()):
-        value: Any = checker.files.get(leaf.path, leaf.plain)
-        sources = dict.fromkeys(map(str, (leaf.mark, *arguments_in(leaf))))
-        yield leaf.name, Setting(value, ", ".join(sources), leaf.path)
-
-
-def _defaults(step: Declared, bound: dict[str, Step]) -> Iterator[tuple[str, Setting]]:
-    """Yield the parameters of a step that the recipe does not set, with the default values in SI."""
-    first = bound.get(step.instances[0]) if step.instances else None
-    for name, value in (first.params if first else {}).items():
-        if first and name not in first.param_marks:
-            path = (*step.value.path, "with", name)
-            yield ".".join(map(str, path)), Setting(value, f"default of {first.node.path}", path, True)
 
 
 def families_of(name: str, folder: Path | None = None) -> Own:

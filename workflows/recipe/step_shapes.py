@@ -89,3 +89,17 @@ def tensors_of(form: Form) -> list[Tensor]:
     if isinstance(form, Tensor):
         return [form]
     return [tensor for item in form for tensor in tensors_of(item)] if isinstance(form, tuple | list) else []
+
+
+def alike(one: Form, other: Form) -> bool:
+    """Return True if two forms tell the same: equal shapes and types, and equal values as far as these are known."""
+    from torch import Tensor, equal
+
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, Tensor):
+        same = one.shape == other.shape and one.dtype == other.dtype and one.device == other.device
+        return same and (one.device.type == "meta" or equal(one, other))
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(map(alike, one, other))
+    return one is None or (isinstance(one, str | int | float) and one == other)

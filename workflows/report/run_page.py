@@ -24,10 +24,10 @@ from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.step_record import StepRecord
 from neusee.workflows.recipe.distributions.nominal_values import told
-from neusee.workflows.recipe.paper_readings import consequences, in_force
 from neusee.workflows.report.contents import FIGURES, compared
 from neusee.workflows.report.frame_story import said_of_frame
 from neusee.workflows.report.mask_story import story
+from neusee.workflows.report.paper_readings import consequences, in_force
 from neusee.workflows.report.result_numbers import expected, metrics, table
 from neusee.workflows.report.run_html import present_time
 from neusee.workflows.report.run_timing import said_of, timing

@@ -177,7 +177,7 @@ def _beat() -> None:
         with _guard:
             if not _held:
                 _thread = None
-                _retire()
+                retire()
                 return
             badges = list(_badges.values())
         for path in badges:
@@ -185,7 +185,7 @@ def _beat() -> None:
                 append(path, b".")  # a change that other processes see whatever their clocks say
 
 
-def _retire() -> None:
+def retire() -> None:
     """Delete all files that identify this process as an owner of leases.
 
     Two threads may call this function at the same time.
@@ -205,5 +205,5 @@ def _forked() -> None:
     _badges.clear()
 
 
-atexit.register(_retire)
+atexit.register(retire)
 os.register_at_fork(after_in_child=_forked)

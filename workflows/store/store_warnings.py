@@ -22,9 +22,14 @@ class Warned:
     def report_failure(self, error: Exception, use: str = "written") -> None:
         """Warn that the folder cannot be written or read, once for each store; `failure` keeps the text for reports."""
         if not self.failure:
-            self.failure = f"the cache {self.root} cannot be {use} ({error}): {_CONSEQUENCE}"
-            self.failures.append(self.failure)
+            self.pass_on(f"the cache {self.root} cannot be {use} ({error}): {_CONSEQUENCE}")
             warnings.warn(self.failure, stacklevel=5)
+
+    def pass_on(self, failure: str) -> None:
+        """Keep for reports the warning ``failure``, which this store or that of a worker process has issued."""
+        if not self.failure:
+            self.failure = failure
+            self.failures.append(failure)
 
     def leave(self, error: NotRead) -> None:
         """Issue one warning for all results that are left alone, because they are of another format or unsigned."""

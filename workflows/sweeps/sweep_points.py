@@ -1,4 +1,4 @@
-"""The runs of a sweep: all points are checked first, and then run one after another.
+"""The runs of a sweep: all points are checked first, and then run, in worker processes or one after another.
 
 Every point is composed and checked before the first point runs. A point keeps its composed values, most of which are
 the same objects at all points; the steps of a point are built again when the point runs.
@@ -9,13 +9,17 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
+from neusee.workflows.engine.local_executor import memory_limit
 from neusee.workflows.engine.node_call import place
 from neusee.workflows.engine.runner import run
+from neusee.workflows.engine.worker_processes import shared
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.graph.run_error import RunError
@@ -66,6 +70,7 @@ class SweepPlan:
     costs: dict[str, float]  #: seconds by step, of steps that ran before
     work: tuple[float, ...]  #: work of each point without stored results, in seconds, or in steps if no step ran before
     notes: tuple[str, ...]
+    code: Code  #: digests of the code of all nodes, the same for all points
 
     @property
     def jobs(self) -> list[PointJob]:
@@ -86,7 +91,7 @@ def plan_sweep(
     costs = _costs(store)
     in_turn = [checked[i] for i in best_order([c.job for c in checked], costs, paired)]
     work = work_left([c.job for c in in_turn], costs, store.has)
-    return SweepPlan(checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes))
+    return SweepPlan(checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes), checker.code)
 
 
 def outcomes(
@@ -96,35 +101,63 @@ def outcomes(
     device: str = "cpu",
     started: Callable[[Point], None] = lambda point: None,
     watch: Callable[[Event], None] | None = None,
+    workers: int = 1,
 ) -> Generator[PointOutcome, None, None]:
-    """Run the points of a sweep one after another, and yield the outcome of each point.
+    """Run the points of a sweep, and yield the outcome of each point as it ends.
 
-    With ``on_error="stop"``, the first error is raised after the outcome of its point is yielded.
+    Several ``workers`` are processes with one thread each, and one worker is this process. A point that fails in a
+    worker runs again here. With ``on_error="stop"``, the first error is raised after the outcome of its point is
+    yielded.
     """
     clock = _Clock(plan.work)
-    for checked in plan.checked:
-        started(checked.point)
-        began = time.perf_counter()
-        try:
-            state, numbers = _run(checked, store, watch, device)
-        except Exception as error:
-            seconds = time.perf_counter() - began
-            error.add_note(f"at point {checked.point.number}: {checked.point.shown}")
-            yield _failed(checked.point, error, seconds, clock.left(seconds))
-            if on_error == "stop":
-                raise
-        else:
-            seconds = time.perf_counter() - began
-            yield PointOutcome(checked.point, state, seconds, numbers, left=clock.left(seconds))
+    memory = partial(memory_limit, None, workers)
+
+    def alone(number: int) -> _Found:
+        return _found(plan, number, store, None, device, int(memory()))
+
+    with closing(shared(alone, range(len(plan.checked)), workers, apart=True)) as ended:
+        for number, given in ended:
+            checked, began = plan.checked[number], time.perf_counter()
+            if given is None:
+                started(checked.point)
+            try:
+                found = given[0] if given else _found(plan, number, store, watch, device)
+            except Exception as error:
+                seconds = time.perf_counter() - began
+                error.add_note(f"at point {checked.point.number}: {checked.point.shown}")
+                yield _failed(checked.point, error, seconds, clock.left(number))
+                if on_error == "stop":
+                    raise
+            else:
+                if found.failure:
+                    store.pass_on(found.failure)
+                yield PointOutcome(checked.point, *found[:3], left=clock.left(number))
 
 
-def _run(
-    checked: CheckedPoint, store: Store, watch: Callable[[Event], None] | None, device: str
-) -> tuple[PointState, tuple[ResultNumber, ...]]:
-    result = run(check(checked.composed), store, watch=watch, device=device)
+class _Found(NamedTuple):
+    """What the run of one point of a sweep gave, and the warning of a store that cannot be written."""
+
+    state: PointState
+    seconds: float
+    numbers: tuple[ResultNumber, ...]
+    failure: str
+
+
+def _found(
+    plan: SweepPlan,
+    number: int,
+    store: Store,
+    watch: Callable[[Event], None] | None,
+    device: str,
+    memory: int | None = None,
+) -> _Found:
+    began = time.perf_counter()
+    recipe = check(plan.checked[number].composed)
+    result = run(recipe, store, watch=watch, device=device, memory=memory, code=plan.code)
     rows = (row for step, value in result.values.items() for row in numbers_of(step, value))
     ran = any(step.state == "run" for step in result.done.values())
-    return "run" if ran else "cached", tuple((step, field, index, number) for step, field, index, number in rows)
+    numbers = tuple((step, field, index, number) for step, field, index, number in rows)
+    return _Found("run" if ran else "cached", time.perf_counter() - began, numbers, store.failure)
 
 
 def _failed(point: Point, error: Exception, seconds: float, left: float) -> PointOutcome:
@@ -142,19 +175,19 @@ def _costs(store: Store) -> dict[str, float]:
 
 
 class _Clock:
-    """Prediction of the remaining time of a sweep from the time of its finished points."""
+    """Prediction of the remaining time of a sweep from the time that its finished points took, however many at once."""
 
     def __init__(self, work: Sequence[float]) -> None:
         least = sum(work) / 100 / len(work) or 1.0  # reading the numbers of a stored point also takes time
         self.work = [max(one, least) for one in work]
-        self.todo = sum(self.work)
-        self.done = self.seconds = 0.0
+        self.todo, self.done, self.points = sum(self.work), 0.0, len(self.work)
+        self.began = time.perf_counter()
 
-    def left(self, seconds: float) -> float:
-        """Record that a point of a sweep took ``seconds``, and return the predicted seconds of all remaining points."""
-        work = self.work.pop(0)
-        self.todo, self.done, self.seconds = self.todo - work, self.done + work, self.seconds + seconds
-        return max(self.todo, 0.0) * self.seconds / self.done if self.work else 0.0
+    def left(self, number: int) -> float:
+        """Record that a point of a sweep has ended, and return the predicted seconds of all remaining points."""
+        work, self.points = self.work[number], self.points - 1
+        self.todo, self.done = self.todo - work, self.done + work
+        return max(self.todo, 0.0) * (time.perf_counter() - self.began) / self.done if self.points else 0.0
 
 
 class _Checker:

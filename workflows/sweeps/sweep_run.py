@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neusee.workflows.engine.provenance import versions
+from neusee.workflows.engine.worker_processes import workers_for
 from neusee.workflows.graph.final_values import flow
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.text.overrides import Override
@@ -89,20 +90,24 @@ def sweep(
     on_error: OnError = "stop",
     device: str = "cpu",
     folder: str | os.PathLike[str] | None = None,
+    workers: int = 0,
 ) -> Sweep:
     """Run ``recipe`` at every combination of axis values, or, with ``zip``, at the n-th values of all axes together.
 
     Args: axes: by parameter or group, a list of values, or a text as on the command line, such
     as ``"linspace(450 nm, 650 nm, 5)"``. overrides: changes that are the same at every point.
     on_error: ``"stop"`` raises the error of the first failed point, ``"continue"`` writes each error into its row.
-    folder: the folder to which relative paths refer, by default the current folder.
+    folder: the folder to which relative paths refer, by default the current folder. workers: the number of processes
+    that run points at the same time; 0 means one for each processor that other work leaves free, and none beside
+    threads of others, as in a notebook.
 
     Raises: RecipeError with every mistake of every point, before anything runs.
     """
     place = Path(folder or ".").absolute()
     arguments = [*read_words(overrides, place), *read_axes(axes, place)]
     work = Sweeping(os.fspath(recipe), arguments, place, store or open_store(), zip, device)
-    return work.sweep(list(outcomes(work.plan, work.store, on_error, device)), "complete")
+    done = outcomes(work.plan, work.store, on_error, device, workers=work.workers(workers))
+    return work.sweep(list(done), "complete")
 
 
 class Sweeping:
@@ -117,6 +122,10 @@ class Sweeping:
         self.store, self.paired, self.device = store, paired, device
         self.plan: SweepPlan = plan_sweep(recipe, points(arguments, paired), folder, store, paired, device)
         self.sharing = sharing(self.plan.jobs, self.plan.costs)
+
+    def workers(self, asked: int) -> int:
+        """Return how many processes run the points, of which ``asked`` is a wish and 0 none; one beside a GPU."""
+        return workers_for(len(self.plan.checked), asked) if self.device == "cpu" else 1
 
     def sweep(self, outcomes: Sequence[PointOutcome], state: SweepState) -> Sweep:
         """Return the result of the sweep, with the outcomes sorted by the number of the point."""

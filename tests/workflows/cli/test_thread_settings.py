@@ -9,7 +9,9 @@ import sys
 import pytest
 
 from neusee.workflows.cli import thread_settings
-from neusee.workflows.cli.thread_settings import settle_threads, threads_for
+from neusee.workflows.cli.thread_settings import settle_threads
+from neusee.workflows.engine import processors
+from neusee.workflows.engine.processors import threads_for
 
 
 @pytest.fixture
@@ -52,7 +54,7 @@ def test_nothing_changes_where_torch_is_imported():
 
 def test_a_machine_that_tells_no_load_keeps_its_threads(monkeypatch):
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
-    assert thread_settings.free_processors() is None
+    assert processors.free_processors() is None
 
 
 def test_a_command_decides_before_torch_is_imported():

@@ -8,10 +8,11 @@ import torch
 
 from neusee.nodes import doe, node, optics, registered_nodes, shape_rules
 from neusee.workflows.engine.cost_laws import Law, Loading, Size, guess, libraries_of, shipped, size_of, sizes_of
-from neusee.workflows.engine.cost_model import Costs
-from neusee.workflows.engine.placement_inputs import MOST_PARTS, parts_of
+from neusee.workflows.engine.cost_model import _MOST, Costs
+from neusee.workflows.engine.placement_inputs import MOST_PARTS, parts_of, past_costs
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.store.result_store import Store
 
 SMALL, LARGE = Size(1e8, 1e8, 0.0, 5e7), Size(4e8, 4e8, 0.0, 2e8)
 
@@ -222,3 +223,31 @@ def test_a_guess_needs_the_most_that_a_shipped_node_needs_for_its_size():
     }
     bound = guess().peak(LARGE) / (LARGE.inputs + LARGE.result)
     assert max(ratios.values()) < bound < 3 * max(ratios.values())
+
+
+def test_costs_follow_the_journal_and_read_each_line_once(tmp_path, monkeypatch):
+    store, seen = Store(tmp_path), []
+    learn = Costs.learn
+    monkeypatch.setattr(Costs, "learn", lambda self, rows: (seen.append(len(rows)), learn(self, rows))[1])
+
+    def put(n, seconds):
+        about = {"step": "a", "recipe": "r", "origin": {"node": "toy.a"}, "seconds": seconds, "device": "cpu"}
+        date = f"2026-11-26 00:00:{n:02d}"
+        store.put(f"{n:032x}", 1.0, {**about, "bytes": 1, "peak": None, "size": None, "date": date})
+
+    for n in range(9):
+        put(n, 1.0 if n < 4 else 3.0)
+        costs = past_costs(store, {})
+    assert sum(seen) == 9
+    assert [len(rows) for rows in costs._nodes.values()] == [9]
+    assert costs._nodes == Costs(store.journal.rows())._nodes
+    store.journal.compact()  # begins anew
+    put(9, 5.0)
+    assert past_costs(store, {})._nodes == Costs(store.journal.rows())._nodes
+
+
+def test_only_the_newest_runs_of_a_step_are_kept():
+    costs = Costs([row("a", float(n), of=SMALL) for n in range(1000)])
+    assert {len(rows) for rows in (*costs._nodes.values(), *costs._steps.values())} <= set(range(_MOST, 2 * _MOST + 1))
+    newest = Costs([row("a", float(n), of=SMALL) for n in range(900, 1000)], {"a": SMALL})
+    assert costs.with_sizes({"a": SMALL}).of(step("a"), ["cpu"]) == newest.of(step("a"), ["cpu"])

@@ -281,10 +281,10 @@ def test_two_may_clear_the_badges_away_at_once(tmp_path, monkeypatch):
     def unlink(path):
         removed.append(path)
         if len(removed) == 1:
-            lease_module._retire()
+            lease_module.retire()
 
     monkeypatch.setattr(lease_module.os, "unlink", unlink)
-    lease_module._retire()
+    lease_module.retire()
     assert sorted(removed) == sorted(places.values())
     assert lease_module._badges == {}
 

@@ -5,6 +5,8 @@ import gc
 import importlib.util
 import io
 import logging
+import os
+import signal
 import sys
 from pathlib import Path
 
@@ -12,10 +14,11 @@ import pytest
 import torch
 
 from neusee.workflows.cli.sweep_screen import run_sweep
+from neusee.workflows.engine import local_executor
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.sweeps import sweep_files
+from neusee.workflows.sweeps import sweep_files, sweep_points
 from neusee.workflows.sweeps.sweep_run import sweep
 from tests.workflows.crate_rules import faults
 
@@ -226,6 +229,89 @@ def test_an_interrupted_sweep_leaves_a_valid_table_and_goes_on(command, nodes, r
     assert {row["point"] for row in rows} == set("123456")
     assert {row["point"] for row in rows if row["cached"] == "True"} == done
     assert nodes.CALLS.count("quality") == 6 - len(done)
+
+
+# --- workers --------------------------------------------------------------------------------------------------------
+
+
+def of_numbers(found):
+    return [{name: value for name, value in row.items() if name not in ("seconds", "cached")} for row in found.rows]
+
+
+def test_workers_give_the_same_rows_and_leave_nothing_in_the_store(recipe, tmp_path, nodes):
+    alone = sweep(recipe, AXES, store=Store(tmp_path / "alone"))
+    nodes.CALLS.clear()
+    store = Store(tmp_path / "shared")
+    found = sweep(recipe, AXES, store=store, workers=3)
+    assert nodes.CALLS == []
+    assert of_numbers(found) == of_numbers(alone)
+    assert [o.state for o in found.outcomes] == ["run"] * 6
+    kept = {key: about.get("kept", True) for key, about in Store(tmp_path / "alone").entries()}
+    assert {key: about.get("kept", True) for key, about in Store(tmp_path / "shared").entries()} == kept
+    assert {path.name for path in (tmp_path / "shared/tmp").iterdir()} <= {".lock"}
+    again = sweep(recipe, AXES, store=Store(tmp_path / "shared"), workers=2)
+    assert [o.state for o in again.outcomes] == ["cached"] * 6
+
+
+def test_a_point_that_fails_in_a_worker_has_the_error_of_a_sweep_without_workers(recipe, store):
+    with pytest.raises(RunError, match="3 e- are too many") as caught:
+        sweep(recipe, AXES, ["sensor.most=2"], store=store, workers=2)
+    assert "sensor.read_noise=3 e-" in caught.value.__notes__[0]
+    found = sweep(recipe, AXES, ["sensor.most=1"], store=store, on_error="continue", workers=2)
+    alone = sweep(recipe, AXES, ["sensor.most=1"], store=store, on_error="continue")
+    assert [o.point.number for o in found.failed] == [3, 4, 5, 6]
+    assert of_numbers(found) == of_numbers(alone)
+
+
+def test_points_of_a_killed_worker_are_run(recipe, store, nodes, monkeypatch):
+    mine, whole = os.getpid(), torch.Tensor.sum
+    wanted = of_numbers(sweep(recipe, AXES, store=Store(store.root.parent / "alone")))
+
+    def deadly(tensor, *args, **how):
+        if os.getpid() != mine and float(tensor[0, 0]) == 1002.0:  # the point with 2 e- and 500 nm
+            os.kill(os.getpid(), signal.SIGKILL)
+        return whole(tensor, *args, **how)
+
+    monkeypatch.setattr(torch.Tensor, "sum", deadly)
+    assert of_numbers(sweep(recipe, AXES, store=store, workers=2)) == wanted
+
+
+def test_workers_divide_the_memory_and_a_point_that_has_too_little_runs_here(recipe, store, nodes, monkeypatch):
+    asked = []
+    monkeypatch.setattr(sweep_points, "memory_limit", lambda memory, workers: asked.append(workers) or 1.0)
+    wanted = of_numbers(sweep(recipe, AXES, store=Store(store.root.parent / "alone")))
+    assert asked == []
+    nodes.CALLS.clear()
+    assert of_numbers(sweep(recipe, AXES, store=store, workers=2)) == wanted
+    assert nodes.CALLS.count("noted") == 6  # one byte is too little for any step
+    free = local_executor.free_memory()
+    monkeypatch.setattr(local_executor, "free_memory", lambda: free)
+    monkeypatch.setattr(local_executor, "process_memory", lambda: 0)
+    assert local_executor.memory_limit(None, 2) == pytest.approx(local_executor.memory_limit(None) / 2)
+
+
+def test_a_command_with_workers_that_is_interrupted_keeps_what_is_done(command, nodes):
+    nodes.INTERRUPT.add(2.0)  # in this process too, where a point that fails in a worker runs again
+    code, folder, _ = command(workers=2)
+    done = {row["point"] for row in read_table(folder)}
+    assert code == 130
+    assert len(done) < 6
+    nodes.INTERRUPT.clear()
+    code, folder, _ = command(workers=2)
+    rows = read_table(folder)
+    assert code == 0
+    assert {row["point"] for row in rows} == set("123456")
+    assert done <= {row["point"] for row in rows if row["cached"] == "True"}
+
+
+def test_a_cache_that_cannot_be_written_is_said_once_by_all_workers(recipe, tmp_path, capsys):
+    (tmp_path / "cache").write_text("no folder")
+    store = Store(tmp_path / "cache")
+    with pytest.warns(UserWarning, match="cannot be written") as told:
+        code = run_sweep(recipe, WORDS, out=tmp_path / "runs", store=store, workers=2)
+    assert code == 0
+    assert len({str(each.message) for each in told}) == 1
+    assert "warning  the cache" in capsys.readouterr().out
 
 
 # --- files ----------------------------------------------------------------------------------------------------------

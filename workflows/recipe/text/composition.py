@@ -124,12 +124,11 @@ def _new_step(value: Value) -> bool:
 def _choose(root: Value, overrides: list[Override], groups: Groups) -> tuple[list[Choice], list[Override]]:
     """Return the option of each group after overrides such as ``laser=six``, and the overrides of single values."""
     choices = {choice.group: choice for choice in choices_of(root, groups.diagnostics)}
-    names = groups.names()
-    rest = []
+    names, rest = functools.cache(groups.names), []
     for o in overrides:
         group, data = o.path[0], o.value.data if o.value else None
-        of_values = group not in choices and (group in root.items or group not in names)
-        if len(o.path) > 1 or isinstance(data, dict | list) or of_values:
+        values = len(o.path) > 1 or isinstance(data, dict | list)
+        if values or (group not in choices and (group in root.items or group not in names())):
             rest.append(o)
         elif message := _group_fault(o, choices):
             groups.diagnostics.append(Diagnostic(o.mark, o.text, message))

@@ -53,6 +53,8 @@ class References:
         self.notes: list[str] = []  #: on values of the user's recipe that the arguments make unused
         self.used: set[Where] = set()
         self.known: dict[Where, Value] = {}  #: resolved values
+        self.trace: list[tuple[Where, Value | None]] = []  #: each path that was looked up, with the value there
+        self._traces: dict[Where, list[tuple[Where, Value | None]]] = {}  #: by resolved value
         self.open: list[Where] = []  #: values that are being resolved
         self.lacking: list[tuple[Where, Diagnostic]] = []  #: targets that do not exist
         self.spare: set[Where] = set()  #: unused values of packaged options
@@ -108,6 +110,7 @@ class References:
                 return None
             start = item
         target = start.below(parts)
+        self.trace.append(((*start.path, *parts), target))
         if target is None and optional:
             self.offered.add((*start.path, *parts))
             return replace(origin, data=ABSENT)
@@ -120,6 +123,7 @@ class References:
     def _followed(self, target: Value, scope: Scope, origin: Value) -> Value | None:
         """Return the target value of a reference, with its own references resolved; report a cycle of references."""
         if target.path in self.known:
+            self.trace += self._traces[target.path]
             return self.known[target.path]
         if target.path in self.open:
             loop = [*self.open[self.open.index(target.path) :], target.path]
@@ -133,6 +137,7 @@ class References:
             self._fail(origin, f"references expand this value to more than {_MOST_VALUES} values")
             return None
         self.open.append(target.path)
+        first = len(self.trace)
         value = self.resolve(target, scope if target.path[0] == "steps" else Scope({}, dotted(target.path)))
         self.open.pop()
         if self._weight(value) > _MOST_VALUES:
@@ -140,7 +145,7 @@ class References:
         elif any(child.data is BROKEN for child in value.items.values()):
             value = replace(value, data=BROKEN)
         if target.path[0] != "steps":
-            self.known[target.path] = value
+            self.known[target.path], self._traces[target.path] = value, self.trace[first:]
         return value
 
     def _weight(self, value: Value) -> int:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property
@@ -20,6 +18,7 @@ from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.engine.node_call import place
 from neusee.workflows.engine.provenance import timestamp
+from neusee.workflows.engine.worker_processes import shared_in_order, workers_for
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.keys.cache_key import device_kind, digest, key_of
 from neusee.workflows.keys.code_digest import Code
@@ -41,7 +40,7 @@ class OutputDraws:
 
     def __init__(self, inputs: Inputs, store: Store, device: str = "cpu", workers: int = 0) -> None:
         self.inputs, self.store, self.device = inputs, store, device
-        self.workers = 1 if device != "cpu" else workers or os.cpu_count() or 1
+        self.workers = workers  #: processes that compute draws; 0 means one for each free processor
         recipe = inputs.recipe
         self._order = needed(recipe, recipe.outputs)
         self._live = _reached_steps(inputs, self._order)
@@ -130,19 +129,19 @@ class OutputDraws:
         return numbers
 
     def _results(self, rows: Sequence[FloatArray]) -> Iterator[dict[str, Any]]:
-        """Yield the outputs for each draw of the inputs, in order; ``self.workers`` threads compute in parallel."""
+        """Yield the outputs for each draw of the inputs, in order; worker processes compute in parallel."""
         if not rows:
             return
         self.ready()
         began = time.perf_counter()
         _keep_memory()
-        with one_thread(), ThreadPoolExecutor(self.workers) as pool:
-            for first in range(0, len(rows), self.workers):
-                for result in pool.map(self._result, rows[first : first + self.workers]):
-                    self.computed += 1
-                    self.seconds += time.perf_counter() - began
-                    yield result
-                    began = time.perf_counter()
+        workers = workers_for(len(rows), self.workers) if self.device == "cpu" else 1
+        with one_thread():
+            for result in shared_in_order(lambda number: self._result(rows[number]), len(rows), workers):
+                self.computed += 1
+                self.seconds += time.perf_counter() - began
+                yield result
+                began = time.perf_counter()
 
     def _result(self, row: FloatArray) -> dict[str, Any]:
         values = self._named(row)

@@ -45,7 +45,7 @@ def study(
     """Sample inputs, up to ``most`` times, until all output standard deviations are known to the relative ``error``.
 
     With ``until``, names of outputs or of single quantities, only their deviations decide. On the CPU, ``workers``
-    draws are computed at once; 0 means one for each core. Returns the folder with the results.
+    processes compute draws; 0 means one for each free processor. Returns the folder with the results.
     """
     study_run = StudyRun("uncertainty", recipe, command)
     require_salib()

@@ -7,8 +7,8 @@ import pytest
 
 from neusee.workflows import load
 from neusee.workflows.cli.catalogue import node_lines
-from neusee.workflows.recipe.paper_readings import READINGS, SETTLED, consequences, in_force
 from neusee.workflows.report.console import opening
+from neusee.workflows.report.paper_readings import READINGS, SETTLED, consequences, in_force
 
 PAGE = Path(__file__).parents[3] / "recipes" / "guide" / "readings.md"
 CAMERA = [row for row in READINGS if row.path.startswith(("reading.", "sensor."))]

@@ -1,0 +1,78 @@
+"""Memory of a step graph for the points of a sweep: a step is checked again only if a value that it reads has changed.
+
+Values of a recipe are never changed in place, and an override rebuilds the values along its path alone. So a value that
+is the same object at two points is equal at both, with all that it holds. Steps that read files are always checked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sized
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from neusee.workflows.graph.final_values import Setting
+from neusee.workflows.recipe.known_before_run import CheckedStep, KnownForm
+from neusee.workflows.recipe.parameters import Checker
+from neusee.workflows.recipe.text.references import References
+from neusee.workflows.recipe.text.yaml_values import Value, Where
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoundStep:
+    """A step without mistakes, and the values that its references read; None for a path without a value."""
+
+    checked: CheckedStep
+    reads: Mapping[Where, Value | None]
+
+    def holds(self, root: Value) -> bool:
+        """Return True if each value that the step read is still the same object."""
+        return all(root.below(path) is value for path, value in self.reads.items())
+
+
+@dataclass(eq=False)
+class GraphMemory:
+    """What earlier checks of one step graph found: steps, forms of results, and final values by block."""
+
+    bound: dict[str, BoundStep] = field(default_factory=dict)
+    forms: dict[str, KnownForm] = field(default_factory=dict)
+    settings: dict[int, tuple[Value, dict[str, Setting]]] = field(default_factory=dict)  #: by identity of the block
+
+    def find(self, name: str, references: References) -> CheckedStep | None:
+        """Return the step ``name`` as it was checked before, or None if a value that it reads has changed."""
+        known = self.bound.get(name)
+        if known is None or not known.holds(references.root):
+            return None
+        for path, value in known.reads.items():
+            if value is None:
+                references.offered.add(path)
+            else:
+                references.used.add(value.path)
+        return known.checked
+
+
+class Attempt:
+    """The check of one step, which is remembered if it made no mistake, gave no note and reads no file."""
+
+    def __init__(self, references: References, checker: Checker) -> None:
+        self._references, self._checker = references, checker
+        self._first, self._before = len(references.trace), self._state()
+
+    def remember(self, name: str, checked: CheckedStep, memory: GraphMemory | None) -> None:
+        """Let later checks of the same graph find the step."""
+        if memory is None or _has_path(checked.step.params) or self._checker.own or self._state() != self._before:
+            return
+        memory.bound[name] = BoundStep(checked, dict(self._references.trace[self._first :]))
+
+    def _state(self) -> tuple[int, ...]:
+        references, checker = self._references, self._checker
+        told: tuple[Sized, ...] = (references.diagnostics, references.lacking, references.notes)
+        lists = (*told, checker.diagnostics, checker.notes)
+        return tuple(len(each) for each in lists)
+
+
+def _has_path(value: Any) -> bool:
+    """Return True if a parameter, or a part of it, is the path of a file."""
+    if isinstance(value, Mapping):
+        return any(map(_has_path, value.values()))
+    return isinstance(value, Path) or (isinstance(value, list | tuple) and any(map(_has_path, value)))
