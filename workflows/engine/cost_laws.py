@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from neusee.nodes import Node
 from neusee.workflows.engine.band_results import bands_in
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.recipe.step_shapes import Form, bytes_of, complete, form_of, inputs_of, without_values
+from neusee.workflows.graph.step_shapes import Form, bytes_of, complete, form_of, inputs_of, without_values
 
 _LEAST = float(1 << 26)  #: bytes of a result whose shape is not known, in a recipe without any known shape
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step, Wire, in_order
+from neusee.workflows.graph.step_shapes import Form, alike, bytes_of, form_of, inputs_of, tensors_of
 from neusee.workflows.recipe.parameters import Checker
-from neusee.workflows.recipe.step_shapes import Form, alike, bytes_of, form_of, inputs_of, tensors_of
 from neusee.workflows.recipe.text.yaml_values import Value
 
 if TYPE_CHECKING:
