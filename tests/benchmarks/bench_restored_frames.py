@@ -58,6 +58,33 @@ defaults:
   - reading: coherent
 seed: 7
 """
+#: the network of this package after the search, which is no option that ships, for it gains nothing there
+NETWORK = """\
+defaults: [search]
+restore:
+  weights: @
+  width: 12              # of the network
+steps:
+  deconvolved:
+    node: restore.informed
+    from:
+      electrons: signal[mask]
+      psf: psf[mask]
+      illuminant: illuminant
+      responses: responses
+      bands: bands
+      clipped: clipped[mask]
+      glare: found_glare
+      nearby: found_nearby
+    with:
+      weights: "${restore.weights}"
+      width: "${restore.width}"
+      balance: "${restore.balance}"
+      doubt: "${restore.doubt}"
+      least_doubt: "${restore.least_doubt}"
+      scatter: "${restore.scatter}"
+      read_noise: "${sensor.read_noise}"
+""".replace("@", str(ROOT / "recipes" / "samples" / "neusee_network.safetensors"))
 OPTICS = f"""\
 defaults: [small]
 optics:
@@ -79,6 +106,10 @@ sensor:
   gain: {own.GAIN} DN/e-
   bits: {own.BITS}
 """
+
+FILES = {
+    "camera.yaml": CAMERA, "optics/own.yaml": OPTICS, "sensor/own.yaml": SENSOR, "restore/network.yaml": NETWORK,
+}  # fmt: skip
 
 # --- the true camera --------------------------------------------------------------------------------------------------
 
@@ -164,7 +195,7 @@ def taken(mask, strength, seed, kind, picture):
 
 def written_camera(folder):
     """Write the recipe of the clean camera and its masks; return the recipe's path."""
-    for name, text in {"camera.yaml": CAMERA, "optics/own.yaml": OPTICS, "sensor/own.yaml": SENSOR}.items():
+    for name, text in FILES.items():
         path = folder / name
         path.parent.mkdir(exist_ok=True)
         path.write_text("# The clean camera.\n" + text)
@@ -180,7 +211,7 @@ def written_camera(folder):
 def restored(numbers, mask, method, laser, folder):
     """What `neusee restore` returns for a frame, linear sRGB (3, y, x), its numbers of lasers, and processor time."""
     np.save(folder / "frame.npy", numbers)
-    options = {"blind": "wiener_blind", "nothing": "wiener_blind", "network": "neusee_search"}
+    options = {"blind": "wiener_blind", "nothing": "wiener_blind"}
     words = [f"restore={options.get(method, method)}"]
     if method == "told":
         y, x = (1e3 * s * own.PITCH / own.FOCAL for s in laser.spot)

@@ -14,9 +14,6 @@ from neusee.workflows.cli.command_list import BAD, COLUMNS, DONE, FAILED, INTERR
 if TYPE_CHECKING:
     import typer
 
-#: objects and searches between two searches for garbage: with Python's 700 objects, imports take a quarter longer
-_GARBAGE = (50_000, 20, 20)
-
 app: typer.Typer  #: the program with the options of all commands, built when a caller first reads the name
 
 
@@ -32,7 +29,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit; print an error as one line, or with ``--debug`` as a traceback."""
     arguments = sys.argv[1:] if arguments is None else arguments
     TYPED[:] = arguments
-    gc.set_threshold(*_GARBAGE)
+    gc.disable()  # a search for garbage among imported modules takes a tenth of the start-up time
     try:
         sys.exit(_run(arguments))
     except BrokenPipeError:

@@ -67,6 +67,12 @@ def _is_change(word: str) -> bool:
     return "=" in word or word.startswith(("~", "+"))
 
 
+def search_for_garbage() -> None:
+    """Let Python search for garbage from here on, but not among what was imported; the program begins without."""
+    gc.freeze()
+    gc.enable()
+
+
 def load(words: list[str] | None, *command: str, before: int = 0, exact: bool = False) -> tuple[Recipe, list[str]]:
     """Return the recipe that the arguments ``words`` name and change, and the command line that runs this recipe."""
     name, changes, first = split(words, before)
@@ -74,7 +80,7 @@ def load(words: list[str] | None, *command: str, before: int = 0, exact: bool = 
 
     with refusing():
         recipe = read(name, changes, first=first)
-    gc.freeze()  # what was imported is no garbage
+    search_for_garbage()
     again = ["neusee", *command, name, *changes]
     return (replace(recipe, exact=True), [*again, "--exact"]) if exact else (recipe, again)
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, refusing, split, the_store
+from neusee.workflows.cli.command_frame import fail, refusing, search_for_garbage, split, the_store
 from neusee.workflows.cli.command_options import AsJson, Debug, Device, Out, Words, check_device
 from neusee.workflows.cli.interruption import kept_in, resumable
 
@@ -43,19 +43,10 @@ def sweep(
     from neusee.workflows.cli.sweep_screen import run_sweep
 
     with refusing(), resumable(lambda: kept_in(store, "the points that are finished are")):
+        search_for_garbage()
         code = run_sweep(
-            name,
-            words,
-            first=first,
-            zip=paired,
-            on_error="continue" if on_error == "continue" else "stop",
-            netcdf=netcdf,
-            device=device,
-            out=out,
-            store=store,
-            quiet=quiet,
-            as_json=as_json,
-            workers=workers,
-        )
+            name, words, first=first, zip=paired, on_error="continue" if on_error == "continue" else "stop",
+            netcdf=netcdf, device=device, out=out, store=store, quiet=quiet, as_json=as_json, workers=workers,
+        )  # fmt: skip
     if code:
         raise typer.Exit(code)

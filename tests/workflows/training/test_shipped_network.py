@@ -22,7 +22,7 @@ def test_all_data_that_ships_is_less_than_a_megabyte():
 
 @pytest.mark.parametrize(
     ("recipe", "words"),
-    [("demonstration", []), ("first_light", ["restore=neusee"]), ("first_light", ["restore=neusee_search"])],
+    [("demonstration", []), ("first_light", ["restore=neusee"])],
 )
 def test_the_weights_fit_the_recipes_that_name_them(recipe, words):
     filtered = load(recipe, words).steps["deconvolved"]  # refuses weights of another network

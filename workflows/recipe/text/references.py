@@ -145,6 +145,7 @@ class References:
         elif any(child.data is BROKEN for child in value.items.values()):
             value = replace(value, data=BROKEN)
         if target.path[0] != "steps":
+            self.trace[first:] = dict(self.trace[first:]).items()  # each once: nested lists would grow it
             self.known[target.path], self._traces[target.path] = value, self.trace[first:]
         return value
 
