@@ -40,3 +40,10 @@ def joined(samples: list[Sample]) -> Sample:
         return Sample(pictures, truths, light, first.drawn)
     facts = FilterFacts._make(map(torch.stack, zip(*(s.given[0] for s in samples if s.given), strict=True)))
     return Sample(pictures, truths, light, first.drawn, (facts, torch.stack([s.given[1] for s in samples if s.given])))
+
+
+def noted(pictures: Iterable[tuple[int, Sample]], seen: list[Sample]) -> Iterator[tuple[int, Sample]]:
+    """Yield numbered pictures as they come, and add each to ``seen``."""
+    for number, sample in pictures:
+        seen.append(sample)
+        yield number, sample

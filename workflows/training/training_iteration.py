@@ -39,7 +39,7 @@ from neusee.workflows.recipe.blocks.train_block import Network, Stage, Training
 from neusee.workflows.training.loop.resumable_loop import Losses, averaged, require_finite
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.picture_batches import together
+from neusee.workflows.training.picture_batches import noted, together
 from neusee.workflows.training.several_cameras import Samples
 from neusee.workflows.training.training_pictures import Sample
 from neusee.workflows.training.warm_start import WarmStart
@@ -142,7 +142,7 @@ class Learner:
         shared = samples.begin(self.height()) if samples.shared else Shared.of({})
         found = self._mask_suppression(shared, samples) if self.learns else {}
         batch, seen, pairs = self.stage.batch, list[Sample](), dict[int, tuple[Scales, Scales]]()
-        pictures = _noted(samples.batch(shared, stage, iteration * batch, batch), seen)
+        pictures = noted(samples.batch(shared, stage, iteration * batch, batch), seen)
         for numbers, sample in together(pictures, self._whole):
             terms, truth, estimate = self._restoration_terms(sample)
             pairs |= _apart(numbers, truth, estimate)
@@ -271,12 +271,6 @@ class Learner:
         require_finite({**found, "norm of the gradient": norm})
         optimiser.step()
         return norm
-
-
-def _noted(pictures: Iterator[tuple[int, Sample]], seen: list[Sample]) -> Iterator[tuple[int, Sample]]:
-    for number, sample in pictures:
-        seen.append(sample)
-        yield number, sample
 
 
 def _apart(numbers: Sequence[int], truth: Scales, estimate: Scales) -> dict[int, tuple[Scales, Scales]]:
