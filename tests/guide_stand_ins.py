@@ -131,10 +131,13 @@ FEW_POINTS = {
 }  # fmt: skip
 FEW_STOPS = {"protection.protection_result:_RATIO": 0.5, "protection.protection_result:_MASK_STOPS": (1.0, 0.7)}
 
+#: of a recipe that states the sizes of its frame itself
+SMALL_FRAME = ("scene.shape=[40, 40]", "sensor.shape=[32, 32]")
+
 STAND_INS = {
     "run demonstration": StandIn(
         "the trained mask has the 540 samples of the full pupil", more=(
-            "+steps.height.with.pitch=14.96 um", "+steps.height.with.between=nearest")
+            "+steps.height.with.pitch=14.96 um", "+steps.height.with.between=nearest", *SMALL_FRAME)
     ),
     "run first_light doe=pixelwise doe.file=mask.npy": FULL_MASK,
     "run doe=pixelwise doe.file=mask.npy": FULL_MASK,

@@ -36,7 +36,7 @@ class GraphMemory:
 
     bound: dict[str, BoundStep] = field(default_factory=dict)
     forms: dict[str, KnownForm] = field(default_factory=dict)
-    settings: dict[int, tuple[Value, dict[str, Setting]]] = field(default_factory=dict)  #: by identity of the block
+    settings: dict[Where, tuple[Value, dict[str, Setting]]] = field(default_factory=dict)  #: by path of the block
 
     def find(self, name: str, references: References) -> CheckedStep | None:
         """Return the step ``name`` as it was checked before, or None if a value that it reads has changed."""

@@ -16,8 +16,6 @@ from neusee.workflows.recipe.text.overrides import arguments_in
 from neusee.workflows.recipe.text.yaml_values import Value
 from neusee.workflows.recipe.wiring import Wiring
 
-_MOST_BLOCKS = 1000  #: blocks whose final values are remembered
-
 
 def final_values(
     wiring: Wiring,
@@ -46,14 +44,13 @@ def final_values(
 
 def _block_settings(block: Value, checker: Checker, memory: GraphMemory | None) -> dict[str, Setting]:
     """Return the final values of a block by path, those of an earlier check if the block is the same object."""
-    same = memory.settings.get(id(block)) if memory else None
-    found = same[1] if same and same[0] is block else dict(settings_of([block], checker))
+    known = memory.settings.get(block.path) if memory else None
+    same = known is not None and known[0] is block
+    found = known[1] if known and same else dict(settings_of([block], checker))
     if any(setting.path in checker.files for setting in found.values()):  # paths of files may differ
         return dict(settings_of([block], checker))
     if memory and not same:
-        if len(memory.settings) > _MOST_BLOCKS:
-            memory.settings.clear()
-        memory.settings[id(block)] = block, found
+        memory.settings[block.path] = block, found
     return found
 
 
