@@ -49,7 +49,7 @@ OTHERS = {  #: cameras beside that of the training, by name: the mask, and what 
 }
 STOP = PEAK**0.25  #: the peak falls with the fourth power of the diameter, the light with its square
 BACKGROUND, DIAMETER = 0.7, 11.0
-EACH = 3  #: photographs, of which one stands behind the rivals too
+EACH = 3  #: photographs, of which one is seen by the rivals and by the other cameras too
 NO_POOL = ("+mismatch=usual", "train.augment.pooled=none", "train.pool=null")
 METHODS = ("developed", "told", "likeliest", "uncertain", "network")
 STEPS = """

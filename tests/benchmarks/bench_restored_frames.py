@@ -40,6 +40,7 @@ from tests.nodes.restore.lasers import own_camera as own  # noqa: E402
 SIDE, RIM = 128, 8
 MASKS = ("plain", "half_ring", "designed")
 STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
+WEIGHTS = ROOT / "recipes" / "samples" / "neusee_network.safetensors"
 METHODS = ("nothing", "blind", "told", "search", "network")
 DESIGNED, DEPTH = ROOT / "recipes" / "samples" / "demonstration_mask.png", 33.9189e-6  #: of recipes/doe/demonstration
 
@@ -59,32 +60,12 @@ defaults:
 seed: 7
 """
 #: the network of this package after the search, which is no option that ships, for it gains nothing there
-NETWORK = """\
-defaults: [search]
-restore:
-  weights: @
-  width: 12              # of the network
-steps:
-  deconvolved:
-    node: restore.informed
-    from:
-      electrons: signal[mask]
-      psf: psf[mask]
-      illuminant: illuminant
-      responses: responses
-      bands: bands
-      clipped: clipped[mask]
-      glare: found_glare
-      nearby: found_nearby
-    with:
-      weights: "${restore.weights}"
-      width: "${restore.width}"
-      balance: "${restore.balance}"
-      doubt: "${restore.doubt}"
-      least_doubt: "${restore.least_doubt}"
-      scatter: "${restore.scatter}"
-      read_noise: "${sensor.read_noise}"
-""".replace("@", str(ROOT / "recipes" / "samples" / "neusee_network.safetensors"))
+NETWORK = (
+    (ROOT / "recipes" / "restore" / "search.yaml")
+    .read_text()
+    .replace("node: restore.wiener\n", "node: restore.informed\n")
+    .replace("    with:\n      balance:", f"    with:\n      weights: {WEIGHTS}\n      width: 12\n      balance:")
+)
 OPTICS = f"""\
 defaults: [small]
 optics:

@@ -68,7 +68,7 @@ def test_an_enlarged_part_is_that_of_pillow_and_has_no_detail_of_one_pixel(quart
     turned = np.rot90(part[0].numpy(), quarters)
     with Image.fromarray(np.ascontiguousarray(turned)) as small:
         expected = np.asarray(small.resize(shape[::-1], Image.Resampling.BICUBIC))
-    np.testing.assert_allclose(found[0].numpy(), np.maximum(expected, 0), atol=2e-3)
+    np.testing.assert_allclose(found[0].numpy(), np.maximum(expected, 0), atol=1e-5)
 
 
 def test_the_factor_of_size_is_drawn_by_its_logarithm_and_changes_no_other_value():
