@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 _BAND = (5.0, 50.0, 95.0)  #: percentiles
 _POINTS = 1500  #: most points of a chain in the picture
 _LEAST = 0.1  #: DN², the variance at which a level without scatter is drawn
-_CLIPPED = {"marker": "v", "color": VERMILION, "markerfacecolor": "none",
-            "label": "clipped or coarse: numbers counted one by one; variance at most as drawn"}  # fmt: skip
+_CLIPPED = {"marker": "v", "color": VERMILION, "markerfacecolor": "none"}
+COUNTED = "clipped or coarse: numbers counted one by one; variance at most as drawn"
 
 
 @drawn
-def transfer(measured: FloatArray, predicted: FloatArray, whole: NDArray[np.bool_]) -> Any:
+def transfer(measured: FloatArray, predicted: FloatArray, whole: NDArray[np.bool_], other: str) -> Any:
     """Draw the photon-transfer curve, and the deviation of each light level from the posterior's prediction.
 
     ``measured`` (2, level) has mean and variance, and ``predicted`` (2, draw, level) mean and variance of a repeated
-    measurement. ``whole`` (level,) is False for levels that the well or the converter clips.
+    measurement. ``whole`` (level,) is False for levels without a prediction, which the label ``other`` describes.
     """
     figure, axes = canvas(9.0, 7.2, 2, 1, sharex=True, height_ratios=(2.2, 1.0))
     above, below = axes[0, 0], axes[1, 0]
@@ -35,7 +35,10 @@ def transfer(measured: FloatArray, predicted: FloatArray, whole: NDArray[np.bool
     above.fill_between(mean, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %")
     above.plot(mean, middle, color=BLUE, linewidth=1.2, label="predicted, median")
     lowest = max(_LEAST, 0.5 * float(min([*measured[1, whole], *middle], default=_LEAST)))
-    for at, style in ((whole, {"marker": "o", "color": BLACK, "label": "measured"}), (~whole, _CLIPPED)):
+    for at, style in (
+        (whole, {"marker": "o", "color": BLACK, "label": "measured"}),
+        (~whole, {**_CLIPPED, "label": other}),
+    ):
         if at.any():
             above.plot(measured[0, at], measured[1, at].clip(lowest), linestyle="", markersize=5, **style)
     above.set(xscale="log", yscale="log", ylabel="temporal variance (DN²)", title="Photon-transfer curve")
