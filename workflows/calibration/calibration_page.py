@@ -136,7 +136,8 @@ def banner(result: CalibrationResult) -> str:
     wrong = [f"{check.name}: {check.found}" for check in result.checks if check.mark == "fail"]
     if not wrong:
         return ""
-    return f"Not fit for use: {len(wrong)} of {len(result.checks)} checks fail. {'; '.join(wrong)}."
+    count = f"{len(wrong)} of {len(result.checks)} checks fail{'s' * (len(wrong) == 1)}"
+    return f"Not fit for use: {count}. {'; '.join(wrong)}."
 
 
 def lead(result: CalibrationResult) -> str:

@@ -25,8 +25,9 @@ _COUNTED = """The measured variance of each level against its mean, and the pred
     converter, or too coarse for a mean and a variance, each of its digital numbers enters the likelihood, and the level
     has no prediction here."""
 _EXCLUDED = """The measured variance of each level against its mean, and the prediction of the posterior for a repeated
-    measurement, before corrections for what the frames show or may hide. Levels above {share}, and levels that are
-    clipped, are not used and have no prediction."""
+    measurement, before corrections for what the frames show or may hide. Below it, how far each variance, and each mean
+    from what the stated light gives, lies from the prediction. Levels above {share}, and levels that are clipped, are
+    not used and have no prediction."""
 _CORNER = 20_000  #: draws for the picture of pairs
 
 
@@ -40,19 +41,22 @@ def curve_section(result: CalibrationResult) -> Section:
     if isinstance(result.problem.levels, Rings):
         return _rings(result, result.problem.levels)
     levels: Any = result.problem.levels
-    mean, variance = _repeated(result)
+    mean, variance, away = _repeated(result)
     whole: NDArray[np.bool_] = np.asarray((variance > 0).all(0))
     whole[levels.cell_level.numpy()] = False
     text, label = _COUNTED, figures.COUNTED
     if is_camera(result.problem):
         share = f"{result.params['share']:.0%} of saturation"
         text, label = _EXCLUDED.format(share=share), f"not used: above {share}, or clipped"
-    picture = figures.transfer(np.stack(_moments(levels)), np.stack([mean, variance]), whole, label)
+    picture = figures.transfer(np.stack(_moments(levels)), np.stack([mean, variance]), whole, label, away)
     return Section("Photon-transfer curve", text, picture=picture)
 
 
-def _repeated(result: CalibrationResult) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance (draw, level) of a repeated measurement, with what scatters beyond chance."""
+def _repeated(result: CalibrationResult) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Return mean and variance (draw, level) of a repeated measurement, with what scatters beyond chance.
+
+    For a real camera also the distances (level,) of the means from those that the light gives, in standard deviations.
+    """
     rng = np.random.default_rng(1)
     flat = result.walked.flat
     drawn = flat[rng.integers(len(flat), size=_PREDICTED)]
@@ -61,7 +65,11 @@ def _repeated(result: CalibrationResult) -> tuple[FloatArray, FloatArray]:
     values = {**result.params, **result.problem.parameters(drawn)}
     scatter = np.broadcast_to(np.asarray(values.get("scatter", 0.0)), len(drawn))
     width = np.sqrt(2 / freedom + scatter[:, None] ** 2)
-    return look.mean.numpy(), look.variance.numpy() * (1 + width * rng.standard_normal(width.shape))
+    variance, away = look.variance.numpy() * (1 + width * rng.standard_normal(width.shape)), None
+    if is_camera(result.problem):
+        away = np.full(len(freedom), np.nan)
+        away[look.degrees_of_freedom.numpy() > 0] = np.split(look.scaled.numpy(), 4, axis=-1)[2].mean(0)
+    return look.mean.numpy(), variance, away
 
 
 def _rings(result: CalibrationResult, rings: Rings) -> Section:
