@@ -60,7 +60,8 @@ def _repeated(result: CalibrationResult) -> tuple[FloatArray, FloatArray, FloatA
     rng = np.random.default_rng(1)
     flat = result.walked.flat
     drawn = flat[rng.integers(len(flat), size=_PREDICTED)]
-    look, levels = result.problem.likelihood(drawn), result.problem.levels
+    levels: Any = result.problem.levels
+    look = result.problem.likelihood(drawn)
     freedom = levels.degrees_of_freedom.numpy().clip(1)
     values = {**result.params, **result.problem.parameters(drawn)}
     scatter = np.broadcast_to(np.asarray(values.get("scatter", 0.0)), len(drawn))

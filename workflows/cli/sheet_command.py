@@ -15,6 +15,7 @@ from neusee.workflows.cli.command_options import AsJson, Debug, Out, Quiet, Word
 from neusee.workflows.cli.interruption import say_folder
 
 if TYPE_CHECKING:
+    from neusee.workflows.calibration.emva_frames import Release
     from neusee.workflows.graph.recipe_graph import Recipe
 
 
@@ -60,7 +61,7 @@ def sheet(
 
     recipe, command = _loaded(words)
     said = [word for fact in state or () for word in ("--state", fact)]
-    chosen = release and release.value
+    chosen: Release | None = None if release is None else "3" if release is StandardRelease.three else "4"
     command += [*option_words({"release": chosen, "relative": relative}), *said]
     with failing(RunError, code=FAILED), failing(ValueError):
         folder = write_sheet(recipe, the_store(), out, command, release=chosen, relative=relative, state=state or ())

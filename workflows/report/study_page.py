@@ -78,7 +78,7 @@ def said(value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, numbers.Real) and not isinstance(value, numbers.Integral):
         text = f"{float(value):.3g}"
-        return f"{float(text):.0f}" if _LARGE <= abs(value) < _LARGEST else text  # 3720 in place of 3.72e+03
+        return f"{float(text):.0f}" if _LARGE <= abs(float(value)) < _LARGEST else text  # 3720 in place of 3.72e+03
     return str(value)
 
 
