@@ -2,6 +2,7 @@
 
 import importlib.util
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from scipy.stats import cauchy, norm
 
 from neusee.nodes.calibrate import FrameTest, Hidden, Stack, corrections, inspect_frames, uncorrected
 
+DATA = Path(os.environ.get("NEUSEE_EMVA1288", Path(__file__).parents[4] / "../shared/data/emva1288"))
+CCD = DATA / "EMVA1288_ReferenceSet_001_CCD_12Bit_pairs_64x64.npz"
 _spec = importlib.util.spec_from_file_location("numpy_camera", Path(__file__).parents[1] / "numpy_camera.py")
 numpy_camera = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(numpy_camera)
@@ -136,6 +139,28 @@ def test_noise_of_the_readout_counts_as_dark_noise_and_is_no_filter():
     assert change["noise"].sd < 0.006
     assert abs(change["gain"].mean) < 3 * change["gain"].sd
     assert uncorrected(test).verdict != "refused"
+
+
+@pytest.mark.skipif(not CCD.exists(), reason="the reference sets of EMVA 1288 are not there: set NEUSEE_EMVA1288")
+def test_a_real_ccd_has_noise_of_the_readout():
+    """Set 001: its darks correlate, its light does not; before, a sheet refused it for an error of 3 %."""
+    with np.load(CCD) as pairs:
+        stacks = [
+            Stack(
+                name,
+                float(name.split("_")[2]),
+                1e-9 * float(name.split("_")[1]),
+                "steady",
+                torch.from_numpy(x.astype(int)),
+            )
+            for name, x in pairs.items()
+        ]
+    (test,) = (test for test in inspect_frames(stacks, exact=False) if test.name == "white noise")
+    assert test.verdict == "modelled"
+    assert "as noise of the readout does" in test.sentence
+    change = corrections(test.hidden)
+    assert abs(change["noise"].mean) < 0.01
+    assert uncorrected(test).verdict == "widened"
 
 
 def test_sharpened_frames_are_no_noise_of_the_readout():
