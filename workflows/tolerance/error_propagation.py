@@ -148,8 +148,7 @@ def _rounded(
 def _own(step: Step, done: StepRecord, facts_of: FactsOf) -> float | None:
     """Return the error that a step adds by its own approximation or omission, in the unit of its result."""
     share = done.bound if done.state == "left out" else done.error and done.error[0]
-    facts = facts_of(done.step)
-    if not share or facts is None:
+    if not share or (facts := facts_of(done.step)) is None:
         return None
     largest = max(abs(facts.min), abs(facts.max))
     if done.state == "left out" and step.node.hooks.skip_scale is not None:

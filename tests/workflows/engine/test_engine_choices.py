@@ -56,6 +56,27 @@ def add(x, *, k: float = 1.0):
 
 
 @node()
+def shaped(*, n: int = BIG):
+    CALLS.append("make")
+    return torch.ones(n)
+
+
+@shaped.shape
+def _(*, n):
+    return torch.empty(n, device="meta")
+
+
+@node()
+def glow(x, *, amount: float = 0.0):
+    return x + amount
+
+
+@glow.skip_bound
+def _(x, *, amount):
+    return abs(amount) / x.max
+
+
+@node()
 def mean(x, y=None):
     CALLS.append("mean")
     return x.mean() if y is None else x.mean() + y.mean()
@@ -123,6 +144,18 @@ def test_what_is_asked_for_is_always_kept(store):
     again = run(recipe("b m", **CHEAP), Store(store.root))
     assert states(again)["b"] == "cached"
     assert torch.equal(again.values["b"], torch.full((BIG,), 2.0))
+
+
+@pytest.mark.parametrize(("n", "kept"), [(4096, False), (BIG, True)], ids=["small", "large"])
+def test_a_small_value_that_a_verdict_alone_asks_for_is_kept_only_where_it_pays(store, n, kept):
+    steps = {"a": (shaped, {}, {"n": n}), "g": (glow, {"x": "a"}, {"amount": 0.5}), "m": (mean, {"x": "g"}, {})}
+    first = run(recipe("m", **steps), Dear(store.root))
+    assert first.done["g"].state == "run"
+    assert CALLS == ["make", "mean"]  # the value stays in memory between verdict and use
+    assert Store(store.root).has(first.keys["a"]) is kept
+    CALLS.clear()
+    again = run(recipe("m", **steps), Store(store.root))
+    assert (states(again)["m"], again.values["m"], CALLS) == ("cached", 1.5, [])
 
 
 def test_a_value_that_was_not_kept_is_computed_again_and_says_why(store):
