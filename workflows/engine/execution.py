@@ -22,7 +22,7 @@ from neusee.workflows.engine.local_executor import Local
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare, room_for
 from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, Show, StepJob
-from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order, nodes_of
+from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order, needed, nodes_of
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key, key_of
@@ -60,13 +60,11 @@ class Execution:
         self.keys: dict[str, Key] = {}
         self.makers: dict[Key, Step] = {}  # the first step of each key
         self.origins: dict[Key, dict[str, Any]] = {}  # the parts of each key
-        self.values: dict[Key, Any] = {}
-        self.facts: dict[Key, TensorStats | None] = {}
+        self.values, self.facts = dict[Key, Any](), dict[Key, TensorStats | None]()
         self.again: dict[Key, float] = {}  # s to obtain again a value that was computed in this run
         self.took: dict[str, float] = {}  # the longest time of a step of each node, s
         self.verdicts, self.ledger = dict[str, SkipDecision](), ErrorBudget(recipe)
-        self.done: dict[str, StepRecord] = {}
-        self._asleep: dict[str, StepRecord] = {}  # of steps that did not run so far
+        self.done, self._asleep = dict[str, StepRecord](), dict[str, StepRecord]()  # and of steps that did not run
         self.receipts: dict[Key, dict[str, Any]] = {}  # metadata of values that were not kept
         self.costs: Costs | None = None
         self.expected: Mapping[Key, Estimate] = {}  # predicted costs of the steps that are being computed
@@ -179,7 +177,6 @@ class Execution:
     def _execute(
         self, plan: list[Key], again: frozenset[Key], targets: list[Key], keep: bool, uses: Counter[Key], asked: bool
     ) -> None:
-        """Compute the values ``plan``, and load the values ``targets``, which are stored if they are ``asked`` for."""
         self._free(list(self.values), uses, keep)
         if plan:
             for outcome in self._outcomes(plan, again, targets, asked):
@@ -201,8 +198,10 @@ class Execution:
 
     def _outcomes(self, plan: list[Key], again: frozenset[Key], targets: list[Key], asked: bool) -> Iterator[Outcome]:
         """Compute the values with the keys ``plan`` and yield each outcome; after an error no further step begins."""
-        self.costs = self.costs or past_costs(self.store, sizes_of(self.recipe, list(self.keys)))
-        works = [self._work(key, key in again, key in targets and (asked or not self._stays(key))) for key in plan]
+        self.costs = self.costs or past_costs(self.store, sizes_of(self.recipe, needed(self.recipe, self.wanted)))
+        stays = self.executor.shares and not asked  # in memory, if small, until the steps that read it
+        kept = {key for key in targets if not stays or self.costs.size_of(self.makers[key].name) >= _SMALL}
+        works = [self._work(key, key in again, key in kept) for key in plan]
         try:
             prepared = prepare(works, self.costs, self.receipts, self.executor.lanes, targets, self.values)
         except TooLarge as error:
@@ -221,18 +220,12 @@ class Execution:
             self.executor.cancel()
             raise
 
-    def _stays(self, key: Key) -> bool:
-        """Return True if a result that only a verdict or the proof needs may stay in memory alone until then."""
-        assert self.costs is not None
-        return self.executor.shares and self.costs.size_of(self.makers[key].name) < _SMALL
-
     def _work(self, key: Key, recompute: bool, target: bool) -> StepJob:
         step = self.makers[key]
         reads = tuple(self._read(step.wires.get(name)) for name in step.node.inputs)
         device, lanes = places(step, self.devices)[0], self.executor.lanes
         lane = next(iter(lanes)) if len(lanes) == 1 else ""
-        wanted = target or step.name in self.wanted
-        name, seed = self.recipe.name, self.recipe.seed
+        wanted, name, seed = target or step.name in self.wanted, self.recipe.name, self.recipe.seed
         return StepJob(step, key, self.origins[key], reads, seed, name, device, lane, wanted, recompute=recompute)
 
     def _read(self, wire: Wire) -> Read:
@@ -295,9 +288,8 @@ class Execution:
         return self.facts[key] if key in self.facts else facts_in(self.store.about(key))
 
     def _why(self, name: str, key: Key) -> str:
-        verdict = self.verdicts.get(name)
         why = "faster to compute than to store" if key in self.receipts else "not in the store"
-        return f"{why}; {verdict.why}" if verdict else why
+        return f"{why}; {self.verdicts[name].why}" if name in self.verdicts else why
 
     def _bound(self, name: str) -> float | None:
         return self.verdicts[name].bound if name in self.verdicts else None
