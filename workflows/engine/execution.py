@@ -32,7 +32,7 @@ from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.error_budget import ErrorBudget
 from neusee.workflows.tolerance.skip_decision import SkipDecision
 
-_SMALL = 1 << 20  #: bytes of a result that a verdict needs, below which it stays in memory where storing does not pay
+_SMALL = 1 << 23  #: bytes of a result that a verdict needs, below which it stays in memory where storing does not pay
 _QUICK = 1e-3  #: s below which two processes may both compute a step without a lease
 _UNKNOWN = 100.0  #: s of a step without measurement, when loading is compared with computing
 
