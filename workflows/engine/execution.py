@@ -20,7 +20,7 @@ from neusee.workflows.engine.finished_step import facts_in, loaded, ran, unneede
 from neusee.workflows.engine.load_or_recompute import Upstream, cheaper_to_recompute, uses_of, worth_solving
 from neusee.workflows.engine.local_executor import Local
 from neusee.workflows.engine.node_call import places
-from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare, room_for
+from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare, room_for, small_result
 from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, Show, StepJob
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order, needed, nodes_of
 from neusee.workflows.graph.run_error import RunError
@@ -32,7 +32,6 @@ from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.error_budget import ErrorBudget
 from neusee.workflows.tolerance.skip_decision import SkipDecision
 
-_SMALL = 1 << 23  #: bytes of a result that a verdict needs, below which it stays in memory where storing does not pay
 _QUICK = 1e-3  #: s below which two processes may both compute a step without a lease
 _UNKNOWN = 100.0  #: s of a step without measurement, when loading is compared with computing
 
@@ -199,8 +198,8 @@ class Execution:
     def _outcomes(self, plan: list[Key], again: frozenset[Key], targets: list[Key], asked: bool) -> Iterator[Outcome]:
         """Compute the values with the keys ``plan`` and yield each outcome; after an error no further step begins."""
         self.costs = self.costs or past_costs(self.store, sizes_of(self.recipe, needed(self.recipe, self.wanted)))
-        stays = self.executor.shares and not asked  # in memory, if small, until the steps that read it
-        kept = {key for key in targets if not stays or self.costs.size_of(self.makers[key].name) >= _SMALL}
+        most = 0.0 if asked else small_result(self.executor)  # a small one stays in memory until it is read
+        kept = {key for key in targets if self.costs.size_of(self.makers[key].name) >= most}
         works = [self._work(key, key in again, key in kept) for key in plan]
         try:
             prepared = prepare(works, self.costs, self.receipts, self.executor.lanes, targets, self.values)

@@ -11,6 +11,7 @@ import torch
 from neusee.nodes import node
 from neusee.workflows.engine import step_job
 from neusee.workflows.engine.local_executor import program_memory
+from neusee.workflows.engine.memory_use import process_memory
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -146,10 +147,14 @@ def test_what_is_asked_for_is_always_kept(store):
     assert torch.equal(again.values["b"], torch.full((BIG,), 2.0))
 
 
-@pytest.mark.parametrize(("n", "kept"), [(4096, False), (4 * BIG, True)], ids=["small", "large"])
-def test_a_small_value_that_a_verdict_alone_asks_for_is_kept_only_where_it_pays(store, n, kept):
+@pytest.mark.parametrize(
+    ("n", "room", "kept"),
+    [(BIG, None, False), (4 * BIG, None, True), (BIG, 400_000_000, True)],
+    ids=["small", "large", "little room"],
+)
+def test_a_small_value_that_a_verdict_alone_asks_for_is_kept_only_where_it_pays(store, n, room, kept):
     steps = {"a": (shaped, {}, {"n": n}), "g": (glow, {"x": "a"}, {"amount": 0.5}), "m": (mean, {"x": "g"}, {})}
-    first = run(recipe("m", **steps), Dear(store.root))
+    first = run(recipe("m", **steps), Dear(store.root), memory=room and process_memory() + room)
     assert first.done["g"].state == "run"
     assert CALLS == ["make", "mean"]  # the value stays in memory between verdict and use
     assert Store(store.root).has(first.keys["a"]) is kept
