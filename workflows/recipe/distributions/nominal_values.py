@@ -117,7 +117,7 @@ def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
             yield from (((key, *path), value) for path, value in _laws_in(block))
 
 
-@functools.lru_cache(maxsize=1024)
+@functools.lru_cache(maxsize=64)
 def _laws_in(block: Value) -> tuple[tuple[Where, Value], ...]:
     """Return the distributions in a block, which the points of a sweep share where they have the same block."""
     found: list[tuple[Where, Value]] = []
