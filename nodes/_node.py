@@ -10,6 +10,7 @@ generator for a parameter named ``rng``.
     @digitize.reference        # slow and simple form in float64; a test compares to rtol
     @digitize.skip_bound       # upper bound of the change if the step is skipped
     @digitize.propagate_error  # upper bound of the error that errors of the inputs cause
+    @digitize.rounding_error   # the same with what rounding to whole numbers adds, an estimate
     @digitize.preflight        # checks the parameters before anything runs
     @digitize.check            # checks that the result is plausible
     @digitize.shape            # shape and type of the result, before anything runs
@@ -79,6 +80,9 @@ class Hooks:
     #: upper bounds in root mean square; a list input has a list, an absent input None; without this hook the inputs
     #: must satisfy the tolerance themselves, because the error of the result is not known
     propagate_error: Callable[..., float] | None = None
+    #: (rms error of the result as `propagate_error` gives it, *, result: TensorStats, parameters): the rms error with
+    #: what rounding to whole numbers adds; an estimate, which a run states and does not hold to the tolerance
+    rounding_error: Callable[..., float] | None = None
     #: True if `propagate_error` or `approximation_error` gives an estimate and no bound, which a recipe with
     #: ``estimates: false`` does not use
     estimated: bool = False
@@ -208,7 +212,7 @@ class Node:
     reference, preflight, check = _attaches("reference"), _attaches("preflight"), _attaches("check")
     skip_bound, skip_scale, zero_bound = _attaches("skip_bound"), _attaches("skip_scale"), _attaches("zero_bound")
     propagate_error, approximation_error = _attaches("propagate_error"), _attaches("approximation_error")
-    band_invariant = _attaches("band_invariant")
+    rounding_error, band_invariant = _attaches("rounding_error"), _attaches("band_invariant")
     shape, work, example = _attaches("shape"), _attaches("work"), _attaches("example")
 
     @property

@@ -15,6 +15,7 @@ from neusee.nodes.torch_func import transformed
 from neusee.nodes.units import Gain, Shape
 
 Rounding = Literal["nearest", "dithered_floor", "truncation"]
+_SURE = math.log(1e4)  #: negative logarithm of the probability that more pixels change than an estimate says
 _BLOCK = 2**18  #: pixels that are converted at a time, so that their float64 numbers stay in the cache of the processor
 Bits = Annotated[int, Field(ge=1, le=16)]
 
@@ -132,11 +133,34 @@ def _(
 
 @digitize.propagate_error
 def _(electrons: ErrorBound, *, result: TensorStats, gain: float, **params: Any) -> float:
-    """Return an error bound of the digital numbers, without the effect of rounding.
-
-    A value near the middle of two numbers may be rounded to either number.
-    """
+    """Return an error bound of the digital numbers before rounding, whose effect `rounding_error` estimates."""
     return electrons.rms * gain
+
+
+@digitize.rounding_error
+def _(rms: float, *, result: TensorStats, **params: Any) -> float:
+    """Return an estimate of the rms error in DN after rounding.
+
+    A small error e (DN) moves a value across the edge between two numbers with the probability e, and changes its
+    number by 1: the mean square grows by e - e^2, and by 1/4 at most. This holds where noise spreads the values over at
+    least one number. An even area without noise may change as a whole, by one number more.
+    """
+    pixels = max(1, math.prod(result.shape))
+    share = rms * (1.0 - rms) if rms < 0.5 else 0.25
+    return math.sqrt(rms**2 + _seldom_more(share * pixels) / pixels)
+
+
+def _seldom_more(mean: float) -> float:
+    """Return the number of independent rare events, ``mean`` in the mean, that is exceeded in one of 10 000 cases.
+
+    Source: union bound for few events; Bernstein's inequality: Boucheron, Lugosi and Massart, Concentration
+    Inequalities, section 2.7 (2013).
+    """
+    most, chance = 0, mean  # P(more than n events) <= mean^(n + 1) / (n + 1)!
+    while mean < 1.0 and chance > math.exp(-_SURE):
+        most += 1
+        chance *= mean / (most + 1)
+    return most if mean < 1.0 else mean + math.sqrt(2.0 * mean * _SURE) + 2.0 / 3.0 * _SURE
 
 
 @digitize.preflight

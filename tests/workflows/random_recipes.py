@@ -9,6 +9,13 @@ ELEMENTS = ("axicon", "cubic", "five_half_rings", "flat", "half_ring", "spiral_a
 LASERS = ("none", "green", "red", "violet")
 LIFTS = ("lmmse", "mallett")
 SIDES = (48, 64, 75, 97)
+LARGE = (  # large enough for PSFs of few bands
+    "optics.samples=256",
+    f"optics.pitch={8078.4 / 256} um",
+    "optics.window=[256, 256]",
+    "scene.shape=[256, 256]",
+    "sensor.shape=[200, 200]",
+)
 
 
 def draw(seed, **more):
@@ -21,6 +28,15 @@ def draw(seed, **more):
         changes.append("optics.bands=5")
     changes += [f"{name}={value}" for name, value in more.items()]
     return load("first_light", changes), changes
+
+
+def draw_large(seed, size=LARGE):
+    """The recipe of a seed with larger pictures, raw and developed, and a tolerance between 1e-4 and 3e-2."""
+    changes = [c for c in draw(seed)[1] if not c.startswith(("tolerance", "outputs"))]
+    tolerance = 10 ** random.Random(-1 - seed).uniform(-4, -1.523)
+    bands = ["optics.bands=31"] if random.Random(-1000 - seed).random() < 0.7 else []
+    chosen = [*changes, *size, *bands, "outputs=[raw, developed]", f"tolerance={tolerance:.3g}"]
+    return load("first_light", chosen)
 
 
 def _optics(rng):

@@ -12,6 +12,7 @@ import json
 import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -20,7 +21,16 @@ from typing import Any, NamedTuple
 from neusee.nodes import Node
 from neusee.workflows.engine.band_results import bands_in
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.graph.step_shapes import Form, bytes_of, complete, form_of, inputs_of, without_values
+from neusee.workflows.graph.step_shapes import (
+    Form,
+    bytes_of,
+    complete,
+    form_of,
+    has_path,
+    inputs_of,
+    is_same,
+    without_values,
+)
 
 _LEAST = float(1 << 26)  #: bytes of a result whose shape is not known, in a recipe without any known shape
 
@@ -102,13 +112,50 @@ def _law(law: Mapping[str, Any]) -> Law:
 
 def libraries_of(paths: Iterable[str]) -> float:
     """Return the bytes of the libraries that the nodes with these paths load, and this process has not loaded yet."""
-    total, there = 0.0, set(sys.modules)
+    total, loaded = 0.0, set[str]()
     for path in paths:
         law = shipped().get(path)
-        if law and law.loads and not there.issuperset(law.loads.libraries):
-            there.update(law.loads.libraries)
+        if law and law.loads and not all(name in loaded or name in sys.modules for name in law.loads.libraries):
+            loaded.update(law.loads.libraries)
             total += law.loads.memory
     return total
+
+
+class Sized(NamedTuple):
+    """The size of a step, and what it follows from: the points of a sweep share most steps."""
+
+    step: Step
+    inputs: Sequence[Any]
+    below: Sequence[Size]
+    least: float
+    form: Form
+    size: Size
+
+    def holds(self, step: Step, inputs: Sequence[Any], below: Sequence[Size], least: float) -> bool:
+        """Return True if a step has the same node, parameters and known inputs, and therefore the same size."""
+        if step.node is not self.step.node or least != self.least or below != self.below:
+            return False
+        same = len(inputs) == len(self.inputs) and all(map(is_same, inputs, self.inputs))
+        return same and (step.params is self.step.params or _equal(step.params, self.step.params))
+
+
+def _equal(params: Mapping[str, Any], others: Mapping[str, Any]) -> bool:
+    with suppress(Exception):  # values such as tensors, which have no single answer
+        return bool(params == others)
+    return False
+
+
+_sized: dict[str, Sized] = {}  # by step
+_MOST_SIZED = 4096
+
+
+def _remember(sized: Sized) -> None:
+    """Keep the size of a step for the next recipe, unless it depends on a file, which may change."""
+    if has_path(sized.step.params):
+        return
+    if len(_sized) >= _MOST_SIZED:
+        _sized.clear()
+    _sized[sized.step.name] = sized
 
 
 def sizes_of(recipe: Recipe, order: Sequence[str]) -> dict[str, Size]:
@@ -129,16 +176,20 @@ def _sizes(recipe: Recipe, order: Sequence[str], least: float) -> dict[str, Size
     found: dict[str, Size] = {}
     for name in order:
         step = recipe.steps[name]
-        inputs = inputs_of(step, forms)
+        inputs, below = inputs_of(step, forms), [found[source] for source in dict.fromkeys(step.sources)]
+        known = _sized.get(name)
+        if known is not None and known.holds(step, inputs, below, least):
+            forms[name], found[name] = known.form, known.size
+            continue
         try:
             forms[name] = form_of(step.node, inputs, step.params)
         except OverflowError:
             found[name] = Size(0.0, math.inf, math.inf, math.inf)
             continue
-        below = [found[source] for source in dict.fromkeys(step.sources)]
         found[name] = _size(step, inputs, forms[name], below, least)
         if forms[name] is None and not found[name].known:  # a guess, so that the sizes of later steps can be computed
             forms[name] = next((x for x in inputs if x is not None), None)
+        _remember(Sized(step, inputs, below, least, forms[name], found[name]))
     return found
 
 

@@ -7,6 +7,7 @@ was never measured, the upper end of what shipped nodes need.
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
@@ -86,12 +87,12 @@ class Costs:
 
         Args: steps: a key, the step, and the measured costs of the same result or None. Returns: the costs by key.
         """
-        found, there = dict[str, Estimate](), set(sys.modules)
+        found, loaded = dict[str, Estimate](), set[str]()
         for key, step, exact in steps:
             found[key] = self.of(step, kinds, exact)
             law = shipped().get(step.node.path)
-            if law and law.loads and not there.issuperset(law.loads.libraries):
-                there.update(law.loads.libraries)
+            if law and law.loads and not all(name in loaded or name in sys.modules for name in law.loads.libraries):
+                loaded.update(law.loads.libraries)
                 if not self._measured(step, exact):
                     found[key] = _loading(found[key], law.loads)
         return found
@@ -118,11 +119,11 @@ class Costs:
 
     def _predicted(self, path: str, kinds: Sequence[str], size: Size) -> Estimate:
         """Predict a step from runs at the same size, or from the law of its node, scaled by runs on this machine."""
-        rows = [row for row in self._nodes.get(path, []) if _size(row)]
-        same = [row for row in rows if _alike(_size(row), size)][-_NEWEST:]
-        law = shipped().get(path)
-        if same:
-            return self._repeated(same, kinds, size, law)
+        law, past = shipped().get(path), self._nodes.get(path, [])
+        newest = (row for row in reversed(past) if (other := _size(row)) and _alike(other, size))
+        if same := list(itertools.islice(newest, _NEWEST)):
+            return self._repeated(same[::-1], kinds, size, law)
+        rows = [row for row in past if _size(row)]
         if law is None and _FARTHEST * max((_extent(_size(row)) for row in rows), default=0.0) < _extent(size):
             return self._guess(path, kinds, size, rows[-_NEWEST:])
         base = law or guess()

@@ -8,21 +8,21 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from neusee.nodes import Check, TensorStats
+from neusee.nodes import TensorStats
 from neusee.workflows.engine.cost_laws import sizes_of
 from neusee.workflows.engine.cost_model import Costs, Estimate
 from neusee.workflows.engine.dispatch import Loop, chains_of
-from neusee.workflows.engine.finished_step import error_in, facts_in, ran
+from neusee.workflows.engine.finished_step import facts_in, loaded, ran, unneeded
 from neusee.workflows.engine.load_or_recompute import Upstream, cheaper_to_recompute, uses_of, worth_solving
 from neusee.workflows.engine.local_executor import Local
 from neusee.workflows.engine.node_call import places
-from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare, room_for
+from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare, room_for, small_result
 from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, Show, StepJob
-from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order, nodes_of
+from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order, needed, nodes_of
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key, key_of
@@ -59,14 +59,14 @@ class Execution:
         self.keys: dict[str, Key] = {}
         self.makers: dict[Key, Step] = {}  # the first step of each key
         self.origins: dict[Key, dict[str, Any]] = {}  # the parts of each key
-        self.values: dict[Key, Any] = {}
-        self.facts: dict[Key, TensorStats | None] = {}
+        self.values, self.facts = dict[Key, Any](), dict[Key, TensorStats | None]()
         self.again: dict[Key, float] = {}  # s to obtain again a value that was computed in this run
         self.took: dict[str, float] = {}  # the longest time of a step of each node, s
         self.verdicts, self.ledger = dict[str, SkipDecision](), ErrorBudget(recipe)
-        self.done: dict[str, StepRecord] = {}
+        self.done, self._asleep = dict[str, StepRecord](), dict[str, StepRecord]()  # and of steps that did not run
         self.receipts: dict[Key, dict[str, Any]] = {}  # metadata of values that were not kept
         self.costs: Costs | None = None
+        self.expected: Mapping[Key, Estimate] = {}  # predicted costs of the steps that are being computed
         self.schedule: Schedule | None = None
 
     def resolve(self, order: list[str]) -> None:
@@ -104,7 +104,7 @@ class Execution:
             try:
                 plan = [key for key in order if key in below.missing]
                 uses = uses_of(plan, [*targets, *later], self.known, self.sources)
-                return self._execute(plan, again, targets, keep, uses)
+                return self._execute(plan, again, targets, keep, uses, asked=not (keep or later))
             except InputMissing:
                 continue
 
@@ -130,8 +130,10 @@ class Execution:
 
     def asleep(self, name: str) -> StepRecord:
         """Return the record of a step whose value no other step needed."""
-        key, error = self.keys[name], error_in(self.store.about(self.keys[name]))
-        return StepRecord(name, "not needed", "nothing needed it", 0.0, key, bound=self._bound(name), error=error)
+        if name not in self._asleep:
+            key = self.keys[name]
+            self._asleep[name] = unneeded(name, key, self.store.about(key), self._bound(name))
+        return self._asleep[name]
 
     def missing(self, names: Iterable[str]) -> set[Key]:
         """Return the cache keys of all values that must be computed to obtain the results of the steps ``names``."""
@@ -172,11 +174,11 @@ class Execution:
         return self.store.read_seconds(about.get("bytes") or 0) if about else float("inf")
 
     def _execute(
-        self, plan: list[Key], again: frozenset[Key], targets: list[Key], keep: bool, uses: Counter[Key]
+        self, plan: list[Key], again: frozenset[Key], targets: list[Key], keep: bool, uses: Counter[Key], asked: bool
     ) -> None:
         self._free(list(self.values), uses, keep)
         if plan:
-            for outcome in self._outcomes(plan, again, targets):
+            for outcome in self._outcomes(plan, again, targets, asked):
                 key, sources = outcome.work.key, outcome.work.sources
                 if outcome.value is not None or not outcome.kept:
                     self.values[key] = outcome.value
@@ -193,10 +195,12 @@ class Execution:
             if uses[key] <= 0 and key in self.values and not unsafe:
                 del self.values[key]
 
-    def _outcomes(self, plan: list[Key], again: frozenset[Key], targets: list[Key]) -> Iterator[Outcome]:
+    def _outcomes(self, plan: list[Key], again: frozenset[Key], targets: list[Key], asked: bool) -> Iterator[Outcome]:
         """Compute the values with the keys ``plan`` and yield each outcome; after an error no further step begins."""
-        works = [self._work(key, key in again, key in targets) for key in plan]
-        self.costs = self.costs or past_costs(self.store, sizes_of(self.recipe, list(self.keys)))
+        self.costs = self.costs or past_costs(self.store, sizes_of(self.recipe, needed(self.recipe, self.wanted)))
+        most = 0.0 if asked else small_result(self.executor)  # a small one stays in memory until it is read
+        kept = {key for key in targets if self.costs.size_of(self.makers[key].name) >= most}
+        works = [self._work(key, key in again, key in kept) for key in plan]
         try:
             prepared = prepare(works, self.costs, self.receipts, self.executor.lanes, targets, self.values)
         except TooLarge as error:
@@ -205,10 +209,11 @@ class Execution:
         chains = chains_of(prepared.works, fused=not self.executor.shares)
         if not self.executor.shares:  # values for other chains must be in the store
             chains = [(*chain[:-1], replace(chain[-1], wanted=True)) for chain in chains]
+        self.expected = prepared.expected
         room = room_for(prepared.expected, self.executor, self.values)
         try:
             for outcome in Loop(chains, self.executor, self._begin, room).outcomes():
-                self._note(outcome, prepared.expected[outcome.work.key])
+                self._note(outcome)
                 yield outcome
         except BaseException:
             self.executor.cancel()
@@ -219,8 +224,7 @@ class Execution:
         reads = tuple(self._read(step.wires.get(name)) for name in step.node.inputs)
         device, lanes = places(step, self.devices)[0], self.executor.lanes
         lane = next(iter(lanes)) if len(lanes) == 1 else ""
-        wanted = target or step.name in self.wanted
-        name, seed = self.recipe.name, self.recipe.seed
+        wanted, name, seed = target or step.name in self.wanted, self.recipe.name, self.recipe.seed
         return StepJob(step, key, self.origins[key], reads, seed, name, device, lane, wanted, recompute=recompute)
 
     def _read(self, wire: Wire) -> Read:
@@ -230,10 +234,11 @@ class Execution:
         """Report that a job begins; return the job with the predicted time for obtaining its inputs again."""
         self.watch(Event(work.step.name, None))
         refetch = sum(self.again[key] if key in self.again else self._reading(key) for key in set(work.sources))
-        unlocked = self.took.get(work.step.node.path, _QUICK) < _QUICK
-        return replace(work, refetch_seconds=refetch, unlocked=unlocked)
+        path, expected = work.step.node.path, self.expected[work.key]
+        seconds = self.took[path] if path in self.took else expected.seconds["cpu"] if expected.known else _QUICK
+        return replace(work, refetch_seconds=refetch, unlocked=seconds < _QUICK)
 
-    def _note(self, outcome: Outcome, expected: Estimate) -> None:
+    def _note(self, outcome: Outcome) -> None:
         """Record the outcome of a step, or raise the error in this outcome."""
         work, step, key = outcome.work, outcome.work.step, outcome.work.key
         if outcome.lost:
@@ -248,7 +253,7 @@ class Execution:
         self.took[path] = max(outcome.seconds, self.took.get(path, 0.0))
         computing = outcome.seconds + work.refetch_seconds
         self.again[key] = self.store.read_seconds(outcome.bytes) if outcome.kept else computing
-        self._finish(ran(outcome, self._why(step.name, key), self._bound(step.name), self.began, expected))
+        self._finish(ran(outcome, self._why(step.name, key), self._bound(step.name), self.began, self.expected[key]))
 
     def _fetch(self, key: Key) -> Any:
         """Return a value from memory or from the store; raise `InputMissing` if neither has the value."""
@@ -267,12 +272,7 @@ class Execution:
         if about is None:
             raise InputMissing(key)
         name = self.makers[key].name
-        why = why or f"computed {about.get('date')} in {about.get('seconds') or 0.0:.3g} s"
-        checks = tuple(Check(text, ok) for text, ok in about.get("checks") or ())
-        facts, bound, error = facts_in(about), self._bound(name), error_in(about)
-        return StepRecord(
-            name, "cached", why, seconds, key, facts, checks, "cpu", about.get("bytes") or 0, bound, error=error
-        )
+        return loaded(name, key, about, self._bound(name), why, seconds)
 
     def _facts_of(self, name: str) -> TensorStats | None:
         """Return the statistics of the result of a step; compute the result if no statistics are known."""
@@ -287,9 +287,8 @@ class Execution:
         return self.facts[key] if key in self.facts else facts_in(self.store.about(key))
 
     def _why(self, name: str, key: Key) -> str:
-        verdict = self.verdicts.get(name)
         why = "faster to compute than to store" if key in self.receipts else "not in the store"
-        return f"{why}; {verdict.why}" if verdict else why
+        return f"{why}; {self.verdicts[name].why}" if name in self.verdicts else why
 
     def _bound(self, name: str) -> float | None:
         return self.verdicts[name].bound if name in self.verdicts else None

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from neusee.nodes import TensorStats
+from neusee.nodes import Check, TensorStats
 from neusee.workflows.graph.step_record import StepRecord
-from neusee.workflows.keys.cache_key import device_kind
+from neusee.workflows.keys.cache_key import Key, device_kind
 
 if TYPE_CHECKING:
     from neusee.workflows.engine.cost_model import Estimate
@@ -27,6 +27,19 @@ def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
         return TensorStats(**{**found, "shape": tuple(found["shape"])}) if found else None
     except (TypeError, LookupError):  # no statistics that this program writes
         return None
+
+
+def unneeded(name: str, key: Key, about: Mapping[str, Any] | None, bound: float | None) -> StepRecord:
+    """Return the record of a step whose value no other step needed."""
+    return StepRecord(name, "not needed", "nothing needed it", 0.0, key, bound=bound, error=error_in(about))
+
+
+def loaded(name: str, key: Key, about: Mapping[str, Any], bound: float | None, why: str, seconds: float) -> StepRecord:
+    """Return the record of a step whose stored result was read in ``seconds``."""
+    why = why or f"computed {about.get('date')} in {about.get('seconds') or 0.0:.3g} s"
+    checks = tuple(Check(text, ok) for text, ok in about.get("checks") or ())
+    size, error = about.get("bytes") or 0, error_in(about)
+    return StepRecord(name, "cached", why, seconds, key, facts_in(about), checks, "cpu", size, bound, error=error)
 
 
 def ran(outcome: Outcome, why: str, bound: float | None, began: float, expected: Estimate) -> StepRecord:

@@ -21,6 +21,8 @@ from neusee.workflows.store.journal import Journal, Row
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import tensors_in
 
+_SMALL = 1 << 23  #: bytes below which a result that only a decision needs is stored only where this pays
+_HELD = 256  #: how many such results fit into the memory of a run
 MOST_PARTS = 64  #: upper bound on the parts of a step
 
 
@@ -97,6 +99,11 @@ def room_for(expected: Mapping[Key, Estimate], executor: Executor, values: Mappi
         return held + need <= sum(lane.memory for lane in executor.lanes.values() if pool_of(lane.device) == pool)
 
     return room
+
+
+def small_result(executor: Executor) -> float:
+    """Return the bytes below which a result may stay in memory until it is read; 0 if values leave this process."""
+    return min(_SMALL, *(lane.memory / _HELD for lane in executor.lanes.values())) if executor.shares else 0.0
 
 
 def running_peak(schedule: Schedule | None, lanes: Mapping[str, Lane]) -> float:

@@ -190,10 +190,11 @@ def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Leas
         return outcome
     work, value, about = outcome.work, outcome.value, _about(outcome)
     small = outcome.bytes <= INLINE
+    not_worth = not (work.wanted or small or _pays(outcome, store, outcome.bytes))
     try:
-        if work.unlocked and (small or not work.wanted) and not _pays(outcome, store, 0):
+        if work.unlocked and (not_worth or (small and not _pays(outcome, store, 0))):
             outcome.kept = store.put_small(work.key, value, about)
-        elif not (work.wanted or small or _pays(outcome, store, outcome.bytes)):
+        elif not_worth:
             store.put_receipt(work.key, about)
         elif later is not None and outcome.bytes >= LARGE:
             pack(value)  # a value that cannot be stored raises here, where the step is known

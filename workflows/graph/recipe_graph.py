@@ -38,12 +38,12 @@ class Step:
     mark: Location
     param_marks: Mapping[str, Location]  #: location of each given value
     device: str = ""  #: requested device: ``cpu``, ``gpu``, ``cuda:1``; empty if any; never part of a key
+    #: names of all steps whose results are inputs of this step, in the order of the inputs
+    sources: tuple[str, ...] = field(init=False, repr=False, compare=False)
 
-    @property
-    def sources(self) -> tuple[str, ...]:
-        """Return the names of all steps whose results are inputs of this step, in the order of the inputs."""
+    def __post_init__(self) -> None:
         wires = ((wire,) if isinstance(wire, str) else wire for wire in self.wires.values())
-        return tuple(name for names in wires for name in names or ())
+        object.__setattr__(self, "sources", tuple(name for names in wires for name in names or ()))
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neusee.nodes import Node
@@ -52,6 +53,20 @@ def form_of(node: Node, inputs: Sequence[Form], params: Mapping[str, Any]) -> Fo
     except Exception:  # a wrong recipe fails where the step runs, with the names of its inputs
         pass
     return None
+
+
+def is_same(one: Form, other: Form) -> bool:
+    """Return True if two forms of an input are the same object, or lists of the same objects."""
+    if type(one) is list and type(other) is list:
+        return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
+    return one is other
+
+
+def has_path(value: Any) -> bool:
+    """Return True if a parameter, or a part of it, is the path of a file, which may change."""
+    if isinstance(value, Mapping):
+        return any(map(has_path, value.values()))
+    return isinstance(value, Path) or (isinstance(value, list | tuple) and any(map(has_path, value)))
 
 
 def complete(node: Node, inputs: Sequence[Form]) -> bool:

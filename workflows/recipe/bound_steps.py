@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sized
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
 
 from neusee.workflows.graph.final_values import Setting
+from neusee.workflows.graph.step_shapes import has_path
 from neusee.workflows.recipe.known_before_run import CheckedStep, KnownForm
 from neusee.workflows.recipe.parameters import Checker
 from neusee.workflows.recipe.text.references import References
@@ -60,7 +59,7 @@ class Attempt:
 
     def remember(self, name: str, checked: CheckedStep, memory: GraphMemory | None) -> None:
         """Let later checks of the same graph find the step."""
-        if memory is None or _has_path(checked.step.params) or self._checker.own or self._state() != self._before:
+        if memory is None or has_path(checked.step.params) or self._checker.own or self._state() != self._before:
             return
         memory.bound[name] = BoundStep(checked, dict(self._references.trace[self._first :]))
 
@@ -69,10 +68,3 @@ class Attempt:
         told: tuple[Sized, ...] = (references.diagnostics, references.lacking, references.notes)
         lists = (*told, checker.diagnostics, checker.notes)
         return tuple(len(each) for each in lists)
-
-
-def _has_path(value: Any) -> bool:
-    """Return True if a parameter, or a part of it, is the path of a file."""
-    if isinstance(value, Mapping):
-        return any(map(_has_path, value.values()))
-    return isinstance(value, Path) or (isinstance(value, list | tuple) and any(map(_has_path, value)))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step, Wire, in_order
-from neusee.workflows.graph.step_shapes import Form, alike, bytes_of, form_of, inputs_of, tensors_of
+from neusee.workflows.graph.step_shapes import Form, alike, bytes_of, form_of, inputs_of, is_same, tensors_of
 from neusee.workflows.recipe.parameters import Checker
 from neusee.workflows.recipe.text.yaml_values import Value
 
@@ -40,7 +40,7 @@ class KnownForm(NamedTuple):
 
     def holds(self, checked: CheckedStep, inputs: Sequence[Any], computed: bool) -> bool:
         """Return True if the step and what is known of its inputs are the same objects."""
-        return checked is self.checked and computed == self.computed and all(map(_same, inputs, self.inputs))
+        return checked is self.checked and computed == self.computed and all(map(is_same, inputs, self.inputs))
 
 
 def check_steps(
@@ -88,12 +88,6 @@ def check_steps(
             before[name] = KnownForm(each, forms, name in computed, found, known[name])
     for name in by_name:
         checker.notes.update(dict.fromkeys(notes.get(name, ())))
-
-
-def _same(one: Any, other: Any) -> bool:
-    if type(one) is list and type(other) is list:
-        return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
-    return one is other
 
 
 def _set_aside(step: Step, inputs: Mapping[str, Any], checker: Checker) -> list[str]:

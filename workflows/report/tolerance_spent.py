@@ -23,7 +23,8 @@ def spent(result: Result) -> dict[str, Any]:
     """Return the tolerance of a run, with the omitted and the cheaper steps and their errors, as JSON values.
 
     ``bounds`` has the error bound of each output, and of each input of a step without an error bound.
-    ``estimated`` names those of them that count errors which are estimated and not proved.
+    ``estimated`` names those of them that count errors which are estimated and not proved. ``rounded`` has those bounds
+    that are larger with an estimate of what rounding to digital numbers adds.
     ``measured`` has the error of each output relative to a run with ``--exact``, if the store has its results.
     """
     estimated = _estimated(result)
@@ -40,6 +41,7 @@ def spent(result: Result) -> dict[str, Any]:
         "exact": result.recipe.exact,
         "bounds": {name: share for name, share in result.proof.held.items() if share > 0},
         "estimated": [name for name, share in result.proof.held.items() if share > 0 and name in estimated],
+        "rounded": {name: share for name, share in result.proof.stated.items() if share > result.proof.held[name]},
         "unbounded": [name for name in result.recipe.outputs if result.proof.of(name) is None],
         "measured": _measured(result),
         "economies": [_economy(result, costs, each, each.instead in estimated) for each in result.recipe.substitutions],
@@ -68,6 +70,8 @@ def said_of_economies(account: Mapping[str, Any]) -> str:
     measured = f", measured {found:.1e}" if found is not None else ""
     names = ", ".join([*summed, *nothing])
     most = f"{worst:.1e} in all, in part estimated" if account["estimated"] else f"at most {worst:.1e} in all"
+    rounded = max(account["rounded"].values(), default=0.0)
+    most += f", about {rounded:.1e} with rounding to digital numbers" if rounded > worst else ""
     return f"cheaper  {names}: error {most}{measured}; tolerance {account['tolerance']:g}"
 
 

@@ -28,6 +28,7 @@ from neusee.workflows.store.journal import Journal
 from neusee.workflows.store.lease import Lease, Leases
 from neusee.workflows.store.maintenance import Maintained
 from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept, record_use
+from neusee.workflows.store.receipts import Receipts
 from neusee.workflows.store.shared_folder import Disk
 from neusee.workflows.store.small_results import SmallResults
 from neusee.workflows.store.store_warnings import Warned
@@ -64,6 +65,7 @@ class Store(Warned, Maintained):
         self._room = None if self.budget is None else CacheBudget(self.disk, self.budget)
         self._speeds = Speeds(self.disk)
         self._known: dict[str, Metadata] = {}
+        self._receipts = Receipts(self.disk)
         self._lost: set[str] = set()  # damaged results that the user may have no permission to move
         self._used: set[str] = set()
         self._missed: set[str] = set()
@@ -92,7 +94,7 @@ class Store(Warned, Maintained):
         about = self.brief.find(key)
         if not is_kept(about):
             try:
-                about = metadata.find(self.disk, key) or about
+                about = self._receipts.find(key) or about
             except NotRead as error:
                 self.leave(error)
             except UNREADABLE as error:

@@ -30,6 +30,7 @@ class SmallResults:
         self._disk, self._guard = disk, threading.Lock()
         self._path = f"{disk.folder}/brief.jsonl"
         self._lines: dict[str, bytes] = {}
+        self._read: dict[str, tuple[bytes, Metadata]] = {}  # lines that were read, with their metadata
         self._file, self._offset = 0, 0
 
     def find(self, key: str) -> Metadata | None:
@@ -37,7 +38,10 @@ class SmallResults:
         if key not in self._lines:
             self._read_new_lines()
         with suppress(*UNREADABLE):  # also a KeyError if the key has no line
-            return metadata.unseal_of(key, self._lines[key])
+            raw = self._lines[key]
+            if key not in self._read or self._read[key][0] is not raw:
+                self._read[key] = raw, metadata.unseal_of(key, raw)
+            return self._read[key][1]
         return None
 
     def append(self, about: Metadata) -> None:

@@ -1,14 +1,13 @@
 """The runs of a sweep: all points are checked first, and then run, in worker processes or one after another.
 
-Every point is composed and checked before the first point runs. A point keeps its composed values, most of which are
-the same objects at all points; the steps of a point are built again when the point runs.
+Every point is composed and checked before the first point runs. A point keeps what differs from the first point.
 """
 
 from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -21,16 +20,18 @@ from neusee.workflows.engine.node_call import place
 from neusee.workflows.engine.runner import run
 from neusee.workflows.engine.worker_processes import shared
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
-from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event
+from neusee.workflows.graph.step_shapes import has_path
 from neusee.workflows.keys.cache_key import Key, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.loading import check
-from neusee.workflows.recipe.text.composition import Composed, compose
+from neusee.workflows.recipe.text.composition import compose
 from neusee.workflows.report.result_numbers import numbers_of
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Point
+from neusee.workflows.sweeps.kept_recipes import KeptRecipe
 from neusee.workflows.sweeps.point_order import PointJob, best_order, work_left
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
@@ -44,7 +45,7 @@ class CheckedPoint:
     """A point of a sweep that passed all checks, with the steps that the point needs."""
 
     point: Point
-    composed: Composed
+    kept: KeptRecipe
     job: PointJob
 
 
@@ -152,8 +153,7 @@ def _found(
     memory: int | None = None,
 ) -> _Found:
     began = time.perf_counter()
-    recipe = check(plan.checked[number].composed)
-    result = run(recipe, store, watch=watch, device=device, memory=memory, code=plan.code)
+    result = run(plan.checked[number].kept.recipe, store, watch=watch, device=device, memory=memory, code=plan.code)
     rows = (row for step, value in result.values.items() for row in numbers_of(step, value))
     ran = any(step.state == "run" for step in result.done.values())
     numbers = tuple((step, field, index, number) for step, field, index, number in rows)
@@ -200,31 +200,42 @@ class _Checker:
         self.notes: dict[str, None] = {}
         self.first: Recipe | None = None
         self._same: dict[Any, Any] = {}
+        self._keyed: dict[str, tuple[Step, tuple[Any, ...], Key]] = {}  # the newest key of each step, and its parts
 
     def every(self, points: Sequence[Point]) -> Iterator[CheckedPoint]:
         """Yield each point that passes all checks, and add the mistakes of the other points to ``diagnostics``."""
         for point in points:
             try:
-                composed = compose(self.recipe, point.overrides, self.folder)
-                yield CheckedPoint(point, composed, self._job(point, check(composed)))
+                recipe = check(compose(self.recipe, point.overrides, self.folder))
+                self.first = self.first or recipe
+                yield CheckedPoint(point, KeptRecipe.of(recipe, self.first), self._job(point, recipe))
             except RecipeError as error:
                 self.diagnostics += error.diagnostics
         self.code.save()
 
     def _job(self, point: Point, recipe: Recipe) -> PointJob:
-        self.first = self.first or recipe
         self.notes.update(dict.fromkeys(recipe.notes))
         keys: dict[str, Key] = {}
         recipe = with_substitutions(recipe, recipe.outputs)
         for name in needed(recipe, recipe.outputs):
             step = recipe.steps[name]
             try:
-                keys[name] = self._once(key_of(step, keys, recipe.seed, self.code, place(step, self.device))[0])
+                keys[name] = self._key(step, keys, recipe.seed)
             except (OSError, LookupError, TypeError) as error:
                 raise RecipeError([Diagnostic(step.mark, name, str(error))]) from error
         sources = tuple((name, recipe.steps[name].sources) for name in keys)
         graph = self._same.setdefault(sources, dict(sources))
         return PointJob(point.place, keys, graph, recipe.outputs)
+
+    def _key(self, step: Step, keys: Mapping[str, Key], seed: int) -> Key:
+        """Return the cache key of a step; a step that is the same object as at the point before has the same key."""
+        parts = (seed, *(keys[name] for name in step.sources))
+        known = self._keyed.get(step.name)
+        if known is not None and known[0] is step and known[1] == parts and not has_path(step.params):
+            return known[2]
+        key = self._once(key_of(step, keys, seed, self.code, place(step, self.device))[0])
+        self._keyed[step.name] = step, parts, key
+        return key
 
     def _once(self, key: Key) -> Key:
         """Return the same string object for equal cache keys, which saves memory because points share most keys."""

@@ -11,6 +11,11 @@ from neusee.workflows.tolerance.cheaper_steps import CHANNELS
 from neusee.workflows.tolerance.skip_decision import FactsOf, SkipDecision, judge
 
 
+def skip_share(recipe: Recipe) -> float:
+    """Return the share of the tolerance that omitted steps may use, beside the cheaper steps of a recipe."""
+    return 1.0 - 2 * CHANNELS if any(each.within for each in recipe.substitutions) else 1.0
+
+
 class ErrorBudget:
     """Error bounds of omitted steps, summed for each later step; the sum reduces the tolerance of the later step.
 
@@ -18,8 +23,7 @@ class ErrorBudget:
     """
 
     def __init__(self, recipe: Recipe) -> None:
-        share = 1.0 - 2 * CHANNELS if any(e.within for e in recipe.substitutions) else 1.0
-        self._recipe, self._share = recipe, share
+        self._recipe, self._share = recipe, skip_share(recipe)
         self._spent: dict[str, dict[str, float]] = {}  # by step: bound by omitted step; equal dicts are one object
 
     def copy(self) -> ErrorBudget:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from neusee.nodes import ErrorBound, TensorStats
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
@@ -26,6 +26,8 @@ class ErrorBounds:
 
     shares: Mapping[str, float] = field(default_factory=dict)  #: by step; infinite where a node gives no bound
     held: Mapping[str, float] = field(default_factory=dict)  #: of outputs, and of the inputs of nodes without bounds
+    #: the same values with an estimate of what rounding to digital numbers adds, which the tolerance does not limit
+    stated: Mapping[str, float] = field(default_factory=dict)
 
     def of(self, step: str) -> float | None:
         """Return the error bound of a step's result, or None if no bound is known."""
@@ -94,26 +96,59 @@ def proof(
     held: dict[str, float] = {}
     for name in order:
         step = recipe.steps[name]
-        inputs = [_gathered(step.wires.get(i), bounds) for i in step.node.inputs]
-        own = _own(step, done(name), facts_of)
-        if own is None and not any(bound.rms for bound in _flat(inputs)):
+        bound = _bound(step, bounds, done(name), facts_of, _propagates(step, recipe))
+        if bound is None:
             continue  # exact, like almost every step
-        facts, error = facts_of(name), done(name).error
-        carried = _carried(step, inputs, facts, _propagates(step, recipe))
-        if math.isinf(carried):
+        if math.isinf(bound.rms):
             shares = {source: bounds[source].share for source in step.sources if source in bounds}
             held |= {source: share for source, share in shares.items() if math.isfinite(share)}
-        bounds[name] = ErrorBound(carried + (own or 0.0), facts, error[1] if error else None)
+        bounds[name] = bound
     shares = {name: bound.share for name, bound in bounds.items()}
     held |= {name: shares[name] for name in wanted if math.isfinite(shares.get(name, math.inf))}
-    return ErrorBounds(shares, held)
+    rounded = _rounded(recipe, bounds, done, facts_of)
+    return ErrorBounds(shares, held, {name: (rounded.get(name) or bounds[name]).share for name in held})
+
+
+def _bound(
+    step: Step, known: Mapping[str, ErrorBound], done: StepRecord, facts_of: FactsOf, propagates: bool
+) -> ErrorBound | None:
+    """Return the error bound of a step's result from the ``known`` bounds of its inputs, or None if it is exact."""
+    inputs = [_gathered(step.wires.get(i), known) for i in step.node.inputs]
+    own = _own(step, done, facts_of)
+    if own is None and not any(bound.rms for bound in _flat(inputs)):
+        return None
+    facts, error = facts_of(step.name), done.error
+    carried = _carried(step, inputs, facts, propagates)
+    return ErrorBound(carried + (own or 0.0), facts, error[1] if error else None)
+
+
+def _rounded(
+    recipe: Recipe, bounds: Mapping[str, ErrorBound], done: Callable[[str], StepRecord], facts_of: FactsOf
+) -> dict[str, ErrorBound]:
+    """Return the error bounds of the results of ``bounds`` to which rounding to digital numbers adds something."""
+    found: dict[str, ErrorBound] = {}
+    for name, before in bounds.items():
+        step, bound = recipe.steps[name], before
+        rounding = step.node.hooks.rounding_error
+        if not found.keys().isdisjoint(step.sources):
+            bound = _bound(step, {**bounds, **found}, done(name), facts_of, _propagates(step, recipe)) or before
+        elif rounding is None:
+            continue
+        if (
+            rounding is not None
+            and bound.stats is not None
+            and math.isfinite(bound.rms)
+            and done(name).state != "left out"
+        ):
+            bound = replace(bound, rms=float(rounding(bound.rms, result=bound.stats, **step.params)))
+        found[name] = bound
+    return found
 
 
 def _own(step: Step, done: StepRecord, facts_of: FactsOf) -> float | None:
     """Return the error that a step adds by its own approximation or omission, in the unit of its result."""
     share = done.bound if done.state == "left out" else done.error and done.error[0]
-    facts = facts_of(done.step)
-    if not share or facts is None:
+    if not share or (facts := facts_of(done.step)) is None:
         return None
     largest = max(abs(facts.min), abs(facts.max))
     if done.state == "left out" and step.node.hooks.skip_scale is not None:

@@ -145,3 +145,32 @@ def test_check_of_the_converter():
         digitize.hooks.check(torch.tensor([0.0, 1.0, 2.0, 255.0]), bits=8)[0].text
         == "25.00% of pixels are at the largest digital number, 25.00% at 0 DN"
     )
+
+
+@pytest.mark.parametrize("rounding", ["nearest", "truncation", "dithered_floor"])
+@pytest.mark.parametrize("error", [1e-7, 1e-5, 3e-3, 0.2, 0.5, 0.9, 3.3])
+def test_numbers_changed_by_rounding_are_as_many_as_estimated(error, rounding):
+    """Values spread by noise, errors of any law: the rms of the changed numbers, and at most half as much again."""
+    draw = torch.Generator().manual_seed(1)
+    values = 200.0 * torch.rand(400, 500, generator=draw, dtype=torch.float64)
+    for errors in (torch.randn(values.shape, generator=draw, dtype=torch.float64), torch.ones_like(values)):
+        off = errors * error / errors.square().mean().sqrt()
+        before, after = (
+            digitize(x, gain=1.0, rounding=rounding, rng=torch.Generator().manual_seed(2))
+            for x in (values, values + off)
+        )
+        found = float((after - before).square().mean().sqrt())
+        told = digitize.hooks.rounding_error(error, result=TensorStats.of(after), gain=1.0)
+        assert error <= told
+        assert found <= told
+        assert told <= 1.5 * found or told**2 * values.numel() < 60  # so few numbers that their count is chance
+
+
+@pytest.mark.parametrize("mean", [1e-6, 1e-3, 0.1, 0.9, 5.0, 400.0])
+def test_more_numbers_change_in_one_of_ten_thousand_cases(mean):
+    pixels = 10**7
+    most = digitize.hooks.rounding_error(mean / pixels, result=TensorStats((pixels,), "float32", 0, 1, 1, 1, True)) ** 2
+    few = math.floor(most * pixels + 1e-6)
+    more = 1.0 - sum(math.exp(n * math.log(mean) - mean - math.lgamma(n + 1)) for n in range(few + 1))
+    assert more <= 1e-4
+    assert few <= mean + 8.0 * math.sqrt(mean) + 9.0

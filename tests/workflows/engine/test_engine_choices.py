@@ -11,6 +11,7 @@ import torch
 from neusee.nodes import node
 from neusee.workflows.engine import step_job
 from neusee.workflows.engine.local_executor import program_memory
+from neusee.workflows.engine.memory_use import process_memory
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -53,6 +54,27 @@ def slow(x=None, *, n: int = BIG, seconds: float = 0.3):
 def add(x, *, k: float = 1.0):
     CALLS.append("add")
     return x + k
+
+
+@node()
+def shaped(*, n: int = BIG):
+    CALLS.append("make")
+    return torch.ones(n)
+
+
+@shaped.shape
+def _(*, n):
+    return torch.empty(n, device="meta")
+
+
+@node()
+def glow(x, *, amount: float = 0.0):
+    return x + amount
+
+
+@glow.skip_bound
+def _(x, *, amount):
+    return abs(amount) / x.max
 
 
 @node()
@@ -123,6 +145,22 @@ def test_what_is_asked_for_is_always_kept(store):
     again = run(recipe("b m", **CHEAP), Store(store.root))
     assert states(again)["b"] == "cached"
     assert torch.equal(again.values["b"], torch.full((BIG,), 2.0))
+
+
+@pytest.mark.parametrize(
+    ("n", "room", "kept"),
+    [(BIG, None, False), (4 * BIG, None, True), (BIG, 400_000_000, True)],
+    ids=["small", "large", "little room"],
+)
+def test_a_small_value_that_a_verdict_alone_asks_for_is_kept_only_where_it_pays(store, n, room, kept):
+    steps = {"a": (shaped, {}, {"n": n}), "g": (glow, {"x": "a"}, {"amount": 0.5}), "m": (mean, {"x": "g"}, {})}
+    first = run(recipe("m", **steps), Dear(store.root), memory=room and process_memory() + room)
+    assert first.done["g"].state == "run"
+    assert CALLS == ["make", "mean"]  # the value stays in memory between verdict and use
+    assert Store(store.root).has(first.keys["a"]) is kept
+    CALLS.clear()
+    again = run(recipe("m", **steps), Store(store.root))
+    assert (states(again)["m"], again.values["m"], CALLS) == ("cached", 1.5, [])
 
 
 def test_a_value_that_was_not_kept_is_computed_again_and_says_why(store):

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from neusee.workflows import load
 from neusee.workflows.cli.sweep_screen import run_sweep
 from neusee.workflows.engine import local_executor
 from neusee.workflows.graph.diagnostics import RecipeError
@@ -467,7 +468,7 @@ def test_fifty_sweeps_leave_nothing_behind(recipe, tmp_path):
     assert after[2] - objects < 50 * 4  # a single recipe is hundreds
 
 
-def test_points_share_their_composed_values(recipe, store):
+def test_points_keep_what_differs_from_the_first(recipe, store):
     from neusee.workflows.sweeps.axes import points, read_axes
     from neusee.workflows.sweeps.sweep_points import plan_sweep
 
@@ -477,6 +478,13 @@ def test_points_share_their_composed_values(recipe, store):
         Path().absolute(),
         store,
     )
-    graphs = {id(checked.composed.root.items["steps"]) for checked in found.checked}
-    assert len(graphs) == 1
+    for number, checked in enumerate(found.checked):
+        assert set(checked.kept.values) == ({"sensor.read_noise"} if number else set())
+        kept, alone = checked.kept.recipe, load(recipe, [f"sensor.read_noise={number} e-"])
+        assert kept.config.values == alone.config.values
+        assert list(kept.steps) == list(alone.steps)
+        for name, step in alone.steps.items():
+            assert (kept.steps[name].params, kept.steps[name].wires) == (step.params, step.wires)
+        assert (kept.seed, kept.outputs, kept.tolerance) == (alone.seed, alone.outputs, alone.tolerance)
+    assert all(len(checked.kept.steps) < len(found.recipe.steps) / 2 for checked in found.checked)
     assert len({id(checked.job.sources) for checked in found.checked}) == 1

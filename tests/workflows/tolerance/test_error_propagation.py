@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from neusee.nodes import ErrorBound, TensorStats, node
+from neusee.workflows.engine import runner
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Substitution
@@ -94,6 +95,16 @@ def first(pair):
 @first.propagate_error
 def _(pair, *, result):
     return pair.share * result.max
+
+
+@node()
+def magnified(x, *, times: float = 1.0):
+    return x + 0
+
+
+@magnified.propagate_error
+def _(x, *, result, times):
+    return x.rms * times
 
 
 def step(name, node, params=None, **wires):
@@ -275,3 +286,16 @@ def test_lists_and_absent_inputs_are_told_apart(store):
     assert result.proof.of("out") == pytest.approx(0.3 / 300, rel=0.02)
     unknown = proof(result.recipe, list(result.done), ["out"], result.done.__getitem__, lambda name: None)
     assert unknown.worst == 0.0
+
+
+@pytest.mark.parametrize(("times", "attempts"), [(1e4, 2), (10.0, 3)])
+def test_a_second_attempt_is_made_only_where_smaller_limits_can_help(store, monkeypatch, times, attempts):
+    """Rounding leaves 1.4e-6 of an error: 1e4 times this is above the tolerance of 1e-2, whatever the limits are."""
+    made, execution = [], runner.Execution
+    monkeypatch.setattr(runner, "Execution", lambda *args: made.append(args[0]) or execution(*args))
+    steps = [step("l", light), step("r", rough, {"digits": 0}, x="l"), step("f", first, pair="r")]
+    steps += [step("out", magnified, {"times": times}, x="f")]
+    result = run(recipe(*steps), store)
+    assert result.recipe.exact
+    assert len(made) == attempts
+    assert torch.equal(result["out"], run(recipe(*steps, exact=True), store)["out"])

@@ -5,6 +5,7 @@ A run uses the median of a distribution and the value that ``posterior`` chooses
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -111,12 +112,22 @@ def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
 
 def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
     """Yield the path and the value of every distribution in a recipe; a value with YAML aliases has several paths."""
-    stack: list[tuple[Where, Value]] = [((key,), value) for key, value in root.items.items() if key != KEY]
+    for key, block in reversed(root.items.items()):
+        if key != KEY:
+            yield from (((key, *path), value) for path, value in _laws_in(block))
+
+
+@functools.lru_cache(maxsize=64)
+def _laws_in(block: Value) -> tuple[tuple[Where, Value], ...]:
+    """Return the distributions in a block, which the points of a sweep share where they have the same block."""
+    found: list[tuple[Where, Value]] = []
+    stack: list[tuple[Where, Value]] = [((), block)]
     while stack:
         path, value = stack.pop()
         if is_law(value.data):
-            yield path, value
+            found.append((path, value))
         stack += [((*path, key), child) for key, child in value.items.items()]
+    return tuple(found)
 
 
 def put(root: Value, path: Where, data: Any, mark: Location | None = None) -> Value:

@@ -18,6 +18,7 @@ BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 BLACK = "#000000"
 
 _MARGIN = 0.08  #: inches around what is drawn
+_COMPRESSION = 3  #: of zlib: half the time of its usual 6, and files that are 4 % larger
 _RC: Mapping[str, Any] = {
     "font.family": ["DejaVu Sans"],
     "font.size": 10,
@@ -76,7 +77,8 @@ def png_of(figure: Any) -> bytes:
         engine.execute(figure)
     drawn_part = figure.get_tightbbox(figure.canvas.get_renderer()).padded(_MARGIN)
     figure.set_layout_engine(None)
-    figure.savefig(out, format="png", bbox_inches=drawn_part, metadata={"Software": "neusee"})
+    more = {"metadata": {"Software": "neusee"}, "pil_kwargs": {"compress_level": _COMPRESSION}}
+    figure.savefig(out, format="png", bbox_inches=drawn_part, **more)
     return out.getvalue()
 
 

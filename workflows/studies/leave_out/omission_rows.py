@@ -79,7 +79,8 @@ class OmissionComparison:
         errors = []
         for name in self.recipe.outputs:
             value, reference = self.chosen.values[name], self.truth.values[name]
-            rms, bound = error_of(value, reference), self.chosen.proof.of(name)
+            rms, proved = error_of(value, reference), self.chosen.proof
+            bound = proved.stated.get(name, proved.of(name))
             holds = rms <= min(self.recipe.tolerance, math.inf if bound is None or self.chosen.recipe.exact else bound)
             errors.append(OutputError(name, bound, rms, largest_error(value, reference), holds))
         return errors

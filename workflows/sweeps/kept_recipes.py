@@ -1,0 +1,54 @@
+"""Recipes of the points of a sweep, each kept as its differences from the recipe of the first point."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from neusee.workflows.graph.final_values import Config
+from neusee.workflows.graph.recipe_graph import Recipe
+
+
+@dataclass(frozen=True, slots=True)
+class KeptRecipe:
+    """A checked recipe in little memory: the steps, values and fields that differ from those of another recipe."""
+
+    first: Recipe
+    steps: Mapping[str, Any]
+    values: Mapping[str, Any]
+    others: Mapping[str, Any]  #: by field of `Recipe`
+
+    @classmethod
+    def of(cls, recipe: Recipe, first: Recipe) -> KeptRecipe:
+        """Keep ``recipe`` beside ``first``, with which it shares what is equal in both."""
+        others = {
+            f.name: value for f in fields(Recipe) if (value := getattr(recipe, f.name)) is not getattr(first, f.name)
+        }
+        steps, values = _changed(recipe.steps, first.steps), _changed(recipe.config.settings, first.config.settings)
+        if steps is not None:
+            others.pop("steps", None)
+        if values is not None:
+            others.pop("config", None)
+        return cls(first, steps or {}, values or {}, others)
+
+    @property
+    def recipe(self) -> Recipe:
+        """Return the recipe, equal to the one that was kept."""
+        same = self.first
+        steps, values = {**same.steps, **self.steps}, {**same.config.settings, **self.values}
+        return replace(same, **{"steps": steps, "config": Config(values), **self.others})
+
+
+def _changed(mapping: Mapping[str, Any], first: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the entries of a mapping that are not equal to those of ``first``, or None if the keys differ."""
+    if list(mapping) != list(first):
+        return None
+    return {key: value for key, value in mapping.items() if not _equal(value, first[key])}
+
+
+def _equal(one: Any, other: Any) -> bool:
+    with suppress(Exception):  # values such as arrays, whose comparison has no single answer
+        return one is other or bool(one == other)
+    return False
