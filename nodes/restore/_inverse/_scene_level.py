@@ -50,6 +50,7 @@ class SceneDoubt(NamedTuple):
     blotches: Tensor  #: (channel, y, x), deviation of light that is the same over some pixels
 
 
+@torch.no_grad()
 def scene_doubt(
     used: tuple[Tensor, Tensor], told: tuple[Told, Told], white: Tensor | None, full: float, light: Light
 ) -> SceneDoubt | None:
