@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Generator, Tensor
@@ -42,22 +43,40 @@ def frame_deviation(
     with torch.no_grad():
         law = fitted_law(problem, scaled.doubt)
         own = _details(problem.first(most_likely(problem, inverses=inverses)))
-    coarse = fine = noisy = problem.picture.new_zeros(len(matrix), *own.shape)
-    drawn = true = torch.zeros_like(own)
-    for error, restored in _of_scenes(scaled, law.power, scenes, rng, kernels, inverses):
-        smooth = _around(error, _NEAR)
-        coarse = coarse + _COARSE * law.low * _square(smooth, matrix) / scenes
-        fine = fine + _square(error - smooth, matrix) / scenes
-        drawn = drawn + _details(restored) / scenes
-        true = true + _details(restored + error * scaled.share / scaled.scale) / scenes
-    told = (_around(drawn, _NEAR) / (_around(true, _NEAR) + _DARK)).clamp(max=1.0)
+    drawn = _of_scenes(scaled, law.power, scenes, rng, kernels, inverses)
+    found = _Scenes.of(drawn, scenes, scaled, matrix)
+    noisy, details = torch.zeros_like(found.coarse), found.restored
     for error in _of_noise(scaled, law.noise**0.5, noises, rng, inverses):
         noisy = noisy + _square(scaled.scale / scaled.share * error, matrix) / noises
-        drawn = drawn + _details(error) / noises
-    ratio = _ratio(own, drawn, problem.weight)
-    ratio = ratio.where(ratio > 1.0, ratio**told)  # a lack of details means little where the frame cannot show any
-    total: Tensor = ratio * _around(fine, _SMOOTH) + ratio.clamp_min(1.0) * _around(coarse + noisy, _SMOOTH)
+        details = details + _details(error) / noises
+    ratio = _ratio(own, details, problem.weight)
+    ratio = ratio.where(ratio > 1.0, ratio**found.told)  # a lack of details means little where none could be seen
+    slow = _COARSE * law.low * found.coarse + noisy
+    total: Tensor = ratio * _around(found.fine, _SMOOTH) + ratio.clamp_min(1.0) * _around(slow, _SMOOTH)
     return total.sqrt()
+
+
+class _Scenes(NamedTuple):
+    """Mean squares over drawn scenes, (colour, y, x) of errors and (y, x) of details."""
+
+    coarse: Tensor  #: of errors averaged over the pixels near
+    fine: Tensor  #: of the rest of the errors
+    restored: Tensor  #: of restored details
+    told: Tensor  #: the part of the details of a scene that is restored, near each pixel
+
+    @classmethod
+    def of(cls, drawn: Iterator[tuple[Tensor, Tensor]], count: int, scaled: Scaled, matrix: Tensor) -> _Scenes:
+        """Return the mean squares of drawn errors and restored scenes."""
+        coarse = fine = scaled.problem.picture.new_zeros(len(matrix), *scaled.problem.picture.shape[-2:])
+        restored = true = torch.zeros_like(coarse[0])
+        for error, seen in drawn:
+            smooth = _around(error, _NEAR)
+            coarse = coarse + _square(smooth, matrix) / count
+            fine = fine + _square(error - smooth, matrix) / count
+            restored = restored + _details(seen) / count
+            true = true + _details(seen + error * scaled.share / scaled.scale) / count
+        told = (_around(restored, _NEAR) / (_around(true, _NEAR) + _DARK)).clamp(max=1.0)
+        return cls(coarse, fine, restored, told)
 
 
 def drawn_scene(problem: Blurred, power: Tensor, rng: Generator) -> Tensor:

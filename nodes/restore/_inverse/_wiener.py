@@ -236,9 +236,8 @@ def posed(
     transfer, power = torch.fft.rfft2(wrapped(kernels, size)), fall(size).to(kernels)
     found = average((picture - mean).square(), trusted)
     passed = expected_variance(transfer, power, size).clamp_min(1e-6)
-    contrast = torch.maximum(found - mean - read**2 - wrong, 0.01 * found) / passed
-    scale = contrast.clamp_min(1e-6).sqrt()
-    own_mean = mean
+    told = mean, (found - mean - read**2 - wrong) / passed
+    scale = torch.maximum(told[1], 0.01 * found / passed).clamp_min(1e-6).sqrt()
     if scatter and white is not None and light.modes:
         trust = trusted.sum((-2, -1), keepdim=True) / known.sum((-2, -1), keepdim=True) * some
         mean, scale = (shared_level(x, trust.detach(), white) for x in (mean.clamp_min(1.0), scale))
@@ -249,9 +248,9 @@ def posed(
     bright = mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None] / share
     if not scatter:
         return Scaled(problem, scale, bright, share, kernels)
-    rest, full = (found - own_mean.clamp_min(0.0) - read**2 - wrong) / passed, float(electrons.detach().max())
-    told = told_of_scene(own_mean, rest, wrong / passed, light, trusted, (some == 0) * full)
-    return Scaled(problem, scale, bright, share, kernels, scene_doubt((mean, scale), told, white, full, light))
+    full = float(electrons.detach().max())
+    both = told_of_scene(*told, wrong / passed, light, trusted, (some == 0) * full)
+    return Scaled(problem, scale, bright, share, kernels, scene_doubt((mean, scale), both, white, full, light))
 
 
 def _doubted(
