@@ -21,6 +21,7 @@ _NEAR = 11  #: pixels a side of the square around a pixel whose details tell of 
 _SMOOTH = 7  #: pixels a side of the square over which the variance of few draws is averaged
 _KNOWN = 0.02  #: share of known pixels around a pixel, below which nothing around it tells of details
 _COARSE = 2.0  #: mean square of errors of photographs averaged over 11 x 11 pixels, over that of scenes of their law
+_SHOWN = 0.2  #: part of the energy of details that is restored, from which on a lack of them tells
 _DARK = 1e-30  #: added to energies
 
 
@@ -62,7 +63,7 @@ class _Scenes(NamedTuple):
     coarse: Tensor  #: of errors averaged over the pixels near
     fine: Tensor  #: of the rest of the errors
     restored: Tensor  #: of restored details
-    told: Tensor  #: the part of the details of a scene that is restored, near each pixel
+    told: Tensor  #: from 0 to 1, how far a lack of restored details near a pixel tells of a lack of details
 
     @classmethod
     def of(cls, drawn: Iterator[tuple[Tensor, Tensor]], count: int, scaled: Scaled, matrix: Tensor) -> _Scenes:
@@ -75,7 +76,7 @@ class _Scenes(NamedTuple):
             fine = fine + _square(error - smooth, matrix) / count
             restored = restored + _details(seen) / count
             true = true + _details(seen + error * scaled.share / scaled.scale) / count
-        told = (_around(restored, _NEAR) / (_around(true, _NEAR) + _DARK)).clamp(max=1.0)
+        told = (_around(restored, _NEAR) / (_SHOWN * _around(true, _NEAR) + _DARK)).clamp(max=1.0)
         return cls(coarse, fine, restored, told)
 
 
