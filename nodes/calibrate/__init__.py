@@ -15,6 +15,7 @@ from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
 from neusee.nodes.calibrate._frames._emva_descriptor import (
     descriptor,
     descriptor_frames,
+    descriptor_release,
     descriptor_series,
     refuse_descriptor,
 )
@@ -95,6 +96,7 @@ __all__ = [
     "density",
     "descriptor",
     "descriptor_frames",
+    "descriptor_release",
     "descriptor_series",
     "emva_sheet",
     "expose",

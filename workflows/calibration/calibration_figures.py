@@ -17,38 +17,56 @@ if TYPE_CHECKING:
 _BAND = (5.0, 50.0, 95.0)  #: percentiles
 _POINTS = 1500  #: most points of a chain in the picture
 _LEAST = 0.1  #: DN², the variance at which a level without scatter is drawn
-_CLIPPED = {"marker": "v", "color": VERMILION, "markerfacecolor": "none",
-            "label": "clipped or coarse: numbers counted one by one; variance at most as drawn"}  # fmt: skip
+_CLIPPED = {"marker": "v", "color": VERMILION, "markerfacecolor": "none"}
+COUNTED = "clipped or coarse: numbers counted one by one; variance at most as drawn"
 
 
 @drawn
-def transfer(measured: FloatArray, predicted: FloatArray, whole: NDArray[np.bool_]) -> Any:
+def transfer(
+    measured: FloatArray,
+    predicted: FloatArray,
+    whole: NDArray[np.bool_],
+    other: str,
+    means: FloatArray | None = None,
+) -> Any:
     """Draw the photon-transfer curve, and the deviation of each light level from the posterior's prediction.
 
     ``measured`` (2, level) has mean and variance, and ``predicted`` (2, draw, level) mean and variance of a repeated
-    measurement. ``whole`` (level,) is False for levels that the well or the converter clips.
+    measurement. ``whole`` (level,) is False for levels without a prediction, which the label ``other`` describes.
+    ``means`` (level,) are the deviations of the means from the light in standard deviations, if the light is uncertain.
     """
-    figure, axes = canvas(9.0, 7.2, 2, 1, sharex=True, height_ratios=(2.2, 1.0))
-    above, below = axes[0, 0], axes[1, 0]
+    rows = 2 if means is None else 3
+    figure, axes = canvas(9.0, 4.8 + 1.2 * rows, rows, 1, sharex=True, height_ratios=(2.2, *(rows - 1) * (1.0,)))
+    above = axes[0, 0]
     order = np.flatnonzero(whole)[np.argsort(predicted[0].mean(0)[whole])]
     mean, (low, middle, high) = predicted[0].mean(0)[order], np.percentile(predicted[1], _BAND, axis=0)[:, order]
     above.fill_between(mean, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %")
     above.plot(mean, middle, color=BLUE, linewidth=1.2, label="predicted, median")
     lowest = max(_LEAST, 0.5 * float(min([*measured[1, whole], *middle], default=_LEAST)))
-    for at, style in ((whole, {"marker": "o", "color": BLACK, "label": "measured"}), (~whole, _CLIPPED)):
+    for at, style in (
+        (whole, {"marker": "o", "color": BLACK, "label": "measured"}),
+        (~whole, {**_CLIPPED, "label": other}),
+    ):
         if at.any():
             above.plot(measured[0, at], measured[1, at].clip(lowest), linestyle="", markersize=5, **style)
     above.set(xscale="log", yscale="log", ylabel="temporal variance (DN²)", title="Photon-transfer curve")
     above.set_ylim(bottom=lowest / 2)  # a clipped level does not stretch the axis
     above.legend(loc="upper left")
     distance = (measured[1, whole] - predicted[1].mean(0)[whole]) / predicted[1].std(0)[whole]
-    below.axhspan(-2, 2, color=BLUE, alpha=0.12, linewidth=0)
-    below.axhline(0, color=BLUE, linewidth=1.0)
-    below.plot(measured[0, whole], distance, "o", color=BLACK, markersize=5)
-    below.set(xlabel="mean (DN)", ylabel="distance in sd\nof the prediction")
-    reach = max(3.5, 1.1 * float(np.abs(distance).max(initial=0.0)))
-    below.set_ylim(-reach, reach)
+    _distances(axes[1, 0], measured[0, whole], distance, "variance: distance\nin sd")
+    if means is not None:
+        _distances(axes[2, 0], measured[0, whole], means[whole], "mean: distance\nin sd")
+    axes[-1, 0].set_xlabel("mean (DN)")
     return figure
+
+
+def _distances(ax: Any, at: FloatArray, distance: FloatArray, label: str) -> None:
+    """Draw distances from a prediction in standard deviations, over a band of two standard deviations."""
+    ax.axhspan(-2, 2, color=BLUE, alpha=0.12, linewidth=0)
+    ax.axhline(0, color=BLUE, linewidth=1.0)
+    ax.plot(at, distance, "o", color=BLACK, markersize=5)
+    reach = max(3.5, 1.1 * float(np.abs(distance).max(initial=0.0)))
+    ax.set(ylabel=label, ylim=(-reach, reach))
 
 
 @drawn
@@ -73,15 +91,10 @@ def rings(
     above.set(xscale="log", yscale="log", ylabel="signal (e- of a pixel)", title="Rings about the source")
     above.legend(loc="lower left")
     width = np.sqrt(predicted.var(0) + variance.mean(0))
-    below.axhspan(-2, 2, color=BLUE, alpha=0.12, linewidth=0)
-    below.axhline(0, color=BLUE, linewidth=1.0)
-    distance = (measured - predicted.mean(0)) / width
-    below.plot(radius, distance, "o", color=BLACK, markersize=4)
-    below.set(xlabel="distance from the source (pixels)", ylabel="distance in sd\nof the prediction")
+    _distances(below, radius, (measured - predicted.mean(0)) / width, "distance in sd\nof the prediction")
+    below.set_xlabel("distance from the source (pixels)")
     below.xaxis.set_major_formatter("{x:g}")
     below.xaxis.set_minor_formatter("{x:g}")
-    reach = max(3.5, 1.1 * float(np.abs(distance).max(initial=0.0)))
-    below.set_ylim(-reach, reach)
     return figure
 
 

@@ -3,35 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from neusee.nodes.calibrate import Budget, FrameTest, Rings, Sufficient
-from neusee.nodes.values import Levels
-from neusee.workflows.calibration import calibration_figures as figures
+from neusee.nodes.calibrate import Budget, FrameTest, Rings
 from neusee.workflows.calibration.budget_page import budget_picture, budget_sections
-from neusee.workflows.calibration.corner_figure import corners
 from neusee.workflows.calibration.frame_validity import frame_section
 from neusee.workflows.calibration.identifiability import KINDS, Identifiability
 from neusee.workflows.calibration.laboratory import RELATIVE, stated
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import IntervalEstimate, ModelSpread
+from neusee.workflows.calibration.picture_sections import chains_section, corner_section, curve_section, words
 from neusee.workflows.calibration.posterior_checks import Check, count_failures
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
 from neusee.workflows.calibration.standard_fit import least_squares_section
 from neusee.workflows.report.study_page import Mark, Section, with_uncertainty
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from neusee.workflows.calibration.emcee_sampler import Chains
     from neusee.workflows.calibration.log_posterior import FloatArray
 
-_PREDICTED = 400  #: draws for the band of the predicted variance
-_CORNER = 20_000  #: draws for the picture of pairs
 #: by kind of a result: the numbers that the frames do not give
 NOT_TOLD = {
     "estimate": (),
@@ -87,13 +81,23 @@ class CalibrationResult:
     checks: Sequence[Check]
     models: Sequence[ModelSpread] = ()  #: of a camera of unknown response
     frames: Sequence[FrameTest] = ()  #: the tests of the frames
-    unwidened: Mapping[str, float] = field(default_factory=dict)  #: sd of each parameter in the draws of the walk
+    walk: Chains | None = None  #: the draws of the walkers, where `chains` also has what the frames may hide
     budgets: Sequence[Budget] = ()  #: the uncertainty budgets of the estimates
 
     @cached_property
     def budget_picture(self) -> bytes | None:
         """Return the picture of the uncertainty budgets, or None where nothing has a value."""
         return budget_picture(self.budgets) if self.budgets else None
+
+    @property
+    def walked(self) -> Chains:
+        """Return the draws of the walkers themselves, which the levels alone determine."""
+        return self.walk or self.chains
+
+    @cached_property
+    def unwidened(self) -> Mapping[str, float]:
+        """Return the standard deviation of each parameter in the draws of the walkers."""
+        return {name: float(x.std()) for name, x in self.problem.parameters(self.walked.draws).items()}
 
     @property
     def params(self) -> Mapping[str, Any]:
@@ -132,13 +136,14 @@ def banner(result: CalibrationResult) -> str:
     wrong = [f"{check.name}: {check.found}" for check in result.checks if check.mark == "fail"]
     if not wrong:
         return ""
-    return f"Not fit for use: {len(wrong)} of {len(result.checks)} checks fail. {'; '.join(wrong)}."
+    count = f"{len(wrong)} of {len(result.checks)} checks fail{'s' * (len(wrong) == 1)}"
+    return f"Not fit for use: {count}. {'; '.join(wrong)}."
 
 
 def lead(result: CalibrationResult) -> str:
     """Return the opening of a calibration's page: estimates, values to report, and undetermined parameters."""
-    values = [f"{_words(row.name)} {row.text}" for row in result.rows()]
-    stated = [f"{_words(m.name)} {_between(m.stated)}" for m in estimated_models(result)]
+    values = [f"{words(row.name)} {row.text}" for row in result.rows()]
+    stated = [f"{words(m.name)} {_between(m.stated)}" for m in estimated_models(result)]
     return "\n\n".join(
         f"{opening}{'; '.join(parts)}."
         for opening, parts in (
@@ -155,16 +160,12 @@ def estimated_models(result: CalibrationResult) -> list[ModelSpread]:
     return [model for model in result.models if result.identifiability.kinds[model.name] == "estimate"]
 
 
-def _words(name: str) -> str:
-    return name.replace("_", " ")
-
-
 def sections(result: CalibrationResult) -> list[Section]:
     """Return the sections of a calibration's page: parameters, checks, identifiability and pictures."""
     models = (_models,) if result.models else ()
     frames = (_frames,) if result.frames else ()
     standard = (_standard,) if result.problem.measured is not None else ()
-    parts = (_checks, *frames, _not_determined, _curve, _corner, _chains)
+    parts = (_checks, *frames, _not_determined, curve_section, corner_section, chains_section)
     budget = budget_sections(result.budgets, stated(result.problem.recipe), result.budget_picture)
     return [*(part(result) for part in (_parameters, *standard, *models)), *budget, *(part(result) for part in parts)]
 
@@ -186,7 +187,7 @@ def _parameters(result: CalibrationResult) -> Section:
     columns = ("parameter", "posterior", "5 %", "95 %", "unit", "recipe", "draws below it", "width / prior")
     estimates = result.rows()
     rows = [
-        (_words(r.name), r.text, r.end("low"), r.end("high"), r.unit, f"{r.nominal:.6g}", r.share, r.narrower)
+        (words(r.name), r.text, r.end("low"), r.end("high"), r.unit, f"{r.nominal:.6g}", r.share, r.narrower)
         for r in estimates
     ]
     marks: dict[tuple[int, int], Mark] = {
@@ -202,9 +203,14 @@ def _models(result: CalibrationResult) -> Section:
         interval. The stated value is the mean of the two models with the most terms. The stated standard deviation is
         the larger one of both models and half the distance of both values, added in quadrature. The interval of a
         single model is too narrow."""
-    columns = ("parameter", *(f"{n} terms" for n in range(len(result.models[0].models))), "stated", "unit")
+    columns = (
+        "parameter",
+        *(f"{n} term{'s' * (n != 1)}" for n in range(len(result.models[0].models))),
+        "stated",
+        "unit",
+    )
     rows = [
-        (_words(m.name), *map(_between, (*m.models, m.stated)), unit_of(m.name, result.params))
+        (words(m.name), *map(_between, (*m.models, m.stated)), unit_of(m.name, result.params))
         for m in estimated_models(result)
     ]
     return Section("How models of the response differ", text, columns, rows)
@@ -230,66 +236,3 @@ def _not_determined(result: CalibrationResult) -> Section:
     rows = list(zip(strengths, [""] * (len(strengths) - len(directions)) + [*directions], strict=True))
     marks: dict[tuple[int, int], Mark] = {(i, 0): "warn" if text else "pass" for i, (_, text) in enumerate(rows)}
     return Section("What the levels determine", text, ("strength", "not determined"), rows, marks=marks)
-
-
-def _curve(result: CalibrationResult) -> Section:
-    if isinstance(result.problem.levels, Rings):
-        return _rings(result, result.problem.levels)
-    rng = np.random.default_rng(1)
-    flat = result.chains.flat
-    look = result.problem.likelihood(flat[rng.integers(len(flat), size=_PREDICTED)])
-    levels: Any = result.problem.levels
-    mean, variance, freedom = look.mean.numpy(), look.variance.numpy(), levels.degrees_of_freedom.numpy()
-    chance = rng.standard_normal(variance.shape) * np.sqrt(2 / freedom.clip(1))
-    whole: NDArray[np.bool_] = np.asarray((variance > 0).all(0))
-    whole[levels.cell_level.numpy()] = False
-    picture = figures.transfer(np.stack(_moments(levels)), np.stack([mean, variance * (1 + chance)]), whole)
-    text = """The measured variance of each level against its mean, and the prediction of the posterior for a repeated
-        measurement. If a level is clipped by the well or the converter, or too coarse for a mean and a variance, each
-        of its digital numbers enters the likelihood, and the level has no prediction here."""
-    return Section("Photon-transfer curve", text, picture=picture)
-
-
-def _rings(result: CalibrationResult, rings: Rings) -> Section:
-    rng, flat = np.random.default_rng(1), result.chains.flat
-    look = result.problem.likelihood(flat[rng.integers(len(flat), size=_PREDICTED)])
-    picture = figures.rings(*ring_radii(rings), rings.mean.numpy(), look.mean.numpy(), look.variance.numpy())
-    text = """The mean signal of each ring about the source, and the prediction of the posterior for a repeated
-        measurement. Rings whose every pixel is cut off only bound the signal from below."""
-    return Section("Rings about the source", text, picture=picture)
-
-
-def ring_radii(rings: Rings) -> tuple[FloatArray, FloatArray]:
-    """Return the root mean square radius of each averaged ring, and of each ring that is cut off, in pixels."""
-    at, count = rings.ring.numpy(), rings.weight.numpy()
-    square = np.bincount(at, count * rings.square.numpy()) / np.bincount(at, count)
-    return np.sqrt(square), np.sqrt(rings.cut_square.numpy())
-
-
-def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:
-    """Return the mean and the variance of all digital numbers of each light level, including histograms."""
-    if isinstance(levels, Levels):
-        return levels.mean.numpy(), levels.variance.numpy()
-    at, value, count = (x.numpy() for x in levels[-3:])
-    total, mean, variance = (x.numpy() for x in (levels.pixels, levels.mean, levels.variance))
-    sums = [np.bincount(at, count * value**n, minlength=len(total)) for n in range(3)]
-    every = total + sums[0]
-    middle = (total * mean + sums[1]) / every
-    square = total * (variance + mean**2) + sums[2]
-    return middle, square / every - middle**2
-
-
-def _corner(result: CalibrationResult) -> Section:
-    every = max(1, result.chains.flat.shape[0] // _CORNER)
-    told = [r for r in result.rows() if r.kind != "none"]
-    shown = np.stack([result.draws[r.name].reshape(-1)[::every] for r in told], -1)
-    text = """Every pair of parameters of which the frames tell a value or a limit; the recipe's own values are orange.
-        Gain, offset, noise and efficiency correlate."""
-    picture = corners(shown, [f"{_words(r.name)}\n{r.unit}" for r in told], [r.nominal for r in told])
-    return Section("Parameters in pairs", text, picture=picture)
-
-
-def _chains(result: CalibrationResult) -> Section:
-    text = "Four independent ensembles of walkers, in the coordinates of the posterior."
-    picture = figures.traces(result.chains.draws, result.problem.coordinates.labels)
-    return Section("Chains", text, picture=picture)

@@ -17,6 +17,7 @@ from neusee.nodes.calibrate import (
     coarse,
     descriptor,
     descriptor_frames,
+    descriptor_release,
     descriptor_series,
     inspect_frames,
     levels,
@@ -33,6 +34,7 @@ from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 
 Release = Literal["4", "3"]
+_STEADY = 3.1  #: release of EMVA 1288 since which the variance in time excludes the difference of means
 #: what the standard wants to be told of the operating point
 OPERATING_POINT = {
     "camera": "camera",
@@ -62,6 +64,8 @@ class EmvaFrames(NamedTuple):
     spatial: Nonuniformity
     frames: int  #: least number of frames of a level
     tests: Sequence[FrameTest] = ()  #: of the frames themselves
+    release: Release = "4"  #: whose variance in time the levels have
+    stated: str = ""  #: release that the descriptor states
 
 
 def descriptor_recipe(file: Path, changes: Sequence[str] = ()) -> Recipe:
@@ -79,18 +83,21 @@ def descriptor_recipe(file: Path, changes: Sequence[str] = ()) -> Recipe:
         return load(path, changes)
 
 
-def frames_of_recipe(recipe: Recipe, store: Store, release: Release = "4") -> EmvaFrames:
+def frames_of_recipe(recipe: Recipe, store: Store, release: Release | None = None) -> EmvaFrames:
     """Return levels with the variance in time, and the dark and the lit series, of a recipe that reads frames.
 
-    In release 4 the variance of a level excludes the difference of the means of its frames; in 3 it includes it.
+    In release 4 the variance of a level excludes the difference of the means of its frames; in 3 it includes it. By
+    default the release is that which the descriptor states, and 4 where no descriptor states one.
     Raises: ValueError for a recipe that reads neither frames, a descriptor nor a table.
     """
     steps = {path: [s for s in recipe.steps.values() if s.node.path == path] for path in _READERS}
-    scatter: Any = "steady" if release == "4" else "temporal"
     if described := steps["calibrate.descriptor"]:
-        return _described(described[0], scatter)
+        stated = descriptor_release(described[0].params["file"])
+        release = release or ("3" if stated and float(stated) < _STEADY else "4")
+        return _described(described[0], _SCATTER[release])._replace(release=release, stated=stated)
+    release = release or "4"
     if reduced := steps["calibrate.reduce"]:
-        return _reduced(recipe, store, reduced, scatter)
+        return _reduced(recipe, store, reduced, _SCATTER[release])._replace(release=release)
     if tables := steps["calibrate.table"]:
         found = run(recipe, store, (tables[0].name,)).values[tables[0].name]
         dark = found.variance[found.photons == 0]
@@ -101,6 +108,7 @@ def frames_of_recipe(recipe: Recipe, store: Store, release: Release = "4") -> Em
 
 
 _READERS = ("calibrate.descriptor", "calibrate.reduce", "calibrate.table")
+_SCATTER: dict[Release, Any] = {"4": "steady", "3": "temporal"}  #: parameter of the nodes that reduce frames
 
 
 def _described(step: Step, scatter: Any) -> EmvaFrames:

@@ -26,6 +26,10 @@ _TESTED = """Each test asks if the frames are such as the model of the standard 
 allow for it. Widened: it is found, and the error of K or of the noise that may follow is small. Refused: this error may
 exceed 2 %, or is unknown. Numbers and limits of noise and patterns are in standard deviations of chance."""
 _MOMENTS = "Only moments are given, so that noise, patterns and numbers of the frames are not tested."
+_VARIANCE: dict[Release, str] = {
+    "3": "includes the difference of the means of its frames, as in release 3.0",
+    "4": "excludes the difference of the means of its frames, as since release 3.1",
+}
 _HALF = (0.45, 0.55)  #: shares of saturation that count as 50 %
 _TABLES = {
     "Quantities": ("eta", "DR_bit"),
@@ -88,17 +92,22 @@ def banner(sheet: EmvaSheet, tests: Sequence[FrameTest] = ()) -> str:
     return f"Not fit for use: {'; '.join(reasons)}." if reasons else ""
 
 
-def lead(sheet: EmvaSheet, release: Release) -> str:
-    """Return the summary of the page."""
+def temporal_variance(frames: EmvaFrames, chosen: bool) -> str:
+    """Return which variance in time the sheet has, and why; ``chosen`` is True if the user chose the release."""
+    text = f"The variance of a level {_VARIANCE[frames.release]}"
+    if not frames.stated:
+        return f"{text}."
+    if chosen:
+        return f"{text}: `--release {frames.release}`. The descriptor states release {frames.stated}."
+    other = {"3": "`--release 4` excludes it", "4": "`--release 3` includes it"}
+    return f"{text}, because the descriptor states release {frames.stated}; {other[frames.release]}."
+
+
+def lead(sheet: EmvaSheet, variance: str) -> str:
+    """Return the summary of the page; ``variance`` is the sentence of `temporal_variance`."""
     named = ("eta", "K", "sigma_d", "mu_p_min", "mu_e_sat", "SNR_max_dB", "DR_dB", "DSNU1288", "PRNU1288")
     told = "; ".join(f"{sheet[key].symbol} {sheet[key].text}" for key in named if sheet[key].value is not None)
-    kept = (
-        ""
-        if release == "4"
-        else """ The variance of a level includes the difference of the means of its frames, as in
-        release 3.0."""
-    )
-    return f"The quantities of EMVA 1288, release 4.0 Linear: {told}.{kept}"
+    return f"The quantities of EMVA 1288, release 4.0 Linear: {told}. {variance}"
 
 
 def sections(

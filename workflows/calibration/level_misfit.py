@@ -28,7 +28,13 @@ class Deviations(NamedTuple):
 
     variance: FloatArray  #: (level,), of the levels that are used, in rising order of the mean
     mean: FloatArray  #: (level,) as `variance`
-    lit: NDArray[np.bool_]  #: (level,) True for a level with light
+    photons: FloatArray  #: (level,)
+    exposure: FloatArray  #: (level,) s
+
+    @property
+    def lit(self) -> NDArray[np.bool_]:
+        """Return (level,) True for a level with light."""
+        return self.photons > 0
 
 
 class Misfit(NamedTuple):
@@ -53,16 +59,27 @@ def misfits(problem: SensorPosterior, samples: FloatArray, weights: FloatArray, 
     predict, and widths that no lamp and no electronics have.
     """
     found = left_out(problem, samples, weights)
-    largest = float(np.abs(np.concatenate([found.variance, found.mean])).max())
-    limit = _limit(ALARM / (4 * len(found.variance)))
-    text = f"a level deviates by {largest:.1f} sd from its prediction by the other levels"
-    yield Misfit("each level is predicted by the others", text, f"at most {limit:.1f} sd", largest <= limit)
+    yield _prediction(found)
     if found.lit.sum() >= _LEAST:
         for name, z in (("variances", found.variance[found.lit]), ("means", found.mean[found.lit])):
             p = min(1.0, 2 * min(runs(z), waves(z)))
             text = f"{_signs(z)} runs of sign over {len(z)} levels, waves of {_strength(z):.1f}; p = {p:.2g}"
             yield Misfit(f"the {name} deviate without a trend", text, f"a p-value above {ALARM}", p >= ALARM)
     yield from _widths(problem, theta)
+
+
+def _prediction(found: Deviations) -> Misfit:
+    """Return the test of the level that deviates most from its prediction by the others."""
+    limit = _limit(ALARM / (4 * len(found.variance)))
+    what, z = max((("variance", found.variance), ("mean", found.mean)), key=lambda each: np.abs(each[1]).max())
+    at = int(np.abs(z).argmax())
+    light = f"of {found.photons[at]:.5g} photons" if found.photons[at] else "without light"
+    text = f"the {what} of the level {light} and {found.exposure[at]:.4g} s deviates by {z[at]:+.1f} sd from its "
+    text, good = f"{text}prediction by the other levels", abs(z[at]) <= limit
+    if not good:
+        why = "its light or exposure may not be as stated" if what == "mean" else "its frames may be disturbed"
+        text += f": {why}; measure it again, or leave it out"
+    return Misfit("each level is predicted by the others", text, f"at most {limit:.1f} sd", good)
 
 
 def _widths(problem: SensorPosterior, theta: FloatArray) -> Iterator[Misfit]:
@@ -97,7 +114,7 @@ def left_out(problem: SensorPosterior, samples: FloatArray, weights: FloatArray)
     assert isinstance(levels, Levels)
     used = look.degrees_of_freedom.numpy() > 0
     order = np.argsort(levels.mean.numpy()[used])
-    return Deviations(z[0][order], z[1][order], (levels.photons.numpy()[used] > 0)[order])
+    return Deviations(*(x[order] for x in (*z, levels.photons.numpy()[used], levels.exposure.numpy()[used])))
 
 
 def runs(z: FloatArray) -> float:

@@ -144,7 +144,6 @@ def _widened(result: CalibrationResult, laboratory: Laboratory) -> CalibrationRe
     """Return a calibration with what the frames show or may hide, with what the laboratory states, and its budgets."""
     problem, tests = result.problem, result.frames
     told = result.identifiability
-    unwidened = {name: float(x.std()) for name, x in problem.parameters(result.chains.draws).items()}
     chains = widened(problem, result.chains, tests, problem.recipe.seed)
     models = widened_models(result.models, tests, problem.coordinates.prior.may_hide)
     result = replace(
@@ -152,7 +151,7 @@ def _widened(result: CalibrationResult, laboratory: Laboratory) -> CalibrationRe
         identifiability=without_efficiency(told) if is_relative(problem.recipe) else told,
         chains=with_laboratory(problem, chains, laboratory, problem.recipe.seed),
         models=with_laboratory_models(models, laboratory),
-        unwidened=unwidened,
+        walk=result.chains,
     )
     return replace(result, budgets=budgets(result, laboratory))
 

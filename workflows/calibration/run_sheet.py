@@ -18,7 +18,15 @@ from neusee.workflows.calibration.budget_page import (
     budget_sections,
 )
 from neusee.workflows.calibration.emva_frames import OPERATING_POINT, EmvaFrames, Release, frames_of_recipe
-from neusee.workflows.calibration.emva_page import banner, group_of, lead, operating_point, requirements, sections
+from neusee.workflows.calibration.emva_page import (
+    banner,
+    group_of,
+    lead,
+    operating_point,
+    requirements,
+    sections,
+    temporal_variance,
+)
 from neusee.workflows.calibration.emva_patterns import pattern_tables
 from neusee.workflows.calibration.frame_validity import as_rows
 from neusee.workflows.calibration.laboratory import is_relative, laboratory_of, stated
@@ -39,12 +47,13 @@ def write_sheet(
     runs: Path,
     command: Sequence[str] = (),
     *,
-    release: Release = "4",
+    release: Release | None = None,
     relative: bool = False,
     state: Sequence[str] = (),
 ) -> Path:
     """Write the EMVA 1288 sheet of the frames of a recipe: page, PDF, JSON, CSV and pictures; return the folder.
 
+    ``release`` says whose variance in time is taken; by default that which the descriptor states, otherwise release 4.
     With ``relative`` the photons of the recipe are known up to a factor, and nothing in photons is stated. ``state``
     has what is told of the operating point, such as ``temperature=25 °C``.
     Raises: ValueError for a recipe without frames, without dark frames or without two lit levels, and for a wrong
@@ -55,16 +64,16 @@ def write_sheet(
     frames = frames_of_recipe(recipe, store, release)
     sheet = emva_sheet(frames.levels, frames.spatial, photons_told=photons_told)
     budgets = sheet_budgets(frames.levels, sheet, laboratory, photons_told)
-    document = study_run.document(_document(sheet, frames, told, release))
-    report = _report(recipe, sheet, frames, told, release, document, budgets)
+    document = study_run.document(_document(sheet, frames, told, release is not None))
+    report = _report(recipe, sheet, frames, told, document, budgets)
     return study_run.write(runs, digest(document["quantities"]), document, report, "emva1288")
 
 
-def _document(sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any], release: Release) -> dict[str, Any]:
-    """Return the content of ``emva1288.json``."""
+def _document(sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any], chosen: bool) -> dict[str, Any]:
+    """Return the content of ``emva1288.json``; ``chosen`` is True if the user chose the release."""
     return {
         "standard": "EMVA 1288, release 4.0 Linear",
-        "temporal variance": "release 4: without the difference of means" if release == "4" else "release 3.0",
+        "temporal variance": temporal_variance(frames, chosen),
         "fails": banner(sheet, frames.tests),
         "quantities": {q.key: {"section": group_of(q, sheet), **asdict(q)} for q in sheet.quantities},
         "operating point": dict(told),
@@ -79,7 +88,6 @@ def _report(
     sheet: EmvaSheet,
     frames: EmvaFrames,
     told: Mapping[str, Any],
-    release: Release,
     document: Mapping[str, Any],
     budgets: Sequence[Budget],
 ) -> StudyReport:
@@ -88,9 +96,10 @@ def _report(
     budget = {"budget": budget_picture(named)} if named else {}
     traced = budget_sections(named, stated(recipe), budget.get("budget"), _MORE)
     summary = [f"{name}: {'not stated' if told[key] is None else told[key]}" for key, name in OPERATING_POINT.items()]
+    summary += [document["temporal variance"], _PLUS, document["fails"]]
     return StudyReport(
         title,
-        lead(sheet, release),
+        lead(sheet, document["temporal variance"]),
         sections(sheet, frames, told, pictures, traced),
         pictures | budget,
         tables={
@@ -102,7 +111,7 @@ def _report(
         files={
             "emva1288.json": as_json(document),
             "budget.json": as_json(budget_document(budgets, stated(recipe))),
-            "emva1288.pdf": emva_pdf.pdf(sheet, title, [*summary, _PLUS, document["fails"]], budgets),
+            "emva1288.pdf": emva_pdf.pdf(sheet, title, summary, budgets),
         },
         banner=document["fails"],
     )

@@ -72,7 +72,8 @@ def _say_results(folder: Path, quiet: bool, as_json: bool) -> None:
     say_folder(folder, as_json)
     if count := document["failed"]:
         wrong = "; ".join(f"{c['name']}: {c['found']}" for c in document["checks"] if c["mark"] == "fail")
-        fail(f"not fit for use: {count} checks fail ({wrong}); see {folder / 'report.html'}", MISSED)
+        checks = "1 check fails" if count == 1 else f"{count} checks fail"
+        fail(f"not fit for use: {checks} ({wrong}); see {folder / 'report.html'}", MISSED)
 
 
 def _target(sensor: str) -> Path | None:

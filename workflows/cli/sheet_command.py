@@ -15,6 +15,7 @@ from neusee.workflows.cli.command_options import AsJson, Debug, Out, Quiet, Word
 from neusee.workflows.cli.interruption import say_folder
 
 if TYPE_CHECKING:
+    from neusee.workflows.calibration.emva_frames import Release
     from neusee.workflows.graph.recipe_graph import Recipe
 
 
@@ -28,9 +29,13 @@ class StandardRelease(StrEnum):
 def sheet(
     words: Words = None,
     release: Annotated[
-        StandardRelease,
-        typer.Option("--release", help="3 keeps the difference of the means of a pair in its variance."),
-    ] = StandardRelease.four,
+        StandardRelease | None,
+        typer.Option(
+            "--release",
+            help="3 keeps the difference of the means of a pair in its variance. Default: as the descriptor states, "
+            "else 4.",
+        ),
+    ] = None,
     relative: Annotated[
         bool, typer.Option("--relative", help="Photons are known up to a factor: state nothing in photons.")
     ] = False,
@@ -56,14 +61,13 @@ def sheet(
 
     recipe, command = _loaded(words)
     said = [word for fact in state or () for word in ("--state", fact)]
-    command += [*option_words({"release": release.value, "relative": relative}), *said]
+    chosen: Release | None = None if release is None else "3" if release is StandardRelease.three else "4"
+    command += [*option_words({"release": chosen, "relative": relative}), *said]
     with failing(RunError, code=FAILED), failing(ValueError):
-        folder = write_sheet(
-            recipe, the_store(), out, command, release=release.value, relative=relative, state=state or ()
-        )
+        folder = write_sheet(recipe, the_store(), out, command, release=chosen, relative=relative, state=state or ())
     document = json.loads((folder / "emva1288.json").read_text(encoding="utf-8"))
     if not quiet and not as_json:
-        say([_line(each) for each in document["quantities"].values()])
+        say([*(_line(each) for each in document["quantities"].values()), document["temporal variance"]])
     say_folder(folder, as_json)
     if document["fails"]:
         fail(f"{document['fails']} See {folder / 'report.html'}", MISSED)

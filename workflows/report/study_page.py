@@ -15,6 +15,7 @@ from html import escape
 from pathlib import Path
 from typing import Any, Literal
 
+_LARGE, _LARGEST = 999.5, 1e6  #: real numbers between these are shown without an exponent
 _SHORT = 16  #: characters of the longest text that a table does not break at a hyphen
 _BREAK = re.compile(r"(?<=[_,/.])(?=[a-z])|(?=\[)")  #: where a long word may go on in a new line
 
@@ -76,7 +77,8 @@ def said(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, numbers.Real) and not isinstance(value, numbers.Integral):
-        return f"{float(value):.3g}"
+        text = f"{float(value):.3g}"
+        return f"{float(text):.0f}" if _LARGE <= abs(float(value)) < _LARGEST else text  # 3720 in place of 3.72e+03
     return str(value)
 
 

@@ -35,6 +35,7 @@ class _Level:
 class _Measurement:
     bits: int = 24
     shape: tuple[int, int] | None = None
+    release: str = ""  #: of EMVA 1288, as line v states it
     levels: list[_Level] = field(default_factory=list)
 
     @property
@@ -121,6 +122,14 @@ def descriptor_series(files: Sequence[Path]) -> Iterator[tuple[float, float, Ite
         yield level.photons, level.exposure, (f for _, image in level.images for f in torch.from_numpy(stack([image])))
 
 
+def descriptor_release(files: Sequence[Path]) -> str:
+    """Return the release of EMVA 1288 that line v of a descriptor states, such as ``3.0``; empty without such a line.
+
+    ``files`` is as in `descriptor_frames`.
+    """
+    return _parsed(files[0]).release
+
+
 def refuse_descriptor(file: Path) -> None:
     """Raise ValueError with the line of the mistake if a descriptor or an image that it names cannot be read."""
     refuse_unreadable("file", _with_images(file)[1:])
@@ -180,7 +189,9 @@ def _take(measurement: _Measurement, kind: str, rest: str, folder: Path, line: i
         numbers = [float(word.replace(",", ".")) for word in words]  # some laboratories write decimal commas
         if kind == "n":
             measurement.bits, measurement.shape = int(words[0]), (int(words[2]), int(words[1]))
-        elif kind != "v":
+        elif kind == "v":
+            measurement.release = words[0].replace(",", ".")
+        else:
             measurement.levels.append(_level(line, kind, numbers))
     except (ValueError, IndexError):
         raise ValueError(f"cannot read {kind} {rest!r}: write {_WORDS[kind]}") from None

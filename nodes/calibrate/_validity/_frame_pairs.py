@@ -22,6 +22,16 @@ _PILED = 5.0  #: standard deviations of counting by which numbers pile up at an 
 _LEAST = 20  #: least count of pixels that pile up
 _AT_ZERO = 5e-3  #: share of the pixels at 0, which hides numbers below 0
 _MOST = 16  #: frames of a level whose noise and patterns are tested
+#: what to do about refused frames, by the name of the test
+_REMEDIES = {
+    "white noise": "take raw frames: without denoising, sharpening, interpolation and compression",
+    "no blocks": "save the frames without compression",
+    "no lag": "reset the sensor, or take a frame that is not used, before each frame",
+    "no row noise": "remove the interference from the readout",
+    "no column noise": "remove the interference from the readout",
+    "no drift within a level": "write `scatter: steady`, or let the lamp settle",
+    "homogeneity of the light": "light the sensor evenly, or cut the frames to their even part",
+}
 _FLOOR = 1e-12  #: DN2, so that frames without noise divide by more than 0
 
 
@@ -170,7 +180,12 @@ def outcome(
     worst = max(shifts.values(), default=math.inf)
     verdict: Verdict = "refused" if worst > REFUSED else "widened"
     means = f"an error of {100 * worst:.2g} % may follow" if math.isfinite(worst) else "no model describes such frames"
-    return FrameTest(name, evidence.strength, evidence.limit, verdict, f"{sentence}: {means}", shifts)
+    text = f"{sentence}: {means}{_remedy(name, verdict)}"
+    return FrameTest(name, evidence.strength, evidence.limit, verdict, text, shifts)
+
+
+def _remedy(name: str, verdict: Verdict) -> str:
+    return f"; {_REMEDIES[name]}" if verdict == "refused" and name in _REMEDIES else ""
 
 
 def corrected(name: str, evidence: Evidence, hidden: Sequence[Hidden], sentence: str, passed: str) -> FrameTest:
@@ -183,7 +198,8 @@ def corrected(name: str, evidence: Evidence, hidden: Sequence[Hidden], sentence:
         verdict = "modelled" if worst.sd <= REFUSED else "refused"
         words = [f"{what} by {100 * x.mean:+.2g} % ± {100 * x.sd:.2g} %" for what, x in change.items() if x.sd]
         text = f"{sentence}: corrected, {' and '.join(words)}" if verdict == "modelled" else ""
-        text = text or f"{sentence}: an error of {100 * max(abs(x.mean) for x in change.values()):.2g} % may follow"
+        error = max(abs(x.mean) for x in change.values())
+        text = text or f"{sentence}: an error of {100 * error:.2g} % may follow{_remedy(name, verdict)}"
     return FrameTest(name, evidence.strength, evidence.limit, verdict, text, hidden=tuple(hidden))
 
 
@@ -192,5 +208,6 @@ def uncorrected(test: FrameTest) -> FrameTest:
     if not test.hidden or test.verdict != "modelled":
         return test
     worst = max(abs(change.mean) + change.sd for change in corrections(test.hidden).values())
+    verdict: Verdict = "refused" if worst > REFUSED else "widened"
     text = f"{test.sentence.partition(': corrected')[0]}: an error of {100 * worst:.2g} % may follow"
-    return replace(test, verdict="refused" if worst > REFUSED else "widened", sentence=text)
+    return replace(test, verdict=verdict, sentence=text + _remedy(test.name, verdict))

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 
 from neusee.nodes.calibrate._validity._block_test import blocks, products
 from neusee.nodes.calibrate._validity._frame_pairs import (
+    ALARM,
     FrameTest,
     Level,
     corrected,
+    normal_limit,
     outcome,
     strongest,
     studentised,
@@ -23,6 +25,7 @@ from neusee.nodes.calibrate._validity._hidden_faults import Hidden
 _NEAR = ((0, 1), (1, 0))  #: lags in pixels (y, x)
 _BOTH = ((1, 1), (1, -1))
 _FAR = ((0, 2), (2, 0))
+_NOISE = "the noise of neighbouring pixels"
 _MIXED = 0.02  #: scale of the prior of the share of the variance that neighbours take from each other
 _QUIET = 0.24  #: DN2, least variance of EMVA 1288
 _CORE = 1.5  #: standard deviations of the middle of a distribution that gives its robust width
@@ -59,17 +62,42 @@ def _whiteness(levels: Sequence[Level], white: Sequence[Tensor]) -> FrameTest:
         [sum(studentised(products(x, lag)) for lag in lags) / math.sqrt(2) for x in white] for lags in (_NEAR, _FAR)
     )
     evidence = strongest([near, far], sides=2)
-    hidden = []
-    for dark in (False, True):
-        chosen = [x for x, level in zip(white, levels, strict=True) if level.dark == dark]
+    darks, lit = ([x for x, each in zip(white, levels, strict=True) if each.dark == dark] for dark in (True, False))
+    of_readout = _from_readout(darks, lit)
+    text = f"{_NOISE} {_correlates(white)}"
+    sentence = f"{text}, as in frames that are mixed, denoised, interpolated or compressed"
+    if of_readout:
+        sentence = (
+            f"in the dark {_NOISE} {_correlates(darks)}, as noise of the readout does, which counts as dark noise"
+        )
+        sentence += f"; in light it {_correlates(lit)}"
+    return corrected("white noise", evidence, [*_of_mixing(darks, lit, of_readout)], sentence, text)
+
+
+def _correlates(levels: Sequence[Tensor]) -> str:
+    rows, columns = (_correlation(levels, lag) for lag in _NEAR)
+    return f"correlates by {rows:.2g} along rows and {columns:.2g} along columns"
+
+
+def _from_readout(darks: Sequence[Tensor], lit: Sequence[Tensor]) -> bool:
+    """Return True if neighbours are unlike in the dark, and more so than in light, beyond chance.
+
+    A filter that makes neighbours unlike acts on light too; those that act on weak noise alone make neighbours alike.
+    An electronic readout adds noise of any correlation, which shot noise hides in light.
+    """
+    if not darks or not lit:
+        return False
+    (dark, error), (light, other) = (_missing(levels, _NEAR) for levels in (darks, lit))
+    limit = normal_limit(ALARM)
+    return dark < -limit * error and dark - light < -limit * math.hypot(error, other)
+
+
+def _of_mixing(darks: Sequence[Tensor], lit: Sequence[Tensor], of_readout: bool) -> Iterator[Hidden]:
+    """Yield what a filter may have taken from the variance in light, and from that in the dark."""
+    for chosen, gain, noise in ((lit, 1.0, 0.5 * of_readout), (() if of_readout else darks, 0.0, 0.5)):
         for lags, scale in ((_NEAR, _MIXED), ((*_BOTH, *_FAR), _MIXED / 2)):
             if chosen:  # noise that is made correlated, as by rows of a readout, lacks nothing in the dark
-                gain, noise = (0.0, 0.5) if dark else (1.0, 0.0)
-                hidden.append(Hidden("mixing", *_missing(chosen, lags), scale, gain, noise, partly=dark))
-    rows, columns = (_correlation(white, lag) for lag in _NEAR)
-    text = f"the noise of neighbouring pixels correlates by {rows:.2g} along rows and {columns:.2g} along columns"
-    sentence = f"{text}, as in frames that are mixed, denoised, interpolated or compressed"
-    return corrected("white noise", evidence, hidden, sentence, text)
+                yield Hidden("mixing", *_missing(chosen, lags), scale, gain, noise, partly=noise > 0)
 
 
 def _missing(levels: Sequence[Tensor], lags: Sequence[tuple[int, int]]) -> tuple[float, float]:

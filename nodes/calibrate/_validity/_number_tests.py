@@ -50,6 +50,7 @@ def _codes(levels: Sequence[Level]) -> FrameTest:
         text += f": all numbers are {int(present[0])} plus a multiple of {step}: a bit is stuck, or shifted"
     else:
         text += ": a bit is stuck, or the numbers were stretched or compressed"
+    text += "; take the numbers as the converter gives them"
     return FrameTest("no missing codes", float(number), 0.0, "refused", text)
 
 

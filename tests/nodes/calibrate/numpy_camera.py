@@ -19,6 +19,7 @@ FAULTS = {
     "black": "standard deviations of the dark above its mean at which the black is cut, and set to 0",
     "rows": "e-, noise that a whole row shares",
     "columns": "e-, noise that a whole column shares",
+    "coloured": "share of the read noise of a pixel that the next pixel of its row has with the other sign",
     "compression": "DN, step of the cosines of blocks of 8 x 8 pixels",
     "drift": "relative change of the lamp within a pair",
     "lamp": "relative scatter of the lamp from level to level",
@@ -82,10 +83,14 @@ class Camera:
 
     def _electrons(self, rng, mean, exposure):
         shape = (self.size, self.size)
-        electrons = rng.poisson(mean + (5 + self._hot) * exposure) + self.noise * rng.standard_normal(shape)
+        electrons = rng.poisson(mean + (5 + self._hot) * exposure) + self.noise * self._read(rng.standard_normal(shape))
         electrons += self._dsnu + 60 * (self._jumping & (rng.random(shape) < 0.5))
         electrons += self._of("rows") * rng.standard_normal((self.size, 1))
         return electrons + self._of("columns") * rng.standard_normal((1, self.size))
+
+    def _read(self, white):
+        share = self._of("coloured")
+        return (white - share * np.roll(white, 1, 1)) / np.sqrt(1 + share**2)
 
     def _numbers(self, rng, electrons):
         m = self._of("mixing")

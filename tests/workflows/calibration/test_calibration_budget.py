@@ -53,7 +53,7 @@ def test_the_statistics_of_the_frames_are_the_scatter_under_the_same_lamp(tmp_pa
     draws = mode.draw(2000, rng).reshape(4, 100, 5, -1)
     chains = Chains(draws, np.zeros(draws.shape[:-1]), 0.5, 1.0, 100, True)
     unwidened = {name: float(x.std()) for name, x in problem.parameters(draws).items()}
-    result = CalibrationResult(problem, mode, identify(problem, mode), chains, [], unwidened=unwidened)
+    result = CalibrationResult(problem, mode, identify(problem, mode), chains, [])
     lines = {b.key: {c.source: c.share or 0.0 for c in b.contributions} for b in budgets(result, Laboratory())}
     for name in ("gain", "quantum_efficiency", "temporal_dark_noise"):
         scatter = np.std([each[name] for each in found], ddof=1)

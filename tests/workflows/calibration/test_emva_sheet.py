@@ -159,6 +159,58 @@ def test_release_3_keeps_the_drift_of_a_pair(archive, tmp_path):
         assert float(of["4"].variance[i]) == pytest.approx(steady, rel=1e-12)
 
 
+DRIFT = 30  # DN, between the frames of a pair
+
+
+@pytest.fixture(scope="module")
+def drifting(tmp_path_factory):
+    """The lines of a descriptor after its line v; the second frame of each pair is brighter."""
+    folder, rng = tmp_path_factory.mktemp("drifting"), np.random.default_rng(5)
+    text = [f"n 12 {SHAPE[1]} {SHAPE[0]}"]
+    for photons in (0, 4000, 8000):
+        text.append(f"b 10000000 {photons}" if photons else "d 10000000")
+        for i, frame in enumerate(exposed(rng, photons, 2)):
+            np.save(folder / f"{photons}_{i}.npy", frame + np.uint16(DRIFT * i))
+            text.append(f"i {folder / f'{photons}_{i}.npy'}")
+    return text
+
+
+@pytest.mark.parametrize(
+    ("stated", "option", "kept", "said"),
+    [
+        ("v 3.0", None, True, "includes the difference of the means of its frames, as in release 3.0, because the "
+         "descriptor states release 3.0; `--release 4` excludes it."),
+        ("v 3,0", None, True, "the descriptor states release 3.0; `--release 4`"),
+        ("v 3.1", None, False, "because the descriptor states release 3.1; `--release 3` includes it."),
+        ("v 4.0", None, False, "because the descriptor states release 4.0"),
+        ("v 3.0", "4", False, ": `--release 4`. The descriptor states release 3.0."),
+        ("v 4.0", "3", True, ": `--release 3`. The descriptor states release 4.0."),
+        ("# release 3.0, but only as a comment", None, False, "as since release 3.1."),
+    ],
+)  # fmt: skip
+def test_the_release_is_that_of_the_descriptor_unless_the_user_says_another(
+    stated, option, kept, said, neusee, drifting, tmp_path
+):
+    file = tmp_path / "set.txt"
+    file.write_text("\n".join([stated, *drifting]))
+    _, out, err = neusee(str(file), *(("--release", option) if option else ()))
+    folder = results(out, tmp_path)
+    with (folder / "transfer.csv").open(newline="") as opened:
+        lit = [row for row in csv.DictReader(opened) if float(row["photons"])]
+    for row in lit:
+        one, two = (np.load(drifting[-1][2:].replace("8000_1", f"{float(row['photons']):.0f}_{i}")) for i in (0, 1))
+        apart = one.astype(float) - two
+        bare = (apart.var() + kept * apart.mean() ** 2) / 2
+        assert float(row["variance"]) == pytest.approx(bare, rel=1e-3)
+        assert apart.mean() ** 2 / 2 > 0.3 * apart.var() / 2, "the drift is large enough to tell both"
+    sentence = out.splitlines()[-2]
+    assert said in sentence, (out, err)
+    assert json.loads((folder / "emva1288.json").read_text())["temporal variance"] == sentence
+    assert sentence.replace("`", "") in re.sub(r"<[^>]*>|`", "", (folder / "report.html").read_text())
+    command = json.loads((folder / "provenance.json").read_text())["command"]
+    assert command.endswith(f" --release {option}" if option else "set.txt")
+
+
 def test_relative_light_and_tables_without_frames(neusee, tmp_path):
     code, out, _ = neusee("calibrate_camera", "--relative")
     found = json.loads((results(out, tmp_path) / "emva1288.json").read_text())["quantities"]

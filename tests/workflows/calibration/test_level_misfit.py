@@ -82,6 +82,25 @@ def test_what_the_deviance_does_not_find_is_a_misfit(folder, change, name):
     assert fit.good  # the free widths take the misfit up
 
 
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda i, x, rng: (1.06, 1.06) if i == 4 else (1.0, 1.0), "mean of the level {} deviates by +"),
+        (lambda i, x, rng: (0.94, 0.94) if i == 4 else (1.0, 1.0), "mean of the level {} deviates by -"),
+        (lambda i, x, rng: (1.0, 1.15 if i == 4 else 1.0), "variance of the level {} deviates by +"),
+    ],
+    ids=["brighter", "darker", "noisier"],
+)
+def test_the_level_that_deviates_is_named_with_what_to_do(folder, change, says):
+    found, _, _ = looked_at(folder, change=change)
+    rows = list(csv.DictReader((folder / "levels.csv").read_text().splitlines()))
+    lit = [row for row in rows if float(row["photons"]) > 0]
+    name = f"of {float(lit[4]['photons']):.5g} photons and {float(lit[4]['exposure_s']):.4g} s"
+    assert found[PREDICTED].found.startswith(f"the {says.format(name)}")
+    assert found[PREDICTED].found.endswith("measure it again, or leave it out")
+    assert PREDICTED in wrong(found)
+
+
 def test_no_laboratory_has_such_a_lamp(folder):
     found, _, _ = looked_at(folder, lamp=0.2)
     assert LAMP in wrong(found)

@@ -7,9 +7,10 @@ from scipy.integrate import quad
 
 from neusee.nodes import calibrate
 from neusee.workflows.calibration import calibration_figures, emcee_sampler, importance_sampling, posterior_checks
-from neusee.workflows.calibration.calibration_page import ring_radii, unit_of
+from neusee.workflows.calibration.calibration_page import unit_of
 from neusee.workflows.calibration.identifiability import identify, identify_from_draws
 from neusee.workflows.calibration.importance_sampling import draw_guide, draw_samples, weights
+from neusee.workflows.calibration.picture_sections import ring_radii
 from neusee.workflows.calibration.posterior_checks import importance_samples
 from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
 from tests.workflows.calibration.simulated_lenses import (

@@ -167,7 +167,8 @@ def _document(path: Path) -> Posterior:
         return summary(doc)
     if doc.get("failed"):
         failed = [check["name"] for check in doc.get("checks", ()) if check["mark"] == "fail"]
-        raise ValueError(f"the calibration cannot be used: {doc['failed']} checks fail ({'; '.join(failed)})")
+        checks = "1 check fails" if doc["failed"] == 1 else f"{doc['failed']} checks fail"
+        raise ValueError(f"the calibration cannot be used: {checks} ({'; '.join(failed)})")
     joint = read_posterior(path.with_name("draws.npz")).joint
     assert joint.draws is not None
     rows = {POSTERIOR_NAMES.get(name, name): row for name, row in doc["parameters"].items()}

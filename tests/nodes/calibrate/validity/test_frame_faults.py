@@ -17,6 +17,11 @@ _spec.loader.exec_module(numpy_camera)
 UNEQUAL = {"prnu": 0.01, "dsnu": 3, "lamp": 0.015}
 FIXED = [({"dsnu": 8}, "noise"), ({"prnu": 0.02}, "gain"), ({"drift": 0.02}, "gain")]
 SLOW = pytest.mark.slow
+#: tests whose refusal says what to do; telegraph pixels are a property of the sensor
+TOLD = (
+    "white noise", "no lag", "no missing codes", "no pile at the lowest number", "no row noise", "no column noise",
+    "no blocks",
+)  # fmt: skip
 #: fault, test that must find it, and verdict
 PLANTED = [
     ({"mixing": 0.03}, "white noise", "refused"),
@@ -60,6 +65,8 @@ def test_a_planted_fault_is_found_by_its_test(faults, name, verdict):
     test = found(camera(1, faults))[name]
     assert test.verdict == verdict
     assert test.number > test.limit
+    said = test.sentence.split("; ")[-1]
+    assert said.startswith(("take ", "reset ", "raise ", "remove ", "save ")) == (name in TOLD and verdict == "refused")
 
 
 @pytest.mark.parametrize("faults", [{}, UNEQUAL, {"hot": 0.01}, {"truncation": 1}, {"knee": 0.5}])

@@ -265,7 +265,7 @@ def test_what_cannot_be_taken_of_a_posterior_is_refused(calibrated, said, messag
 
 
 def test_a_calibration_that_is_not_fit_for_use_is_refused(calibrated):
-    with pytest.raises(RecipeError, match="the calibration cannot be used: 1 checks fail \\(chains agree\\)"):
+    with pytest.raises(RecipeError, match="the calibration cannot be used: 1 check fails \\(chains agree\\)"):
         load("first_light", [f"posterior={calibrated(failed=1)}"])
 
 
