@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Generator, Tensor
@@ -12,12 +13,15 @@ from torch.nn.functional import avg_pool2d
 from neusee.nodes.restore._inverse._frame_spectrum import fitted_law
 from neusee.nodes.restore._inverse._hidden_pixels import Inverses, most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred, blurred, mixed
+from neusee.nodes.restore._inverse._scene_level import drawn_blotches
 from neusee.nodes.restore._inverse._wiener import Scaled, wrapped
 
 _DETAIL = 5  #: pixels a side; what differs from its mean over such a square is a detail
 _NEAR = 11  #: pixels a side of the square around a pixel whose details tell of this pixel
 _SMOOTH = 7  #: pixels a side of the square over which the variance of few draws is averaged
 _KNOWN = 0.02  #: share of known pixels around a pixel, below which nothing around it tells of details
+_COARSE = 2.0  #: mean square of errors of photographs averaged over 11 x 11 pixels, over that of scenes of their law
+_SHOWN = 0.2  #: part of the energy of details that is restored, from which on a lack of them tells
 _DARK = 1e-30  #: added to energies
 
 
@@ -30,26 +34,50 @@ def frame_deviation(
     The variance of details (errors of a scene less their mean over 11 x 11 pixels) grows and falls with the energy of
     the details of the restored picture around a pixel, relative to that of the restored draws: an edge has larger
     errors than a sky. Where the picture has more details than the draws, the rest of the variance grows as well.
+    Low frequencies of photographs vary about a power law, by `_COARSE`, and are not below those of the prior. What is
+    not known of a scene behind glare is drawn too.
     ``kernels`` (any, channel, y, x) are PSFs that blur the drawn scenes in turn, in place of the PSF of the filter.
     """
     problem, inverses = scaled.problem, Inverses()
     scenes = max(1, draws // 2)
     noises = max(1, draws - scenes - 1)
     with torch.no_grad():
-        law = fitted_law(problem)
+        law = fitted_law(problem, scaled.doubt)
         own = _details(problem.first(most_likely(problem, inverses=inverses)))
-    coarse = fine = noisy = problem.picture.new_zeros(len(matrix), *own.shape)
-    drawn = torch.zeros_like(own)
-    for error, restored in _of_scenes(scaled, law.power, scenes, rng, kernels, inverses):
-        smooth = _around(error, _NEAR)
-        coarse, fine = coarse + _square(smooth, matrix) / scenes, fine + _square(error - smooth, matrix) / scenes
-        drawn = drawn + _details(restored) / scenes
+    drawn = _of_scenes(scaled, law.power, scenes, rng, kernels, inverses)
+    found = _Scenes.of(drawn, scenes, scaled, matrix)
+    noisy, details = torch.zeros_like(found.coarse), found.restored
     for error in _of_noise(scaled, law.noise**0.5, noises, rng, inverses):
         noisy = noisy + _square(scaled.scale / scaled.share * error, matrix) / noises
-        drawn = drawn + _details(error) / noises
-    ratio = _ratio(own, drawn, problem.weight)
-    total: Tensor = ratio * _around(fine, _SMOOTH) + ratio.clamp_min(1.0) * _around(coarse + noisy, _SMOOTH)
+        details = details + _details(error) / noises
+    ratio = _ratio(own, details, problem.weight)
+    ratio = ratio.where(ratio > 1.0, ratio**found.told)  # a lack of details means little where none could be seen
+    slow = _COARSE * law.low * found.coarse + noisy
+    total: Tensor = ratio * _around(found.fine, _SMOOTH) + ratio.clamp_min(1.0) * _around(slow, _SMOOTH)
     return total.sqrt()
+
+
+class _Scenes(NamedTuple):
+    """Mean squares over drawn scenes, (colour, y, x) of errors and (y, x) of details."""
+
+    coarse: Tensor  #: of errors averaged over the pixels near
+    fine: Tensor  #: of the rest of the errors
+    restored: Tensor  #: of restored details
+    told: Tensor  #: from 0 to 1, how far a lack of restored details near a pixel tells of a lack of details
+
+    @classmethod
+    def of(cls, drawn: Iterator[tuple[Tensor, Tensor]], count: int, scaled: Scaled, matrix: Tensor) -> _Scenes:
+        """Return the mean squares of drawn errors and restored scenes."""
+        coarse = fine = scaled.problem.picture.new_zeros(len(matrix), *scaled.problem.picture.shape[-2:])
+        restored = true = torch.zeros_like(coarse[0])
+        for error, seen in drawn:
+            smooth = _around(error, _NEAR)
+            coarse = coarse + _square(smooth, matrix) / count
+            fine = fine + _square(error - smooth, matrix) / count
+            restored = restored + _details(seen) / count
+            true = true + _details(seen + error * scaled.share / scaled.scale) / count
+        told = (_around(restored, _NEAR) / (_SHOWN * _around(true, _NEAR) + _DARK)).clamp(max=1.0)
+        return cls(coarse, fine, restored, told)
 
 
 def drawn_scene(problem: Blurred, power: Tensor, rng: Generator) -> Tensor:
@@ -103,6 +131,8 @@ def _of_noise(scaled: Scaled, factor: float, draws: int, rng: Generator, inverse
     for _ in range(draws):
         with torch.no_grad():
             noise = factor * drawn_noise(scaled.problem, rng)
+            if scaled.doubt is not None:
+                noise = noise + drawn_blotches(scaled.doubt.blotches, rng)
             error = scaled.problem.first(most_likely(replace(scaled.problem, picture=noise), inverses=inverses))
         yield error
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from neusee.nodes.restore._inverse._masked_blur import Blurred, Size
+from neusee.nodes.restore._inverse._masked_blur import variance as variance_of
+from neusee.nodes.restore._inverse._scene_level import SceneDoubt
 
 _SLOPES = (2.0, 4.0, 9)  #: first, last and number of the exponents that are tried; scenes have 2 to 4
 _POWERS = (-7.0, 1.0, 25)  #: of e, times the variance that explains the whole frame
@@ -16,6 +19,8 @@ _MOST = 20_000  #: frequencies that count, at most
 _LOWEST = 3.0  #: cycles in the picture, below which the window mixes frequencies
 _SURE = 0.75  #: quantile of the weights of pixels, above which a pixel counts fully
 _SAMPLE = 1 << 20  #: pixels from which this quantile is taken, at most
+_PRIOR = 1.0  #: standard deviation of the logarithm of the variance of a scene, over that of the filter
+_ALIKE = 4.0  #: frequencies of a window that tell the same
 
 
 class FrameLaw(NamedTuple):
@@ -23,15 +28,17 @@ class FrameLaw(NamedTuple):
 
     power: Tensor  #: half a spectrum of the torus
     noise: float  #: variance of the noise over the variance that the filter assumes
+    low: float = 1.0  #: factor of the power, at least 1, by which the variance is not below that of the prior
 
 
-def fitted_law(problem: Blurred) -> FrameLaw:
+def fitted_law(problem: Blurred, doubt: SceneDoubt | None = None) -> FrameLaw:
     """Return the law of a frame of the highest debiased Whittle likelihood.
 
     The power of the scene is A (f^2 + 1 / pixels)^(-b / 2), as the prior of the filter, whose b is 3. The likelihood
     compares the periodogram of the frame with its exact expectation: the correlation of the blurred scene times that of
     the window. So light that the window or a hole moves to other frequencies, such as the zeros of a PSF, is expected
-    there. The window falls to the edges and, with the weight of a pixel, near glare that is not known.
+    there. The window falls to the edges and, with the weight of a pixel, near glare that is not known. ``doubt`` says
+    what is not known of mean and variance of the scene; without it the variance is nearly 1 before the frame is seen.
     Source: Sykulski, Olhede, Guillaumin, Lilly and Early, Biometrika 106, 251 (2019).
     """
     window = _window(problem)
@@ -51,10 +58,19 @@ def fitted_law(problem: Blurred) -> FrameLaw:
     for exponent in torch.linspace(*_SLOPES[:2], int(_SLOPES[2])).tolist():
         law = _sampled(_expected(problem, exponent, lags), far, step)
         unit = float(found.sum() / law.sum().clamp_min(1e-30))
-        loss, times, extra = _likeliest(found, unit * law, level)
+        loss, times, extra = _likeliest(found, unit * law, level, _before(problem, doubt, exponent) - math.log(unit))
         if loss < best:
             best, slope, strength, factor = loss, exponent, unit * times, extra
-    return FrameLaw(strength * _law(problem, slope), factor)
+    power = strength * _law(problem, slope)
+    low = max(1.0, math.exp(_before(problem, doubt, slope)) / max(strength, 1e-30))
+    power[0, 0] += doubt.mean * problem.torus[0] * problem.torus[1] if doubt else 0.0
+    return FrameLaw(power, factor, low)
+
+
+def _before(problem: Blurred, doubt: SceneDoubt | None, slope: float) -> float:
+    """Return the logarithm of the strength of a law that gives a scene the variance it is expected to have."""
+    expected = doubt.contrast if doubt else 1.0
+    return math.log(expected / float(variance_of(_law(problem, slope), problem.torus)))
 
 
 def _window(problem: Blurred) -> Tensor:
@@ -95,14 +111,20 @@ def _sampled(spectrum: Tensor, far: Tensor, step: int) -> Tensor:
     return sampled
 
 
-def _likeliest(found: Tensor, law: Tensor, noise: Tensor) -> tuple[float, float, float]:
-    """Return the least loss of a law, its strength, and the factor of the noise, which grows while the loss falls."""
+def _likeliest(found: Tensor, law: Tensor, noise: Tensor, middle: float) -> tuple[float, float, float]:
+    """Return the least loss of a law, its strength, and the factor of the noise, which grows while the loss falls.
+
+    The logarithm of the strength has the mean ``middle`` before the frame is seen.
+    """
     best = (float("inf"), 0.0, 1.0)
+    many = len(found) / _ALIKE
     for factor in _NOISES:
         here = (float("inf"), 0.0, factor)
         for strength in torch.linspace(*_POWERS[:2], int(_POWERS[2])).exp().tolist():
             expected = strength * law + factor * noise
-            here = min(here, (float((expected.log() + found / expected).mean()), strength, factor))
+            loss = float((expected.log() + found / expected).mean())
+            loss += ((math.log(strength) - middle) / _PRIOR) ** 2 / many
+            here = min(here, (loss, strength, factor))
         if here[0] >= best[0]:
             break
         best = here

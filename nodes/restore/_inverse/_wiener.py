@@ -19,6 +19,7 @@ from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred, variance
 from neusee.nodes.restore._inverse._picture_scale import expected_variance, picture_noise, power_of_two, shared_level
 from neusee.nodes.restore._inverse._scattered_glare import scattered
+from neusee.nodes.restore._inverse._scene_level import SceneDoubt, scene_doubt, told_of_scene
 from neusee.nodes.sensor._digitization import crop
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf
@@ -174,6 +175,7 @@ class Scaled(NamedTuple):
     mean: Tensor  #: (channel, 1, 1), of the scene
     share: Tensor  #: (channel, 1, 1), powers of two by which the PSF was divided
     kernels: Tensor  #: (channel, any, any), the PSF of each channel, divided by ``share``
+    doubt: SceneDoubt | None = None  #: of a scene behind glare
 
     def pixels(self, spectrum: Tensor) -> Tensor:
         """Return the contrast of a scene in e-, given its spectrum."""
@@ -233,9 +235,9 @@ def posed(
     size = torus((y, x), edge(kernels, (y, x)))
     transfer, power = torch.fft.rfft2(wrapped(kernels, size)), fall(size).to(kernels)
     found = average((picture - mean).square(), trusted)
-    passed = expected_variance(transfer, power, size)
-    contrast = torch.maximum(found - mean - read**2 - wrong, 0.01 * found) / passed.clamp_min(1e-6)
-    scale = contrast.clamp_min(1e-6).sqrt()
+    passed = expected_variance(transfer, power, size).clamp_min(1e-6)
+    told = mean, (found - mean - read**2 - wrong) / passed
+    scale = torch.maximum(told[1], 0.01 * found / passed).clamp_min(1e-6).sqrt()
     if scatter and white is not None and light.modes:
         trust = trusted.sum((-2, -1), keepdim=True) / known.sum((-2, -1), keepdim=True) * some
         mean, scale = (shared_level(x, trust.detach(), white) for x in (mean.clamp_min(1.0), scale))
@@ -243,7 +245,12 @@ def posed(
     weight = known * (scale / noise.sqrt()).square()
     scaled = tuple(pattern / scale for pattern in (*glare.patterns, *light.modes))
     problem = Blurred((picture - mean) / scale, weight, transfer, power, size, GREY, scaled, bounded=len(light.modes))
-    return Scaled(problem, scale, mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None] / share, share, kernels)
+    bright = mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None] / share
+    if not scatter:
+        return Scaled(problem, scale, bright, share, kernels)
+    full = float(electrons.detach().max())
+    both = told_of_scene(*told, wrong / passed, light, trusted, (some == 0) * full)
+    return Scaled(problem, scale, bright, share, kernels, scene_doubt((mean, scale), both, white, full, light))
 
 
 def _doubted(

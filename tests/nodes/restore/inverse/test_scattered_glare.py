@@ -97,10 +97,11 @@ def test_a_picture_is_restored_better_when_light_is_scattered_and_as_well_when_n
     assert errors[1, 0] < errors[1, 1] + 0.05
 
 
-def test_the_interval_knows_of_scattered_light():
+@pytest.mark.parametrize("strength", [1e7, 1e9])
+def test_the_interval_knows_of_scattered_light(strength):
     shares = []
     for seed in (6, 7):
-        true, seen, told = frame(1e7, (0.2, 0.01, 0.02), seed)
+        true, seen, told = frame(strength, (0.2, 0.01, 0.02), seed)
         known = seen < WELL
         error = restored(seen, told, True) - true
         more = {"before": [torch.eye(3, dtype=torch.float64)], "rng": torch.Generator().manual_seed(seed)}
