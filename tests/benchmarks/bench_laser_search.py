@@ -2,13 +2,16 @@
 
     python tests/benchmarks/bench_laser_search.py results.jsonl --seeds 1000 40
     python tests/benchmarks/bench_laser_search.py results.jsonl --seeds 1000 50 --only empty --side 64
+    python tests/benchmarks/bench_laser_search.py results.jsonl --seeds 1000 40 --only lasers --wrong
     python tests/benchmarks/bench_laser_search.py results.jsonl --report
 
 The frames come from `tests/nodes/restore/lasers/own_camera.py`, a camera in NumPy alone. Each seed makes, for each
 mask, two frames without a laser, one of them with lamps, one with a laser of 1000 or more, and one with a weaker laser.
-``--only`` keeps the frames without a laser, or those with one. A frame that stands in the file is not computed again,
-so that a run that was stopped continues. The patterns on the axis, which depend on the mask alone, are computed once.
-Intervals of rates are those of Clopper and Pearson, 90 %.
+``--only`` keeps the frames without a laser, those with one, or those with one of 1000 or more. With ``--wrong`` the
+camera has the errors of `bench_restored_frames.py`, of which the search is not told: defocus, half a pixel of tilt,
+grains of dirt, another illuminant. The tilt moves the spot that counts as true, because no frame can tell it from a
+direction. A frame that stands in the file is not computed again, so that a run that was stopped continues. The patterns
+on the axis, which depend on the mask alone, are computed once. Intervals of rates are of 90 % (Clopper and Pearson).
 """
 
 import argparse
@@ -27,37 +30,53 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 from neusee.nodes.restore._lasers import _find_lasers  # noqa: E402
+from tests.benchmarks import bench_restored_frames as wrong_camera  # noqa: E402
+from tests.benchmarks.bench_restored_intervals import recipe_daylight  # noqa: E402
 from tests.nodes.restore.lasers import own_camera as own  # noqa: E402
 from tests.nodes.restore.lasers.as_inputs import found_in, kept_templates  # noqa: E402
 
 MASKS = ("plain", "half_ring", "cubic")
 STRONG, WEAK = (1e3, 1e4, 1e5, 1e6), (1.0, 10.0, 100.0)
 KINDS = ("sample", "leaves", "noise")
+KEPT = {None: lambda s: True, "empty": lambda s: s == 0, "lasers": lambda s: s > 0, "strong": lambda s: s >= STRONG[0]}
 
 
-def cases(seed):
+def cases(seed, masks=MASKS):
     """Name, mask, strength and number of lamps of each frame of a seed."""
-    for mask in MASKS:
+    for mask in masks:
         yield f"{mask}-none", mask, 0.0, 0
         yield f"{mask}-lamps", mask, 0.0, 1 + seed % 3
         yield f"{mask}-strong", mask, STRONG[seed % len(STRONG)], 0
         yield f"{mask}-weak", mask, WEAK[seed % len(WEAK)], 0
 
 
-def row(seed, name, mask, strength, lamps, side):
-    """What is true of one frame, and what was found."""
+def taken(seed, name, mask, strength, lamps, side, wrong):
+    """A frame, what it shows, and the place of the spot in pixels from the middle."""
     rng = np.random.default_rng([seed, *name.encode()])
     kind = KINDS[int(rng.integers(len(KINDS)))]
     spot, wavelength = tuple(rng.uniform(-0.35, 0.35, 2) * side), rng.uniform(420e-9, 670e-9)
     lasers = [own.Laser(spot, wavelength, strength)] if strength else []
-    frame = own.frame(mask, kind, side, lasers, rng, lamps)
+    if wrong:
+        own.scene_psf.cache_clear()  # of seeds that do not come again
+    frame = own.frame(f"{mask}~{seed}" if wrong else mask, kind, side, lasers, rng, lamps)
+    if wrong:
+        bend = own.silica(wavelength) / own.silica(550e-9)  # the tilt is one of glass
+        spot = np.add(spot, bend * np.array(wrong_camera.tilt_of(seed)))
+    return frame, kind, lasers, list(map(float, spot)), wavelength
+
+
+def row(seed, name, mask, strength, lamps, side, wrong):
+    """What is true of one frame, and what was found."""
+    frame, kind, lasers, spot, wavelength = taken(seed, name, mask, strength, lamps, side, wrong)
     start = time.process_time()
-    found = found_in(frame, mask)
+    with patch.object(own, "daylight", recipe_daylight if wrong else own.daylight):
+        found = found_in(frame, mask)
     pixel = own.PITCH / own.FOCAL
     return {
         "seed": seed, "name": name, "side": side, "mask": mask, "strength": strength, "lamps": lamps, "kind": kind,
+        "camera": "wrong" if wrong else "exact",
         "clipped": float(frame.clipped.any(0).mean()), "seconds": round(time.process_time() - start, 2),
-        "spot": list(spot), "nm": wavelength * 1e9, "channels": lasers[0].channels.tolist() if lasers else None,
+        "spot": spot, "nm": wavelength * 1e9, "channels": lasers[0].channels.tolist() if lasers else None,
         "number": int(found.number), "found_spot": (found.direction[0] / pixel).tolist(),
         "spot_ends": (found.direction_interval[0] / pixel).tolist(), "found_nm": float(found.wavelength[0]) * 1e9,
         "nm_ends": (found.wavelength_interval[0] * 1e9).tolist(), "found_channels": found.strength[0].tolist(),
@@ -66,18 +85,20 @@ def row(seed, name, mask, strength, lamps, side):
     }  # fmt: skip
 
 
-def run(path, first, count, side, only):
+def run(path, first, count, side, only, wrong):
     """Append the frames that the file lacks."""
-    done = {(r["seed"], r["name"], r["side"]) for r in rows(path)}
+    camera = "wrong" if wrong else "exact"
+    done = {(r["seed"], r["name"], r["side"], r.get("camera", "exact")) for r in rows(path)}
     keep = functools.cache(kept_templates)
-    for seed in range(first, first + count):
-        for name, mask, strength, lamps in cases(seed):
-            if (seed, name, side) in done or only == ("lasers" if strength == 0 else "empty"):
-                continue
-            with patch.object(_find_lasers, "line_templates", lambda *_, mask=mask: keep(mask, side)):
-                each = row(seed, name, mask, strength, lamps, side)
-            with path.open("a") as file:
-                file.write(json.dumps(each) + "\n")
+    with patch.object(own, "pupil", wrong_camera.true_pupil):
+        for seed in range(first, first + count):
+            for name, mask, strength, lamps in cases(seed, wrong_camera.MASKS if wrong else MASKS):
+                if (seed, name, side, camera) in done or not KEPT[only](strength):
+                    continue
+                with patch.object(_find_lasers, "line_templates", lambda *_, mask=mask: keep(mask, side)):
+                    each = row(seed, name, mask, strength, lamps, side, wrong)
+                with path.open("a") as file:
+                    file.write(json.dumps(each) + "\n")
 
 
 def rows(path):
@@ -146,11 +167,12 @@ if __name__ == "__main__":
     parser.add_argument("file", type=Path)
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "COUNT"))
     parser.add_argument("--side", type=int, default=128, help="pixels a side")
-    parser.add_argument("--only", choices=["empty", "lasers"])
+    parser.add_argument("--only", choices=["empty", "lasers", "strong"])
+    parser.add_argument("--wrong", action="store_true", help="a camera with errors that the search is not told")
     parser.add_argument("--report", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
     if given.seeds:
-        run(given.file, *given.seeds, given.side, given.only)
+        run(given.file, *given.seeds, given.side, given.only, given.wrong)
     if given.report:
         report(rows(given.file))

@@ -97,6 +97,12 @@ FILES = {
 own_pupil = own.pupil
 
 
+def tilt_of(seed):
+    """Pixels (y, x) by which the tilt of a seed moves the picture, half a pixel in all."""
+    towards = np.random.default_rng([seed, 99]).uniform(0, 2 * np.pi)
+    return 0.5 * np.cos(towards), 0.5 * np.sin(towards)
+
+
 @functools.lru_cache(64)
 def true_pupil(name):
     """Aperture and height of a mask; a name such as `half_ring~3` has the errors of seed 3."""
@@ -114,8 +120,9 @@ def true_pupil(name):
     rng = np.random.default_rng([int(seed), 99])
     at = (np.arange(own.SAMPLES) - (own.SAMPLES - 1) / 2) / (own.SAMPLES / 2)
     v, u = np.meshgrid(at, at, indexing="ij")
-    towards = rng.uniform(0, 2 * np.pi)
-    tilt = 0.5 * own.PITCH * (own.DIAMETER / 2) / own.FOCAL * (v * np.cos(towards) + u * np.sin(towards))
+    rng.uniform()  # which has drawn the tilt
+    down, right = tilt_of(int(seed))
+    tilt = own.PITCH * (own.DIAMETER / 2) / own.FOCAL * (v * down + u * right)
     path = rng.choice([-1, 1]) * 0.1 * 550e-9 * (v**2 + u**2) + tilt
     clean = np.ones_like(inside)
     for y, x, r in zip(*rng.uniform(-1, 1, (2, 40)), rng.uniform(0.01, 0.04, 40), strict=True):

@@ -12,15 +12,15 @@ from neusee.nodes.restore._lasers._candidates import Candidate, Templates, candi
 from neusee.nodes.restore._lasers._censored import censored
 from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Lamp, LampLight, Laser
 from neusee.nodes.restore._lasers._joint_fit import Data, Fit, Parts, fitted, misfit_of
-from neusee.nodes.restore._lasers._line_pattern import grid_patterns, response_at
+from neusee.nodes.restore._lasers._nearest import FAR, nearest, nearest_of_many
 from neusee.nodes.restore._lasers._whitening import Filter, Weights, filter_of, noise_of, weights_of
 
 _AHEAD = 10.0  #: log likelihood by which a laser is ahead of a lamp at least
 _SAME = (2.0, 25.0)  #: pixels and nm, within which two lasers are one
-_HALVES, _NEAR = (-0.6, -0.3, 0.0, 0.3, 0.6), (-3.0, -1.5, 0.0, 1.5, 3.0)  #: pixels and nm around a candidate
-_AROUND = 256  #: pixels a side of the window in which these are compared
 _FEW = 4  #: clipped pixels, fewer of which need no explanation
 _TRIED = 2  #: candidates that are fitted before one of them is chosen
+_LEFT = 0.25  #: share of the clipped pixels that no part explains, from which on one more is sought farther away
+_ODD = 6.25  #: sum of squares of the errors of three responses, which one laser in ten exceeds by chance
 _CLIPPED = 4  #: candidates for clipped pixels, whose surroundings are searched before any is fitted
 _BEHIND = 0.25  #: share of a gain, candidates below which are not fitted
 _WIDER = 1.5  #: times the first width, up to which a fitted width is not compared with others
@@ -139,10 +139,19 @@ def _best(known: Known, fit: Fit, data: Data, least: float, margin: float) -> Ch
     choose = (residual, left.data.use, left.data.weights)
     lamp = Templates(torch.zeros(1).double(), left.known.lamp.patterns[None], left.known.lamp.colour[None])
     starts = [*candidates(*choose, known.lines, _TRIED), *candidates(*choose, lamp, 1)]
-    clipped = _clipped_starts(known, fit.parts, data.use)
-    near = [_nearest(left, residual, one) for one in clipped if one.gain >= _BEHIND * clipped[0].gain]
+    all_clipped = _clipped_starts(known, fit.parts, data.use)
+    clipped = [one for one in all_clipped if one.gain >= _BEHIND * all_clipped[0].gain]
+    rough = (left.known.camera, left.data)
+    near = [nearest(*rough, residual, one) for one in clipped]
     starts += sorted(near, reverse=True)[:_TRIED]
     grown = _all_grown(left, sorted(starts, reverse=True))
+    if clipped and _leaves_dark(known, fit.parts, grown):
+        grown = _with_more(left, grown, [nearest_of_many(*rough, residual, one) for one in clipped[:_TRIED]])
+    for _ in range(_TRIED):
+        odd = [each.part for each in grown if isinstance(each.part, Laser)][:1]
+        if not odd or float(odd[0].values[5:].square().sum()) < _ODD:
+            break
+        grown = _with_more(left, grown, [nearest(*rough, residual, _start(odd[0]), near=FAR)])
     found = [each for each in grown if not _known_already(each.part, fit.parts)]
     lasers = [each for each in found if isinstance(each.part, Laser)]
     best = _ahead(left, found, lasers, least, margin) if lasers else (found[0] if found else None)
@@ -182,6 +191,17 @@ def _all_grown(left: _Left, starts: list[Candidate]) -> list[Choice]:
     return sorted(found, key=lambda each: -each.gain)
 
 
+def _with_more(left: _Left, grown: list[Choice], starts: list[Candidate]) -> list[Choice]:
+    """Return what was grown with what grows from more candidates, the largest gain first."""
+    return sorted([*grown, *_all_grown(left, sorted(starts, reverse=True))], key=lambda each: -each.gain)
+
+
+def _start(part: Laser) -> Candidate:
+    """Return a laser as a candidate."""
+    y, x, nm, strength = part.values[:4].tolist()
+    return Candidate(0.0, (y, x), nm * NANOMETRE, strength)
+
+
 def _widened(left: _Left, one: Choice) -> Choice:
     """Return a laser with the width of its line that explains most; one of a narrow line stays as it is."""
     best, widths = one, left.known.widths
@@ -207,56 +227,32 @@ def _known_already(part: Laser | Lamp, parts: Parts) -> bool:
     return False
 
 
+def _full_well(known: Known) -> Tensor:
+    """Return the value of the clipped pixels of each channel, 0 in a channel without any: (channel, 1, 1)."""
+    return known.electrons.where(known.seen == 0, 0.0).amax((-2, -1), keepdim=True)
+
+
+def _dark(known: Known, light: Tensor) -> int:
+    """Return the number of clipped pixels for which the light of the parts is too weak."""
+    return int(((known.seen == 0) & (light < 0.5 * _full_well(known))).any(0).sum())
+
+
+def _leaves_dark(known: Known, parts: Parts, grown: list[Choice]) -> bool:
+    """Return True if many of the clipped pixels are too bright for the parts and for the one that gains most."""
+    more = [_precise(each.part, known).electrons() for each in grown[:1]]
+    return _dark(known, sum(more, _light(known, parts))) > _LEFT * int((known.seen == 0).any(0).sum())
+
+
 def _clipped_starts(known: Known, parts: Parts, use: Filter) -> list[Candidate]:
     """Return candidates whose clipped pixels are those that no part explains; none where all are explained."""
-    full = known.electrons.where(known.seen == 0, 0.0).amax((-2, -1), keepdim=True)
-    light = _light(known, parts)
-    dark = ((known.seen == 0) & (light < 0.5 * full)).any(0)
-    if int(dark.sum()) < _FEW:
+    full, light = _full_well(known), _light(known, parts)
+    if _dark(known, light) < _FEW:
         return []
     picture = known.electrons - torch.minimum(light, full.where(full > 0, torch.inf))
     every = Filter(torch.ones_like(known.seen), use.kernel)
     noise = noise_of(known.electrons, every.seen, known.read_noise)
     weights = weights_of(every(picture), every, noise, picture)
     return clipped_candidates(picture, float(full.max()), every, weights, known.lines, _CLIPPED)
-
-
-def _nearest(left: _Left, residual: Tensor, start: Candidate) -> Candidate:
-    """Return the best of the candidates around one, because the rings far from a clipped spot are narrow."""
-    window, middle = _window(residual, start.spot)
-    seen = Filter(left.data.use.seen[..., *window], left.data.use.kernel)
-    within = Weights(*(x[..., *window] for x in left.data.weights))
-    white, best, camera = within(residual[..., *window]), start._replace(gain=0.0), left.known.camera
-    lens = camera.lens._replace(shape=(white.shape[-2], white.shape[-1]))
-    down, right = (
-        torch.tensor([at + half - m for half in _HALVES], dtype=torch.float64, device=white.device)
-        for at, m in zip(start.spot, middle, strict=True)
-    )
-    for nm in _NEAR:
-        wavelength = torch.tensor(start.wavelength + nm * NANOMETRE, dtype=torch.float64, device=white.device)
-        heard = start.strength * response_at(wavelength, camera.responses, camera.bands).to(white)
-        patterns = grid_patterns(camera.pupil, down, right, wavelength, lens).to(white)
-        light = within(heard[:, None, None] * seen(patterns.flatten(0, 1)[:, None]))
-        product, norm = (light * white).sum((1, 2, 3)), light.square().sum((1, 2, 3)).clamp_min(1e-30)
-        gain = 0.5 * product.clamp_min(0.0).square() / norm
-        n = int(gain.argmax())
-        if float(gain[n]) > best.gain:
-            y, x = divmod(n, len(_HALVES))
-            spot = (start.spot[0] + _HALVES[y], start.spot[1] + _HALVES[x])
-            strength = max(float(product[n] / norm[n]), 0.01) * start.strength
-            best = Candidate(float(gain[n]), spot, float(wavelength), strength)
-    return best
-
-
-def _window(frame: Tensor, spot: tuple[float, float]) -> tuple[tuple[slice, slice], tuple[int, int]]:
-    """Return the window of a frame around a spot that tells the candidates apart, and where its middle lies."""
-    window, middle = [], []
-    for n, at in zip(frame.shape[-2:], spot, strict=True):
-        side = min(n, _AROUND)
-        first = min(max(round(at) + n // 2 - side // 2, 0), n - side)
-        window.append(slice(first, first + side))
-        middle.append(first + side // 2 - n // 2)
-    return (window[0], window[1]), (middle[0], middle[1])
 
 
 def _laser(known: Known, start: Candidate, like: Tensor) -> Laser:

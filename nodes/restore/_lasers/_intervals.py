@@ -11,7 +11,8 @@ from neusee.nodes.restore._lasers._joint_fit import Fit, products, solved
 
 NORMAL = 1.6448536269514722  #: standard deviations on each side of a 90 % interval
 _BLOCK = 8  #: pixels a side of blocks whose residuals count as independent of one another
-_MODEL = (0.007, 0.007, 0.07)  #: pixels, pixels and nm, standard deviations of what dirt and defocus change
+_MODEL = (0.0036, 0.0036, 0.08)  #: pixels, pixels and nm, standard deviations of what dirt and defocus change
+_GRAINS = (0.23, 0.23, 5.9)  #: the same over the root of the number of pixels seen, whose scattered light is random
 _SHAPE = 0.03  #: standard deviation of the wavelength from the unknown shape of a line, over the width of the line
 _AMOUNT = 0.0015  #: the same of the electrons of each channel, relative
 
@@ -40,18 +41,22 @@ def covariances(fit: Fit, seen: Tensor) -> list[Tensor]:
         own = whole[first : first + len(part.values), first : first + len(part.values)]
         first += len(part.values)
         if isinstance(part, Laser):
-            found.append(_of_channels(part, own))
+            found.append(_of_channels(part, own, int(seen.amin(0).sum())))
     return found
 
 
-def _of_channels(laser: Laser, own: Tensor) -> Tensor:
-    """Return the covariance of place, wavelength and electrons of each channel, with what the model neglects."""
+def _of_channels(laser: Laser, own: Tensor, pixels: int) -> Tensor:
+    """Return the covariance of place, wavelength and electrons of each channel, with what the model neglects.
+
+    ``pixels`` counts those that no channel clips.
+    """
     slopes = laser.channel_slopes().to(own)
     to = torch.zeros(3 + len(slopes), len(own)).to(own)
     to[:3, :3] = torch.eye(3).to(own)
     to[3:] = slopes
     neglected = torch.zeros(len(to)).to(own)
-    neglected[:3] = torch.tensor(_MODEL).to(own).square()
+    grains = torch.tensor(_GRAINS).to(own).square() / max(pixels, 1)
+    neglected[:3] = torch.tensor(_MODEL).to(own).square() + grains
     neglected[2] += (_SHAPE * laser.fwhm.to(own) / NANOMETRE).square()
     neglected[3:] = (_AMOUNT * laser.channels()).square().to(own)
     return to @ own @ to.T + neglected.diag()

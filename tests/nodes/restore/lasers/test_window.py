@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neusee.nodes.restore._lasers._greedy_search import _AROUND, _window
+from neusee.nodes.restore._lasers._nearest import _AROUND, _window
 
 
 @pytest.mark.parametrize("sides", [(640, 500), (641, 257), (90, 300)])

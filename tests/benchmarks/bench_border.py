@@ -1,0 +1,153 @@
+"""What the periodic border and the mean of a frame cost the Wiener filter, with no laser.
+
+    python tests/benchmarks/bench_border.py results.jsonl --pictures photographs/ --seeds 1100 3
+    python tests/benchmarks/bench_border.py results.jsonl --report
+
+Frames of `bench_restored_frames.py`: crops of photographs behind each mask, and crops of the sample behind the designed
+mask whose scene is an even sky. Each is restored by `restore=wiener_blind`, as the filter is, with twice the unknown
+border, with the variance that the prior expects about the mean of the frame, and with both. The gains are those over
+the frame as developed, in dB.
+"""
+
+import argparse
+import contextlib
+import io
+import json
+import sys
+import tempfile
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import torch
+from safetensors.torch import load_file
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT))
+
+from neusee.nodes import restore  # noqa: E402
+from neusee.nodes.restore._inverse import _wiener  # noqa: E402
+from neusee.nodes.values import Bands, Psf  # noqa: E402
+from neusee.workflows.cli import app  # noqa: E402
+from tests.benchmarks import bench_restored_frames as frames  # noqa: E402
+from tests.nodes.restore.lasers import own_camera as own  # noqa: E402
+
+EVEN = 0.04  #: standard deviation of an encoded scene, below which it counts as an even sky
+OUTPUTS = [
+    "developed[mask]",
+    "signal[mask]",
+    "clipped[mask]",
+    "psf[mask]",
+    "matrix",
+    "illuminant",
+    "responses",
+    "bands",
+]
+edge, expected_variance = _wiener.edge, _wiener.expected_variance
+
+
+def doubled(kernels, picture):
+    y, x = edge(kernels, picture)
+    return 2 * y, 2 * x
+
+
+def about_the_mean(transfer, power, size):
+    """The expected variance of a frame about its own mean: without what the mean of its pixels has."""
+    frame = torch.zeros(size, dtype=torch.float64)
+    frame[: frames.SIDE, : frames.SIDE] = 1 / frames.SIDE**2
+    return expected_variance(transfer, power * (1 - torch.fft.rfft2(frame).abs().square().to(power)), size)
+
+
+FILTERS = {
+    "now": (edge, expected_variance), "border": (doubled, expected_variance), "mean": (edge, about_the_mean),
+    "both": (doubled, about_the_mean),
+}  # fmt: skip
+
+
+def inputs(numbers, mask, folder):
+    """What the filter of `neusee restore` is given for a frame."""
+    np.save(folder / "frame.npy", numbers)
+    told = io.StringIO()
+    with tempfile.TemporaryDirectory() as out, contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+        try:
+            app.main(
+                ["restore", str(folder / "frame.npy"), "--camera", str(folder / "camera.yaml"), "--mask",
+                 str(folder / f"{mask}.npy"), "restore=wiener_blind", f"outputs={json.dumps(OUTPUTS)}", "--out", out]
+            )  # fmt: skip
+        except SystemExit as end:
+            if end.code not in (0, 3):
+                raise RuntimeError(told.getvalue()) from None
+        return load_file(str(next(Path(out).glob("*/data/outputs.safetensors"))))
+
+
+def gains(given, truth):
+    """The gain of each filter over the frame as developed, and the PSNR of that, in dB."""
+    psf = Psf(given["psf[mask].intensity"], given["psf[mask].clear_peak"])
+    bands = Bands(*(given[f"bands.{name}"] for name in ("centres", "widths", "weights")))
+    light = (given["signal[mask]"], psf, given["illuminant"], given["responses"], bands, given["clipped[mask]"].bool())
+    nothing = frames.score(given["developed[mask]"].double().numpy(), truth)
+    found = {"developed": nothing}
+    for name, (border, variance) in FILTERS.items():
+        with patch.object(_wiener, "edge", border), patch.object(_wiener, "expected_variance", variance):
+            seen = restore.wiener(*light, read_noise=own.READ)
+        picture = torch.einsum("kc,cyx->kyx", given["matrix"].to(seen), seen).double().numpy()
+        found[name] = frames.score(picture, truth) - nothing
+    return {name: round(float(value), 3) for name, value in found.items()}
+
+
+def scenes(first, count, pictures):
+    """Kind of scene, mask, seed, kind of picture and its function; skies are looked for in later seeds."""
+    for seed in range(first, first + count):
+        for mask in frames.MASKS:
+            yield "photograph", mask, seed, seed, pictures
+    for seed in range(first, first + 40 * count):
+        yield "sky", "designed", seed, "sample", own.picture
+
+
+def run(path, first, count, folder):
+    """Append the frames that the file lacks."""
+    done, skies = {(r["scene"], r["mask"], r["seed"]) for r in frames.rows(path)}, 0
+    with tempfile.TemporaryDirectory() as place:
+        frames.written_camera(Path(place))
+        for scene, mask, seed, kind, picture in scenes(first, count, frames.photographs(folder)):
+            if (scene, mask, seed) in done:
+                skies += scene == "sky"
+                continue
+            if scene == "sky" and (skies >= count or not is_even(mask, seed)):
+                continue
+            skies += scene == "sky"
+            numbers, truth, _ = frames.taken(mask, 0.0, seed, kind, picture)
+            each = {"scene": scene, "mask": mask, "seed": seed, **gains(inputs(numbers, mask, Path(place)), truth)}
+            with path.open("a") as file:
+                file.write(json.dumps(each) + "\n")
+
+
+def is_even(mask, seed):
+    """True if the part of the sample that a seed draws is an even sky."""
+    rng = np.random.default_rng([seed, *mask.encode(), 0])
+    rng.uniform(size=3)  # place and wavelength of a laser
+    inner = own.picture("sample", 2 * frames.SIDE, rng)[64:-64, 64:-64]
+    return frames.encoded(inner / np.percentile(inner, 99.5)).std((0, 1)).mean() < EVEN
+
+
+def report(rows):
+    """Print the mean gain and the least of each filter, by scene and mask."""
+    print(f"scene, mask: frames, PSNR as developed; mean gain (least) of the filter {', '.join(FILTERS)} (dB)")
+    for scene, mask in sorted({(r["scene"], r["mask"]) for r in rows}):
+        some = [r for r in rows if (r["scene"], r["mask"]) == (scene, mask)]
+        shown = [f"{np.mean([r[k] for r in some]):+.2f} ({min(r[k] for r in some):+.2f})" for k in FILTERS]
+        print(f"{scene:10} {mask:9} {len(some):3}  {np.mean([r['developed'] for r in some]):.2f}  {'  '.join(shown)}")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--pictures", type=Path, help="folder of photographs")
+    parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "COUNT"))
+    parser.add_argument("--report", action="store_true")
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    if given.seeds:
+        run(given.file, *given.seeds, given.pictures)
+    if given.report:
+        report(frames.rows(given.file))
