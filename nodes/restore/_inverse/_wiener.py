@@ -7,11 +7,10 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from pydantic import Field
 from torch import Tensor
-from torch.nn.functional import pad
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_not_finite, single
-from neusee.nodes.restore._inverse._fft_grid import torus
+from neusee.nodes.restore._inverse._fft_grid import edge, torus, wrapped
 from neusee.nodes.restore._inverse._glare import Glare, Light, average, doubted, visible, with_light_around
 from neusee.nodes.restore._inverse._glare_doubt import likeliest_doubt
 from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_white
@@ -27,7 +26,6 @@ from neusee.nodes.values import Bands, Psf
 _FALL = 3.0  #: the power spectrum of pictures falls with frequency to this power, like that of edges
 GREY = 0.95  #: correlation between the channels of pictures
 PRECISE = 256  #: pixels a side, up to which all is computed in float64: the dense float64 algebra takes most time there
-_LIGHT = 0.999  #: share of the light that the unknown border around the picture is wide enough for
 
 
 #: standard deviation of a glare pattern in each pixel over its light around there; None: the likeliest for the picture
@@ -216,20 +214,13 @@ def posed(
     take mean and contrast of others.
     """
     y, x = electrons.shape[-2:]
-    balance, read, doubt, least = settings
+    balance, read, _, _ = settings
     seen, some = known, known.amax((-2, -1), keepdim=True)
     known = torch.where(some > 0, known, 1.0)
     share = power_of_two(kernels.sum((-2, -1), keepdim=True).detach())
     kernels = kernels / share  # the same bits, and the floors below concern the shape of the PSF, not a grey filter
 
-    def own_noise(mean: Tensor) -> Tensor:
-        return picture_noise(electrons, mean, read)
-
-    if scatter and glare.patterns:
-        trusted, light, wrong = scattered(electrons, seen, glare, own_noise)
-        glare = glare._replace(patterns=[])
-    else:
-        trusted, light, wrong = _doubted(electrons, known, glare, (doubt, least), own_noise)
+    free, trusted, light, wrong = _found_light(electrons, (known, seen), glare, settings, scatter)
     picture = electrons - light.sum
     mean = average(picture, trusted)
     size = torus((y, x), edge(kernels, (y, x)))
@@ -243,7 +234,7 @@ def posed(
         mean, scale = (shared_level(x, trust.detach(), white) for x in (mean.clamp_min(1.0), scale))
     noise = balance * picture_noise(electrons, mean, read) + light.variance
     weight = known * (scale / noise.sqrt()).square()
-    scaled = tuple(pattern / scale for pattern in (*glare.patterns, *light.modes))
+    scaled = tuple(pattern / scale for pattern in (*free, *light.modes))
     problem = Blurred((picture - mean) / scale, weight, transfer, power, size, GREY, scaled, bounded=len(light.modes))
     bright = mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None] / share
     if not scatter:
@@ -251,6 +242,23 @@ def posed(
     full = float(electrons.detach().max())
     both = told_of_scene(*told, wrong / passed, light, trusted, (some == 0) * full)
     return Scaled(problem, scale, bright, share, kernels, scene_doubt((mean, scale), both, white, full, light))
+
+
+def _found_light(
+    electrons: Tensor, known: tuple[Tensor, Tensor], glare: Glare, settings: Settings, scatter: bool
+) -> tuple[list[Tensor], Tensor, Light, Tensor]:
+    """Return the patterns of unknown strength, and what `doubted` returns; ``known`` with and without blind channels.
+
+    With ``scatter`` the strengths are found too, so that no pattern of unknown strength is left.
+    """
+    _, read, doubt, least = settings
+
+    def own_noise(mean: Tensor) -> Tensor:
+        return picture_noise(electrons, mean, read)
+
+    if scatter and glare.patterns:
+        return [], *scattered(electrons, known[1], glare, own_noise)
+    return glare.patterns, *_doubted(electrons, known[0], glare, (doubt, least), own_noise)
 
 
 def _doubted(
@@ -275,24 +283,3 @@ def fall(size: tuple[int, int]) -> Tensor:
     power: Tensor = squared.pow_(-_FALL / 2.0)
     power /= variance(power, size)
     return power
-
-
-def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
-    """Return the radii (y, x) that hold 99.9 % of the PSF, at most the larger of 256 pixels and half the picture."""
-    reach = []
-    for dim, size in ((-1, picture[0]), (-2, picture[1])):
-        profile = kernels.detach().sum((0, dim)).double()
-        radius = (torch.arange(len(profile), device=profile.device) - len(profile) // 2).abs()
-        inside = profile.new_zeros(int(radius.max()) + 1).index_add(0, radius, profile).cumsum(0)
-        reach.append(min(int((inside < _LIGHT * inside[-1]).sum()), max(256, size // 2), size))
-    return reach[0], reach[1]
-
-
-def wrapped(kernels: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return PSFs centred on the first sample of a periodic grid; a PSF wider than the grid wraps around."""
-    (m, n), (y, x) = kernels.shape[-2:], size
-    rows, columns = -(-m // y), -(-n // x)
-    around = pad(kernels, (0, columns * x - n, 0, rows * y - m))
-    if rows * columns > 1:
-        around = around.reshape(-1, rows, y, columns, x).sum((1, 3))
-    return around.roll((-(m // 2), -(n // 2)), (-2, -1))

@@ -12,6 +12,7 @@ from torch import Generator, Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
+from neusee.nodes.restore._inverse._fft_grid import edge
 from neusee.nodes.restore._inverse._frame_deviation import frame_deviation
 from neusee.nodes.restore._inverse._glare import Glare, with_light_around
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
@@ -23,7 +24,6 @@ from neusee.nodes.restore._inverse._wiener import (
     LeastDoubt,
     Scaled,
     Settings,
-    edge,
     known_and_light,
     posed,
 )

@@ -484,6 +484,8 @@ def test_results_that_were_removed_are_passed_over(trial):
     second = trial.run("sensor.gain=5").keys["raw"]
     for path in trial.cache.glob(f"{second[:2]}/{second}.*"):
         path.unlink()
+    if (brief := trial.cache / "brief.jsonl").exists():  # where a result is that was computed faster than written
+        brief.write_text("\n".join(line for line in brief.read_text().split("\n") if second not in line[:60]))
     *_, beside = trial.why("raw", "sensor.gain=4")
     assert beside.startswith(f"  compared with the nearest of 2 earlier results, {first[:8]} of ")
 
