@@ -7,9 +7,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes.restore._inverse._fft_grid import edge, torus, wrapped
+from neusee.nodes.restore._inverse._fft_grid import torus
 from neusee.nodes.restore._inverse._grey_psf import effective_psf
 from neusee.nodes.restore._inverse._masked_blur import Size, blurred, gathered
+from neusee.nodes.restore._inverse._psf_on_grid import edge, wrapped
 from neusee.nodes.values import Bands, Psf
 
 

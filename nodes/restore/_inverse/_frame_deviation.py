@@ -10,10 +10,10 @@ import torch
 from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d
 
-from neusee.nodes.restore._inverse._fft_grid import wrapped
 from neusee.nodes.restore._inverse._frame_spectrum import fitted_law
 from neusee.nodes.restore._inverse._hidden_pixels import Inverses, most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred, blurred, mixed
+from neusee.nodes.restore._inverse._psf_on_grid import wrapped
 from neusee.nodes.restore._inverse._scene_level import drawn_blotches
 from neusee.nodes.restore._inverse._wiener import Scaled
 

@@ -10,13 +10,14 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_not_finite, single
-from neusee.nodes.restore._inverse._fft_grid import edge, torus, wrapped
+from neusee.nodes.restore._inverse._fft_grid import torus
 from neusee.nodes.restore._inverse._glare import Glare, Light, average, doubted, visible, with_light_around
 from neusee.nodes.restore._inverse._glare_doubt import likeliest_doubt
 from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_white
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred, variance
 from neusee.nodes.restore._inverse._picture_scale import expected_variance, picture_noise, power_of_two, shared_level
+from neusee.nodes.restore._inverse._psf_on_grid import edge, wrapped
 from neusee.nodes.restore._inverse._scattered_glare import scattered
 from neusee.nodes.restore._inverse._scene_level import SceneDoubt, scene_doubt, told_of_scene
 from neusee.nodes.sensor._digitization import crop

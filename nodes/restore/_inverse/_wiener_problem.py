@@ -8,9 +8,10 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
-from neusee.nodes.restore._inverse._fft_grid import edge, torus, wrapped
+from neusee.nodes.restore._inverse._fft_grid import torus
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred
+from neusee.nodes.restore._inverse._psf_on_grid import edge, wrapped
 from neusee.nodes.restore._inverse._wiener import GREY, Doubt, LeastDoubt, Scaled, fall, pose
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf, WienerProblem

@@ -12,11 +12,11 @@ from torch import Generator, Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
-from neusee.nodes.restore._inverse._fft_grid import edge
 from neusee.nodes.restore._inverse._frame_deviation import frame_deviation
 from neusee.nodes.restore._inverse._glare import Glare, with_light_around
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._posterior_spread import Draws, with_shading
+from neusee.nodes.restore._inverse._psf_on_grid import edge
 from neusee.nodes.restore._inverse._scattered_glare import with_smooth
 from neusee.nodes.restore._inverse._wiener import (
     PRECISE,
