@@ -49,6 +49,7 @@ def _changed(mapping: Mapping[str, Any], first: Mapping[str, Any]) -> dict[str, 
 
 
 def _equal(one: Any, other: Any) -> bool:
+    """Return True for equal values that are also written alike, unlike 0.0 and -0.0, or 1, 1.0 and True."""
     with suppress(Exception):  # values such as arrays, whose comparison has no single answer
-        return one is other or bool(one == other)
+        return one is other or (bool(one == other) and repr(one) == repr(other))
     return False
