@@ -10,8 +10,6 @@ the frame as developed, in dB.
 """
 
 import argparse
-import contextlib
-import io
 import json
 import sys
 import tempfile
@@ -28,7 +26,6 @@ sys.path.insert(0, str(ROOT))
 from neusee.nodes import restore  # noqa: E402
 from neusee.nodes.restore._inverse import _wiener  # noqa: E402
 from neusee.nodes.values import Bands, Psf  # noqa: E402
-from neusee.workflows.cli import app  # noqa: E402
 from tests.benchmarks import bench_restored_frames as frames  # noqa: E402
 from tests.nodes.restore.lasers import own_camera as own  # noqa: E402
 
@@ -66,18 +63,7 @@ FILTERS = {
 
 def inputs(numbers, mask, folder):
     """What the filter of `neusee restore` is given for a frame."""
-    np.save(folder / "frame.npy", numbers)
-    told = io.StringIO()
-    with tempfile.TemporaryDirectory() as out, contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
-        try:
-            app.main(
-                ["restore", str(folder / "frame.npy"), "--camera", str(folder / "camera.yaml"), "--mask",
-                 str(folder / f"{mask}.npy"), "restore=wiener_blind", f"outputs={json.dumps(OUTPUTS)}", "--out", out]
-            )  # fmt: skip
-        except SystemExit as end:
-            if end.code not in (0, 3):
-                raise RuntimeError(told.getvalue()) from None
-        return load_file(str(next(Path(out).glob("*/data/outputs.safetensors"))))
+    return frames.outputs_of(numbers, mask, ["restore=wiener_blind"], OUTPUTS, folder, load_file)
 
 
 def gains(given, truth):

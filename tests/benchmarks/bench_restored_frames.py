@@ -196,18 +196,9 @@ def written_camera(folder):
     return folder / "camera.yaml"
 
 
-def restored(numbers, mask, method, laser, folder):
-    """What `neusee restore` returns for a frame, linear sRGB (3, y, x), its numbers of lasers, and processor time."""
+def outputs_of(numbers, mask, words, outputs, folder, load=load_file):
+    """The named outputs of `neusee restore` for a frame and a mask, with further words of the command."""
     np.save(folder / "frame.npy", numbers)
-    options = {"blind": "wiener_blind", "nothing": "wiener_blind"}
-    words = [f"restore={options.get(method, method)}"]
-    if method == "told":
-        y, x = (1e3 * s * own.PITCH / own.FOCAL for s in laser.spot)
-        line = f"wavelength: {laser.wavelength * 1e9} nm, fwhm: {laser.fwhm * 1e9} nm, strength: 1"
-        words = ["restore=wiener", f"lasers={{it: {{{line}, angle: [{y} mrad, {x} mrad]}}}}"]
-        words = words if laser.strength else ["restore=wiener"]
-    outputs = ["restored", "developed[mask]", *(["search"] if method in ("search", "network") else [])]
-    start = time.process_time()
     told = io.StringIO()
     with tempfile.TemporaryDirectory() as out, contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
         try:
@@ -218,7 +209,21 @@ def restored(numbers, mask, method, laser, folder):
         except SystemExit as end:
             if end.code not in (0, 3):
                 raise RuntimeError(told.getvalue()) from None
-        results = load_file(str(next(Path(out).glob("*/data/outputs.safetensors"))))
+        return load(str(next(Path(out).glob("*/data/outputs.safetensors"))))
+
+
+def restored(numbers, mask, method, laser, folder):
+    """What `neusee restore` returns for a frame, linear sRGB (3, y, x), its numbers of lasers, and processor time."""
+    options = {"blind": "wiener_blind", "nothing": "wiener_blind"}
+    words = [f"restore={options.get(method, method)}"]
+    if method == "told":
+        y, x = (1e3 * s * own.PITCH / own.FOCAL for s in laser.spot)
+        line = f"wavelength: {laser.wavelength * 1e9} nm, fwhm: {laser.fwhm * 1e9} nm, strength: 1"
+        words = ["restore=wiener", f"lasers={{it: {{{line}, angle: [{y} mrad, {x} mrad]}}}}"]
+        words = words if laser.strength else ["restore=wiener"]
+    outputs = ["restored", "developed[mask]", *(["search"] if method in ("search", "network") else [])]
+    start = time.process_time()
+    results = outputs_of(numbers, mask, words, outputs, folder)
     number = next((int(v) for k, v in results.items() if k.startswith("search") and k.endswith("number")), None)
     picture = results["developed[mask]" if method == "nothing" else "restored"]
     return picture.astype(float), number, time.process_time() - start

@@ -12,8 +12,6 @@ the fifth of the pixels with the steepest slopes of the scene, *even* places the
 """
 
 import argparse
-import contextlib
-import io
 import json
 import sys
 import tempfile
@@ -24,13 +22,11 @@ from unittest.mock import patch
 import colour
 import numpy as np
 import torch
-from safetensors.numpy import load_file
 from scipy.ndimage import maximum_filter
 from scipy.signal import fftconvolve
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from neusee.workflows.cli import app
 from neusee.workflows.report.figures.frame_and_interval import half_width
 from tests.benchmarks import bench_restored_frames as frames
 from tests.nodes.restore.lasers import own_camera as own
@@ -76,20 +72,8 @@ def taken(mask, strength, seed, kind, picture, exact):
 
 def restored(numbers, mask, folder):
     """The outputs of `neusee restore` for a frame."""
-    np.save(folder / "frame.npy", numbers)
     outputs = ["restored", "restored_spread", "clipped[mask]", "developed[mask]", "matrix"]
-    told = io.StringIO()
-    with tempfile.TemporaryDirectory() as out, contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
-        try:
-            app.main(
-                ["restore", str(folder / "frame.npy"), "--camera", str(folder / "camera.yaml"), "--mask",
-                 str(folder / f"{mask}.npy"), "restore=search", f"frame.draws={DRAWS}",
-                 f"outputs={json.dumps(outputs)}", "--out", out]
-            )  # fmt: skip
-        except SystemExit as end:
-            if end.code not in (0, 3):
-                raise RuntimeError(told.getvalue()) from None
-        return load_file(str(next(Path(out).glob("*/data/outputs.safetensors"))))
+    return frames.outputs_of(numbers, mask, ["restore=search", f"frame.draws={DRAWS}"], outputs, folder)
 
 
 def moved(picture, shift):

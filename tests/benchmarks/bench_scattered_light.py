@@ -11,8 +11,6 @@ frame without its laser, the tilt of the camera taken back, saturated pixels and
 """
 
 import argparse
-import contextlib
-import io
 import json
 import tempfile
 import time
@@ -29,7 +27,6 @@ from neusee.nodes.restore._inverse._frame_deviation import frame_deviation
 from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_white
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.values import Bands, Psf
-from neusee.workflows.cli import app
 from neusee.workflows.report.figures.frame_and_interval import half_width
 from tests.benchmarks import bench_restored_frames as frames
 from tests.benchmarks.bench_laser_search import rate
@@ -42,19 +39,8 @@ OUTPUTS = ["signal[mask]", "clipped[mask]", "developed[mask]", "matrix", "illumi
 
 def searched(numbers, mask, folder, optics):
     """The outputs of `neusee restore` for a frame, and those that depend on the mask alone."""
-    np.save(folder / "frame.npy", numbers)
     wanted = OUTPUTS + ([] if optics.exists() else ["psf[mask]", "bands"])
-    told = io.StringIO()
-    with tempfile.TemporaryDirectory() as out, contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
-        try:
-            app.main(
-                ["restore", str(folder / "frame.npy"), "--camera", str(folder / "camera.yaml"), "--mask",
-                 str(folder / f"{mask}.npy"), "restore=search", f"outputs={json.dumps(wanted)}", "--out", out]
-            )  # fmt: skip
-        except SystemExit as end:
-            if end.code not in (0, 3):
-                raise RuntimeError(told.getvalue()) from None
-        found = load_file(str(next(Path(out).glob("*/data/outputs.safetensors"))))
+    found = frames.outputs_of(numbers, mask, ["restore=search"], wanted, folder, load_file)
     apart = {k: v for k, v in found.items() if k.startswith(("psf", "bands"))}
     if apart:
         torch.save(apart, optics)
