@@ -72,8 +72,7 @@ def wiener_spread(
             holds under the model of the filter: not for light that the filter is not told of, such as a laser, nor for
             a wrong PSF, and not for the colour of paints. The iteration adds what `restore.wiener` says. On 60
             photographs behind three masks, lasers of 0 to 1e6 found by the search, intervals of 90 % hold 92.6 % of the
-            pixels; of a single frame 45 to 100 %, least for an even scene onto which a mask spreads light from beyond
-            the frame.
+            pixels; of a single frame 45 to 100 %, least behind a mask that spreads light over most of the frame.
             The result has a derivative with respect to ``matrix`` alone; draws and fitted power count as constants.
     Raises: ValueError as `restore.wiener`.
     Source: Papandreou and Yuille, Gaussian sampling by local perturbations, NIPS 23 (2010), algorithm 1; Sykulski,

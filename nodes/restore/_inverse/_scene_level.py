@@ -24,7 +24,7 @@ _ALONE = 0.1  #: part of the variance of an error that is not the same in all ch
 _ROUGH = 0.1  #: relative error of a variance that is estimated from one picture
 _GRID = 241  #: logarithms that are tried
 _WIDE = 4.0  #: deviations of the prior, over which they are tried
-_BLOTCHES = 0.3  #: deviation of scattered light over blotches, over that of its speckle
+_BLOTCHES = 0.3  #: deviation of scattered light over blotches, over that of a pixel of it
 _BLOTCH = 16  #: pixels from one blotch to the next
 
 
