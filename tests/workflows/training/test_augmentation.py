@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from PIL import Image
 
 from neusee.nodes.scene import Change, Photographs, symmetry
 from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.training.parallel.process_mesh import ALONE
 from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.training_pictures import TrainingStream
+from tests.workflows.training.noise_photographs import noise_photograph
 from tests.workflows.training.test_warm_start import TINY, trained
 
 ALL = ["train.augment.symmetries=all", "train.augment.exposure=2", "train.augment.colour=0.3"]
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.fixture(scope="module")
 def photograph(tmp_path_factory):
     file = tmp_path_factory.mktemp("photographs") / "one.png"
-    Image.effect_noise((60, 50), 60).convert("RGB").save(file)
+    noise_photograph().save(file)
     return file
 
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from neusee.nodes import restore
 from neusee.nodes.scene import Photographs
@@ -15,6 +14,7 @@ from neusee.workflows.training.held_out import HELD_OUT
 from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.run_training import train
 from neusee.workflows.training.training_pictures import TrainingStream
+from tests.workflows.training.noise_photographs import noise_photograph
 from tests.workflows.training.test_warm_start import TINY
 
 CAMERA = [*TINY, "doe=half_ring", "train.picture=restored", "train.laser_free=0"]
@@ -31,7 +31,7 @@ def differing(*laws):
 @pytest.fixture(scope="module")
 def photograph(tmp_path_factory):
     file = tmp_path_factory.mktemp("photographs") / "one.png"
-    Image.effect_noise((60, 50), 60).convert("RGB").save(file)
+    noise_photograph().save(file)
     return file
 
 

@@ -2,13 +2,13 @@
 
 import pytest
 import torch
-from PIL import Image
 
 from neusee.nodes import restore
 from neusee.nodes.scene import Photographs
 from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.training.training_pictures import TrainingStream
+from tests.workflows.training.noise_photographs import noise_photograph
 from tests.workflows.training.test_warm_start import TINY, trained
 
 OTHER = [*TINY, "doe=half_ring", "train.picture=restored", "train.pool=2"]
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.fixture(scope="module")
 def photograph(tmp_path_factory):
     file = tmp_path_factory.mktemp("photographs") / "one.png"
-    Image.effect_noise((60, 50), 60).convert("RGB").save(file)
+    noise_photograph().save(file)
     return file
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from neusee import recipes
 from neusee.nodes.scene import Photographs
@@ -19,6 +18,7 @@ from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.several_cameras import SeveralCameras, require_alone
 from neusee.workflows.training.training_key import key_of_training
 from neusee.workflows.training.training_pictures import HELD_OUT, TrainingStream
+from tests.workflows.training.noise_photographs import noise_photograph
 from tests.workflows.training.test_posed_pictures import POSED
 from tests.workflows.training.test_warm_start import trained
 
@@ -29,7 +29,7 @@ WORDS = [*POSED, "train.pool=3", "+mismatch=usual", "sensor.read_noise=uniform(5
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("files")
-    Image.effect_noise((60, 50), 60).convert("RGB").save(folder / "one.png")
+    noise_photograph().save(folder / "one.png")
     np.save(folder / "mask.npy", np.random.default_rng(3).uniform(0, 1e-6, (48, 48)))
     return folder
 
@@ -118,7 +118,7 @@ def test_a_training_of_two_cameras_validates_and_is_not_that_of_one(tmp_path):
     folder = tmp_path / "photographs"
     folder.mkdir()
     for i in range(2):
-        Image.effect_noise((60, 50), 40 + 20 * i).convert("RGB").save(folder / f"{i}.png")
+        noise_photograph(40 + 20 * i, i).save(folder / f"{i}.png")
     words = [*POSED, f"train.photographs={folder}", "train.held_out=0.5", "train.validate_every=1"]
     found = trained([*words, "train.cameras=[[doe=flat]]"], tmp_path)
     rows = list(csv.DictReader((found / "losses.csv").read_text().splitlines()))

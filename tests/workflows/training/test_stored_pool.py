@@ -7,6 +7,7 @@ from PIL import Image
 from neusee.nodes.scene import Photographs
 from neusee.workflows import Store, load
 from neusee.workflows.training.training_pictures import TrainingStream
+from tests.workflows.training.noise_photographs import noise_photograph
 from tests.workflows.training.test_warm_start import TINY, trained
 
 POOL = ["train.pool=3"]
@@ -17,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.fixture(scope="module")
 def photograph(tmp_path_factory):
     file = tmp_path_factory.mktemp("photographs") / "one.png"
-    Image.effect_noise((60, 50), 60).convert("RGB").save(file)
+    noise_photograph().save(file)
     return file
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from PIL import Image
 from safetensors.torch import load_file
 
 from neusee.nodes import doe
@@ -19,6 +18,7 @@ from neusee.workflows.training.parallel.band_shards import Shards
 from neusee.workflows.training.parallel.process_mesh import Mesh, MeshError, shape_of
 from neusee.workflows.training.run_training import _photographs, train
 from neusee.workflows.training.training_pictures import TrainingStream
+from tests.workflows.training.noise_photographs import noise_photograph
 
 ROOT = Path(__file__).parents[4]
 SMALL = [
@@ -272,7 +272,7 @@ def samples(recipe, folder, mesh):
 def test_all_processes_hold_out_the_same_photographs(tmp_path):
     (tmp_path / "photographs").mkdir()
     for i in range(4):
-        Image.effect_noise((60, 50), 40 + 20 * i).convert("RGB").save(tmp_path / "photographs" / f"{i}.png")
+        noise_photograph(40 + 20 * i, i).save(tmp_path / "photographs" / f"{i}.png")
     words = [*SHORT, "train.stages.2.iterations=2", "train.held_out=0.5", "train.validate_every=2",
              f"train.photographs={tmp_path / 'photographs'}"]  # fmt: skip
     found = processes(tmp_path, [(mesh, mesh, "train", words) for mesh in ("1x1", "2x1", "1x2")])
