@@ -11,7 +11,7 @@ from neusee.nodes._half_precision import single
 from neusee.nodes.losses._contrast_loss import HighestFrequency
 from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_shares
 from neusee.nodes.restore._inverse._masked_blur import variance
-from neusee.nodes.restore._inverse._wiener import fall
+from neusee.nodes.restore._inverse._picture_scale import fall
 from neusee.nodes.values import Bands, Psf
 
 OneBandShare = Annotated[float, Field(ge=0, le=1)]

@@ -17,6 +17,7 @@ from neusee.nodes.restore._inverse._hidden_pixels import MOST, STEPS
 from neusee.nodes.restore._inverse._lowest_frequencies import MODES, SHARE
 from neusee.nodes.restore._inverse._nearby_glare import nearby_glare
 from neusee.nodes.restore._inverse._posterior_spread import wiener_spread
+from neusee.nodes.restore._inverse._psf_on_grid import bordered
 from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
 from neusee.nodes.restore._inverse._wiener import PRECISE, wiener
 from neusee.nodes.restore._inverse._wiener_problem import wiener_problem
@@ -136,10 +137,11 @@ for node in (found_glare, found_nearby):
 
 @wiener.work
 def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any) -> tuple[float, float]:
-    y, x = _torus(electrons, psf)
+    border = params.get("border", 1.0)
+    y, x = _torus(electrons, psf, border)
     coarse = max(electrons.shape[-2:]) / 2 ** halvings((electrons.shape[-2], electrons.shape[-1]))
     unknowns = len(electrons) * coarse**2  # of the coarsest grid, which is solved as a dense system
-    steps, side = _descent(electrons, psf)
+    steps, side = _descent(electrons, psf, border)
     operations = steps + _FILLED * unknowns**2
     largest = max(unknowns, _WHITENED * side)
     nearby = _MODE * sum(len(each) for each in (others[5] if len(others) > 5 else None) or ()) * electrons.numel()
@@ -161,7 +163,8 @@ def _(electrons: Tensor, measured: Any, clipped: Any, matrix: Tensor, *others: A
 
 @wiener_spread.work
 def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, draws: int = 8, **params: Any) -> tuple[float, float]:
-    memory, operations = wiener.hooks.work(result, electrons, psf, *others[:4], *others[5:])  # type: ignore[misc]
+    told = (*others[:4], *others[5:])  # without the matrix
+    memory, operations = wiener.hooks.work(result, electrons, psf, *told, **params)  # type: ignore[misc]
     return 1.5 * memory, draws * operations
 
 
@@ -220,11 +223,11 @@ def _(signal: Any, clipped: Any, psf: Any, bands: Bands, *others: Any, **params:
     return double(len(bands.centres))
 
 
-def _descent(electrons: Tensor, psf: Psf) -> tuple[float, float]:
+def _descent(electrons: Tensor, psf: Psf, border: float) -> tuple[float, float]:
     """Return the operations of the steps on all grids but the coarsest, and the largest matrix that speeds them up."""
     channels, *picture = electrons.shape
     rims = [min(k // 2, max(256, n // 2), n) for n, k in zip(picture, psf.intensity.shape[-2:], strict=True)]
-    size = torus((picture[0], picture[1]), (rims[0], rims[1]))
+    size = torus((picture[0], picture[1]), bordered((rims[0], rims[1]), border))
     total, largest, steps = 0.0, 0.0, STEPS
     for level in range(halvings((picture[0], picture[1]))):
         y, x = (n >> level for n in size)
@@ -244,9 +247,10 @@ def _(
     return 4.0 * len(electrons) * y * x, 4.0 * (iterations + 1) * len(electrons) * transform_operations(y, x)
 
 
-def _torus(picture: Tensor, psf: Psf) -> tuple[int, int]:
+def _torus(picture: Tensor, psf: Psf, border: float = 1.0) -> tuple[int, int]:
     """Return the size of the transforms that deconvolve a picture, whose border they extend by the PSF."""
-    y, x = (n + min(k, 2 * n) for n, k in zip(picture.shape[-2:], psf.intensity.shape[-2:], strict=True))
+    sides = zip(picture.shape[-2:], psf.intensity.shape[-2:], strict=True)
+    y, x = (n + math.ceil(border * min(k, 2 * n)) for n, k in sides)
     return y, x
 
 

@@ -76,7 +76,8 @@ def restored(found, optics, scatter, interval):
         psf, camera[1], found["signal[mask]"], found["clipped[mask]"].bool(), *light, None
     )
     kernels = effective_psf(psf, *camera, fine.dtype).to(fine)
-    scaled = filters.posed(fine, known, kernels, glare, (1.0, own.READ, None, 0.3), scatter, grey_white(*camera))
+    settings = filters.Settings(1.0, own.READ, None, 0.3, scatter)
+    scaled = filters.posed(fine, known, kernels, glare, settings, grey_white(*camera))
     matrix = found["matrix"].double()
     picture = torch.tensordot(matrix, scaled.pixels(most_likely(scaled.problem)) + scaled.mean, 1).numpy()
     if not interval:

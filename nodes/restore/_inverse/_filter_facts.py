@@ -10,7 +10,7 @@ from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred, variance
-from neusee.nodes.restore._inverse._wiener import Doubt, LeastDoubt, Scaled, pose
+from neusee.nodes.restore._inverse._wiener import Doubt, LeastDoubt, Scaled, Settings, pose
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, FilterFacts, Psf
 
@@ -57,10 +57,8 @@ def filter_facts(
     Source: as `restore.wiener`; the maps are ours.
     """
     electrons, light = single(electrons), (glare, nearby, ghosts)
-    scaled = pose(
-        electrons, psf, illuminant, responses, bands, clipped, *light, (balance, read_noise, doubt, least_doubt)
-    )
-    return facts(scaled)
+    settings = Settings(balance, read_noise, doubt, least_doubt)
+    return facts(pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings))
 
 
 @filter_facts.check

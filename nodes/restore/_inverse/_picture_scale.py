@@ -1,6 +1,8 @@
-"""What scales a picture before its deconvolution: the variance of its noise, and that which its prior expects."""
+"""What scales a picture before its deconvolution: the variance of its noise, the prior, and what the prior expects."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
@@ -9,6 +11,7 @@ from torch.nn.functional import avg_pool2d
 from neusee.nodes.restore._inverse._conjugate_gradients import pieces
 from neusee.nodes.restore._inverse._masked_blur import Size, variance
 
+_FALL = 3.0  #: the power spectrum of pictures falls with frequency to this power, like that of edges
 _NO_LIGHT = 1e-12  #: share of the light below which a PSF counts as one without light
 _TOLD = 0.05  #: trust in a channel, at which its own level counts as much as that of the other channels
 
@@ -28,6 +31,25 @@ def expected_variance(transfer: Tensor, power: Tensor, size: Size) -> Tensor:
         through = transfer[:, rows]
         total = total + variance((through.real.square() + through.imag.square()) * power[rows], size)
     return total[:, None, None]
+
+
+def fall(size: Size, period: Size | None = None) -> Tensor:
+    """Return the power spectrum that the prior of the scene assumes, as half a spectrum of mean 1.
+
+    Below one cycle in ``period`` pixels, those of the torus without a number, it hardly rises.
+    """
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in size)
+    squared = fy[:, None].square() + fx[None, : size[1] // 2 + 1].square() + 1.0 / math.prod(period or size)
+    power: Tensor = squared.pow_(-_FALL / 2.0)
+    power /= variance(power, size)
+    return power
+
+
+def about_mean(power: Tensor, frame: Size, torus: Size) -> Tensor:
+    """Return half a power spectrum on a periodic grid, without the variance that the mean over a frame has."""
+    rows, columns = (torch.ones(n, dtype=power.dtype, device=power.device) / n for n in frame)
+    share = torch.fft.fft(rows, torus[0]).abs().square()[:, None] * torch.fft.rfft(columns, torus[1]).abs().square()
+    return power * (1.0 - share)
 
 
 def power_of_two(x: Tensor) -> Tensor:

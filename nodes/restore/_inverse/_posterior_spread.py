@@ -13,7 +13,7 @@ from neusee.nodes._half_precision import single
 from neusee.nodes.restore._inverse._frame_deviation import drawn_noise, drawn_scene, frame_deviation
 from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_white
 from neusee.nodes.restore._inverse._hidden_pixels import Inverses, most_likely
-from neusee.nodes.restore._inverse._wiener import Doubt, LeastDoubt, Scaled, known_and_light, posed
+from neusee.nodes.restore._inverse._wiener import Border, Doubt, LeastDoubt, Scaled, Settings, known_and_light, posed
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf, Shading
 
@@ -39,6 +39,7 @@ def wiener_spread(
     doubt: Doubt = 0.0,
     least_doubt: LeastDoubt = 0.0,
     scatter: bool = False,
+    border: Border = 1.0,
     draws: Draws = 8,
     law: Literal["filter", "frame"] = "frame",
     read_noise: Electrons,
@@ -82,8 +83,8 @@ def wiener_spread(
         fine, known, light = known_and_light(psf, responses, single(electrons), clipped, glare, nearby, ghosts)
         kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
         white = grey_white(illuminant, responses, bands).to(fine)
-        settings = (balance, read_noise, doubt, least_doubt)
-        scaled = posed(fine, known, kernels, light, settings, scatter, white)
+        settings = Settings(balance, read_noise, doubt, least_doubt, scatter, border)
+        scaled = posed(fine, known, kernels, light, settings, white)
     drawn = drawn_deviation if law == "filter" else frame_deviation
     return with_shading(drawn(scaled, matrix, draws, rng).to(single(electrons)), restored, shading)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -18,6 +20,11 @@ def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
         inside = profile.new_zeros(int(radius.max()) + 1).index_add(0, radius, profile).cumsum(0)
         reach.append(min(int((inside < _LIGHT * inside[-1]).sum()), max(256, size // 2), size))
     return reach[0], reach[1]
+
+
+def bordered(reach: tuple[int, int], border: float) -> tuple[int, int]:
+    """Return the width (y, x) of the unknown border around a picture, ``border`` times the reach of the PSF."""
+    return math.ceil(border * reach[0]), math.ceil(border * reach[1])
 
 
 def wrapped(kernels: Tensor, size: tuple[int, int]) -> Tensor:

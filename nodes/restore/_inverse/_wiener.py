@@ -15,16 +15,22 @@ from neusee.nodes.restore._inverse._glare import Glare, Light, average, doubted,
 from neusee.nodes.restore._inverse._glare_doubt import likeliest_doubt
 from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_white
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
-from neusee.nodes.restore._inverse._masked_blur import Blurred, variance
-from neusee.nodes.restore._inverse._picture_scale import expected_variance, picture_noise, power_of_two, shared_level
-from neusee.nodes.restore._inverse._psf_on_grid import edge, wrapped
+from neusee.nodes.restore._inverse._masked_blur import Blurred
+from neusee.nodes.restore._inverse._picture_scale import (
+    about_mean,
+    expected_variance,
+    fall,
+    picture_noise,
+    power_of_two,
+    shared_level,
+)
+from neusee.nodes.restore._inverse._psf_on_grid import bordered, edge, wrapped
 from neusee.nodes.restore._inverse._scattered_glare import scattered
 from neusee.nodes.restore._inverse._scene_level import SceneDoubt, scene_doubt, told_of_scene
 from neusee.nodes.sensor._digitization import crop
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf
 
-_FALL = 3.0  #: the power spectrum of pictures falls with frequency to this power, like that of edges
 GREY = 0.95  #: correlation between the channels of pictures
 PRECISE = 256  #: pixels a side, up to which all is computed in float64: the dense float64 algebra takes most time there
 
@@ -32,7 +38,18 @@ PRECISE = 256  #: pixels a side, up to which all is computed in float64: the den
 #: standard deviation of a glare pattern in each pixel over its light around there; None: the likeliest for the picture
 Doubt = Annotated[float, Field(ge=0, le=10)] | None
 LeastDoubt = Annotated[float, Field(ge=0, le=10)]  #: of a doubt that is found
-Settings = tuple[float, float, float | None, float]  #: balance, read noise, doubt and least doubt
+Border = Annotated[float, Field(ge=1, le=4)]  #: of unknown pixels around a picture, over the reach of its PSF
+
+
+class Settings(NamedTuple):
+    """What the filter is told besides the picture and the camera; as the parameters of `wiener`."""
+
+    balance: float
+    read_noise: float
+    doubt: float | None = 0.0
+    least_doubt: float = 0.0
+    scatter: bool = False
+    border: float = 1.0
 
 
 @node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])
@@ -51,6 +68,7 @@ def wiener(
     doubt: Doubt = 0.0,
     least_doubt: LeastDoubt = 0.0,
     scatter: bool = False,
+    border: Border = 1.0,
     coarser_grids: bool = True,
     read_noise: Electrons,
 ) -> Tensor:
@@ -59,8 +77,11 @@ def wiener(
     Least squares with a Gaussian prior, which for a picture without edges is the Wiener filter. Each channel has the
     PSF that it sees of a grey scene: the mean over bands, weighted by illuminant x response x wavelength. The power
     spectrum of the prior falls as 1 / frequency^3, like that of edges, with the variance of this picture; channels have
-    a correlation of 0.95. Clipped pixels and pixels beyond the edge are unknown. The patterns of `glare` and `ghosts`,
-    wide as the scene, are removed, each with its own unknown strength. By default their shapes count as known exactly.
+    a correlation of 0.95. Clipped pixels and pixels beyond the edge are unknown. The picture with its border repeats
+    itself, so that opposite ends agree. `border` above 1 widens the border beyond the reach of the PSF, so that they
+    may differ behind a wide PSF; the prior then hardly rises below half a cycle in the picture, and its variance counts
+    about the mean of the picture. The patterns of `glare` and `ghosts`, wide as the scene, are removed, each with its
+    own unknown strength. By default their shapes count as known exactly.
     `doubt` is the standard deviation of a pattern in each pixel over the light of the pattern around this pixel, which
     falls as 1 / distance^3 from each point of it: the variance of the noise grows by (doubt x this light)^2. Without a
     number (null) it is the likeliest of 0, 0.01, 0.03, 0.1, 0.3, 1 and 3 for this picture that is not below
@@ -92,17 +113,8 @@ def wiener(
             prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.
     """
     electrons, light = single(electrons), (glare, nearby, ghosts)
-    scaled = pose(
-        electrons,
-        psf,
-        illuminant,
-        responses,
-        bands,
-        clipped,
-        *light,
-        (balance, read_noise, doubt, least_doubt),
-        scatter,
-    )
+    settings = Settings(balance, read_noise, doubt, least_doubt, scatter, border)
+    scaled = pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings)
     return (scaled.pixels(most_likely(scaled.problem, coarser=coarser_grids)) + scaled.mean).to(electrons)
 
 
@@ -192,12 +204,11 @@ def pose(
     nearby: list[Tensor] | None,
     ghosts: list[Tensor] | None,
     settings: Settings,
-    scatter: bool = False,
 ) -> Scaled:
     """Return the inputs of `wiener` as a linear problem, unsolved; ``settings`` as `Settings` says."""
     fine, known, light = known_and_light(psf, responses, electrons, clipped, glare, nearby, ghosts)
     kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
-    return posed(fine, known, kernels, light, settings, scatter, grey_white(illuminant, responses, bands).to(fine))
+    return posed(fine, known, kernels, light, settings, grey_white(illuminant, responses, bands).to(fine))
 
 
 def posed(
@@ -206,34 +217,37 @@ def posed(
     kernels: Tensor,
     glare: Glare,
     settings: Settings,
-    scatter: bool = False,
     white: Tensor | None = None,
 ) -> Scaled:
     """Return the deconvolution of a picture as a linear problem; ``settings`` as `Settings` says.
 
-    With ``scatter`` and ``white``, what the channels (channel, 1, 1) see of a grey scene, channels that glare covers
-    take mean and contrast of others.
+    With `Settings.scatter` and ``white``, what the channels (channel, 1, 1) see of a grey scene, channels that glare
+    covers take mean and contrast of others.
     """
-    y, x = electrons.shape[-2:]
-    balance, read, _, _ = settings
+    frame = (electrons.shape[-2], electrons.shape[-1])
+    read, scatter = settings.read_noise, settings.scatter
     seen, some = known, known.amax((-2, -1), keepdim=True)
     known = torch.where(some > 0, known, 1.0)
     share = power_of_two(kernels.sum((-2, -1), keepdim=True).detach())
     kernels = kernels / share  # the same bits, and the floors below concern the shape of the PSF, not a grey filter
 
-    free, trusted, light, wrong = _found_light(electrons, (known, seen), glare, settings, scatter)
+    free, trusted, light, wrong = _found_light(electrons, (known, seen), glare, settings)
     picture = electrons - light.sum
     mean = average(picture, trusted)
-    size = torus((y, x), edge(kernels, (y, x)))
+    size = torus(frame, bordered(edge(kernels, frame), settings.border))
     transfer, power = torch.fft.rfft2(wrapped(kernels, size)), fall(size).to(kernels)
+    varying = power
+    if settings.border > 1:
+        power = fall(size, (2 * frame[0], 2 * frame[1])).to(kernels)
+        varying = about_mean(power, frame, size)
     found = average((picture - mean).square(), trusted)
-    passed = expected_variance(transfer, power, size).clamp_min(1e-6)
+    passed = expected_variance(transfer, varying, size).clamp_min(1e-6)
     told = mean, (found - mean - read**2 - wrong) / passed
     scale = torch.maximum(told[1], 0.01 * found / passed).clamp_min(1e-6).sqrt()
     if scatter and white is not None and light.modes:
         trust = trusted.sum((-2, -1), keepdim=True) / known.sum((-2, -1), keepdim=True) * some
         mean, scale = (shared_level(x, trust.detach(), white) for x in (mean.clamp_min(1.0), scale))
-    noise = balance * picture_noise(electrons, mean, read) + light.variance
+    noise = settings.balance * picture_noise(electrons, mean, read) + light.variance
     weight = known * (scale / noise.sqrt()).square()
     scaled = tuple(pattern / scale for pattern in (*free, *light.modes))
     problem = Blurred((picture - mean) / scale, weight, transfer, power, size, GREY, scaled, bounded=len(light.modes))
@@ -246,20 +260,19 @@ def posed(
 
 
 def _found_light(
-    electrons: Tensor, known: tuple[Tensor, Tensor], glare: Glare, settings: Settings, scatter: bool
+    electrons: Tensor, known: tuple[Tensor, Tensor], glare: Glare, settings: Settings
 ) -> tuple[list[Tensor], Tensor, Light, Tensor]:
     """Return the patterns of unknown strength, and what `doubted` returns; ``known`` with and without blind channels.
 
-    With ``scatter`` the strengths are found too, so that no pattern of unknown strength is left.
+    With `Settings.scatter` the strengths are found too, so that no pattern of unknown strength is left.
     """
-    _, read, doubt, least = settings
 
     def own_noise(mean: Tensor) -> Tensor:
-        return picture_noise(electrons, mean, read)
+        return picture_noise(electrons, mean, settings.read_noise)
 
-    if scatter and glare.patterns:
+    if settings.scatter and glare.patterns:
         return [], *scattered(electrons, known[1], glare, own_noise)
-    return glare.patterns, *_doubted(electrons, known[0], glare, (doubt, least), own_noise)
+    return glare.patterns, *_doubted(electrons, known[0], glare, (settings.doubt, settings.least_doubt), own_noise)
 
 
 def _doubted(
@@ -275,12 +288,3 @@ def _doubted(
         glare = with_light_around(glare)
     doubt = likeliest_doubt(electrons, known, glare, noise, least) if doubt is None else doubt
     return doubted(electrons, known, glare, doubt, noise)
-
-
-def fall(size: tuple[int, int]) -> Tensor:
-    """Return the power spectrum that the prior of the scene assumes, as half a spectrum of mean 1."""
-    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in size)
-    squared = fy[:, None].square() + fx[None, : size[1] // 2 + 1].square() + 1.0 / (size[0] * size[1])
-    power: Tensor = squared.pow_(-_FALL / 2.0)
-    power /= variance(power, size)
-    return power

@@ -11,8 +11,9 @@ from neusee.nodes._half_precision import single
 from neusee.nodes.restore._inverse._fft_grid import torus
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred
+from neusee.nodes.restore._inverse._picture_scale import fall
 from neusee.nodes.restore._inverse._psf_on_grid import edge, wrapped
-from neusee.nodes.restore._inverse._wiener import GREY, Doubt, LeastDoubt, Scaled, fall, pose
+from neusee.nodes.restore._inverse._wiener import GREY, Doubt, LeastDoubt, Scaled, Settings, pose
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf, WienerProblem
 
@@ -45,9 +46,8 @@ def wiener_problem(
     Source: as `restore.wiener`.
     """
     electrons, light = single(electrons), (glare, nearby, ghosts)
-    return packed(
-        pose(electrons, psf, illuminant, responses, bands, clipped, *light, (balance, read_noise, doubt, least_doubt))
-    )
+    settings = Settings(balance, read_noise, doubt, least_doubt)
+    return packed(pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings))
 
 
 @wiener_problem.check

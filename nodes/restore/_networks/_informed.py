@@ -15,7 +15,7 @@ from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.exact_convolution import exact_convolutions
 from neusee.nodes.network_weights import loaded, same_layout
 from neusee.nodes.restore._inverse._filter_facts import MAPS, facts
-from neusee.nodes.restore._inverse._wiener import Doubt, LeastDoubt, pose
+from neusee.nodes.restore._inverse._wiener import Doubt, LeastDoubt, Settings, pose
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import Restorer
 from neusee.nodes.units import Count, DataFile, Electrons
@@ -99,8 +99,8 @@ def informed(
     electrons, light = single(electrons), (glare, nearby, ghosts)
     if len(electrons) != 3:
         raise ValueError(f"electrons {tuple(electrons.shape)} have {len(electrons)} channels, and the network needs 3")
-    settings = balance, read_noise, doubt, least_doubt
-    found = facts(pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings, scatter))
+    settings = Settings(balance, read_noise, doubt, least_doubt, scatter)
+    found = facts(pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings))
     result = found.answer * found.scale
     if weights is not None:
         net = loaded(partial(Informed, width), weights).requires_grad_(False).eval().to(electrons.device)

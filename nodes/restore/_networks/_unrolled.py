@@ -17,7 +17,7 @@ from neusee.nodes.network_weights import loaded, same_layout
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import Blurred
 from neusee.nodes.restore._inverse._pulled_answer import STEPS, pulled
-from neusee.nodes.restore._inverse._wiener import Doubt, LeastDoubt, pose
+from neusee.nodes.restore._inverse._wiener import Doubt, LeastDoubt, Settings, pose
 from neusee.nodes.restore._inverse._wiener_problem import unpacked
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import Restorer
@@ -131,9 +131,8 @@ def unrolled(
     electrons, light = single(electrons), (glare, nearby, ghosts)
     if len(electrons) != 3:
         raise ValueError(f"electrons {tuple(electrons.shape)} have {len(electrons)} channels, and the network needs 3")
-    scaled = pose(
-        electrons, psf, illuminant, responses, bands, clipped, *light, (balance, read_noise, doubt, least_doubt)
-    )
+    settings = Settings(balance, read_noise, doubt, least_doubt)
+    scaled = pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings)
     problem, spectrum = scaled.problem, most_likely(scaled.problem)
     result = scaled.pixels(spectrum)
     if weights is not None:

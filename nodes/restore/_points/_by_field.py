@@ -62,8 +62,9 @@ def wiener_by_field(
     _refuse_other(electrons, measured)
     total = torch.zeros_like(single(electrons))
     light = _glare(electrons, measured, clipped, (glare, nearby), doubt, scatter)
+    settings = Settings(balance, read_noise, doubt, least_doubt, scatter)
     for part in _parts(electrons, measured):
-        scaled = _problem(electrons, clipped, part, light, (balance, read_noise, doubt, least_doubt), scatter)
+        scaled = _problem(electrons, clipped, part, light, settings)
         found = scaled.pixels(most_likely(scaled.problem, coarser=True)) + scaled.mean
         total[:, part.rows, part.columns] += (part.weight.to(found) * found).to(total)
     return total
@@ -93,11 +94,13 @@ def spread_by_field(
     """
     _refuse_other(electrons, measured)
     total = torch.zeros(len(matrix), *electrons.shape[-2:], dtype=single(electrons).dtype, device=electrons.device)
+    settings = Settings(balance, read_noise, doubt, least_doubt, scatter)
     with torch.no_grad():
         light = _glare(electrons, measured, clipped, (glare, nearby), doubt, scatter)
+    settings = Settings(balance, read_noise, doubt, least_doubt, scatter)
     for part in _parts(electrons, measured):
         with torch.no_grad():
-            scaled = _problem(electrons, clipped, part, light, (balance, read_noise, doubt, least_doubt), scatter)
+            scaled = _problem(electrons, clipped, part, light, settings)
         found = frame_deviation(scaled, matrix, draws, rng, part.draws)
         total[:, part.rows, part.columns] += part.weight.to(total) * found.to(total)
     return with_shading(total, restored, shading)
@@ -152,9 +155,7 @@ def _glare(
     return with_smooth(light) if scatter else light
 
 
-def _problem(
-    electrons: Tensor, clipped: Tensor, part: _Part, light: Glare, settings: Settings, scatter: bool
-) -> Scaled:
+def _problem(electrons: Tensor, clipped: Tensor, part: _Part, light: Glare, settings: Settings) -> Scaled:
     """Return the deconvolution of a part of a frame."""
     inside = (slice(None), part.rows, part.columns)
     fine = single(electrons)[inside]
@@ -167,7 +168,7 @@ def _problem(
     nearby = [None if x is None else cut([x])[0] for x in light.nearby]
     around, smooth = light.around and cut(light.around), light.smooth and [cut(each) for each in light.smooth]
     here = Glare(cut(light.patterns), nearby, around, light.peaks, smooth)
-    return posed(fine, known, kernels, here, settings, scatter)
+    return posed(fine, known, kernels, here, settings)
 
 
 def _around(weight: Tensor, reach: int) -> slice:

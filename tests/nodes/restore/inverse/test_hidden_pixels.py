@@ -12,7 +12,7 @@ from neusee.nodes.restore._inverse._fft_grid import torus
 from neusee.nodes.restore._inverse._hidden_pixels import halved, most_likely
 from neusee.nodes.restore._inverse._lowest_frequencies import Lowest
 from neusee.nodes.restore._inverse._masked_blur import Blurred, variance
-from neusee.nodes.restore._inverse._wiener import fall
+from neusee.nodes.restore._inverse._picture_scale import fall
 
 
 def problem(picture, size, channels=1, grey=0.0, seed=0, hidden=0.0):
