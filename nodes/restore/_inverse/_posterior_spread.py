@@ -54,8 +54,8 @@ def wiener_spread(
     says. The frame itself is then one of the draws: where the restored frame has more details (differences from the
     mean over 5 x 5 pixels) than the restored draws have, errors are larger, and where it is even, errors of details
     are smaller, unless no details could be restored. Low frequencies of photographs vary about a power law: errors
-    averaged over 11 x 11 pixels have twice the variance. Clipped pixels and pixels beyond the edge are as unknown as in
-    `restore.wiener`.
+    averaged over 11 x 11 pixels have twice the variance. Clipped pixels, and the ``border`` beyond the edge, are as
+    unknown as in `restore.wiener`.
 
     With ``scatter`` the mean and the contrast of the scene are as doubtful as the glare leaves them, given that a
     camera is mostly exposed to a seventh of the fullest pixel, to a factor of three, and that the deviation of a scene
