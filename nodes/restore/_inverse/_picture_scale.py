@@ -49,7 +49,8 @@ def about_mean(power: Tensor, frame: Size, torus: Size) -> Tensor:
     """Return half a power spectrum on a periodic grid, without the variance that the mean over a frame has."""
     rows, columns = (torch.ones(n, dtype=power.dtype, device=power.device) / n for n in frame)
     share = torch.fft.fft(rows, torus[0]).abs().square()[:, None] * torch.fft.rfft(columns, torus[1]).abs().square()
-    return power * (1.0 - share)
+    left: Tensor = power * (1.0 - share)
+    return left
 
 
 def power_of_two(x: Tensor) -> Tensor:
