@@ -27,6 +27,7 @@ _USUAL, _FACTOR = 0.004, 2.0  #: relative scatter of electrons behind a dirty le
 #: of the median logarithm that is lost: its value at scatter 1, the power of scatter, and its growth with clipping
 _LOST, _POWER, _CLIPPED = 2.10, 0.74, 2.15
 _WIDTHS = (0.7, 1.2)  #: standard deviations of the logarithm of it, where the frame tells the scatter, and where not
+_ALL = 10.0  #: logarithm, beyond which nothing of a laser follows its pattern
 _NODES = 256  #: quantiles that stand for a law
 _ENDS = (0.5, 0.05, 0.95)  #: probabilities of an estimate and of the ends of a 90 % interval
 _HALVINGS = 60
@@ -52,12 +53,13 @@ def at_the_aperture(straight: Tensor, spread: Tensor, ideal: Tensor, seen: Tenso
     scatter = torch.where(told, scatter, faint.clamp_max(_USUAL))
     width = torch.where(told, _WIDTHS[0], _WIDTHS[1])
     middle = math.log(_LOST) + _POWER * scatter.log() + _CLIPPED * clipped
-    lost = torch.exp(middle[:, None] + width[:, None] * _normal_quantiles().to(size))
+    lost = torch.exp(middle[:, None] + width[:, None] * _normal_quantiles().to(size)).clamp_max(_ALL)
     return _quantiles(straight, spread, lost, dirty)
 
 
 def _normal_quantiles() -> Tensor:
-    return torch.special.ndtri((torch.arange(_NODES, dtype=torch.float64) + 0.5) / _NODES)
+    quantiles: Tensor = torch.special.ndtri((torch.arange(_NODES, dtype=torch.float64) + 0.5) / _NODES)
+    return quantiles
 
 
 def _quantiles(straight: Tensor, spread: Tensor, lost: Tensor, dirty: Tensor) -> tuple[Tensor, Tensor]:

@@ -126,11 +126,12 @@ def test_the_interval_is_that_of_draws_from_the_stated_law():
 
 
 def test_a_channel_that_does_not_see_the_laser_has_a_finite_interval():
-    given = [torch.tensor(x, dtype=torch.float64) for x in ([-3.0, 0.0], [10.0, 0.0], [10.0, 0.0])]
-    middle, ends = at_the_aperture(*given, torch.tensor([1.0, 0.0])[:, None, None].expand(2, 30, 30))
+    given = [torch.tensor(x, dtype=torch.float64) for x in ([-3.0, 0.0, 5.0], [10.0, 0.0, 9.0], [10.0, 0.0, 1.0])]
+    middle, ends = at_the_aperture(*given, torch.tensor([1.0, 0.0, 0.0])[:, None, None].expand(3, 300, 300))
     assert middle.isfinite().all()
     assert ends.isfinite().all()
     assert ends[0, 0] < -3 < ends[0, 1]
+    assert ends[2, 0] < middle[2] < ends[2, 1]
 
 
 def test_speckle_of_a_strong_laser_is_no_laser_and_a_second_laser_is():
