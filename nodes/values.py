@@ -149,13 +149,15 @@ class FoundLasers(NamedTuple):
     direction: Tensor  #: (laser, 2) float64, rad, (n_y, n_x)
     wavelength: Tensor  #: (laser,) float64, m
     fwhm: Tensor  #: (laser,) float64, m, width of the line, the best of those that were tried
-    strength: Tensor  #: (laser, channel) float64, electrons over all of the pattern behind a clear pupil
+    strength: Tensor  #: (laser, channel) float64, electrons over all of the pattern behind a clean and clear pupil
     direction_interval: Tensor  #: (laser, 2, 2) float64, rad: lower and upper end (90 %) along each axis
     wavelength_interval: Tensor  #: (laser, 2) float64, m: lower and upper end (90 %)
     strength_interval: Tensor  #: (laser, channel, 2) float64, electrons: lower and upper end (90 %)
     identifiable: Tensor  #: (laser, 2) bool: True where the frame tells direction, and wavelength
     gain: Tensor  #: (laser, 2) float64: log likelihood gained by the laser, and beyond what a lamp there gains
-    correlation: Tensor  #: (laser, value, value) float64, of n_y, n_x, wavelength and the strength of each channel
+    correlation: Tensor  #: (laser, value, value) float64, of n_y, n_x, wavelength and `straight` of each channel
+    straight: Tensor  #: (laser, channel) float64, electrons that follow the pattern: ``strength`` less what dirt takes
+    straight_spread: Tensor  #: (laser, channel) float64, electrons, standard deviation of ``straight``
 
 
 class Shading(NamedTuple):

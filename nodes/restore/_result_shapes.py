@@ -104,7 +104,8 @@ def _(electrons: Tensor, *inputs: Any, most: int = 3, **params: Any) -> FoundLas
     certain, spread = blank(most, 2, dtype=torch.bool), double(most, 3 + channels, 3 + channels)
     places, wave, width, size, ends, wave_ends, size_ends = values
     number, gain = blank(dtype=torch.int64), double(most, 2)
-    return FoundLasers(number, places, wave, width, size, ends, wave_ends, size_ends, certain, gain, spread)
+    straight = (double(most, channels), double(most, channels))
+    return FoundLasers(number, places, wave, width, size, ends, wave_ends, size_ends, certain, gain, spread, *straight)
 
 
 @find_lasers.work

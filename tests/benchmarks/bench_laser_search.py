@@ -10,8 +10,10 @@ mask, two frames without a laser, one of them with lamps, one with a laser of 10
 ``--only`` keeps the frames without a laser, those with one, or those with one of 1000 or more. With ``--wrong`` the
 camera has the errors of `bench_restored_frames.py`, of which the search is not told: defocus, half a pixel of tilt,
 grains of dirt, another illuminant. The tilt moves the spot that counts as true, because no frame can tell it from a
-direction. A frame that stands in the file is not computed again, so that a run that was stopped continues. The patterns
-on the axis, which depend on the mask alone, are computed once. Intervals of rates are of 90 % (Clopper and Pearson).
+direction. The strength that counts as true is that of the light at the aperture, as in a recipe: grains of dirt absorb
+part of it, which `own_camera` makes up for, so that its light counts over the share of the pupil that is open. A frame
+that stands in the file is not computed again, so that a run that was stopped continues. The patterns on the axis, which
+depend on the mask alone, are computed once. Intervals of rates are of 90 % (Clopper and Pearson).
 """
 
 import argparse
@@ -51,7 +53,7 @@ def cases(seed, masks=MASKS):
 
 
 def taken(seed, name, mask, strength, lamps, side, wrong):
-    """A frame, what it shows, and the place of the spot in pixels from the middle."""
+    """A frame, what it shows, the spot in pixels from the middle, its wavelength, and its electrons at the aperture."""
     rng = np.random.default_rng([seed, *name.encode()])
     kind = KINDS[int(rng.integers(len(KINDS)))]
     spot, wavelength = tuple(rng.uniform(-0.35, 0.35, 2) * side), rng.uniform(420e-9, 670e-9)
@@ -59,15 +61,17 @@ def taken(seed, name, mask, strength, lamps, side, wrong):
     if wrong:
         own.scene_psf.cache_clear()  # of seeds that do not come again
     frame = own.frame(f"{mask}~{seed}" if wrong else mask, kind, side, lasers, rng, lamps)
+    channels = lasers[0].channels if lasers else np.zeros(3)
     if wrong:
+        channels = channels * own.pupil(mask)[0].sum() / own.pupil(f"{mask}~{seed}")[0].sum()
         bend = own.silica(wavelength) / own.silica(550e-9)  # the tilt is one of glass
         spot = np.add(spot, bend * np.array(wrong_camera.tilt_of(seed)))
-    return frame, kind, lasers, list(map(float, spot)), wavelength
+    return frame, kind, channels, list(map(float, spot)), wavelength
 
 
 def row(seed, name, mask, strength, lamps, side, wrong):
     """What is true of one frame, and what was found."""
-    frame, kind, lasers, spot, wavelength = taken(seed, name, mask, strength, lamps, side, wrong)
+    frame, kind, channels, spot, wavelength = taken(seed, name, mask, strength, lamps, side, wrong)
     start = time.process_time()
     with patch.object(own, "daylight", recipe_daylight if wrong else own.daylight):
         found = found_in(frame, mask)
@@ -76,7 +80,7 @@ def row(seed, name, mask, strength, lamps, side, wrong):
         "seed": seed, "name": name, "side": side, "mask": mask, "strength": strength, "lamps": lamps, "kind": kind,
         "camera": "wrong" if wrong else "exact",
         "clipped": float(frame.clipped.any(0).mean()), "seconds": round(time.process_time() - start, 2),
-        "spot": spot, "nm": wavelength * 1e9, "channels": lasers[0].channels.tolist() if lasers else None,
+        "spot": spot, "nm": wavelength * 1e9, "channels": channels.tolist(),
         "number": int(found.number), "found_spot": (found.direction[0] / pixel).tolist(),
         "spot_ends": (found.direction_interval[0] / pixel).tolist(), "found_nm": float(found.wavelength[0]) * 1e9,
         "nm_ends": (found.wavelength_interval[0] * 1e9).tolist(), "found_channels": found.strength[0].tolist(),

@@ -67,7 +67,7 @@ FOUND = FoundLasers(
     torch.tensor(1), _PLACE, _NM, torch.full_like(_NM, 5e-9), _AMOUNT, torch.stack([_PLACE - 1e-6, _PLACE + 1e-6], -1),
     torch.stack([_NM - 2e-9, _NM + 2e-9], -1), torch.stack([0.9 * _AMOUNT, 1.1 * _AMOUNT], -1),
     torch.ones(1, 2, dtype=torch.bool), torch.tensor([[200.0, 100.0]], dtype=torch.float64),
-    (0.9 * torch.eye(6, dtype=torch.float64) + 0.1)[None],
+    (0.9 * torch.eye(6, dtype=torch.float64) + 0.1)[None], 0.95 * _AMOUNT, 0.05 * _AMOUNT,
 )  # fmt: skip
 _KERNELS = rand(4, 1, 2, 3, 9, 9)
 _KERNELS = _KERNELS / _KERNELS.sum((-2, -1), keepdim=True)

@@ -52,6 +52,15 @@ def scattered(
     return trusted, light, average(total, trusted)
 
 
+def speckle(electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]) -> Tensor:
+    """Return the variance of each pixel by the likeliest speckle of glare: (channel, y, x) e-^2."""
+    if not glare.patterns:
+        return torch.zeros_like(electrons)
+    glare = with_smooth(glare)
+    strength, *shares = _likeliest(electrons, known, glare, noise)
+    return _light(glare, strength, shares).variance
+
+
 def with_smooth(glare: Glare) -> Glare:
     """Return the glare with each of its patterns spread over each of the `RADII`."""
     return glare._replace(smooth=[[_spread(pattern, radius) for radius in RADII] for pattern in glare.patterns])

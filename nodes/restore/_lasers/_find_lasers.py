@@ -11,11 +11,13 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes._half_precision import refuse_not_finite
 from neusee.nodes.restore._inverse._wiener import refuse_other_pictures
+from neusee.nodes.restore._lasers._beyond_scatter import without_scattered
 from neusee.nodes.restore._lasers._candidates import line_templates
 from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Laser, lamp_light
 from neusee.nodes.restore._lasers._greedy_search import Found, Known, search
-from neusee.nodes.restore._lasers._intervals import NORMAL, covariances
+from neusee.nodes.restore._lasers._intervals import NORMAL, spreads
 from neusee.nodes.restore._lasers._line_pattern import Lens, Sensor
+from neusee.nodes.restore._lasers._lost_light import at_the_aperture
 from neusee.nodes.units import Electrons, PositiveLength
 from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
 
@@ -60,8 +62,13 @@ def find_lasers(
     where a fit begins. The best candidates are fitted with a free response of each channel (3 %), and with each of the
     ``widths`` (full width at half maximum) of a line. A laser must gain ``least`` of log likelihood, and at least
     ``margin`` of its gain beyond that of a lamp, a point source whose spectrum is smooth. All lasers and lamps are
-    fitted at once, and the search goes on in the rest. Intervals (90 %) come from the second derivatives and the
-    scatter of the residual.
+    fitted at once, and the search goes on in the rest. At the end a laser that does not gain ``least`` beside the
+    likeliest speckle of stronger ones, which a dirty lens scatters, is left out. Intervals (90 %) come from the second
+    derivatives and the scatter of the residual.
+
+    The strength counts all light at the aperture, as in a recipe. Dirt, edges and defocus take part of it out of the
+    pattern; the scatter of the residual tells how much that may be, by a law that was learnt from the dirt of
+    `recipes/flare/dirty_windshield.yaml`. An even attenuation is not told from a weaker laser.
 
     In a frame of one channel nothing but the scale of a pattern tells its wavelength, and nothing but its sharpness
     tells a laser from a lamp.
@@ -94,7 +101,7 @@ def find_lasers(
             read_noise,
             widths,
         )
-        found = search(known, most, lamps, least, margin)
+        found = without_scattered(search(known, most, lamps, least, margin), known, least)
         return _table(found, known, most)
 
 
@@ -148,7 +155,7 @@ def _told(channels: int) -> str:
 def _table(found: Found, known: Known, most: int) -> FoundLasers:
     """Return what was found in SI units, the laser of the largest gain first."""
     at = [n for n, part in enumerate(found.fit.parts) if isinstance(part, Laser)]
-    spread = covariances(found.fit, known.seen) if at else []
+    spread = spreads(found.fit, known.seen) if at else []
     order = sorted(range(len(at)), key=lambda n: -found.choices[at[n]].gain)
     result = _empty(most, len(known.electrons))
     pixel = known.camera.lens.pixel_pitch / known.camera.lens.focal_length
@@ -156,13 +163,15 @@ def _table(found: Found, known: Known, most: int) -> FoundLasers:
         part = found.fit.parts[at[n]]
         assert isinstance(part, Laser)
         values = torch.cat([part.values[:3], part.channels()]).cpu().double()
-        covariance = spread[n].cpu().double()
+        covariance = spread[n].covariance.cpu().double()
         half = NORMAL * covariance.diagonal().sqrt()
         ends = torch.stack([values - half, values + half], -1)
         result.direction[row], result.direction_interval[row] = pixel * values[:2], pixel * ends[:2]
         result.wavelength[row], result.wavelength_interval[row] = NANOMETRE * values[2], NANOMETRE * ends[2]
         result.fwhm[row] = part.fwhm
-        result.strength[row], result.strength_interval[row] = values[3:], ends[3:]
+        result.straight[row], result.straight_spread[row] = values[3:], half[3:] / NORMAL
+        light = (result.straight[row], result.straight_spread[row], spread[n].ideal.cpu().double())
+        result.strength[row], result.strength_interval[row] = at_the_aperture(*light, known.seen.cpu())
         choice = found.choices[at[n]]
         alone = choice.rival > _RIVAL
         result.identifiable[row, 0] = alone and float(half[:2].max()) < _WIDEST[0]
@@ -179,4 +188,5 @@ def _empty(most: int, channels: int) -> FoundLasers:
     gain, spread = (torch.zeros(most, *shape, dtype=torch.float64) for shape in ((2,), (3 + channels, 3 + channels)))
     places, wave, width, size, ends, wave_ends, size_ends = blank
     none = torch.tensor(0)
-    return FoundLasers(none, places, wave, width, size, ends, wave_ends, size_ends, certain, gain, spread)
+    straight = (torch.zeros_like(size), torch.zeros_like(size))
+    return FoundLasers(none, places, wave, width, size, ends, wave_ends, size_ends, certain, gain, spread, *straight)

@@ -33,8 +33,8 @@ def found_glare(
     """Compute the glare of a laser that was found in a frame; 0 where fewer than ``rank`` lasers were found.
 
     The glare is the pattern of a spectral line at the direction and wavelength found, times the electrons of each
-    channel. `restore.wiener` takes it as ``glare``. Every tensor of ``found`` and ``pupil`` receives a derivative. Of
-    ``electrons``, the frame, only the shape is used.
+    channel that follow it. `restore.wiener` takes it as ``glare``. Every tensor of ``found`` and ``pupil`` receives a
+    derivative. Of ``electrons``, the frame, only the shape is used.
 
     Shapes: found (laser,), pupil (v, u), electrons (channel, y, x) -> (channel, y, x).
     Units:  e-; rank counts from 1, the laser of the largest gain.
@@ -50,7 +50,7 @@ def found_glare(
     lens = Lens(focal_length, pixel_pitch, (electrons.shape[-2], electrons.shape[-1]), sensor)
     row = rank - 1
     pattern = line_pattern(pupil, found.direction[row], found.wavelength[row], lens, found.fwhm[row])
-    glare: Tensor = found.strength[row].to(pattern)[:, None, None] * pattern
+    glare: Tensor = found.straight[row].to(pattern)[:, None, None] * pattern
     return glare.to(single(electrons))
 
 
@@ -69,7 +69,7 @@ def found_nearby(
 ) -> Tensor:
     """Draw patterns that the glare of a found laser may have, from the joint normal law of what was found.
 
-    Each pattern has its own direction, wavelength and strength of each channel, drawn with the covariance of the found
+    Each pattern has its own direction, wavelength and electrons of each channel, drawn with the covariance of the found
     laser. `restore.wiener` takes the patterns as ``nearby``. A laser that was not found has patterns of 0.
 
     Shapes: found (laser,), pupil (v, u), electrons (channel, y, x) -> (pattern, channel, y, x).
@@ -101,9 +101,9 @@ def _(result: Tensor, found: FoundLasers, *inputs: Any, rank: int = 1, **params:
 
 def _drawn(found: FoundLasers, row: int, count: int, rng: Generator) -> Tensor:
     """Return draws (draw, value) of direction, wavelength and the strength of each channel of one found laser."""
-    middle = torch.cat([found.direction[row], found.wavelength[row][None], found.strength[row]])
-    each = (found.direction_interval[row], found.wavelength_interval[row][None], found.strength_interval[row])
-    spread = torch.cat([(ends[:, 1] - ends[:, 0]) / (2 * NORMAL) for ends in each])
+    middle = torch.cat([found.direction[row], found.wavelength[row][None], found.straight[row]])
+    each = (found.direction_interval[row], found.wavelength_interval[row][None])
+    spread = torch.cat([*((ends[:, 1] - ends[:, 0]) / (2 * NORMAL) for ends in each), found.straight_spread[row]])
     even = (found.correlation[row] + found.correlation[row].mT) / 2  # the factor reads one triangle alone
     lower = torch.linalg.cholesky(even + 1e-9 * torch.eye(len(even)).to(even))
     numbers = torch.randn(count, len(middle), generator=rng, device=rng.device, dtype=torch.float64).to(middle)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -17,8 +19,15 @@ _SHAPE = 0.03  #: standard deviation of the wavelength from the unknown shape of
 _AMOUNT = 0.0015  #: the same of the electrons of each channel, relative
 
 
-def covariances(fit: Fit, seen: Tensor) -> list[Tensor]:
-    """Return for each laser the covariance of y, x (pixels), nm, and the electrons of each channel.
+class Spread(NamedTuple):
+    """How well a frame tells the values of one laser."""
+
+    covariance: Tensor  #: (value, value), of y, x (pixels), nm, and the electrons of each channel
+    ideal: Tensor  #: (channel,) e-, standard deviation of these electrons behind a lens that is as its recipe says
+
+
+def spreads(fit: Fit, seen: Tensor) -> list[Spread]:
+    """Return for each laser how well its values are told.
 
     ``seen`` (channel, y, x) is 0 for clipped pixels, which the fit has after all others, if at all. The inverse of the
     second derivatives is enlarged where the slopes of blocks of the frame scatter more than the model says.
@@ -38,10 +47,12 @@ def covariances(fit: Fit, seen: Tensor) -> list[Tensor]:
     whole = growth[:, None] * inverse * growth
     found, first = [], 0
     for part in fit.parts:
-        own = whole[first : first + len(part.values), first : first + len(part.values)]
+        own = slice(first, first + len(part.values))
         first += len(part.values)
         if isinstance(part, Laser):
-            found.append(_of_channels(part, own, int(seen.amin(0).sum())))
+            pixels = int(seen.amin(0).sum())
+            grown, ideal = (_of_channels(part, each[own, own], pixels) for each in (whole, inverse))
+            found.append(Spread(grown, ideal.diagonal()[3:].sqrt()))
     return found
 
 
