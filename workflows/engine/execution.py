@@ -106,7 +106,8 @@ class Execution:
                 order = in_order(below, targets)
             try:
                 plan = [key for key in order if key in below.missing]
-                uses = uses_of(plan, [*targets, *later], self.known, self.sources)
+                known = self.known if again else below.knows
+                uses = uses_of(plan, [*targets, *later], known, self.sources)
                 return self._execute(plan, again, targets, keep, uses, asked=not (keep or later))
             except InputMissing:
                 continue
@@ -274,10 +275,10 @@ class Execution:
 
     def _facts_of(self, name: str) -> TensorStats | None:
         """Return the statistics of the result of a step; compute the result if no statistics are known."""
-        key = self.keys[name]
-        if self.known_facts(name) is None and self.store.about(key) is None:
+        key, known = self.keys[name], self.known_facts(name)
+        if known is None and key not in self.facts:
             self.make([key], keep=True)
-        return self.known_facts(name)
+        return known or self.known_facts(name)
 
     def known_facts(self, name: str) -> TensorStats | None:
         """Return the statistics of the result of a step, from this run or from an earlier run."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import os
 import resource
 import time
@@ -96,7 +97,12 @@ def process_peak() -> int:
 def give_back() -> None:
     """Give the memory that was freed back to the system; glibc keeps blocks below 32 MB of a busy process otherwise."""
     with suppress(OSError, AttributeError):  # another C library
-        ctypes.CDLL(None).malloc_trim(0)
+        _libc().malloc_trim(0)
+
+
+@functools.cache
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None)
 
 
 def free_memory() -> int:
