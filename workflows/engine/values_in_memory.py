@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 from neusee.workflows.engine.step_job import Outcome
+from neusee.workflows.engine.write_behind import WriteBehind
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 
@@ -14,10 +15,10 @@ from neusee.workflows.store.result_store import Store
 class ValuesInMemory(dict[Key, Any]):
     """Values by cache key, with what this run knows of their copies in the store.
 
-    ``later`` has the keys of values that are being written in the background.
+    ``later`` has the values that are being written in the background.
     """
 
-    def __init__(self, store: Store, later: Container[Key]) -> None:
+    def __init__(self, store: Store, later: WriteBehind) -> None:
         super().__init__()
         self._store, self._later = store, later
         self._unsure = dict[Key, bool]()  # values that the store may lack; True after a write in the background

@@ -152,8 +152,8 @@ def _found(
     memory: int | None = None,
 ) -> _Found:
     began = time.perf_counter()
-    how = {"watch": watch, "device": device, "memory": memory, "series": plan.series}
-    result = run(plan.checked[number].kept.recipe, store, **how)
+    recipe = plan.checked[number].kept.recipe
+    result = run(recipe, store, watch=watch, device=device, memory=memory, series=plan.series)
     rows = (row for step, value in result.values.items() for row in numbers_of(step, value))
     ran = any(step.state == "run" for step in result.done.values())
     numbers = tuple((step, field, index, number) for step, field, index, number in rows)

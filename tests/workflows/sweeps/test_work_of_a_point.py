@@ -1,7 +1,9 @@
 """What holds for all points of a sweep is done once; a further point does what differs, counted and not timed."""
 
+import sys
 from collections import Counter
 from pathlib import Path
+from statistics import median
 
 import pytest
 
@@ -18,6 +20,37 @@ SMALL = [
     "optics.samples=64", "optics.pitch=126.22 um", "optics.bands=3", "optics.window=[32, 32]", "scene.shape=[28, 28]",
     "sensor.shape=[24, 24]", "outputs=[saturated]",
 ]  # fmt: skip
+CHAIN = """# Three steps
+sensor: {noise: 5 e-}
+steps:
+  light: {node: chained.light}
+  noisy: {node: chained.noisy, from: light, with: {noise: "${sensor.noise}"}}
+  mean: {node: chained.mean, from: noisy}
+outputs: [mean]
+nodes: [chained.py]
+"""
+NODES = '''"""Nodes of a test."""
+import torch
+from torch import Tensor
+
+from neusee.nodes import node
+from neusee.nodes.units import Electrons
+
+
+@node()
+def light() -> Tensor:
+    return torch.ones(8, 8)
+
+
+@node()
+def noisy(image: Tensor, *, noise: Electrons = 0.0) -> Tensor:
+    return image + noise
+
+
+@node()
+def mean(image: Tensor) -> Tensor:
+    return image.mean()
+'''
 
 
 @pytest.fixture
@@ -69,3 +102,20 @@ def test_a_further_point_repeats_nothing_that_cannot_differ(tmp_path, counted):
     further = {name: (many[1][name] - few[1][name]) / 4 for name in many[1]}
     assert further["key_of"] <= 9
     assert further["form_of"] <= 3  # the two steps that have the noise, and the one that reads a file
+
+
+def test_the_calls_of_a_point_do_not_grow_with_the_points_before_it(tmp_path):
+    (tmp_path / "chain.yaml").write_text(CHAIN, encoding="utf-8")
+    (tmp_path / "chained.py").write_text(NODES, encoding="utf-8")
+    axes = read_axes({"sensor.noise": [f"{n / 7} e-" for n in range(1, 101)]}, tmp_path)
+    store = Store(tmp_path / "cache")
+    plan = plan_sweep("chain.yaml", points_of(axes), tmp_path, store)
+    calls, found = [0], []
+    sys.setprofile(lambda frame, event, arg: calls.__setitem__(0, calls[0] + (event == "call")))
+    try:
+        for _ in outcomes(plan, store):
+            found.append(calls[0])
+            calls[0] = 0
+    finally:
+        sys.setprofile(None)
+    assert median(found[80:]) == pytest.approx(median(found[10:30]), rel=0.1)
