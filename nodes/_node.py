@@ -219,7 +219,12 @@ class Node:
     def preflight_inputs(self) -> tuple[str, ...]:
         """Return the names of those inputs of the node that the hook ``preflight`` receives before the run."""
         hook = self.hooks.preflight
-        return tuple(name for name in inspect.signature(hook).parameters if name in self.inputs) if hook else ()
+        return tuple(name for name in _arguments(hook) if name in self.inputs) if hook else ()
+
+
+@functools.lru_cache(1000)
+def _arguments(hook: Callable[..., Any]) -> tuple[str, ...]:
+    return tuple(inspect.signature(hook).parameters)
 
 
 def registered_nodes() -> tuple[Node, ...]:

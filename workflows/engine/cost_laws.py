@@ -23,6 +23,7 @@ from neusee.workflows.engine.band_results import bands_in
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.graph.step_shapes import (
     Form,
+    alike,
     bytes_of,
     complete,
     form_of,
@@ -130,10 +131,11 @@ class Sized(NamedTuple):
     least: float
     form: Form
     size: Size
+    reads_file: bool  #: which may change
 
     def holds(self, step: Step, inputs: Sequence[Any], below: Sequence[Size], least: float) -> bool:
         """Return True if a step has the same node, parameters and known inputs, and therefore the same size."""
-        if step.node is not self.step.node or least != self.least or below != self.below:
+        if self.reads_file or step.node is not self.step.node or least != self.least or below != self.below:
             return False
         same = len(inputs) == len(self.inputs) and all(map(is_same, inputs, self.inputs))
         return same and (step.params is self.step.params or _equal(step.params, self.step.params))
@@ -150,9 +152,7 @@ _MOST_SIZED = 4096
 
 
 def _remember(sized: Sized) -> None:
-    """Keep the size of a step for the next recipe, unless it depends on a file, which may change."""
-    if has_path(sized.step.params):
-        return
+    """Keep the size of a step for the next recipe."""
     if len(_sized) >= _MOST_SIZED:
         _sized.clear()
     _sized[sized.step.name] = sized
@@ -189,7 +189,9 @@ def _sizes(recipe: Recipe, order: Sequence[str], least: float) -> dict[str, Size
         found[name] = _size(step, inputs, forms[name], below, least)
         if forms[name] is None and not found[name].known:  # a guess, so that the sizes of later steps can be computed
             forms[name] = next((x for x in inputs if x is not None), None)
-        _remember(Sized(step, inputs, below, least, forms[name], found[name]))
+        if known is not None and alike(forms[name], known.form):
+            forms[name] = known.form  # the same object, so that later steps have the size that they had
+        _remember(Sized(step, inputs, below, least, forms[name], found[name], has_path(step.params)))
     return found
 
 

@@ -236,7 +236,9 @@ def _extent(size: Size) -> float:
 
 
 def _alike(one: Size, other: Size) -> bool:
-    return all(abs(a - b) <= 1e-9 * max(abs(a), abs(b)) for a, b in zip(one[:4], other[:4], strict=True))
+    return one[:4] == other[:4] or all(
+        abs(a - b) <= 1e-9 * max(abs(a), abs(b)) for a, b in zip(one[:4], other[:4], strict=True)
+    )
 
 
 def _kind(row: Row) -> str:

@@ -21,12 +21,13 @@ from neusee.workflows.engine.load_or_recompute import Upstream, cheaper_to_recom
 from neusee.workflows.engine.local_executor import Local
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare, room_for, small_result
+from neusee.workflows.engine.run_series import RunSeries
 from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, Show, StepJob
+from neusee.workflows.engine.values_in_memory import ValuesInMemory
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order, needed, nodes_of
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event, StepRecord
-from neusee.workflows.keys.cache_key import Key, key_of
-from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.error_budget import ErrorBudget
@@ -49,17 +50,19 @@ class Execution:
         executor: Executor | None,
         memory: int | None,
         show: Show = lambda *_: None,
-        code: Code | None = None,
+        series: RunSeries | None = None,
     ) -> None:
         self.recipe, self.store, self.devices, self.watch, self.show = recipe, store, devices, watch, show
         self.wanted = frozenset(wanted)
         self.own = Local(devices, store, self._fetch, memory, nodes_of(recipe, self.wanted))
         self.executor = executor or self.own
-        self.code, self.began = code or Code(store.code_memo), time.time()
+        self.series = series or RunSeries.begun(store)
+        self.code, self.began = self.series.known_keys.code, time.time()
         self.keys: dict[str, Key] = {}
         self.makers: dict[Key, Step] = {}  # the first step of each key
         self.origins: dict[Key, dict[str, Any]] = {}  # the parts of each key
-        self.values, self.facts = dict[Key, Any](), dict[Key, TensorStats | None]()
+        self.values = ValuesInMemory(store, self.own.later)
+        self.facts: dict[Key, TensorStats | None] = {**self.series.facts}
         self.again: dict[Key, float] = {}  # s to obtain again a value that was computed in this run
         self.took: dict[str, float] = {}  # the longest time of a step of each node, s
         self.verdicts, self.ledger = dict[str, SkipDecision](), ErrorBudget(recipe)
@@ -82,8 +85,8 @@ class Execution:
             else:
                 self.ledger.pass_on(step)
             try:
-                kind = places(step, self.devices)[0]
-                key, origin = key_of(step, self.keys, self.recipe.seed, self.code, kind)
+                device = places(step, self.devices)[0]
+                key, origin = self.series.known_keys.of(step, self.keys, self.recipe.seed, device)
             except (OSError, LookupError, TypeError) as error:
                 raise RunError(step, [], error) from error
             self.keys[name] = key
@@ -103,13 +106,15 @@ class Execution:
                 order = in_order(below, targets)
             try:
                 plan = [key for key in order if key in below.missing]
-                uses = uses_of(plan, [*targets, *later], self.known, self.sources)
+                known = self.known if again else below.knows
+                uses = uses_of(plan, [*targets, *later], known, self.sources)
                 return self._execute(plan, again, targets, keep, uses, asked=not (keep or later))
             except InputMissing:
                 continue
 
     def close(self) -> None:
         """Save the digests of code, finish all writes, and delete the values and the executor, which refers to this."""
+        self.series.keep(self.facts, self.makers)
         self.code.save()
         self.own.cancel()
         self.values.clear()
@@ -132,7 +137,8 @@ class Execution:
         """Return the record of a step whose value no other step needed."""
         if name not in self._asleep:
             key = self.keys[name]
-            self._asleep[name] = unneeded(name, key, self.store.about(key), self._bound(name))
+            about = self.store.about(key) if self.recipe.steps[name].node.hooks.approximation_error else None
+            self._asleep[name] = unneeded(name, key, about, self._bound(name))
         return self._asleep[name]
 
     def missing(self, names: Iterable[str]) -> set[Key]:
@@ -176,24 +182,17 @@ class Execution:
     def _execute(
         self, plan: list[Key], again: frozenset[Key], targets: list[Key], keep: bool, uses: Counter[Key], asked: bool
     ) -> None:
-        self._free(list(self.values), uses, keep)
+        self.values.free(list(self.values), uses, keep)
         if plan:
             for outcome in self._outcomes(plan, again, targets, asked):
                 key, sources = outcome.work.key, outcome.work.sources
                 if outcome.value is not None or not outcome.kept:
-                    self.values[key] = outcome.value
+                    self.values.add(outcome)
                     self.show(self.recipe, self.keys, outcome.work.step.name, outcome.value)
                 uses.subtract(sources)
-                self._free([*sources, key], uses, keep)
+                self.values.free([*sources, key], uses, keep)
         for key in targets:
             self._fetch(key)
-
-    def _free(self, keys: Iterable[Key], uses: Counter[Key], keep: bool) -> None:
-        """Delete from memory the values that no later step needs."""
-        for key in keys:
-            unsafe = key in self.own.later or (keep and not self.store.has(key))
-            if uses[key] <= 0 and key in self.values and not unsafe:
-                del self.values[key]
 
     def _outcomes(self, plan: list[Key], again: frozenset[Key], targets: list[Key], asked: bool) -> Iterator[Outcome]:
         """Compute the values with the keys ``plan`` and yield each outcome; after an error no further step begins."""
@@ -276,15 +275,17 @@ class Execution:
 
     def _facts_of(self, name: str) -> TensorStats | None:
         """Return the statistics of the result of a step; compute the result if no statistics are known."""
-        key = self.keys[name]
-        if key not in self.facts and self.store.about(key) is None:
+        key, known = self.keys[name], self.known_facts(name)
+        if known is None and key not in self.facts:
             self.make([key], keep=True)
-        return self.known_facts(name)
+        return known or self.known_facts(name)
 
     def known_facts(self, name: str) -> TensorStats | None:
         """Return the statistics of the result of a step, from this run or from an earlier run."""
         key = self.keys[name]
-        return self.facts[key] if key in self.facts else facts_in(self.store.about(key))
+        if key not in self.facts and (about := self.store.about(key)) is not None:
+            self.facts[key] = facts_in(about)
+        return self.facts.get(key)
 
     def _why(self, name: str, key: Key) -> str:
         why = "faster to compute than to store" if key in self.receipts else "not in the store"

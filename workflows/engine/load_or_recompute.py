@@ -35,6 +35,10 @@ class Upstream(dict[Key, list[Key]]):
             self[key] = self._sources(key)
         return self[key]
 
+    def knows(self, key: Key) -> bool:
+        """Return True if a value is known; a value that was asked for before is not asked for again."""
+        return key not in self.missing if key in self else self._known(key)
+
 
 def uses_of(
     plan: Iterable[Key], targets: Sequence[Key], known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import os
 import resource
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Self
 
 _CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _USED = ("/sys/fs/cgroup/memory.current", "/sys/fs/cgroup/memory/memory.usage_in_bytes")
+_PAGE = os.sysconf("SC_PAGE_SIZE")  #: bytes
+FRESH = 0.02  #: s, the time between two looks of the watch over the memory
+_told = [-FRESH, 0.0]  # time of the newest look at the free memory in s, and what it found in bytes
 _highest = 0  # peak memory of this process before the last reset of the counter of the system
 
 
@@ -79,7 +84,9 @@ def _resident(field: str) -> int | None:
 
 def process_memory() -> int:
     """Return the memory of this process in bytes: code, libraries and data that are resident now."""
-    return _resident("VmRSS:") or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    with suppress(OSError), open("/proc/self/statm") as file:  # a fifth of the time of /proc/self/status
+        return int(file.read().split()[1]) * _PAGE
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def process_peak() -> int:
@@ -90,11 +97,26 @@ def process_peak() -> int:
 def give_back() -> None:
     """Give the memory that was freed back to the system; glibc keeps blocks below 32 MB of a busy process otherwise."""
     with suppress(OSError, AttributeError):  # another C library
-        ctypes.CDLL(None).malloc_trim(0)
+        _libc().malloc_trim(0)
+
+
+@functools.cache
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None)
 
 
 def free_memory() -> int:
-    """Return the bytes that this process can still use: free memory of the machine, or of its control group."""
+    """Return the bytes that this process can still use: free memory of the machine, or of its control group.
+
+    A number that is younger than `FRESH` seconds is told again, because short runs ask more often than it changes.
+    """
+    now = time.monotonic()
+    if not _told[0] <= now < _told[0] + FRESH:
+        _told[:] = [now, _free_memory()]
+    return int(_told[1])
+
+
+def _free_memory() -> int:
     found = there_is("cpu") - process_memory()
     with suppress(OSError, ValueError, StopIteration), open("/proc/meminfo") as file:
         found = min(found, next(int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable:")))

@@ -16,11 +16,11 @@ from neusee.workflows.engine.memory_use import give_back, process_peak
 from neusee.workflows.engine.memory_watch import limited
 from neusee.workflows.engine.node_call import to_device
 from neusee.workflows.engine.placement_inputs import running_peak
+from neusee.workflows.engine.run_series import RunSeries
 from neusee.workflows.engine.step_job import Executor, Show
 from neusee.workflows.graph.recipe_graph import Recipe, needed, unknown_step
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key
-from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.code_memo import Parts
 from neusee.workflows.placement.heft_schedule import Schedule
 from neusee.workflows.store.remote_store import open_store
@@ -95,15 +95,15 @@ def run(
     executor: Executor | None = None,
     memory: int | None = None,
     show: Show | None = None,
-    code: Code | None = None,
+    series: RunSeries | None = None,
 ) -> Result:
     """Return the values of the steps ``outputs``; compute the values that are not in ``store``.
 
     Args: outputs: if None, the outputs of the recipe. device: one or several devices, such as
     ``cuda:0,cuda:1,cpu``, the preferred device first. executor: computes the steps in place of this process.
     memory: bytes that this process, and each GPU, may use; if None, most of the memory that is free.
-    show: is told each computed result, while later steps wait. code: digests of the code of nodes, which runs that
-    belong together share.
+    show: is told each computed result, while later steps wait. series: what earlier runs found that holds for this
+    one as well.
     Raises `RunError`, which names the step, and ValueError for a device that this machine does not have.
     """
     began = time.perf_counter()
@@ -113,7 +113,7 @@ def run(
         if name not in recipe.steps:
             raise ValueError(unknown_step(name, recipe.steps))
     recipe, store, watch = with_substitutions(recipe, wanted), store or open_store(), watch or (lambda event: None)
-    how = (executor, memory, show or (lambda *_: None), code)
+    how = (executor, memory, show or (lambda *_: None), series)
     while True:
         work = Execution(recipe, store, device.split(","), watch, wanted, *how)
         try:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any, Protocol
 
@@ -35,6 +35,7 @@ Read = Key | tuple[Key, ...] | None  #: content of one input: one value, a list 
 Fetch = Callable[[Key], Any]
 #: function that is told each computed result: the recipe of the run, the keys known so far, the step and its value
 Show = Callable[[Recipe, Mapping[str, Key], str, Any], None]
+_STATS = tuple(field.name for field in fields(TensorStats))
 _WATCHED = 1 << 20  #: bytes of inputs from which the memory of a step is measured
 
 
@@ -224,7 +225,7 @@ def _about(outcome: Outcome) -> dict[str, Any]:
         "step": work.step.name,
         "recipe": work.recipe,
         "origin": dict(work.origin),
-        "facts": outcome.facts and asdict(outcome.facts),
+        "facts": outcome.facts and {name: getattr(outcome.facts, name) for name in _STATS},
         "checks": [[check.text, check.ok] for check in outcome.checks],
         "seconds": outcome.seconds,
         "bytes": outcome.bytes,

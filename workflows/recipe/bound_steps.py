@@ -22,11 +22,27 @@ class BoundStep:
     """A step without mistakes, and the values that its references read; None for a path without a value."""
 
     checked: CheckedStep
-    reads: Mapping[Where, Value | None]
+    reads: Mapping[str | int, Mapping[Where, Value | None]]  #: by block of the recipe
+    blocks: Mapping[str | int, Value | None]  #: each of these blocks, which has not changed if it is the same object
+    used: frozenset[Where]
+    offered: frozenset[Where]
+
+    @classmethod
+    def of(cls, checked: CheckedStep, reads: Mapping[Where, Value | None], root: Value) -> BoundStep:
+        """Remember a step and what it ``reads`` in the recipe ``root``, by path."""
+        by_block: dict[str | int, dict[Where, Value | None]] = {}
+        for path, value in reads.items():
+            by_block.setdefault(path[0], {})[path] = value
+        blocks = {name: root.child(name) for name in by_block}
+        used = frozenset(value.path for value in reads.values() if value is not None)
+        return cls(checked, by_block, blocks, used, frozenset(path for path, value in reads.items() if value is None))
 
     def holds(self, root: Value) -> bool:
         """Return True if each value that the step read is still the same object."""
-        return all(root.below(path) is value for path, value in self.reads.items())
+        return all(
+            root.child(name) is block or all(root.below(path) is value for path, value in self.reads[name].items())
+            for name, block in self.blocks.items()
+        )
 
 
 @dataclass(eq=False)
@@ -35,6 +51,7 @@ class GraphMemory:
 
     bound: dict[str, BoundStep] = field(default_factory=dict)
     forms: dict[str, KnownForm] = field(default_factory=dict)
+    sources: list[tuple[tuple[str, ...], ...]] = field(default_factory=list)  #: of graphs without a cycle
     settings: dict[Where, tuple[Value, dict[str, Setting]]] = field(default_factory=dict)  #: by path of the block
 
     def find(self, name: str, references: References) -> CheckedStep | None:
@@ -42,11 +59,8 @@ class GraphMemory:
         known = self.bound.get(name)
         if known is None or not known.holds(references.root):
             return None
-        for path, value in known.reads.items():
-            if value is None:
-                references.offered.add(path)
-            else:
-                references.used.add(value.path)
+        references.offered |= known.offered
+        references.used |= known.used
         return known.checked
 
 
@@ -61,7 +75,8 @@ class Attempt:
         """Let later checks of the same graph find the step."""
         if memory is None or has_path(checked.step.params) or self._checker.own or self._state() != self._before:
             return
-        memory.bound[name] = BoundStep(checked, dict(self._references.trace[self._first :]))
+        reads = dict(self._references.trace[self._first :])
+        memory.bound[name] = BoundStep.of(checked, reads, self._references.root)
 
     def _state(self) -> tuple[int, ...]:
         references, checker = self._references, self._checker

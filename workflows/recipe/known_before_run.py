@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
-from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step, Wire, in_order
+from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step, Wire, in_order, ordered
 from neusee.workflows.graph.step_shapes import Form, alike, bytes_of, form_of, inputs_of, is_same, tensors_of
 from neusee.workflows.recipe.parameters import Checker
 from neusee.workflows.recipe.text.yaml_values import Value
@@ -55,12 +55,12 @@ def check_steps(
     ``before`` has what earlier checks of the same graph found, and is brought up to date.
     """
     by_name = {each.step.name: each for each in checked}
-    sources = {name: [s for s in each.step.sources if s in by_name] for name, each in by_name.items()}
+    sources = {name: tuple(s for s in each.step.sources if s in by_name) for name, each in by_name.items()}
     known: dict[str, Any] = {}
     notes: dict[str, Iterable[str]] = {}
     memory = machine_memory()
-    computed = set(in_order(sources, [name for name in outputs or () if name in by_name]))
-    for name in by_name if outputs is None else in_order(sources, by_name):
+    computed = set(ordered(sources, [name for name in outputs or () if name in by_name]))
+    for name in by_name if outputs is None else ordered(sources, by_name):
         each, forms = by_name[name], inputs_of(by_name[name].step, known)
         if before is not None and name in before and before[name].holds(each, forms, name in computed):
             notes[name], known[name] = before[name].notes, before[name].form

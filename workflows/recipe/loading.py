@@ -25,7 +25,7 @@ from neusee.workflows.recipe.other_cameras import with_cameras
 from neusee.workflows.recipe.own_families import KEY, OwnFamilies, read_own_families
 from neusee.workflows.recipe.parameters import Checker
 from neusee.workflows.recipe.recipe_settings import final_values, settings_of
-from neusee.workflows.recipe.step_declarations import declare, device_of
+from neusee.workflows.recipe.step_declarations import Declared, declare, device_of
 from neusee.workflows.recipe.text.composition import Composed, compose
 from neusee.workflows.recipe.text.option_groups import groups_of, shared_folders
 from neusee.workflows.recipe.text.overrides import Override
@@ -145,7 +145,7 @@ def check(composed: Composed) -> Recipe:
     steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, diagnostics, own)
     wiring, checked = Wiring(root, steps, absent, references, diagnostics), list[CheckedStep]()
     bound = {step.name: step for step in _bind(wiring, checker, graph, checked)}
-    loops = list(cycles(bound, {name: step.value.key for name, step in steps.items()}))
+    loops = _cycles(bound, steps, graph)
     diagnostics += loops
     seed, tolerance = seed_and_tolerance(root, references, checker.diagnostics)
     estimates, outputs = estimates_of(root, references, checker.diagnostics), outputs_of(root, wiring)
@@ -166,6 +166,17 @@ def check(composed: Composed) -> Recipe:
     args = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, gone, False, estimates
     recipe = Recipe(*args, uncertain=uncertain, safety=safety, traceability=traceability, exports=exports)
     return replace(recipe, training=training, lifting=lifting, evaluation=evaluation)
+
+
+def _cycles(bound: Mapping[str, Step], steps: Mapping[str, Declared], graph: CachedGraph | None) -> list[Diagnostic]:
+    """Return a diagnostic for each cycle of steps; a graph that was found to have none is not searched again."""
+    sources = tuple(step.sources for step in bound.values())
+    if graph and sources in graph.memory.sources:
+        return []
+    loops = list(cycles(bound, {name: step.value.key for name, step in steps.items()}))
+    if graph and not loops:
+        graph.memory.sources[:] = [sources]
+    return loops
 
 
 def _with_mismatch(

@@ -13,7 +13,8 @@ Direction = Literal["read", "write"]
 _FILE = "speeds.json"
 LARGE = 1_000_000  #: bytes from which a transfer updates the speed
 _USUAL: dict[Direction, float] = {"read": 8e9, "write": 0.4e9}  #: bytes / s
-_SETUP: dict[Direction, float] = {"read": 5e-5, "write": 2e-4}  #: s for each transfer, whatever its size
+#: s for each transfer, whatever its size; to write is to make a file, which takes 0.5 to 2 ms
+_SETUP: dict[Direction, float] = {"read": 5e-5, "write": 1e-3}
 _SYNC = 3e-3  #: s until the disk has a file, for each result that is written to a file of its own
 _LEARN = 0.3  #: weight of the newest transfer
 _NEWS = 1.25  #: factor by which a speed must differ from the stored speed to be written to the file

@@ -22,6 +22,7 @@ NamedTupleType = type[tuple[Any, ...]]
 
 _types: dict[str, NamedTupleType] = {}
 _looked_at: dict[str, Node] = {}
+_all_nodes: list[tuple[Node, ...]] = [()]  #: those of the last look
 
 
 class UnknownType(ValueError):
@@ -102,7 +103,11 @@ def _update() -> None:
     if not _types:
         for kind in vars(values).values():
             _add(kind)
-    for node in registered_nodes():
+    nodes = registered_nodes()
+    if nodes == _all_nodes[0]:  # the same objects, as almost always
+        return
+    _all_nodes[0] = nodes
+    for node in nodes:
         if _looked_at.get(name := f"{node.fn.__module__}:{node.fn.__name__}") is not node:
             _looked_at[name] = node
             for kind in _annotated(node):

@@ -45,11 +45,11 @@ def _changed(mapping: Mapping[str, Any], first: Mapping[str, Any]) -> dict[str, 
     """Return the entries of a mapping that are not equal to those of ``first``, or None if the keys differ."""
     if list(mapping) != list(first):
         return None
-    return {key: value for key, value in mapping.items() if not _equal(value, first[key])}
+    return {key: value for key, value in mapping.items() if value is not first[key] and not _equal(value, first[key])}
 
 
 def _equal(one: Any, other: Any) -> bool:
     """Return True for equal values that are also written alike, unlike 0.0 and -0.0, or 1, 1.0 and True."""
     with suppress(Exception):  # values such as arrays, whose comparison has no single answer
-        return one is other or (bool(one == other) and repr(one) == repr(other))
+        return bool(one == other) and repr(one) == repr(other)
     return False

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -17,17 +17,16 @@ from typing import Any, Literal, NamedTuple
 
 from neusee.workflows.engine.local_executor import memory_limit
 from neusee.workflows.engine.node_call import place
+from neusee.workflows.engine.run_series import RunSeries
 from neusee.workflows.engine.runner import run
 from neusee.workflows.engine.worker_processes import shared
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
-from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
+from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event
-from neusee.workflows.graph.step_shapes import has_path
-from neusee.workflows.keys.cache_key import Key, key_of
-from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.recipe.loading import check
-from neusee.workflows.recipe.text.composition import compose
+from neusee.workflows.recipe.text.composition import Composer
 from neusee.workflows.report.result_numbers import numbers_of
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Point
@@ -71,7 +70,7 @@ class SweepPlan:
     costs: dict[str, float]  #: seconds by step, of steps that ran before
     work: tuple[float, ...]  #: work of each point without stored results, in seconds, or in steps if no step ran before
     notes: tuple[str, ...]
-    code: Code  #: digests of the code of all nodes, the same for all points
+    series: RunSeries  #: with the digests of the code of all nodes, the same for all points
 
     @property
     def jobs(self) -> list[PointJob]:
@@ -92,7 +91,7 @@ def plan_sweep(
     costs = _costs(store)
     in_turn = [checked[i] for i in best_order([c.job for c in checked], costs, paired)]
     work = work_left([c.job for c in in_turn], costs, store.has)
-    return SweepPlan(checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes), checker.code)
+    return SweepPlan(checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes), checker.series)
 
 
 def outcomes(
@@ -153,7 +152,8 @@ def _found(
     memory: int | None = None,
 ) -> _Found:
     began = time.perf_counter()
-    result = run(plan.checked[number].kept.recipe, store, watch=watch, device=device, memory=memory, code=plan.code)
+    recipe = plan.checked[number].kept.recipe
+    result = run(recipe, store, watch=watch, device=device, memory=memory, series=plan.series)
     rows = (row for step, value in result.values.items() for row in numbers_of(step, value))
     ran = any(step.state == "run" for step in result.done.values())
     numbers = tuple((step, field, index, number) for step, field, index, number in rows)
@@ -195,23 +195,23 @@ class _Checker:
 
     def __init__(self, recipe: str, folder: Path, store: Store, device: str) -> None:
         self.recipe, self.folder, self.device = recipe, folder, device
-        self.code = Code(store.code_memo)
+        self.series = RunSeries.begun(store)
         self.diagnostics: list[Diagnostic] = []
         self.notes: dict[str, None] = {}
         self.first: Recipe | None = None
         self._same: dict[Any, Any] = {}
-        self._keyed: dict[str, tuple[Step, tuple[Any, ...], Key]] = {}  # the newest key of each step, and its parts
 
     def every(self, points: Sequence[Point]) -> Iterator[CheckedPoint]:
         """Yield each point that passes all checks, and add the mistakes of the other points to ``diagnostics``."""
+        composer = Composer(self.recipe, self.folder)
         for point in points:
             try:
-                recipe = check(compose(self.recipe, point.overrides, self.folder))
+                recipe = check(composer.compose(point.overrides))
                 self.first = self.first or recipe
                 yield CheckedPoint(point, KeptRecipe.of(recipe, self.first), self._job(point, recipe))
             except RecipeError as error:
                 self.diagnostics += error.diagnostics
-        self.code.save()
+        self.series.known_keys.code.save()
 
     def _job(self, point: Point, recipe: Recipe) -> PointJob:
         self.notes.update(dict.fromkeys(recipe.notes))
@@ -220,22 +220,13 @@ class _Checker:
         for name in needed(recipe, recipe.outputs):
             step = recipe.steps[name]
             try:
-                keys[name] = self._key(step, keys, recipe.seed)
+                found = self.series.known_keys.of(step, keys, recipe.seed, place(step, self.device))[0]
+                keys[name] = self._once(found)
             except (OSError, LookupError, TypeError) as error:
                 raise RecipeError([Diagnostic(step.mark, name, str(error))]) from error
         sources = tuple((name, recipe.steps[name].sources) for name in keys)
         graph = self._same.setdefault(sources, dict(sources))
         return PointJob(point.place, keys, graph, recipe.outputs)
-
-    def _key(self, step: Step, keys: Mapping[str, Key], seed: int) -> Key:
-        """Return the cache key of a step; a step that is the same object as at the point before has the same key."""
-        parts = (seed, *(keys[name] for name in step.sources))
-        known = self._keyed.get(step.name)
-        if known is not None and known[0] is step and known[1] == parts and not has_path(step.params):
-            return known[2]
-        key = self._once(key_of(step, keys, seed, self.code, place(step, self.device))[0])
-        self._keyed[step.name] = step, parts, key
-        return key
 
     def _once(self, key: Key) -> Key:
         """Return the same string object for equal cache keys, which saves memory because points share most keys."""

@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.graph.recipe_graph import METRIC_TOLERANCE, Recipe, Step, Substitution, Wire, in_order, needed
+from neusee.workflows.graph.recipe_graph import METRIC_TOLERANCE, Recipe, Step, Substitution, Wire, needed, ordered
 from neusee.workflows.tolerance.error_propagation import unbounded_steps
 from neusee.workflows.tolerance.zero_effect_steps import without_nothing
 
@@ -141,7 +141,7 @@ class _Draft:
         if not self.substitutions:
             return self.recipe
         steps = {**self.recipe.steps, **self.added, **self.rewired}
-        order = in_order({name: step.sources for name, step in steps.items()}, steps)
+        order = ordered({name: step.sources for name, step in steps.items()}, steps)
         steps, whole = {name: steps[name] for name in order}, self.recipe.unsubstituted or self.recipe
         substitutions = (*self.recipe.substitutions, *self.substitutions)
         return replace(self.recipe, steps=steps, substitutions=substitutions, unsubstituted=whole)

@@ -64,7 +64,7 @@ def tolerance_frontier(recipe: Recipe, order: Iterable[str], wanted: Iterable[st
         reads = [source for source in step.sources if source in inexact]
         if reads and not _bounds_its_error(step, recipe):
             frontier |= dict.fromkeys(reads)
-        elif reads or step.node.hooks.approximation_error is not None or step.node.hooks.skip_bound is not None:
+        elif reads or _may_err(step):
             inexact.add(name)
     return list(frontier | dict.fromkeys(name for name in wanted if name in inexact))
 
@@ -76,6 +76,11 @@ def unbounded_steps(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
         if name in unbounded or not _bounds_its_error(recipe.steps[name], recipe):
             unbounded.update(recipe.steps[name].sources)
     return frozenset(unbounded)
+
+
+def _may_err(step: Step) -> bool:
+    """Return True if the result of a step may be approximate, or left out, where its inputs are exact."""
+    return step.node.hooks.approximation_error is not None or step.node.hooks.skip_bound is not None
 
 
 def _bounds_its_error(step: Step, recipe: Recipe) -> bool:
@@ -96,9 +101,11 @@ def proof(
     held: dict[str, float] = {}
     for name in order:
         step = recipe.steps[name]
-        bound = _bound(step, bounds, done(name), facts_of, _propagates(step, recipe))
-        if bound is None:
+        if not _may_err(step) and bounds.keys().isdisjoint(step.sources):
             continue  # exact, like almost every step
+        bound = _bound(step, bounds, done(name), facts_of, recipe)
+        if bound is None:
+            continue
         if math.isinf(bound.rms):
             shares = {source: bounds[source].share for source in step.sources if source in bounds}
             held |= {source: share for source, share in shares.items() if math.isfinite(share)}
@@ -110,15 +117,15 @@ def proof(
 
 
 def _bound(
-    step: Step, known: Mapping[str, ErrorBound], done: StepRecord, facts_of: FactsOf, propagates: bool
+    step: Step, known: Mapping[str, ErrorBound], done: StepRecord, facts_of: FactsOf, recipe: Recipe
 ) -> ErrorBound | None:
     """Return the error bound of a step's result from the ``known`` bounds of its inputs, or None if it is exact."""
-    inputs = [_gathered(step.wires.get(i), known) for i in step.node.inputs]
     own = _own(step, done, facts_of)
-    if own is None and not any(bound.rms for bound in _flat(inputs)):
+    if own is None and not any(known[source].rms for source in step.sources if source in known):
         return None
+    inputs = [_gathered(step.wires.get(i), known) for i in step.node.inputs]
     facts, error = facts_of(step.name), done.error
-    carried = _carried(step, inputs, facts, propagates)
+    carried = _carried(step, inputs, facts, _propagates(step, recipe))
     return ErrorBound(carried + (own or 0.0), facts, error[1] if error else None)
 
 
@@ -131,7 +138,7 @@ def _rounded(
         step, bound = recipe.steps[name], before
         rounding = step.node.hooks.rounding_error
         if not found.keys().isdisjoint(step.sources):
-            bound = _bound(step, {**bounds, **found}, done(name), facts_of, _propagates(step, recipe)) or before
+            bound = _bound(step, {**bounds, **found}, done(name), facts_of, recipe) or before
         elif rounding is None:
             continue
         if (

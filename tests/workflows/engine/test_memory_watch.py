@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neusee.nodes import node
-from neusee.workflows.engine import memory_watch
+from neusee.workflows.engine import memory_use, memory_watch
 from neusee.workflows.engine.local_executor import program_memory
 from neusee.workflows.engine.memory_use import PeakMemory, free_memory, process_memory, process_peak
 from neusee.workflows.engine.memory_watch import MemoryLimit, guarded, limited
@@ -134,6 +134,18 @@ def test_the_peak_of_the_process_is_not_forgotten_when_a_step_is_measured():
         pass
     assert process_peak() >= before - MB
     assert process_memory() < before - 150 * MB
+
+
+def test_runs_that_follow_at_once_look_at_the_free_memory_once(monkeypatch):
+    looks, now = [], [100.0]
+    monkeypatch.setattr(memory_use, "_free_memory", lambda: looks.append(1) or len(looks))
+    monkeypatch.setattr(memory_use.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(memory_use, "_told", [-1.0, 0.0])
+    assert [free_memory(), free_memory()] == [1, 1]
+    now[0] += 1.01 * memory_use.FRESH
+    assert free_memory() == 2
+    now[0] = 1.0  # a clock of another boot
+    assert free_memory() == 3
 
 
 def test_free_memory_is_what_the_machine_can_give():

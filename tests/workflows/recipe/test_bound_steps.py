@@ -2,6 +2,7 @@
 
 import random
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.step_shapes import alike
 from neusee.workflows.recipe import bound_steps, graph_cache
 from neusee.workflows.recipe.loading import check
-from neusee.workflows.recipe.text.composition import compose
+from neusee.workflows.recipe.text.composition import Composer, compose
 
 CHANGES = {
     "sensor.read_noise": ["5 e-", "6 e-", "normal(5 e-, 1 e-)", "5 nm"],
@@ -61,6 +62,16 @@ def test_a_check_after_others_says_what_a_check_alone_says(monkeypatch):
     for each, found in zip(words, after, strict=True):
         graph_cache._graphs.clear()
         assert repr(told(each)) == repr(found), each
+
+
+def test_a_recipe_that_is_composed_after_others_is_the_recipe_composed_alone():
+    composer = Composer("first_light", Path.cwd())
+    changes = [*(drawn(seed) for seed in range(40)), ["doe=axicn", "sensor.bits"], ["+doe=axicon"], ["~flare"], []]
+    for words in [*changes, *changes]:
+        found, alone = composer.compose(words), compose("first_light", words, Path.cwd())
+        assert found.root.plain == alone.root.plain
+        assert [str(each) for each in found.diagnostics] == [str(each) for each in alone.diagnostics]
+        assert replace(found, root=alone.root, diagnostics=()) == replace(alone, diagnostics=())
 
 
 def test_a_step_is_checked_again_only_where_a_value_that_it_reads_has_changed(monkeypatch):

@@ -610,7 +610,7 @@ def test_bands_apart_are_trusted_in_the_same_way(tmp_path, monkeypatch):
 
 def test_speeds_are_learnt_from_large_transfers_and_remembered(tmp_path):
     store = Store(tmp_path)
-    assert store.write_seconds(4e8) == pytest.approx(1.0032)
+    assert store.write_seconds(4e8) == pytest.approx(1.004)
     assert store.read_seconds(8e9) == pytest.approx(1.00005)
     for _ in range(40):
         store._speeds.learn("write", 10**8, 1.0)

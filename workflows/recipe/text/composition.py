@@ -63,25 +63,49 @@ def locate(recipe: str | Path, folder: Path) -> Path:
 
 def compose(recipe: str | Path, arguments: Sequence[str | Override], folder: Path, first: int = 1) -> Composed:
     """Return a recipe composed from its files and arguments; messages number the arguments from ``first``."""
-    path = locate(recipe, folder)
-    document = read(path, shown(path, folder))
-    diagnostics: list[Diagnostic] = []
-    overrides: list[Override] = []
-    for number, argument in enumerate(arguments, first):
-        mark = Location(f"argument {number}", folder=str(folder))
-        try:
-            overrides.append(argument if isinstance(argument, Override) else read_override(argument, mark))
-        except RecipeError as error:
-            diagnostics += error.diagnostics
-    groups = Groups(search_folders(path, folder), folder, _merged, diagnostics)
-    choices, rest = _choose(document.root, overrides, groups)
-    options = [groups.option(choice) for choice in choices if choice.option is not None]
-    root = _merged((*(option for option in options if option is not None), document.root))
-    for override in rest:
-        root = apply(root, override, diagnostics, [choice.group for choice in choices])
-    replaced = tuple(_replaced(document.root, choices, groups))
-    notes = (*_hiding(path, recipe), *groups.notes)
-    return Composed(path.stem, document.title, root, tuple(diagnostics), None not in options, replaced, notes)
+    return Composer(recipe, folder).compose(arguments, first)
+
+
+class Composer:
+    """A recipe that is composed with several lists of arguments, such as the points of a sweep; a file is read once."""
+
+    def __init__(self, recipe: str | Path, folder: Path) -> None:
+        self._path, self._folder = locate(recipe, folder), folder
+        self._document = read(self._path, shown(self._path, folder))
+        self._hides = _hiding(self._path, recipe)
+        self._known: dict[tuple[Choice, ...], Composed] = {}  # before the arguments that set single values
+
+    def compose(self, arguments: Sequence[str | Override], first: int = 1) -> Composed:
+        """Return the recipe with arguments; messages number the arguments from ``first``."""
+        diagnostics: list[Diagnostic] = []
+        overrides: list[Override] = []
+        for number, argument in enumerate(arguments, first):
+            mark = Location(f"argument {number}", folder=str(self._folder))
+            try:
+                overrides.append(argument if isinstance(argument, Override) else read_override(argument, mark))
+            except RecipeError as error:
+                diagnostics += error.diagnostics
+        choices, rest = _choose(self._document.root, overrides, self._groups(diagnostics))
+        chosen = tuple(choices)
+        if chosen not in self._known:
+            self._known[chosen] = self._with_options(chosen)
+        below = self._known[chosen]
+        root, diagnostics = below.root, [*diagnostics, *below.diagnostics]
+        for override in rest:
+            root = apply(root, override, diagnostics, [choice.group for choice in choices])
+        return replace(below, root=root, diagnostics=tuple(diagnostics))
+
+    def _groups(self, diagnostics: list[Diagnostic]) -> Groups:
+        return Groups(search_folders(self._path, self._folder), self._folder, _merged, diagnostics)
+
+    def _with_options(self, choices: tuple[Choice, ...]) -> Composed:
+        """Return the recipe with the chosen option of each group."""
+        document, groups = self._document, self._groups([])
+        options = [groups.option(choice) for choice in choices if choice.option is not None]
+        root = _merged((*(option for option in options if option is not None), document.root))
+        replaced = tuple(_replaced(document.root, choices, groups))
+        told, notes = tuple(groups.diagnostics), (*self._hides, *groups.notes)
+        return Composed(self._path.stem, document.title, root, told, None not in options, replaced, notes)
 
 
 def _hiding(path: Path, recipe: str | Path) -> list[str]:
