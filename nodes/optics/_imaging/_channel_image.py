@@ -84,6 +84,12 @@ def _(result: Channels) -> tuple[float, float]:
     return float(result.bound) + error, float(result.largest) + top
 
 
+@image_channels.expected_range
+def _(*inputs: Any, **params: Any) -> tuple[float, float]:
+    """Return the range of an image whose brightest pixel counts as 1, as `nodes/sensor/_expected_ranges.py` says."""
+    return 0.0, 1.0
+
+
 @image_channels.check
 def _(result: Channels, *inputs: Any, within: float = 0.0, **params: Any) -> list[Check]:
     planes, kernels, bands, y, x = result.kept.tolist()
