@@ -42,7 +42,8 @@ def _(
     pixel_pitch: float,
     exposure: float,
 ) -> Range:
-    return 0.0, irradiance.max * (1.0 if level is None else level.max) * exposure * pixel_pitch**2
+    photons = (1.0 if level is None else level.max) * exposure * pixel_pitch**2
+    return irradiance.min * photons, irradiance.max * photons
 
 
 @add_photons.expected_range

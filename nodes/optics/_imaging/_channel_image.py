@@ -16,6 +16,8 @@ from neusee.nodes.values import Channels, FewBands, LowRankCube, Psf
 
 Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: as a share of the brightest pixel
 _QUICKLY = 0.25  #: share of the error up to which the bound of the brightest pixel may come from cells of pixels
+_DARKEST = 1e-3  #: expected brightness of the darkest pixel; photographs have 1e-2, scenes at night 2e-5
+_LARGE = 512  #: pixels along the sides of an image from which cells of pixels save time
 _TRIES = 3  #: plans tried: with the brightest pixels estimated, then measured, then with nothing omitted
 
 
@@ -88,7 +90,7 @@ def _(result: Channels) -> tuple[float, float]:
 @image_channels.expected_range
 def _(*inputs: Any, **params: Any) -> tuple[float, float]:
     """Return the range of an image whose brightest pixel counts as 1, as `nodes/sensor/_expected_ranges.py` says."""
-    return 0.0, 1.0
+    return _DARKEST, 1.0
 
 
 @image_channels.check
@@ -173,14 +175,15 @@ def _top(result: Tensor, radiance: LowRankCube, intensity: Tensor, given: Given,
     All bands together form the image of the cube's largest residual at each pixel. The true image differs from the
     computed image by at most that image of the residual. The true maximum is therefore at most the maximum of computed
     image plus residual. The true maximum is at least the computed maximum less the residual at the same pixel, and this
-    second error is never the larger one. A bound of at most ``quickly`` comes from cells of 8 x 8 pixels.
+    second error is never the larger one. In a large image, a bound of at most ``quickly``
+    comes from cells of 8 x 8 pixels.
     """
     if not radiance.residual_map.numel():
         return math.inf
     found, rest = result.detach(), radiance.residual_map.to(result)
     low, most = (torch.stack(ends).double().cpu() for ends in zip(*map(torch.aminmax, found), strict=True))
     lost = rounding(given, choose(given, most, 0.0), torch.maximum(most, -low), torch.finfo(found.dtype).eps)
-    if quickly > 0:
+    if quickly > 0 and min(found.shape[1:]) >= _LARGE:
         above = (cells(found) + majorant_by_cell(rest, intensity.detach(), given)).amax((1, 2)).double().cpu()
         if (top := _share(above - most + lost, most)) <= quickly:
             return top
