@@ -101,8 +101,8 @@ class Hooks:
     #: tensors on the device ``meta``, which have a shape and a type but no values; a tensor of few numbers may have
     #: values. A rule that fails, such as one that needs an unknown input, leaves the result unknown
     shape: Callable[..., Any] | None = None
-    #: (`TensorStats` of each input, *, parameters): least and largest element of the result as a plan expects them before
-    #: the run, no bound; an input of which nothing is known raises LookupError where it is read, as may the rule
+    #: (`TensorStats` of each input, *, parameters): least and largest element of the result as a plan expects them
+    #: before the run, no bound; an input of which nothing is known raises LookupError where it is read
     expected_range: Callable[..., tuple[float, float]] | None = None
     #: (): the arguments of one small call by name, on which `neusee check` tries the node
     example: Callable[[], Mapping[str, Any]] | None = None

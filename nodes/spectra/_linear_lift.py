@@ -8,8 +8,8 @@ from torch import Tensor
 
 from neusee.nodes import Check, Node, node
 from neusee.nodes._half_precision import single
-from neusee.nodes.spectra._low_rank_cube import Share, as_low_rank_cube, compress, plane_checks
 from neusee.nodes.spectra._linear_planes import linear_planes
+from neusee.nodes.spectra._low_rank_cube import Share, as_low_rank_cube, compress, plane_checks
 from neusee.nodes.spectra._principal_planes import Source, few_planes
 from neusee.nodes.spectra._spectral_tables import mallett, paints, require_range, to_srgb
 from neusee.nodes.values import Bands, LowRankCube

@@ -45,8 +45,8 @@ def linear_planes(picture: Tensor, matrix: Tensor, within: float) -> LowRankCube
 
 def _axes(picture: Tensor, matrix: Tensor) -> _Axes:
     gram = matrix.new_zeros(len(picture), len(picture))
-    for piece in picture.split(_PIECE, 1):
-        x = piece.double()
+    for at in range(0, picture.shape[1], _PIECE):
+        x = picture[:, at : at + _PIECE].double()
         gram.addmm_(x, x.T)
     values, vectors = torch.linalg.eigh(gram / picture.shape[1])
     root = vectors * values.clamp_min(0).sqrt()  # root @ root.T is the mean product of the channels

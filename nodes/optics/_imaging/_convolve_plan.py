@@ -51,12 +51,14 @@ def majorant_by_cell(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
     whole = torch.fft.irfft2(torch.fft.rfft2(light, length) * torch.fft.rfft2(worst, length), length)
     first = [(k + b) // _CELL for k, b in zip(at, before, strict=True)]
     y, x = (slice(f, f + -(-n // _CELL)) for f, n in zip(first, given.size, strict=True))
-    return whole[y, x].clamp_min_(0)
+    inside: Tensor = whole[y, x]
+    return inside.clamp_min_(0)
 
 
 def cells(planes: Tensor) -> Tensor:
     """Return the largest number in each cell of planes (k, y, x): (k, cell, cell); the last cells may be smaller."""
-    return max_pool2d(planes[None], _CELL, ceil_mode=True)[0]
+    largest: Tensor = max_pool2d(planes[None], _CELL, ceil_mode=True)
+    return largest[0]
 
 
 def _heaviest(intensity: Tensor, given: Given) -> Tensor:
