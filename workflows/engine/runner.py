@@ -25,11 +25,10 @@ from neusee.workflows.keys.code_memo import Parts
 from neusee.workflows.placement.heft_schedule import Schedule
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+from neusee.workflows.tolerance.cheaper_steps import stricter_scale, with_substitutions
 from neusee.workflows.tolerance.error_budget import skip_share
 from neusee.workflows.tolerance.error_propagation import ErrorBounds, ToleranceNotProven, proof, tolerance_frontier
 
-_SAFE = 0.8  #: tolerance scale of a second attempt, relative to the largest scale that would suffice
 _ROUNDING = 1.4e-6  #: error that rounding leaves in sums over bands, whatever their limit
 
 
@@ -123,7 +122,7 @@ def run(
             with limited(memory_limit(memory)):
                 return replace(_attempt(work, wanted, began), attempts=attempt)
         except ToleranceNotProven as failed:
-            scale = recipe.tolerance_scale * _SAFE / failed.over if attempt == 1 else 0.0  # a third attempt is exact
+            scale = stricter_scale(recipe, failed.over) if attempt == 1 else 0.0  # a third attempt is exact
             whole = recipe.unsubstituted or recipe
             recipe = with_substitutions(replace(whole, tolerance_scale=scale, exact=scale == 0.0), wanted)
             if not recipe.exact and _futile(recipe, work, wanted):

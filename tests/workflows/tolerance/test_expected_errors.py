@@ -10,7 +10,7 @@ from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.changed_recipe import changed
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+from neusee.workflows.tolerance.cheaper_steps import stricter_scale, with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of
 from neusee.workflows.tolerance.expected_errors import expected_excess
 
@@ -66,6 +66,27 @@ def test_a_run_whose_converter_clips_begins_once_and_is_within_its_tolerance(rec
     monkeypatch.setattr("neusee.workflows.tolerance.cheaper_steps.expected_excess", lambda *_: 0.0)
     blind = run(clipped, Store(tmp_path / "blind"))
     assert blind.attempts > 1
+
+
+@pytest.mark.parametrize("over", [1.01, 3.0, 1e3])
+def test_a_second_attempt_never_keeps_a_cube_that_was_too_coarse(recipe, over):
+    def limits(plan):
+        return {name: step.params["within"] for name, step in plan.steps.items() if name.endswith(".mixture")
+                and "within" in step.params}  # fmt: skip
+
+    first = with_substitutions(recipe, recipe.outputs)
+    scale = stricter_scale(first, over)
+    second = with_substitutions(replace(recipe, tolerance_scale=scale), recipe.outputs)
+    assert 0 < scale <= 0.8 / over
+    assert limits(first)
+    assert all(limits(second)[name] < within for name, within in limits(first).items() if name in limits(second))
+
+
+def test_a_run_whose_cube_was_too_coarse_needs_no_third_attempt(tmp_path):
+    """Points on black: the residual of the cube was 1.7 times too large, and was the same in the second attempt."""
+    found = run(random_recipes.draw_large(2024), Store(tmp_path))
+    assert found.attempts == 2
+    assert not found.recipe.exact
 
 
 def test_the_plan_foresees_most_failures_of_random_cameras():
