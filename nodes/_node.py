@@ -14,6 +14,7 @@ generator for a parameter named ``rng``.
     @digitize.preflight        # checks the parameters before anything runs
     @digitize.check            # checks that the result is plausible
     @digitize.shape            # shape and type of the result, before anything runs
+    @digitize.expected_range   # least and largest element of the result, a guess before anything runs
     @digitize.work             # memory and number of operations beside what the shapes say
     @digitize.example          # the arguments of one small call, on which `neusee check` tries the node
 
@@ -100,6 +101,9 @@ class Hooks:
     #: tensors on the device ``meta``, which have a shape and a type but no values; a tensor of few numbers may have
     #: values. A rule that fails, such as one that needs an unknown input, leaves the result unknown
     shape: Callable[..., Any] | None = None
+    #: (`TensorStats` of each input, *, parameters): least and largest element of the result as a plan expects them
+    #: before the run, no bound; an input of which nothing is known raises LookupError where it is read
+    expected_range: Callable[..., tuple[float, float]] | None = None
     #: (): the arguments of one small call by name, on which `neusee check` tries the node
     example: Callable[[], Mapping[str, Any]] | None = None
     #: (result, *inputs, **parameters), all as for ``shape``: bytes of memory during the run beside inputs and result,
@@ -213,6 +217,7 @@ class Node:
     skip_bound, skip_scale, zero_bound = _attaches("skip_bound"), _attaches("skip_scale"), _attaches("zero_bound")
     propagate_error, approximation_error = _attaches("propagate_error"), _attaches("approximation_error")
     rounding_error, band_invariant = _attaches("rounding_error"), _attaches("band_invariant")
+    expected_range = _attaches("expected_range")
     shape, work, example = _attaches("shape"), _attaches("work"), _attaches("example")
 
     @property

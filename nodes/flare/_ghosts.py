@@ -133,6 +133,14 @@ def _(spot: TensorStats, *_: Any, pixel_pitch: float, count: int, energy: float,
     return energy * spot.sum / area
 
 
+@ghosts.expected_range
+def _(
+    spot: TensorStats, *_: Any, pixel_pitch: float, energy: float, radius: float, **__: Any
+) -> tuple[float, float]:  # fmt: skip
+    """Return the brightness of a ghost of medium size, if the light of the spot fell on one pixel."""
+    return 0.0, energy * spot.max / max(1.0, math.pi * _in_pixels(radius / 2, pixel_pitch) ** 2)
+
+
 @ghosts.check
 def _(result: Tensor, spot: Tensor, *_: Any, energy: float, **__: Any) -> list[Check]:
     whole, moved = (float(x.sum(-1).sum(dtype=torch.float64)) for x in (spot, result))

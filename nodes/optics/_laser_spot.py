@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import single
-from neusee.nodes.sensor._saturation import Efficiency, Well, saturation
+from neusee.nodes.sensor._saturation import Efficiency, Well, photons_that_fill, saturation
 from neusee.nodes.units import PositiveLength, Time
 from neusee.nodes.values import Bands, LaserLight, Psf
 
@@ -133,6 +133,22 @@ def _(
     ends = torch.tensor([bands.min], dtype=torch.float64)  # the saturation irradiance falls with wavelength
     saturating: Tensor = saturation(Bands(ends, ends, ends), **sensor)
     return _LSR * strength * float(saturating) / least if least > 0 else math.inf
+
+
+@laser_irradiance.expected_range
+def _(
+    *inputs: object,
+    strength: float | None,
+    full_well: float,
+    quantum_efficiency: float,
+    pixel_pitch: float,
+    exposure: float,
+    **params: object,
+) -> tuple[float, float]:
+    """Return the peak behind the clear lens, in photons of the brightest channel per second and square metre."""
+    if strength is None:
+        raise LookupError("the light of a laser in watts is known in the run only")
+    return 0.0, strength * photons_that_fill(full_well, quantum_efficiency) / (exposure * pixel_pitch**2)
 
 
 @laser_irradiance.check

@@ -6,14 +6,14 @@ from torch import Tensor
 from neusee.nodes.values import Pupil
 
 LARGE_STEPS = 0.1  #: share of steps above half a turn, from which the pupil counts as aliased
-_ROWS = 512  #: the least number of pupil rows in which phase steps are measured
+_ROWS = 256  #: the least number of pupil rows in which phase steps are measured
 
 
 def phase_steps(pupil: Pupil) -> tuple[float, float]:
     """Return the median phase step between neighbouring samples, in turns, and the share of steps above half a turn.
 
     Both numbers are from the band with the largest phase steps, inside the stop. In a large pupil only every k-th row
-    is measured, 512 rows or more. A wrapped or split mask has steps at its edges by design, so a few large steps mean
+    is measured, 256 rows or more. A wrapped or split mask has steps at its edges by design, so a few large steps mean
     nothing. Many large steps mean that the samples cannot follow the phase.
     """
     worst = int((pupil.index / pupil.wavelengths).argmax())

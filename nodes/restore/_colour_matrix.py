@@ -69,6 +69,12 @@ def _(bands: ErrorBound, illuminant: ErrorBound, responses: ErrorBound, level: E
     return level.share / (1.0 - level.share) * max(abs(result.min), abs(result.max))
 
 
+@colour_matrix.expected_range
+def _(*inputs: Any, **params: Any) -> tuple[float, float]:
+    """Return a range whose size does not matter: the error of the matrix is relative to its largest element."""
+    return 0.0, 1.0
+
+
 def _target(centres: Tensor, channels: int) -> Tensor:
     """Return the matrix (3, band) from reflectance to linear sRGB, or to grey for a sensor with a single channel."""
     rgb = to_srgb(centres)

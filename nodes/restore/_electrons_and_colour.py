@@ -50,6 +50,12 @@ def _(raw: ErrorBound, shading: ErrorBound | None = None, *, gain: float, **para
     return raw.rms / gain / least if least > 0 else math.inf
 
 
+@electrons.expected_range
+def _(raw: TensorStats, *_: Any, gain: float, offset: float, offset_subtracted: bool) -> tuple[float, float]:
+    low, high = (end / gain - (offset if offset_subtracted else 0.0) for end in (raw.min, raw.max))
+    return low, high
+
+
 @node(rtol=0.0)
 def clipped(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Tensor:
     """Mark clipped pixels, which reach the full well or the largest digital number of the converter.
@@ -100,3 +106,8 @@ def _(channels: ErrorBound, matrix: ErrorBound, *, result: TensorStats, **params
 
 
 colour.hooks.estimated = True
+
+
+@colour.expected_range
+def _(*inputs: Any) -> tuple[float, float]:
+    return 0.0, 1.0

@@ -1,6 +1,6 @@
 """Sensor: conversion of photons to electrons, and of electrons to digital numbers."""
 
-from neusee.nodes.sensor import _result_shapes  # noqa: F401  attaches the shape rules
+from neusee.nodes.sensor import _expected_ranges, _result_shapes  # noqa: F401  attach ranges and shape rules
 from neusee.nodes.sensor._channel_sums import channel_sums
 from neusee.nodes.sensor._digitization import crop, digitize, full_well
 from neusee.nodes.sensor._exposure import add_photons, expose, level

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, Node, node
 from neusee.nodes._half_precision import single
+from neusee.nodes.spectra._linear_planes import linear_planes
 from neusee.nodes.spectra._low_rank_cube import Share, as_low_rank_cube, compress, plane_checks
 from neusee.nodes.spectra._principal_planes import Source, few_planes
 from neusee.nodes.spectra._spectral_tables import mallett, paints, require_range, to_srgb
@@ -149,6 +150,8 @@ def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> LowRankCube:
     """
     needs_rgb(rgb)
     flat, exact = rgb.detach().flatten(1), matrix.to(rgb.device)
+    if (found := linear_planes(flat, exact, within)) is not None:
+        return as_low_rank_cube(found, _lifted(rgb, matrix) if rgb.requires_grad else rgb)
     dtype = rgb.dtype if rgb.dtype == torch.float64 else torch.float32
     source = Source(lambda part: (exact @ flat[:, part].double()).clamp_min_(0), len(exact), flat.shape[1], dtype)
     return as_low_rank_cube(few_planes(source, within), _lifted(rgb, matrix) if rgb.requires_grad else rgb)

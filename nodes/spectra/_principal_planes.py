@@ -42,7 +42,7 @@ def few_planes(source: Source, within: float) -> LowRankCube:
     spread = _spread(gram / source.pixels, axes, source.bands, eps) * (scale if scaled else 1.0)
     count = max(1, next((k for k, left in enumerate(spread) if float(left.max()) <= target), source.bands))
     planes, last, off = _projected(source, axes[:, :count])
-    rest = _rest(most, planes, axes[:, :count], last)
+    rest = bound_by_planes(most, planes, axes[:, :count], last)
     spread = torch.cat([spread[:count], torch.minimum(spread[count], rest[count])[None]])  # no more than was measured
     return LowRankCube(planes, axes[:, :count], rest, spread, off)
 
@@ -96,7 +96,7 @@ def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
     return (after + double).sqrt() + eps * (planes * total).sqrt()
 
 
-def _rest(most: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -> Tensor:
+def bound_by_planes(most: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -> Tensor:
     """Return a bound of the largest error of each band if a cube is approximated by its first k principal components.
 
     The rows of the result are for k = 0, 1, 2 and so on. The errors with no component and with all components are

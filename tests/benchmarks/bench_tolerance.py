@@ -97,7 +97,7 @@ def line(seed, memo):
         with suppress(RunError):
             seconds, result = timed(setting.recipe, memo)
             setting.seconds.append(seconds)
-            first.append((result.proof.worst, result.recipe))
+            first.append((result.proof.worst, result.attempts))
             setting.error = max(error_of(result[name], truth[name]) for name in OUTPUTS)
     good = [s for s in tried if s.error <= recipe.tolerance]
     near = sorted(good, key=lambda s: s.median)[:AGAIN]
@@ -106,8 +106,7 @@ def line(seed, memo):
         for setting in again:
             setting.seconds.append(timed(setting.recipe, memo)[0])
     best = min((s for s in again if s in good), key=lambda s: s.median)
-    bound, done = first[0]  # as it chooses
-    attempts = 3 if done.exact else 1 + (done.tolerance_scale != 1.0)
+    bound, attempts = first[0]  # as it chooses
     seconds = (whole.median, ours.median, best.median)
     return Line(seed, recipe.tolerance, ours.error, bound, attempts, *seconds, best.label)
 

@@ -25,11 +25,10 @@ from neusee.workflows.keys.code_memo import Parts
 from neusee.workflows.placement.heft_schedule import Schedule
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+from neusee.workflows.tolerance.cheaper_steps import stricter_scale, with_substitutions
 from neusee.workflows.tolerance.error_budget import skip_share
 from neusee.workflows.tolerance.error_propagation import ErrorBounds, ToleranceNotProven, proof, tolerance_frontier
 
-_SAFE = 0.8  #: tolerance scale of a second attempt, relative to the largest scale that would suffice
 _ROUNDING = 1.4e-6  #: error that rounding leaves in sums over bands, whatever their limit
 
 
@@ -50,6 +49,7 @@ class Result:
     predicted_peak: float | None = None  #: predicted peak bytes of this process; None if another process computed
     origins: Mapping[Key, Mapping[str, Any]] = field(default_factory=dict)  #: the parts of each key
     code: Mapping[str, Parts] = field(default_factory=dict)  #: what each digest of code covers
+    attempts: int = 1  #: 2 or 3 where the error of the first could not be proved to be within the tolerance
 
     def value(self, step: str) -> Any:
         """Return the value of any step of the recipe; the value is read from the store or computed if necessary."""
@@ -114,13 +114,15 @@ def run(
             raise ValueError(unknown_step(name, recipe.steps))
     recipe, store, watch = with_substitutions(recipe, wanted), store or open_store(), watch or (lambda event: None)
     how = (executor, memory, show or (lambda *_: None), series)
+    attempt = 0
     while True:
+        attempt += 1
         work = Execution(recipe, store, device.split(","), watch, wanted, *how)
         try:
             with limited(memory_limit(memory)):
-                return _attempt(work, wanted, began)
+                return replace(_attempt(work, wanted, began), attempts=attempt)
         except ToleranceNotProven as failed:
-            scale = _SAFE / failed.over if recipe.tolerance_scale == 1.0 else 0.0  # a third attempt is exact
+            scale = stricter_scale(recipe, failed.over) if attempt == 1 else 0.0  # a third attempt is exact
             whole = recipe.unsubstituted or recipe
             recipe = with_substitutions(replace(whole, tolerance_scale=scale, exact=scale == 0.0), wanted)
             if not recipe.exact and _futile(recipe, work, wanted):

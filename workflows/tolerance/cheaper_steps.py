@@ -14,7 +14,9 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.graph.recipe_graph import METRIC_TOLERANCE, Recipe, Step, Substitution, Wire, needed, ordered
+from neusee.workflows.tolerance.error_budget import CHANNELS
 from neusee.workflows.tolerance.error_propagation import unbounded_steps
+from neusee.workflows.tolerance.expected_errors import expected_excess
 from neusee.workflows.tolerance.zero_effect_steps import without_nothing
 
 if TYPE_CHECKING:
@@ -22,8 +24,10 @@ if TYPE_CHECKING:
 
 ESTIMATED = 0.22  #: share of the tolerance for the estimated error of PSFs of few bands
 BESIDE = 0.08  #: share of the tolerance for the channels of an image beside such an estimate, in place of `CHANNELS`
-CHANNELS = 0.25  #: share of the tolerance for the channels of an image; the scene level may depend on a second image
 _LEAST = 2e-5  #: tolerance below which sums over bands cannot be proved, because their round-off alone is 1.4e-6
+_SAFE = 0.8  #: tolerance scale after a failure, or one that is expected, relative to the largest that would suffice
+_USED = 0.5  #: share of its limit that the error of a cheaper step is expected to be
+_TRIES = 4  #: plans with ever smaller limits
 _MIXTURE = 0.1  #: share of the tolerance for a low-rank cube, rounded to a power of ten so that the cube seldom changes
 
 
@@ -31,10 +35,42 @@ def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection
     """Return ``recipe`` with cheaper steps in place of full steps; an exact recipe is returned unchanged.
 
     The errors of the outputs ``wanted`` stay within the tolerance. An image whose scene depends on a step in
-    ``pinned`` stays in full, because a cube that is being optimised has no low-rank form yet. A second call
-    changes nothing.
+    ``pinned`` stays in full, because a cube that is being optimised has no low-rank form yet. Where well or converter
+    are expected to cut off so much light that the errors exceed the tolerance, the steps get smaller limits
+    (`Recipe.tolerance_scale`). A second call changes nothing.
     """
     wanted = frozenset(wanted)
+    planned, again = _substituted(recipe, wanted, pinned), any(each.within for each in recipe.substitutions)
+    for _ in range(0 if again else _TRIES):
+        if not any(each.within for each in planned.substitutions):
+            break
+        if (excess := expected_excess(planned, sorted(wanted), _USED)) <= 1.0:
+            break
+        scale = planned.tolerance_scale * _SAFE / excess if math.isfinite(excess) else 0.0
+        planned = _substituted(replace(planned.unsubstituted or recipe, tolerance_scale=scale), wanted, pinned)
+    return planned
+
+
+def stricter_scale(recipe: Recipe, over: float) -> float:
+    """Return the tolerance scale of a second attempt, after an error of ``recipe`` that was ``over`` times too large.
+
+    The limits of low-rank cubes are powers of ten. The scale is so small that these limits become smaller too, because
+    a cube that stays the same may be what was too coarse.
+    """
+    images = [each.step for each in recipe.substitutions if each.within and each.step in recipe.steps]
+    cubes = [recipe.allowed(name) * _MIXTURE for name in images if recipe.allowed(name) > 0]
+    next_power = min((_power_of_ten(limit) / limit for limit in cubes), default=1.0)
+    return recipe.tolerance_scale * min(_SAFE / over, 0.99 * next_power)
+
+
+def _power_of_ten(limit: float) -> float:
+    """Return the largest power of ten that is at most ``limit``."""
+    power: float = 10.0 ** math.floor(math.log10(limit))
+    return power
+
+
+def _substituted(recipe: Recipe, wanted: frozenset[str], pinned: Collection[str]) -> Recipe:
+    """Return ``recipe`` with cheaper steps that err by at most what `Recipe.allowed` says."""
     if recipe.exact:
         return recipe
     recipe = without_nothing(recipe, needed(recipe, sorted(wanted)))
@@ -209,7 +245,7 @@ class _Draft:
         if through is not None and name not in self.wanted:
             wires = {**step.wires, through: self._mixture(str(step.wires[through]), image)}
             return self._add(new, step.node, wires, step.params, step)
-        within = {"within": 10.0 ** math.floor(math.log10(self.recipe.allowed(image.name) * _MIXTURE))}
+        within = {"within": _power_of_ten(self.recipe.allowed(image.name) * _MIXTURE)}
         if step.node.low_rank_form is not None and name not in self.wanted:
             return self._add(new, step.node.low_rank_form, step.wires, {**step.params, **within}, step)
         return self._add(new, spectra.compress, {"cube": name}, within, step)

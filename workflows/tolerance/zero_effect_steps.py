@@ -23,6 +23,9 @@ class _Unknown:
         raise LookupError(name)
 
 
+UNKNOWN = _Unknown()
+
+
 def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
     """Disconnect steps whose result must be 0 and return the recipe; ``order`` lists each step after its inputs."""
     dark: dict[str, None] = {}
@@ -57,7 +60,7 @@ def _known(wire: Wire, dark: Mapping[str, None]) -> Any:
     if wire is None:
         return None
     if isinstance(wire, str):
-        return _DARK if wire in dark else _Unknown()
+        return _DARK if wire in dark else UNKNOWN
     return [_known(name, dark) for name in wire]
 
 

@@ -41,8 +41,21 @@ def without_gradients(pupil: Pupil, radiance: LowRankCube, rows: Tensor) -> tupl
     return still, radiance._replace(planes=radiance.planes.detach()), rows.detach().double().cpu()
 
 
-def thumbnails(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> tuple[Tensor, int] | None:
-    """Return PSFs (band, cell, cell) of a thinned pupil about the axis, and the pixels along the side of a cell.
+class Thumbnail(NamedTuple):
+    """A thinned pupil, and the window of cells in which its PSFs are small pictures of those of the whole pupil."""
+
+    pupil: Pupil
+    pixels: int  #: along the side of a cell
+    lens: Lens
+
+    def light(self, bands: Tensor) -> Tensor:
+        """Return the PSFs (band, cell, cell) of some bands about the axis."""
+        some = self.pupil._replace(index=self.pupil.index[bands], wavelengths=self.pupil.wavelengths[bands])
+        return binned(focused(some, (self.pixels * SIDE, self.pixels * SIDE), self.lens), self.pixels)
+
+
+def thumbnail(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> Thumbnail | None:
+    """Return the thumbnail of the PSFs of a pupil in a window of ``shape``.
 
     Return None if no window of cells holds the light, or if the PSFs of ``shape`` take little longer.
     """
@@ -56,7 +69,7 @@ def thumbnails(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> tuple[Tensor
         if side > reach or side**2 * _GAIN > shape[0] * shape[1]:
             return None
         if float(focused(some, (side, side), lens).sum((1, 2)).min()) >= _HELD * float(whole / clear):
-            return binned(focused(small, (side, side), lens), pixels), pixels
+            return Thumbnail(small, pixels, lens)
     return None
 
 

@@ -4,12 +4,13 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
 from neusee.nodes.optics._imaging._collapsed_plan import Given, Plan, transform
 from neusee.nodes.optics._imaging._psf_energy import centred
 from neusee.nodes.optics._imaging._summed_convolution import Mix, Where, summed
 
+_CELL = 8  #: pixels along the side of the cells in which the largest error of a pixel is bounded
 _SOME = 16  #: rows of the PSF summed at a time; these rows of 31 bands fit in the cache
 
 
@@ -28,12 +29,43 @@ def _where(given: Given, window: tuple[int, int]) -> Where:
 
 def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
     """Return an upper bound (y, x) of the image error from an error ``off`` (y, x) in every band of the scene."""
-    window = (intensity.shape[1], intensity.shape[2])
-    heaviest = given.rows.abs().amax(0).to(intensity)
-    weights = heaviest[None] if given.share is None else heaviest[None] @ given.share.to(heaviest)
-    kernel = _summed_bands(weights, intensity, given.passed.signed)
+    window, kernel = (intensity.shape[1], intensity.shape[2]), _heaviest(intensity, given)
     reached = summed(bordered(off[None], given, window), kernel, Mix(None, None, None), _where(given, window))
     return reached[0].clamp_min_(0)
+
+
+def majorant_by_cell(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
+    """Return an upper bound of `majorant` over cells of 8 x 8 pixels: (cell, cell) float64, far faster.
+
+    A part of the kernel in one cell takes light to the pixels of a cell from four neighbouring cells of the scene, and
+    from none of their pixels more than from the one with the largest error.
+    """
+    window, kernel = (intensity.shape[1], intensity.shape[2]), _heaviest(intensity, given)[0]
+    at = _where(given, window).at
+    before = [-k % _CELL for k in at]  # so that the middle of the kernel begins a cell
+    around = [-(k + b) % _CELL for k, b in zip(window, before, strict=True)]
+    wide = pad(kernel.double(), (before[1], around[1], before[0], around[0]))
+    light = avg_pool2d(wide[None], _CELL)[0] * _CELL**2
+    worst = max_pool2d(pad(cells(bordered(off[None], given, window))[None], (1, 1, 1, 1)), 2, 1)[0, 0].to(light)
+    length = [a + b for a, b in zip(light.shape, worst.shape, strict=True)]
+    whole = torch.fft.irfft2(torch.fft.rfft2(light, length) * torch.fft.rfft2(worst, length), length)
+    first = [(k + b) // _CELL for k, b in zip(at, before, strict=True)]
+    y, x = (slice(f, f + -(-n // _CELL)) for f, n in zip(first, given.size, strict=True))
+    inside: Tensor = whole[y, x]
+    return inside.clamp_min_(0)
+
+
+def cells(planes: Tensor) -> Tensor:
+    """Return the largest number in each cell of planes (k, y, x): (k, cell, cell); the last cells may be smaller."""
+    largest: Tensor = max_pool2d(planes[None], _CELL, ceil_mode=True)
+    return largest[0]
+
+
+def _heaviest(intensity: Tensor, given: Given) -> Tensor:
+    """Return the PSF (1, y, x) of all bands together, each with its largest weight in any row."""
+    heaviest = given.rows.abs().amax(0).to(intensity)
+    weights = heaviest[None] if given.share is None else heaviest[None] @ given.share.to(heaviest)
+    return _summed_bands(weights, intensity, given.passed.signed)
 
 
 def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:

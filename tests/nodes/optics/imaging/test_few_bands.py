@@ -6,6 +6,7 @@ import torch
 
 from neusee.nodes import doe
 from neusee.nodes.optics import few_bands, few_bands_checked, image_channels, psf, pupil, pupil_of_bands, stop
+from neusee.nodes.optics._imaging import _band_thumbnail
 from neusee.nodes.optics._imaging._band_thumbnail import share_of_bands
 from neusee.nodes.spectra import bands, compress, responses, rows
 from neusee.nodes.values import FewBands, Psf
@@ -83,6 +84,18 @@ def test_a_stricter_limit_takes_more_bands(camera):
     counts = [len(few_bands(clear, scene, ROWS, **LENS, shape=SIZE, within=w).used) for w in (1e-2, 1e-3, 1e-4, 1e-9)]
     assert counts == sorted(counts)
     assert (counts[0] < counts[2], counts[-1]) == (True, 31)
+
+
+def test_a_choice_of_few_bands_is_compared_with_every_second_band(camera, monkeypatch):
+    """All bands have PSFs only where few of every second one are not enough."""
+    clear, scene = camera
+    counted, focused = [], _band_thumbnail.focused
+    monkeypatch.setattr(_band_thumbnail, "focused", lambda p, *a: counted.append(len(p.index)) or focused(p, *a))
+    for within, expected in ((1e-2, 16), (1e-4, 31)):
+        counted.clear()
+        few = few_bands(clear, scene, ROWS, **LENS, shape=SIZE, within=within)
+        assert (len(few.used) <= 5) == (expected == 16)
+        assert sum(counted) - counted[0] == expected  # the first three find the window
 
 
 def test_an_estimate_that_was_too_low_is_raised(camera):
