@@ -12,9 +12,10 @@ from neusee.nodes import Check, ParameterError, node
 from neusee.nodes._half_precision import refuse_not_finite
 from neusee.nodes.restore._inverse._wiener import refuse_other_pictures
 from neusee.nodes.restore._lasers._candidates import line_templates
-from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Laser, lamp_light
+from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Laser
 from neusee.nodes.restore._lasers._greedy_search import Found, Known, search
 from neusee.nodes.restore._lasers._intervals import NORMAL, covariances
+from neusee.nodes.restore._lasers._lamp_light import lamp_light
 from neusee.nodes.restore._lasers._line_pattern import Lens, Sensor
 from neusee.nodes.units import Electrons, PositiveLength
 from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
@@ -59,9 +60,10 @@ def find_lasers(
     are as strong as those around each pixel. The values of clipped pixels are not used; their number and places say
     where a fit begins. The best candidates are fitted with a free response of each channel (3 %), and with each of the
     ``widths`` (full width at half maximum) of a line. A laser must gain ``least`` of log likelihood, and at least
-    ``margin`` of its gain beyond that of a lamp, a point source whose spectrum is smooth. All lasers and lamps are
-    fitted at once, and the search goes on in the rest. Intervals (90 %) come from the second derivatives and the
-    scatter of the residual.
+    ``margin`` of its gain beyond that of a lamp, a point source whose spectrum is smooth. The pattern of a lamp comes
+    from the pupil too, for any place between pixels and over the whole frame; what ``psf`` has beyond it, such as stray
+    light, is added. All lasers and lamps are fitted at once, and the search goes on in the rest. Intervals (90 %) come
+    from the second derivatives and the scatter of the residual.
 
     In a frame of one channel nothing but the scale of a pattern tells its wavelength, and nothing but its sharpness
     tells a laser from a lamp.
@@ -71,7 +73,9 @@ def find_lasers(
     Units:  electrons e-; direction rad; wavelength and widths m; strength e-; gain none.
     Error:  in frames of more than 256 pixels a side float32 rounds the fit. A light that is narrow but no laser, such
             as a light-emitting diode, may be taken for one. A laser that changes no pixel that is seen is not found.
-            Two lasers within 2 pixels and 25 nm count as one. The responses are linear between the bands.
+            Two lasers within 2 pixels and 25 nm count as one. The responses are linear between the bands. The
+            pattern of a lamp has at most 4 samples along a pixel and 4096 a side: where the lens draws finer fringes,
+            a lamp between pixels is not exact.
             `recipes/guide/found_lasers.md` has measured rates and coverage.
     Raises: ValueError for other numbers of channels, frames of fewer than 20 pixels a side, inputs of different
             channels, bands or pixels, and values that are not finite.
@@ -89,7 +93,7 @@ def find_lasers(
             frame,
             (~clipped).to(frame),
             Camera(plain, responses.detach().to(frame), bands, lens, torch.tensor(widths[0], dtype=torch.float64)),
-            lamp_light(psf, illuminant, responses, bands, lens.shape, frame.dtype),
+            lamp_light(psf, plain, illuminant, responses, bands, lens, frame.dtype),
             line_templates(plain, responses, bands, lens),
             read_noise,
             widths,
