@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -148,17 +148,22 @@ class Lamp:
 
         ``of`` is linear, treats each channel by itself, and takes pictures (picture, channel, y, x).
         """
-        (kinds, channels), (y, x) = self.light.spectra.shape[:2], self.light.torus
-        whole = self._spectra()
-        fy, fx = torch.fft.fftfreq(y).to(self.values)[:, None], torch.fft.rfftfreq(x).to(self.values)
-        turn = -2j * torch.pi * self.light.finer  # by pixel
-        spectra = [turn * fy * whole, turn * fx * whole, *(self.light.spectra * self._phase())]
-        seen = of(self._pictures(torch.stack(spectra)))
+        kinds, channels = self.light.spectra.shape[:2]
+        seen = of(torch.stack([self._pictures(each) for each in self._slopes()]))
         amounts = seen.new_zeros(kinds * channels, *seen.shape[1:])
         for k in range(kinds):
             for c in range(channels):
                 amounts[k * channels + c, c] = seen[2 + k, c]
         return torch.cat([seen[:2], amounts])
+
+    def _slopes(self) -> Iterator[Tensor]:
+        """Give the spectra of the changes with y, x (pixels) and each kind, one after another to save memory."""
+        (y, x), whole = self.light.torus, self._spectra()
+        fy, fx = torch.fft.fftfreq(y).to(self.values)[:, None], torch.fft.rfftfreq(x).to(self.values)
+        for frequency in (fy, fx):
+            yield -2j * torch.pi * self.light.finer * frequency * whole
+        for kind in self.light.spectra:
+            yield kind * self._phase()
 
     def moved(self, step: Tensor) -> Lamp:
         """Return the lamp after a step of at most a pixel."""
