@@ -30,10 +30,11 @@ sys.path.insert(0, str(ROOT))
 
 from neusee.nodes import flare, optics  # noqa: E402
 from neusee.nodes.restore._lasers import _lost_light as law  # noqa: E402
-from neusee.nodes.restore._lasers._components import Camera, Laser, lamp_light  # noqa: E402
+from neusee.nodes.restore._lasers._components import Camera, Laser  # noqa: E402
 from neusee.nodes.restore._lasers._greedy_search import Known, _data  # noqa: E402
 from neusee.nodes.restore._lasers._intervals import spreads  # noqa: E402
 from neusee.nodes.restore._lasers._joint_fit import fitted  # noqa: E402
+from neusee.nodes.restore._lasers._lamp_light import lamp_light  # noqa: E402
 from neusee.nodes.restore._lasers._line_pattern import Lens, line_pattern  # noqa: E402
 from tests.benchmarks import bench_restored_frames as masks  # noqa: E402
 from tests.nodes.restore.lasers import own_camera as own  # noqa: E402
@@ -90,7 +91,7 @@ def fit_of(frame, mask, laser, lens):
     electrons, clipped, psf, pupil, light, responses, bands = inputs(frame, mask)
     electrons = electrons.double()
     camera = Camera(pupil, responses, bands, lens, LINE)
-    lamp = lamp_light(psf, light, responses, bands, lens.shape)
+    lamp = lamp_light(psf, pupil, light, responses, bands, lens, torch.float64)
     known = Known(electrons, (~clipped).to(electrons), camera, lamp, None, own.READ, (1e-9, 5e-9, 10e-9))
     light = laser.strength * own.WELL / own.clear_peak(laser.wavelength)
     parts = (Laser(camera, torch.tensor([*laser.spot, laser.wavelength * 1e9, light, *[0.0] * 4]).double()),)

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from neusee.nodes.restore._inverse._grey_psf import grey_shares
+from neusee.nodes.restore._lasers._lamp_light import LampLight, phases
 from neusee.nodes.restore._lasers._line_pattern import Lens, deviation, line_moves, line_pattern, response_at
-from neusee.nodes.restore._lasers._whitening import fast_size
-from neusee.nodes.values import Bands, Psf, Pupil
+from neusee.nodes.values import Bands, Pupil
 
 NANOMETRE = 1e-9
 _WIDTH = 0.5  #: nm^2, standard deviation of the variance of a line, or that variance itself where it is more
 _WIDEST = 50.0  #: nm^2, most that is added to the variance of a line
 _KNOWN = 0.03  #: relative standard deviation of the response of a channel to one line
 _BLIND = 0.003  #: the same as a share of the largest response, for a channel that hardly sees the line
-_TILT = 50e-9  #: m, the scale of the tilt and the bend of a lamp's spectrum
 
 
 class Camera(NamedTuple):
@@ -128,46 +126,6 @@ class Laser:
         return pattern.to(self.values)
 
 
-class LampLight(NamedTuple):
-    """Patterns of a point source of many wavelengths: even, tilted and bent spectra, as each channel sees them."""
-
-    spectra: Tensor  #: (kind, channel, fy, fx), half spectra on a torus, with the spot in its first pixel
-    torus: tuple[int, int]
-    colour: Tensor  #: (channel,), electrons of each channel from the illuminant, relative to the largest
-    patterns: Tensor  #: (channel, y, x) of the even spectrum
-
-
-def lamp_light(
-    psf: Psf,
-    illuminant: Tensor,
-    responses: Tensor,
-    bands: Bands,
-    frame: tuple[int, int],
-    kind: torch.dtype = torch.float64,
-) -> LampLight:
-    """Return what a lamp adds to each channel."""
-    intensity = psf.intensity.to(kind)
-    shares = grey_shares(illuminant, responses, bands)
-    middle = (shares * bands.centres.cpu()).sum(-1, keepdim=True)
-    tilt = (bands.centres.cpu() - middle) / _TILT
-    kinds = torch.stack([shares, shares * tilt, shares * tilt.square()]).to(intensity)
-    patterns = torch.einsum("kcb,byx->kcyx", kinds, intensity)
-    torus = (fast_size(frame[0] + intensity.shape[-2]), fast_size(frame[1] + intensity.shape[-1]))
-    y, x = (n // 2 for n in intensity.shape[-2:])
-    spectra = torch.fft.rfft2(patterns, s=torus)
-    light = (responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()).sum(-1)
-    back = _phase(torus, torch.tensor([-float(y), -float(x)]).to(intensity))
-    return LampLight(spectra * back, torus, (light / light.max()).to(intensity), patterns[0])
-
-
-def _phase(torus: tuple[int, int], move: Tensor) -> Tensor:
-    """Return the factor of a spectrum that moves a picture by (y, x) pixels."""
-    y, x = torus
-    fy, fx = torch.fft.fftfreq(y).to(move), torch.fft.rfftfreq(x).to(move)
-    turns = fy[:, None] * move[0] + fx * move[1]
-    return torch.polar(torch.ones_like(turns), -2 * torch.pi * turns)
-
-
 @dataclass(frozen=True)
 class Lamp:
     """A lamp: place (y, x) of its spot in pixels from the middle, and electrons in each channel by kind of spectrum."""
@@ -190,16 +148,22 @@ class Lamp:
 
         ``of`` is linear, treats each channel by itself, and takes pictures (picture, channel, y, x).
         """
-        (kinds, channels), (y, x) = self.light.spectra.shape[:2], self.light.torus
-        whole = self._spectra()
-        fy, fx = torch.fft.fftfreq(y).to(self.values)[:, None], torch.fft.rfftfreq(x).to(self.values)
-        spectra = [-2j * torch.pi * fy * whole, -2j * torch.pi * fx * whole, *(self.light.spectra * self._phase())]
-        seen = of(self._pictures(torch.stack(spectra)))
+        kinds, channels = self.light.spectra.shape[:2]
+        seen = of(torch.stack([self._pictures(each) for each in self._slopes()]))
         amounts = seen.new_zeros(kinds * channels, *seen.shape[1:])
         for k in range(kinds):
             for c in range(channels):
                 amounts[k * channels + c, c] = seen[2 + k, c]
         return torch.cat([seen[:2], amounts])
+
+    def _slopes(self) -> Iterator[Tensor]:
+        """Give the spectra of the changes with y, x (pixels) and each kind, one after another to save memory."""
+        (y, x), whole = self.light.torus, self._spectra()
+        fy, fx = torch.fft.fftfreq(y).to(self.values)[:, None], torch.fft.rfftfreq(x).to(self.values)
+        for frequency in (fy, fx):
+            yield -2j * torch.pi * self.light.finer * frequency * whole
+        for kind in self.light.spectra:
+            yield kind * self._phase()
 
     def moved(self, step: Tensor) -> Lamp:
         """Return the lamp after a step of at most a pixel."""
@@ -214,8 +178,10 @@ class Lamp:
 
     def _phase(self) -> Tensor:
         middle = torch.tensor([self.shape[0] // 2, self.shape[1] // 2]).to(self.values)
-        return _phase(self.light.torus, self.values[:2] + middle)
+        return phases(self.light.torus, self.light.finer * (self.values[:2] + middle))
 
     def _pictures(self, spectra: Tensor) -> Tensor:
-        whole: Tensor = torch.fft.irfft2(spectra, s=self.light.torus)
-        return whole[..., : self.shape[0], : self.shape[1]]
+        step, (y, x) = self.light.finer, self.light.torus
+        rows = torch.fft.ifft(spectra, n=y, dim=-2)[..., : step * self.shape[0] : step, :]
+        whole: Tensor = torch.fft.irfft(rows, n=x, dim=-1)
+        return whole[..., : step * self.shape[1] : step]

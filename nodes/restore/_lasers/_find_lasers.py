@@ -13,9 +13,10 @@ from neusee.nodes._half_precision import refuse_not_finite
 from neusee.nodes.restore._inverse._wiener import refuse_other_pictures
 from neusee.nodes.restore._lasers._beyond_scatter import without_scattered
 from neusee.nodes.restore._lasers._candidates import line_templates
-from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Laser, lamp_light
+from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Laser
 from neusee.nodes.restore._lasers._greedy_search import Found, Known, search
 from neusee.nodes.restore._lasers._intervals import NORMAL, spreads
+from neusee.nodes.restore._lasers._lamp_light import lamp_light
 from neusee.nodes.restore._lasers._line_pattern import Lens, Sensor
 from neusee.nodes.restore._lasers._lost_light import at_the_aperture
 from neusee.nodes.units import Electrons, PositiveLength
@@ -61,10 +62,11 @@ def find_lasers(
     are as strong as those around each pixel. The values of clipped pixels are not used; their number and places say
     where a fit begins. The best candidates are fitted with a free response of each channel (3 %), and with each of the
     ``widths`` (full width at half maximum) of a line. A laser must gain ``least`` of log likelihood, and at least
-    ``margin`` of its gain beyond that of a lamp, a point source whose spectrum is smooth. All lasers and lamps are
-    fitted at once, and the search goes on in the rest. At the end a laser that does not gain ``least`` beside the
-    likeliest speckle of stronger ones, which a dirty lens scatters, is left out. Intervals (90 %) come from the second
-    derivatives and the scatter of the residual.
+    ``margin`` of its gain beyond that of a lamp, a point source whose spectrum is smooth. The pattern of a lamp comes
+    from the pupil too, for any place between pixels and over the whole frame; what ``psf`` has beyond it, such as stray
+    light, is added. All lasers and lamps are fitted at once, and the search goes on in the rest. At the end a laser
+    that does not gain ``least`` beside the likeliest speckle of stronger ones, which a dirty lens scatters, is left
+    out. Intervals (90 %) come from the second derivatives and the scatter of the residual.
 
     The strength counts all light at the aperture, as in a recipe. Dirt, edges and defocus take part of it out of the
     pattern; the scatter of the residual tells how much that may be, by a law that was learnt from the dirt of
@@ -78,7 +80,9 @@ def find_lasers(
     Units:  electrons e-; direction rad; wavelength and widths m; strength e-; gain none.
     Error:  in frames of more than 256 pixels a side float32 rounds the fit. A light that is narrow but no laser, such
             as a light-emitting diode, may be taken for one. A laser that changes no pixel that is seen is not found.
-            Two lasers within 2 pixels and 25 nm count as one. The responses are linear between the bands.
+            Two lasers within 2 pixels and 25 nm count as one. The responses are linear between the bands. The
+            pattern of a lamp has at most 4 samples along a pixel and 4096 a side: where the lens draws finer fringes,
+            a lamp between pixels is not exact.
             `recipes/guide/found_lasers.md` has measured rates and coverage.
     Raises: ValueError for other numbers of channels, frames of fewer than 20 pixels a side, inputs of different
             channels, bands or pixels, and values that are not finite.
@@ -96,7 +100,7 @@ def find_lasers(
             frame,
             (~clipped).to(frame),
             Camera(plain, responses.detach().to(frame), bands, lens, torch.tensor(widths[0], dtype=torch.float64)),
-            lamp_light(psf, illuminant, responses, bands, lens.shape, frame.dtype),
+            lamp_light(psf, plain, illuminant, responses, bands, lens, frame.dtype),
             line_templates(plain, responses, bands, lens),
             read_noise,
             widths,

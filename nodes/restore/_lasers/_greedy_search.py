@@ -10,8 +10,9 @@ from torch import Tensor
 
 from neusee.nodes.restore._lasers._candidates import Candidate, Templates, candidates, clipped_candidates
 from neusee.nodes.restore._lasers._censored import censored
-from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Lamp, LampLight, Laser
+from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Lamp, Laser
 from neusee.nodes.restore._lasers._joint_fit import Data, Fit, Parts, fitted, misfit_of
+from neusee.nodes.restore._lasers._lamp_light import LampLight
 from neusee.nodes.restore._lasers._nearest import FAR, nearest, nearest_of_many
 from neusee.nodes.restore._lasers._whitening import Filter, Weights, filter_of, noise_of, weights_of
 
@@ -126,7 +127,9 @@ def _rough(known: Known, fit: Fit, data: Data) -> _Left:
     weights = Weights(*(x.float() for x in data.weights))
     camera = known.camera._replace(responses=known.camera.responses.float())
     light, seen = known.lamp, known.seen.float()
-    lamp = LampLight(light.spectra.to(torch.complex64), light.torus, light.colour.float(), light.patterns.float())
+    lamp = light._replace(
+        spectra=light.spectra.to(torch.complex64), colour=light.colour.float(), patterns=light.patterns.float()
+    )
     less = known._replace(electrons=known.electrons.float(), seen=seen, camera=camera, lamp=lamp)
     rough = Data(left, Filter(seen, data.use.kernel.float()), weights)
     return _Left(less, rough, misfit_of(rough, (), 0)[1])

@@ -157,13 +157,12 @@ def irradiance(mask, kind, side, rng, lamps=0, lamp_strength=30.0):
     found *= 0.7 * WELL / found.max()
     for _ in range(lamps):
         warm = np.exp(rng.uniform(-1.0, 1.0) * (BANDS - 550e-9) / 150e-9)
-        spot = np.rint(rng.uniform(-0.4, 0.4, 2) * side).astype(int)
+        spot = tuple(rng.uniform(-0.4, 0.4, 2) * side)
         weight = band_response() * BANDS * warm
-        kernels, peak = np.tensordot(weight, psf, 1), np.tensordot(weight, scene_psf("plain", 3), 1).max()
-        size = lamp_strength * WELL * 10 ** rng.uniform(-1, 1) / peak
-        middle = [rim - side // 2 - s for s in spot]
-        y, x = (np.clip(np.arange(side) + m, 0, 2 * rim) for m in middle)
-        found += size * kernels[:, y[:, None], x]
+        peak = np.tensordot(weight, scene_psf("plain", 3), 1).max()
+        # between pixels, and as far as the frame reaches
+        kernels = np.tensordot(weight, np.stack([pattern(mask, w, spot, (side, side)) for w in BANDS]), 1)
+        found += lamp_strength * WELL * 10 ** rng.uniform(-1, 1) / peak * kernels
     return found
 
 

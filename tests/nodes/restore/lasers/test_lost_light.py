@@ -11,10 +11,11 @@ import torch
 from scipy.stats import norm
 
 from neusee.nodes.restore._lasers._beyond_scatter import without_scattered
-from neusee.nodes.restore._lasers._components import Camera, Laser, lamp_light
+from neusee.nodes.restore._lasers._components import Camera, Laser
 from neusee.nodes.restore._lasers._greedy_search import Choice, Found, Known, _data
 from neusee.nodes.restore._lasers._intervals import NORMAL, spreads
 from neusee.nodes.restore._lasers._joint_fit import fitted, misfit_of
+from neusee.nodes.restore._lasers._lamp_light import lamp_light
 from neusee.nodes.restore._lasers._line_pattern import Lens
 from neusee.nodes.restore._lasers._lost_light import at_the_aperture
 from tests.nodes.restore.lasers import own_camera as own
@@ -50,7 +51,7 @@ def fit_of(frame, mask, lasers):
     electrons, clipped, psf, known_pupil, light, responses, bands = inputs(frame, mask)
     lens = Lens(own.FOCAL, own.PITCH, (SIDE, SIDE))
     camera = Camera(known_pupil, responses, bands, lens, torch.tensor(1e-9, dtype=torch.float64))
-    lamp = lamp_light(psf, light, responses, bands, lens.shape)
+    lamp = lamp_light(psf, known_pupil, light, responses, bands, lens, torch.float64)
     known = Known(electrons.double(), (~clipped).double(), camera, lamp, None, own.READ, (1e-9,))
     parts = tuple(
         Laser(
