@@ -9,14 +9,16 @@ from typing import Any
 
 import torch
 
+from neusee.workflows.engine.cost_laws import sizes_of
 from neusee.workflows.engine.device_names import check_devices
 from neusee.workflows.engine.execution import Execution
 from neusee.workflows.engine.local_executor import memory_limit
 from neusee.workflows.engine.memory_use import give_back, process_peak
 from neusee.workflows.engine.memory_watch import limited
 from neusee.workflows.engine.node_call import to_device
-from neusee.workflows.engine.placement_inputs import running_peak
+from neusee.workflows.engine.placement_inputs import past_costs, running_peak
 from neusee.workflows.engine.step_job import Executor, Show
+from neusee.workflows.engine.step_order import shortest_first
 from neusee.workflows.graph.recipe_graph import Recipe, needed, unknown_step
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key
@@ -157,8 +159,8 @@ def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:
         work.resolve(order)
         first = tolerance_frontier(recipe, order, wanted)
         missing, targets = work.missing(wanted) if first else set(), [work.keys[name] for name in wanted]
-        if early := [work.keys[name] for name in first if work.keys[name] in missing]:
-            work.make(early, keep=False, later=targets)
+        if early := [name for name in first if work.keys[name] in missing]:
+            work.make(_targets_first(work, order, early, wanted, missing), keep=False, later=targets)
 
         def known(name: str) -> StepRecord:
             return work.done.get(name) or work.asleep(name)
@@ -179,3 +181,14 @@ def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:
     expected = running_peak(work.schedule, work.own.lanes) if work.executor is work.own else None
     code = work.origins, work.code.parts
     return Result(values, done, work.keys, seconds, peak, recipe, store, device, work.schedule, proved, expected, *code)
+
+
+def _targets_first(
+    work: Execution, order: list[str], early: list[str], wanted: tuple[str, ...], missing: set[Key]
+) -> list[Key]:
+    """Return the keys of the steps ``early`` and of the outputs that need only shorter steps, the shortest first."""
+    work.costs = work.costs or past_costs(work.store, sizes_of(work.recipe, order))
+    steps = [(name, work.recipe.steps[name], None) for name in order if work.keys[name] in missing]
+    seconds = {name: cost.seconds["cpu"] for name, cost in work.costs.in_turn(steps, ["cpu"]).items()}
+    others = [name for name in wanted if work.keys[name] in missing]
+    return [work.keys[name] for name in shortest_first(work.recipe, order, early, others, seconds)]

@@ -375,7 +375,7 @@ def test_the_plan_is_compared_where_all_that_ran_was_known(tmp_path):
 
     def planned(done, slots):
         told = replace(result, done=done, schedule=Schedule(slots, 3.0, {"cpu": 0.0}, 0.0))
-        return run_page.document(told, [], [], {})["timing"]["planned"]
+        return run_page.document(told, [])["timing"]["planned"]
 
     assert planned(known, slots) == 3.0
     assert planned(known, slots[:1]) is None
