@@ -7,6 +7,7 @@ the run does. Where a fork is not safe, or for another reason no process answers
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import pickle
@@ -110,6 +111,7 @@ def _serve(pipe: Connection, other_end: Connection) -> None:
     """Make the files that the pipe asks for, until its other end closes."""
     other_end.close()  # else the pipe stays open when the run is killed
     _close_all_but(pipe.fileno())
+    gc.freeze()  # a search for garbage among the objects of the run would copy their memory
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run decides what an interrupt ends
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     torch.set_num_threads(1)  # the threads of the run are not in a fork of it
