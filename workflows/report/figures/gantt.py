@@ -15,7 +15,8 @@ Spans = Mapping[str, tuple[str, float, float]]  #: device, start in s and durati
 _COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#56B4E9", "#8C6D1F", "#6A51A3", "#5F6B6D")
 _MOST = 80  #: largest number of rows of steps; only the longest steps have a row
 _MEASURED = 5  #: texts of the names and of the times that are measured to find the widest
-_ASIDE, _ABOVE, _BELOW = 0.15, 0.56, 0.42  #: inches beside the names and times, above and below the axes
+_ASIDE, _ABOVE, _BELOW = 0.15, 0.56, 0.46  #: inches beside the names and times, above and below the axes
+_MOST_BESIDE = 0.5  #: share of the width for names; longer ones make the picture wider
 _BETWEEN = 0.06  #: space between the axes, as a share of their mean height
 _STEP_HEIGHT, _LANE_HEIGHT = 0.2, 0.3  #: heights in inches of the row of a step and of the row of a device
 
@@ -34,7 +35,7 @@ def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
     end = max((start + took for _, start, took in (*plan.values(), *ran.values())), default=0.0) or 1.0
     scale, unit = _unit(end)
     heights = (_LANE_HEIGHT * max(len(lanes), 2) + 0.25, _STEP_HEIGHT * max(len(steps), 3) + 0.25)
-    figure, axes = canvas(10.0, sum(heights) + 1.1, 2, 1, layout="none", sharex=True, height_ratios=heights)
+    figure, axes = canvas(10.0, sum(heights) + 1.1, 2, 1, layout=None, sharex=True, height_ratios=heights)
     colour = dict(zip(lanes, itertools.cycle(_COLOURS), strict=False))
     _lanes(axes[0, 0], colour, plan, ran, scale)
     critical = {slot.task for slot in schedule.critical_path()}
@@ -107,7 +108,7 @@ def _place(figure: Any, names: Sequence[str]) -> None:
         max((text.get_window_extent(renderer).width for text in texts), default=0.0) / figure.dpi
         for texts in (labels, times)
     )
-    inner = {"left": (left + _ASIDE) / width, "right": 1 - (right + _ASIDE) / width}
+    inner = {"left": min((left + _ASIDE) / width, _MOST_BESIDE), "right": 1 - (right + _ASIDE) / width}
     figure.subplots_adjust(**inner, top=1 - _ABOVE / height, bottom=_BELOW / height, hspace=_BETWEEN)
 
 
@@ -144,6 +145,16 @@ def _time(seconds: float) -> str:
     return f"{seconds * scale:.3g} {unit}"
 
 
+def _letter() -> Any:
+    """Return a letter as a marker, without dollar signs, for which matplotlib first makes a parser of formulas."""
+    from matplotlib.textpath import TextPath
+    from matplotlib.transforms import Affine2D
+
+    path = TextPath((0, 0), "a", size=10)
+    box = path.get_extents()
+    return path.transformed(Affine2D().translate(-(box.x0 + box.x1) / 2, -(box.y0 + box.y1) / 2))
+
+
 def _legend(figure: Any) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -151,6 +162,6 @@ def _legend(figure: Any) -> None:
     handles = [
         Patch(facecolor="white", edgecolor="#555555", label="planned"),
         Patch(facecolor="#555555", edgecolor="#555555", label="actual"),
-        Line2D([], [], linestyle="none", marker="$\\mathrm{a}$", color=VERMILION, label="on the planned critical path"),
+        Line2D([], [], linestyle="none", marker=_letter(), color=VERMILION, label="on the planned critical path"),
     ]
     figure.legend(handles=handles, loc="upper center", ncols=3, handlelength=1.4)

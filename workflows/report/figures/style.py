@@ -6,7 +6,7 @@ import functools
 import io
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, ParamSpec
+from typing import Any, Literal, ParamSpec
 
 import torch
 from torch import Tensor
@@ -38,7 +38,12 @@ _RC: Mapping[str, Any] = {
 
 
 def canvas(
-    width: float, height: float, rows: int = 1, columns: int = 1, layout: str = "constrained", **options: Any
+    width: float,
+    height: float,
+    rows: int = 1,
+    columns: int = 1,
+    layout: Literal["constrained"] | None = "constrained",
+    **options: Any,
 ) -> tuple[Any, Any]:
     """Return a new matplotlib figure of ``width`` by ``height`` inches, and the array of its axes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
