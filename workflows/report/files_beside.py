@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from neusee.workflows.engine.memory_use import process_memory
+from neusee.workflows.engine.memory_watch import MemoryLimit
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.keys.code_digest import Code
@@ -109,8 +110,12 @@ class FilesBeside:
         """
         for begun, job in reversed(self._begun):
             if isinstance(job.make, Drawing) and _draws_at_once() and begun.cancel():
-                with suppress(Exception):  # the report meets the error again
+                try:
                     self._make(job, None)
+                except MemoryLimit:
+                    raise
+                except Exception:  # the report meets the error again
+                    continue
         for begun, _ in self._begun:
             with suppress(Exception, CancelledError):
                 begun.result()

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import pytest
 import torch
 
 from neusee.nodes import node
+from neusee.workflows.engine.memory_watch import MemoryLimit
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -27,6 +29,8 @@ from neusee.workflows.report.requirements import Bound
 from neusee.workflows.report.run_pictures import DerivedFile, Drawing, files_of, graphs, states_of
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
+
+HERE = os.getpid()
 
 
 @node()
@@ -218,6 +222,39 @@ def test_the_last_pictures_are_drawn_here_while_the_other_process_is_busy(tmp_pa
         assert (texts(paths), missing, len(early)) == ({"one": "2016", "both": "6048"}, {}, 2)
         makers[imported] = {name: path.read_text().split()[0] == str(os.getpid()) for name, path in paths.items()}
     assert makers == {True: {"one": False, "both": True}, False: {"one": False, "both": False}}
+
+
+def test_the_report_makes_the_files_of_a_process_that_was_killed_during_the_run(tmp_path, forks):
+    shelf = DerivedFiles(Store(tmp_path / "cache"))
+    with FilesBeside(lambda _: files(), shelf, 1e12) as beside:
+
+        def show(*shown):
+            beside(*shown)
+            os.kill(beside._drawer._process.pid, signal.SIGKILL)
+
+        result = run(recipe(), shelf.store, show=show)
+        beside.finish()
+    paths, missing = files_of(files(), result, shelf)
+    assert (texts(paths), missing) == ({"one": "2016", "both": "6048"}, {})
+
+
+def exceeds(path: Path, /, **values: torch.Tensor) -> None:
+    time.sleep(0.5)
+    if os.getpid() == HERE:
+        raise MemoryLimit
+    sums(path, **values)
+
+
+@pytest.mark.parametrize("error", [MemoryLimit, ValueError])
+def test_too_little_memory_ends_the_report_and_other_errors_are_met_again(tmp_path, forks, monkeypatch, error):
+    monkeypatch.setattr(files_beside, "Drawing", type(slow))
+    monkeypatch.setattr(files_beside, "_draws_at_once", lambda: True)
+    shelf = DerivedFiles(Store(tmp_path / "cache"))
+    with FilesBeside(lambda _: files(exceeds if error is MemoryLimit else breaks), shelf, 1e12) as beside:
+        run(recipe(), shelf.store, show=beside)
+        beside.add("late", "0" * 32, exceeds if error is MemoryLimit else breaks, {"x": torch.ones(3)})
+        with pytest.raises(MemoryLimit) if error is MemoryLimit else nullcontext():
+            beside.finish()
 
 
 def test_a_picture_that_is_not_stored_is_drawn_in_any_case(tmp_path, forks):
