@@ -45,6 +45,7 @@ class DrawingProcess:
 
     def __init__(self) -> None:
         self._turn = threading.Lock()  # a second thread waits until the file of the first is written
+        self._next = threading.Lock()  # and is the next then, before the first thread asks again
         context = multiprocessing.get_context("fork")
         self._pipe, there = context.Pipe()
         with warnings.catch_warnings():  # Python 3.12 warns of every fork beside a thread
@@ -55,8 +56,12 @@ class DrawingProcess:
 
     def make(self, path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -> None:
         """Let the process call ``make(path, **arguments)``; raise `NotDrawn` if the call failed or was not made."""
-        with self._turn:
+        with self._next:
+            self._turn.acquire()
+        try:
             self._ask(_sent(path, make, arguments))
+        finally:
+            self._turn.release()
 
     def _ask(self, job: bytes) -> None:
         """Send a job and wait until it is done."""

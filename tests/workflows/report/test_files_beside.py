@@ -190,6 +190,32 @@ def test_two_threads_take_turns_with_the_process_that_draws(tmp_path, forks):
     assert [(tmp_path / str(n)).read_text().split()[1] for n in range(40)] == [str(9 * n) for n in range(40)]
 
 
+def test_a_thread_that_waits_is_the_next(tmp_path, forks):
+    drawer, order = DrawingProcess(), []
+
+    def pictures():
+        for n in range(30):
+            drawer.make(tmp_path / f"picture{n}", short, {"x": torch.ones(3)})
+            order.append("picture")
+
+    with ThreadPoolExecutor(1) as threads:
+        drawing = threads.submit(pictures)
+        waited = []
+        while not drawing.done() and len(waited) < 8:
+            before = len(order)
+            drawer.make(tmp_path / "file", sums, {"x": torch.ones(3)})
+            waited.append(len(order) - before)
+            time.sleep(0.03)
+        drawing.result(60)
+    drawer.close()
+    assert max(waited) <= 2  # the picture that is drawn, and one that was asked for before
+
+
+def short(path: Path, /, **values: torch.Tensor) -> None:
+    time.sleep(0.1)
+    sums(path, **values)
+
+
 def slow(path: Path, /, **values: torch.Tensor) -> None:
     time.sleep(0.5)
     sums(path, **values)
