@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 DEFAULT = "first_light"
 _MOST = 100  #: lines of an error that are printed
+_NEW_OBJECTS = 10_000  #: containers that are new, after which Python searches for garbage; 700 at first
 
 
 def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int]:
@@ -68,8 +69,12 @@ def _is_change(word: str) -> bool:
 
 
 def search_for_garbage() -> None:
-    """Let Python search for garbage from here on, but not among what was imported; the program begins without."""
+    """Let Python search for garbage from here on, but not among what was imported; the program begins without.
+
+    The searches are rare, because packages that are imported later make many objects and hardly any garbage.
+    """
     gc.freeze()
+    gc.set_threshold(_NEW_OBJECTS)
     gc.enable()
 
 

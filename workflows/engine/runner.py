@@ -9,15 +9,17 @@ from typing import Any
 
 import torch
 
+from neusee.workflows.engine.cost_laws import sizes_of
 from neusee.workflows.engine.device_names import check_devices
 from neusee.workflows.engine.execution import Execution
 from neusee.workflows.engine.local_executor import memory_limit
 from neusee.workflows.engine.memory_use import give_back, process_peak
 from neusee.workflows.engine.memory_watch import limited
 from neusee.workflows.engine.node_call import to_device
-from neusee.workflows.engine.placement_inputs import running_peak
+from neusee.workflows.engine.placement_inputs import past_costs, running_peak
 from neusee.workflows.engine.run_series import RunSeries
 from neusee.workflows.engine.step_job import Executor, Show
+from neusee.workflows.engine.step_order import shortest_first
 from neusee.workflows.graph.recipe_graph import Recipe, needed, unknown_step
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key
@@ -113,7 +115,7 @@ def run(
         if name not in recipe.steps:
             raise ValueError(unknown_step(name, recipe.steps))
     recipe, store, watch = with_substitutions(recipe, wanted), store or open_store(), watch or (lambda event: None)
-    how = (executor, memory, show or (lambda *_: None), series)
+    how = (executor, memory, show, series)
     attempt = 0
     while True:
         attempt += 1
@@ -159,8 +161,9 @@ def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:
         work.resolve(order)
         first = tolerance_frontier(recipe, order, wanted)
         missing, targets = work.missing(wanted) if first else set(), [work.keys[name] for name in wanted]
-        if early := [work.keys[name] for name in first if work.keys[name] in missing]:
-            work.make(early, keep=False, later=targets)
+        if early := [name for name in first if work.keys[name] in missing]:
+            shown = _targets_first(work, order, early, wanted, missing) if work.show else early  # a sweep shows nothing
+            work.make([work.keys[name] for name in shown], keep=False, later=targets)
 
         def known(name: str) -> StepRecord:
             return work.done.get(name) or work.asleep(name)
@@ -181,3 +184,14 @@ def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:
     expected = running_peak(work.schedule, work.own.lanes) if work.executor is work.own else None
     code = work.origins, work.code.parts
     return Result(values, done, work.keys, seconds, peak, recipe, store, device, work.schedule, proved, expected, *code)
+
+
+def _targets_first(
+    work: Execution, order: list[str], early: list[str], wanted: tuple[str, ...], missing: set[Key]
+) -> list[str]:
+    """Return the steps ``early`` and the outputs that need only shorter steps, the shortest first."""
+    work.costs = work.costs or past_costs(work.store, sizes_of(work.recipe, order))
+    steps = [(name, work.recipe.steps[name], None) for name in order if work.keys[name] in missing]
+    seconds = {name: cost.seconds["cpu"] for name, cost in work.costs.in_turn(steps, ["cpu"]).items()}
+    others = [name for name in wanted if work.keys[name] in missing]
+    return shortest_first(work.recipe, order, early, others, seconds)

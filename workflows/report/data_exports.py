@@ -27,6 +27,7 @@ from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.serialization import tensor_kind
 
 _VERSION = 2  #: version of the file formats; to be increased when a file is written differently
+_COPIED = ("spectral", "safetensors")  #: formats without compression
 _AT_ONCE = 1 << 22  #: values of an image that are encoded together
 
 
@@ -41,7 +42,7 @@ def data_files(recipe: Recipe) -> Iterator[DerivedFile]:
         half = recipe.exports is not None and recipe.exports[name]
         kind = ("file", form, _VERSION, *(["half"] if half else []))
         write = partial(_WRITERS[form], half=True) if half else _WRITERS[form]
-        yield DerivedFile(name, Path(name).suffix, kind, needs, write)
+        yield DerivedFile(name, Path(name).suffix, kind, needs, write, copied=form in _COPIED)
 
 
 def spectral(path: Path, /, *, cube: Tensor | Psf, bands: Bands, half: bool = False) -> None:

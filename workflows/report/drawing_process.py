@@ -7,11 +7,13 @@ the run does. Where a fork is not safe, or for another reason no process answers
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import pickle
 import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -21,6 +23,7 @@ from typing import Any
 
 import torch
 
+from neusee.workflows.report.figures import style
 from neusee.workflows.store.serialization import pack, tensors_in, unpack
 
 MOST = 1 << 27  #: bytes of the arguments of a picture that go through the pipe
@@ -41,6 +44,8 @@ class DrawingProcess:
     """A forked process that writes one picture at a time; `close` ends the process."""
 
     def __init__(self) -> None:
+        self._turn = threading.Lock()  # a second thread waits until the file of the first is written
+        self._next = threading.Lock()  # and is the next then, before the first thread asks again
         context = multiprocessing.get_context("fork")
         self._pipe, there = context.Pipe()
         with warnings.catch_warnings():  # Python 3.12 warns of every fork beside a thread
@@ -51,8 +56,17 @@ class DrawingProcess:
 
     def make(self, path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -> None:
         """Let the process call ``make(path, **arguments)``; raise `NotDrawn` if the call failed or was not made."""
+        with self._next:
+            self._turn.acquire()
         try:
-            self._pipe.send_bytes(_sent(path, make, arguments))
+            self._ask(_sent(path, make, arguments))
+        finally:
+            self._turn.release()
+
+    def _ask(self, job: bytes) -> None:
+        """Send a job and wait until it is done."""
+        try:
+            self._pipe.send_bytes(job)
             if not self._pipe.poll(_PATIENCE):
                 self.close()
                 raise NotDrawn(f"no answer within {_PATIENCE:.0f} s")
@@ -76,23 +90,38 @@ def _sent(path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -
     """Return a job as bytes; raise `NotDrawn` for arguments that are large or that are no data."""
     if sum(x.nbytes for x in tensors_in(list(arguments.values()))) > MOST:
         raise NotDrawn("the arguments are large")
-    packed: dict[str, Any] = {}
     try:
-        for name, value in arguments.items():
-            layout, tensors = pack(None if isinstance(value, _WORDS) else value)
-            packed[name] = layout, [x.cpu().numpy() for x in tensors], value if isinstance(value, _WORDS) else None
+        packed = {name: _packed(value) for name, value in arguments.items()}
         return pickle.dumps((path, make, packed), protocol=5)
     except (TypeError, pickle.PicklingError, AttributeError) as error:
         raise NotDrawn(str(error)) from error
+
+
+def _packed(value: Any) -> tuple[Any, list[Any], Any]:
+    """Return the layout and the arrays of a value, and None; or a value without tensors at the end, as it is.
+
+    A function that applies the node of a step is such a value; the process that draws has all modules of the run.
+    """
+    if not isinstance(value, _WORDS):
+        try:
+            layout, tensors = pack(value)
+            return layout, [x.cpu().numpy() for x in tensors], None
+        except TypeError:
+            if tensors_in(value):
+                raise
+    return pack(None)[0], [], value
 
 
 def _serve(pipe: Connection, other_end: Connection) -> None:
     """Make the files that the pipe asks for, until its other end closes."""
     other_end.close()  # else the pipe stays open when the run is killed
     _close_all_but(pipe.fileno())
+    gc.freeze()  # a search for garbage among the objects of the run would copy their memory
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run decides what an interrupt ends
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     torch.set_num_threads(1)  # the threads of the run are not in a fork of it
+    with suppress(Exception):  # the first picture meets the error again
+        style.warm()
     with suppress(EOFError, OSError), torch.no_grad():
         while True:
             job = pipe.recv_bytes()

@@ -1,19 +1,23 @@
 """Pictures and data files of a run, made while later steps compute.
 
-A file is made as soon as the last of its results is there, in one thread, which leaves pictures to the process that
-draws. What is made so is found by its key when the report is written, and the report makes what is missing; an
-error is met there again. So nothing of the report depends on this module but its time.
+A file is made as soon as the last of its results is there. One thread writes data files, and another leaves pictures
+to the process that draws, so that neither waits for the other. What is made so is found by its key when the report is
+written, and the report makes what is missing; an error is met there again. So nothing of the report depends on this
+module but its time.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
-from functools import partial
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Self
 
 from neusee.workflows.engine.memory_use import process_memory
+from neusee.workflows.engine.memory_watch import MemoryLimit
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.keys.code_digest import Code
@@ -47,15 +51,17 @@ class FilesBeside:
         self._open: list[tuple[DerivedFile, frozenset[str]]] = []  # files to make, and the steps that they show
         self._held: dict[str, Any] = {}
         self._busy: set[str] = set()  # files of large results that are being written
-        self._thread = ThreadPoolExecutor(1, "neusee files")
+        self._writes = ThreadPoolExecutor(1, "neusee files")
+        self._draws = ThreadPoolExecutor(1, "neusee pictures")
         self._drawer: DrawingProcess | None = None
-        self._begun: list[Future[None]] = []
+        self._begun: list[tuple[Future[None], _Job]] = []
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._thread.shutdown(wait=True, cancel_futures=True)
+        for threads in (self._writes, self._draws):
+            threads.shutdown(wait=True, cancel_futures=True)
         if self._drawer is not None:
             self._drawer.close()
 
@@ -81,13 +87,38 @@ class FilesBeside:
     def add(self, name: str, key: str, make: Callable[..., None], arguments: Mapping[str, Any]) -> None:
         """Begin a picture that shows no result of a step."""
         if self._drawer is not None:
-            self._begun.append(self._thread.submit(self._make, name, key, ".png", make, arguments))
+            self._start(_Job(name, key, ".png", make, arguments), self._draws)
+
+    def draw(self, path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -> Callable[[], None]:
+        """Begin a picture that is not stored; return a function that waits for the picture.
+
+        That function draws the picture itself if the process that draws is missing, is busy with another, or failed.
+        """
+        drawer = self._drawer
+        begun = None if drawer is None else self._draws.submit(drawer.make, path, make, arguments)
+
+        def wait() -> None:
+            if begun is None or (_draws_at_once() and begun.cancel()) or begun.exception() is not None:
+                make(path, **arguments)
+
+        return wait
 
     def finish(self) -> None:
-        """Wait for the files that were begun, and hold no result any more."""
-        for each in self._begun:
-            with suppress(Exception):  # the report meets the error again
-                each.result()
+        """Wait for the files that were begun, and hold no result any more.
+
+        The last pictures are drawn here while the process that draws is busy with others.
+        """
+        for begun, job in reversed(self._begun):
+            if isinstance(job.make, Drawing) and _draws_at_once() and begun.cancel():
+                try:
+                    self._make(job, None)
+                except MemoryLimit:
+                    raise
+                except Exception:  # the report meets the error again
+                    continue
+        for begun, _ in self._begun:
+            with suppress(Exception, CancelledError):
+                begun.result()
         self._begun, self._open, self._held = [], [], {}
 
     def _begin(self, recipe: Recipe) -> None:
@@ -112,23 +143,50 @@ class FilesBeside:
         found = arguments_of(file.needs, recipe, keys, self._code, self._shelf.store)
         arguments = {name: each.make(self._held) for name, each in found.items()}
         large = _bytes_of(list(arguments.values())) > drawing_process.MOST
-        if isinstance(file.make, Drawing) and (large or self._drawer is None):
+        drawing = isinstance(file.make, Drawing)
+        if drawing and (large or self._drawer is None):
             return
-        key = key_of_file(file, found)
-        begun = self._thread.submit(self._make, file.name, key, file.suffix, file.make, arguments)
-        self._begun.append(begun)
+        job = _Job(file.name, key_of_file(file, found), file.suffix, file.make, arguments, large or file.copied)
+        begun = self._start(job, self._draws if drawing else self._writes)
         if large:
             self._busy.add(file.name)
             begun.add_done_callback(lambda _: self._busy.discard(file.name))
 
-    def _make(self, name: str, key: str, suffix: str, make: Callable[..., None], arguments: Mapping[str, Any]) -> None:
-        """Write a file, in the process that draws unless its arguments are large."""
-        if self._shelf.find(key, suffix) is not None:
+    def _start(self, job: _Job, threads: ThreadPoolExecutor) -> Future[None]:
+        begun = threads.submit(self._make, job, None if job.here else self._drawer)
+        self._begun.append((begun, job))
+        return begun
+
+    def _make(self, job: _Job, drawer: DrawingProcess | None) -> None:
+        """Write a file here, or let a process write it."""
+        arguments, job.arguments = job.arguments, {}  # so that this object does not hold them until the end
+        if self._shelf.find(job.key, job.suffix) is not None:
             return
-        large = _bytes_of(list(arguments.values())) > drawing_process.MOST
-        drawer = None if large else self._drawer
-        write = partial(make, **arguments) if drawer is None else lambda path: drawer.make(path, make, arguments)
-        self._shelf.keep(key, suffix, name, write)
+
+        def write(path: Path) -> None:
+            if drawer is None:
+                job.make(path, **arguments)
+            else:
+                drawer.make(path, job.make, arguments)
+
+        self._shelf.keep(job.key, job.suffix, job.name, write)
+
+
+@dataclass(slots=True)
+class _Job:
+    """A file to be made; ``here`` is True for one that this process writes itself."""
+
+    name: str
+    key: str
+    suffix: str
+    make: Callable[..., None]
+    arguments: Mapping[str, Any]
+    here: bool = False
+
+
+def _draws_at_once() -> bool:
+    """Return True if this process has imported what drawing needs; the import takes longer than a picture."""
+    return "matplotlib.figure" in sys.modules
 
 
 def _bytes_of(value: Any) -> int:

@@ -32,10 +32,15 @@ class RunFolder:
     said: dict[str, Any] = field(default_factory=dict)  #: for the crate: command, recipe, inputs, versions, seconds
     taken: dict[str, Path] = field(default_factory=dict)  #: by name: the stored file that was added to the folder
 
-    def write(self, name: str, content: str | bytes) -> Path:
-        """Write a file into the folder of a run, and return the path of the file."""
+    def place(self, name: str) -> Path:
+        """Return the path of a file that is to be written into the folder of a run, and make the folder above it."""
         path = self.path / name
         path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def write(self, name: str, content: str | bytes) -> Path:
+        """Write a file into the folder of a run, and return the path of the file."""
+        path = self.place(name)
         path.write_bytes(content.encode() if isinstance(content, str) else content)
         return path
 
@@ -48,8 +53,7 @@ class RunFolder:
 
     def take(self, name: str, source: Path) -> None:
         """Add a stored file to the folder of a run as a hard link, or as a copy if the file system refuses the link."""
-        path = self.path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path = self.place(name)
         self.taken[name] = source
         try:
             os.link(source, path)

@@ -13,7 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows.report.run_crate import remove_crate, restore_crate
-from neusee.workflows.report.study_page import filled
+from neusee.workflows.report.study_page import compiled, filled
+
+_TEMPLATE = "run_page.html.j2"
+
+
+def prepare() -> None:
+    """Read and compile the template of the page, which takes longer than to fill it."""
+    compiled(_TEMPLATE)
 
 
 def document_text(doc: Mapping[str, Any]) -> str:
@@ -30,7 +37,7 @@ def page(doc: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
     """Return the report of a run, from its document and pictures, as one HTML page that loads no other file."""
     inline = {name: base64.b64encode(content).decode() for name, content in pictures.items()}
     shown = {**doc, "figures": [f for f in doc["figures"] if f["name"] in inline]}
-    return filled("run_page.html.j2", doc=shown, pictures=inline)
+    return filled(_TEMPLATE, doc=shown, pictures=inline)
 
 
 def rebuild(folder: Path) -> Path:

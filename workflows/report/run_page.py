@@ -53,13 +53,14 @@ _UNITS = frozenset(("m", "nm", "rad", "e-", "DN", "photons", "W/m2", "dB"))
 _SAMPLING = "The PSF is sampled at the pixel centres; one pixel centre lies on the optical axis."
 
 
-def document(
-    result: Result, command: Sequence[str], warnings: Iterable[str], missing: Mapping[str, str]
-) -> dict[str, Any]:
-    """Return the report of a run, apart from its pictures, as a document of JSON values."""
+def document(result: Result, command: Sequence[str]) -> dict[str, Any]:
+    """Return the report of a run, apart from its pictures, as a document of JSON values.
+
+    It can be made while the last pictures are drawn; `with_pictures` adds what is known only afterwards.
+    """
     recipe, done = result.recipe, list(result.done.values())
     found, unchecked = expected(recipe, result.value), _unchecked(recipe)
-    steps, warned = [_step(d, result) for d in done], list(dict.fromkeys(warnings))
+    steps = [_step(d, result) for d in done]
     failed = [f"{s['step']}: {c['text']}" for s in steps for c in s["checks"] if not c["ok"]]
     time = timing(steps, _planned(result)) | {"peak": [result.predicted_peak, result.peak_memory]}
     return {
@@ -77,8 +78,8 @@ def document(
         "story": {**story(recipe, result.keys, result.value), **said_of_frame(recipe, result.keys, result.value)},
         "table": table(recipe, result.keys, result.value),
         "metrics": metrics(recipe, result.keys, result.value),
-        "notes": [*_sampling(recipe), *recipe.notes, *unchecked_lines(unchecked), *warned],
-        "warnings": warned,
+        "notes": [*_sampling(recipe), *recipe.notes, *unchecked_lines(unchecked)],
+        "warnings": [],
         "posterior": told(recipe.uncertain.standings) if recipe.uncertain else [],
         "readings": _readings(recipe),
         "consequences": consequences(recipe.config.values),
@@ -88,10 +89,34 @@ def document(
         "absent": [{"step": step, "where": where} for step, where in recipe.absent.items()],
         "timing": {**time, "said": said_of(time)},
         "steps": steps,
-        "figures": _figures(missing, bool(time["ran"])),
-        "missing": [{"name": n, "title": _TITLES.get(n, n), "why": why} for n, why in missing.items() if why],
+        "figures": [],
+        "missing": [],
         "facts": _facts(result),
         "inputs": _inputs(recipe),
+    }
+
+
+def with_pictures(
+    doc: Mapping[str, Any],
+    files: Iterable[str],
+    missing: Mapping[str, str],
+    refused: Mapping[str, str],
+    warnings: Iterable[str],
+) -> dict[str, Any]:
+    """Return the document of a run with its pictures, its data files, what is missing of both, and all warnings.
+
+    ``missing`` and ``refused`` have the reason for each missing picture and data file; a picture without a reason has
+    nothing to show in this recipe.
+    """
+    warned = list(dict.fromkeys(warnings))
+    lacking = [{"name": n, "title": _TITLES.get(n, n), "why": why} for n, why in missing.items() if why]
+    return {
+        **doc,
+        "notes": [*doc["notes"], *warned],
+        "warnings": warned,
+        "figures": _figures(missing, bool(doc["timing"]["ran"])),
+        "missing": [*lacking, *({"name": n, "title": f"data/{n}", "why": why} for n, why in refused.items())],
+        "files": sorted(files),
     }
 
 

@@ -45,6 +45,7 @@ class DerivedFile:
     needs: Mapping[str, str]
     make: Callable[..., None]
     only_tables: bool = False  #: True for a file that is made only if an argument is a table of the user
+    copied: bool = False  #: True for a file that holds results as they are: it is written as fast as sent elsewhere
 
 
 Job = tuple[DerivedFile, str, Mapping[str, Found]]  #: a file, its key, and the arguments of its ``make``
@@ -66,7 +67,7 @@ def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict
     paths, missing = files_of(figure_files(), result, shelf)
     now, _ = (
         shelf.find(key, ".png") or shelf.keep(key, ".png", "graph", partial(GRAPH_DRAWING, **arguments))
-        for key, arguments in graphs(result)
+        for key, arguments in graphs(result.recipe, states_of(result.done))
     )
     return {**paths, "graph": now}, missing
 
@@ -78,15 +79,22 @@ def figure_files() -> Iterator[DerivedFile]:
         yield DerivedFile(f.name, ".png", kind, f.needs, Drawing(f.draw), f.only_tables)
 
 
-def graphs(result: Result) -> list[tuple[str, Mapping[str, Any]]]:
-    """Return key and arguments of the graph of a run, and in advance those of the graph of an identical later run."""
-    states = {name: "cached" if done.state == "not needed" else str(done.state) for name, done in result.done.items()}
+def graphs(recipe: Recipe, states: Mapping[str, str]) -> list[tuple[str, Mapping[str, Any]]]:
+    """Return key and arguments of the graph of a run, and in advance those of the graph of an identical later run.
+
+    ``states`` has the state of each step, as `states_of` returns it.
+    """
     again = {name: "left out" if state == "left out" else "cached" for name, state in states.items()}
-    sources = {name: list(result.recipe.steps[name].sources) for name in result.done}
+    sources = {name: list(recipe.steps[name].sources) for name in states}
     return [
         (digest("graph", _drawing_code(), sources, each), {"sources": sources, "states": each})
         for each in (states, again)
     ]
+
+
+def states_of(done: Mapping[str, StepRecord]) -> dict[str, str]:
+    """Return the state of each step as the graph of a run shows it: a result that no step needed is from the cache."""
+    return {name: "cached" if each.state == "not needed" else str(each.state) for name, each in done.items()}
 
 
 def _drawing_code() -> str:
@@ -116,10 +124,10 @@ def files_of(
     return _made(jobs, result, shelf, missing), missing
 
 
-def timeline(result: Result) -> bytes | None:
-    """Draw the predicted and the actual times of all steps of a run, or return None if no step ran.
+def timeline(result: Result) -> dict[str, Any] | None:
+    """Return the arguments of `TIMELINE_DRAWING`: the predicted and the actual times of all steps of a run.
 
-    The picture is not stored.
+    None if no step ran.
     """
     ran = [done for done in result.done.values() if done.state == "run"]
     if not ran:
@@ -132,7 +140,7 @@ def timeline(result: Result) -> bytes | None:
     # where the time of a step is only a guess, the gap that it leaves in the schedule is no plan to compare with
     whole = len(known) == len(ran) and all(done.step in slots for done in known)
     planned = tuple(slots[done.step] for done in known) if whole else _in_turn(known)
-    return _function("report.figures.gantt:timeline")(schedule=replace(plan, slots=planned), rows=rows)
+    return {"schedule": replace(plan, slots=planned), "rows": rows}
 
 
 def _in_turn(known: Iterable[StepRecord]) -> tuple[Slot, ...]:
@@ -191,3 +199,4 @@ def _function(path: str) -> Callable[..., bytes]:
 
 
 GRAPH_DRAWING = Drawing("report.figures.recipe_graph:graph")
+TIMELINE_DRAWING = Drawing("report.figures.gantt:timeline")  # not stored, for no two runs take the same times

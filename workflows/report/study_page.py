@@ -6,6 +6,7 @@ The page has a light mode, a dark mode and a print mode. A sign in each coloured
 from __future__ import annotations
 
 import base64
+import functools
 import math
 import numbers
 import re
@@ -51,13 +52,19 @@ def page(title: str, lead: str, sections: Sequence[Section], provenance: Mapping
 
 def filled(template: str, **values: Any) -> str:
     """Return the HTML that an HTML template of the folder ``templates`` gives for the given ``values``."""
+    return str(compiled(template).render(**values))
+
+
+@functools.cache
+def compiled(template: str) -> Any:
+    """Return an HTML template of the folder ``templates``, read and compiled once."""
     from jinja2 import Environment, StrictUndefined
 
     text = (Path(__file__).parent / "templates" / template).read_text(encoding="utf-8")
     environment = Environment(autoescape=True, undefined=StrictUndefined)
     environment.filters["code"] = _with_code
     environment.filters["breaks"] = _with_breaks
-    return environment.from_string(text).render(**values)
+    return environment.from_string(text)
 
 
 def _with_code(text: str) -> str:

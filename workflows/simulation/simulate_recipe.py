@@ -22,9 +22,19 @@ from neusee.workflows.report import run_html, run_page, run_timing
 from neusee.workflows.report.contents import wanted
 from neusee.workflows.report.data_exports import data_files, exports
 from neusee.workflows.report.files_beside import FilesBeside
+from neusee.workflows.report.graph_ahead import GraphAhead
 from neusee.workflows.report.run_code import code_text
 from neusee.workflows.report.run_folder import NotWritten, RunFolder, new_run
-from neusee.workflows.report.run_pictures import GRAPH_DRAWING, DerivedFile, figure_files, graphs, pictures, timeline
+from neusee.workflows.report.run_pictures import (
+    GRAPH_DRAWING,
+    TIMELINE_DRAWING,
+    DerivedFile,
+    figure_files,
+    graphs,
+    pictures,
+    states_of,
+    timeline,
+)
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -71,14 +81,18 @@ def simulate(
     ):
         warnings.simplefilter("default")
         recipe = with_substitutions(recipe, wanted(recipe))
-        told = explained(recipe, store, note)
-        result = run(recipe, store, wanted(recipe), told, device, executor, memory, beside)
+        told, graph = explained(recipe, store, note), GraphAhead(beside, store, finished)
+
+        def show(*result: Any) -> None:
+            beside(*result)
+            graph(*result)
+
+        result = run(recipe, store, wanted(recipe), told, device, executor, memory, show)
         result = replace(result, done={name: finished.get(name, done) for name, done in result.done.items()})
         key = digest([[name, result.keys[name]] for name in wanted(result.recipe)])
         with limited(memory_limit(memory)), _watched(), new_run(runs, recipe.name, key) as folder:
             folder.said = {"began": began}
-            bars = _rest(result, beside)
-            doc = _write(result, shelf, folder, command, caught, bars)
+            doc = _write(result, shelf, folder, command, caught, beside)
     return Simulation(folder.path, doc, folder.taken)
 
 
@@ -97,44 +111,51 @@ def _files(recipe: Recipe) -> Iterator[DerivedFile]:
     yield from data_files(recipe)
 
 
-def _rest(result: Result, beside: FilesBeside) -> bytes | None:
-    """Draw what shows no result of a step, while the last files of results are made; return the timeline."""
-    for key, arguments in graphs(result):
-        beside.add("graph", key, GRAPH_DRAWING, arguments)
-    bars = timeline(result)
-    beside.finish()
-    return bars
-
-
 def _write(
     result: Result,
     shelf: DerivedFiles,
     folder: RunFolder,
     command: Sequence[str],
     caught: Sequence[warnings.WarningMessage],
-    bars: bytes | None,
+    beside: FilesBeside,
 ) -> dict[str, Any]:
-    drawn, missing = pictures(result, shelf)
-    files, refused = exports(result, shelf)
-    doc = run_page.document(result, command, (str(warning.message) for warning in caught), missing)
-    doc["files"] = sorted(files)
-    folder.said |= doc
+    """Write the folder of a run: all that shows no picture while the last pictures are drawn, and then the page."""
+    bars, finish = folder.path / "figures" / "timeline.png", _last_pictures(result, folder, beside)
+    doc = run_page.document(result, command)
     folder.write("code.json", code_text(result))
-    doc["missing"] += [{"name": n, "title": f"data/{n}", "why": why} for n, why in refused.items()]
-    shown = {name: path.read_bytes() for name, path in drawn.items()}
-    for name, path in drawn.items():
-        folder.take(f"figures/{name}.png", path)
-    if bars:
-        folder.write("figures/timeline.png", bars)
-        shown["timeline"] = bars
-    for name, path in files.items():
-        folder.take(f"data/{name}", path)
     folder.write("recipe.yaml", recipe_text(result.recipe))
     folder.write_rows("metrics.csv", ("step", "field", "index", "value"), doc["metrics"])
     folder.write_rows("timing.csv", run_timing.COLUMNS, run_timing.rows(doc["steps"]))
+    run_html.prepare()
+    finish()
+    drawn, missing = pictures(result, shelf)
+    files, refused = exports(result, shelf)
+    doc = run_page.with_pictures(doc, files, missing, refused, (str(warning.message) for warning in caught))
+    folder.said |= doc
+    for name, path in drawn.items():
+        folder.take(f"figures/{name}.png", path)
+    for name, path in files.items():
+        folder.take(f"data/{name}", path)
+    shown = {**drawn, **({"timeline": bars} if bars.exists() else {})}
     folder.write("provenance.json", run_html.document_text(doc))
-    folder.write("report.html", run_html.page(doc, shown))
+    folder.write("report.html", run_html.page(doc, {name: path.read_bytes() for name, path in shown.items()}))
     return doc
+
+
+def _last_pictures(result: Result, folder: RunFolder, beside: FilesBeside) -> Callable[[], None]:
+    """Begin the pictures that show no result of a step; return a function that waits for all pictures and files."""
+    times = timeline(result)
+    bars = folder.place("figures/timeline.png")
+    wait = beside.draw(bars, TIMELINE_DRAWING, times) if times else None
+    for key, arguments in graphs(result.recipe, states_of(result.done)):
+        beside.add("graph", key, GRAPH_DRAWING, arguments)
+
+    def finish() -> None:
+        if wait is not None:
+            wait()
+        beside.finish()
+
+    return finish
 
 
 def recipe_text(recipe: Recipe) -> str:

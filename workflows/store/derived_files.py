@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import threading
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
@@ -35,6 +36,7 @@ class DerivedFiles:
         self.store = store
         self.folder = store.root / "files"
         self._spare = ""  # a temporary folder, which goes with this object
+        self._failing = threading.Lock()  # two threads make files
         self._fresh: dict[Path, tuple[int, ...]] = {}  # what the system said of each file when it was right
 
     def find(self, key: str, suffix: str) -> Path | None:
@@ -62,10 +64,11 @@ class DerivedFiles:
             path = self._written(key, suffix, write)
         except OSError as error:
             self.store.report_failure(error)
-            if not self._spare:
-                self._spare = mkdtemp(prefix="neusee-")
-                weakref.finalize(self, _remove, self._spare, os.getpid())
-            self.folder = Path(self._spare)
+            with self._failing:
+                if not self._spare:
+                    self._spare = mkdtemp(prefix="neusee-")
+                    weakref.finalize(self, _remove, self._spare, os.getpid())
+                self.folder = Path(self._spare)
             path = self._written(key, suffix, write)
         about = {
             "step": what,

@@ -31,8 +31,9 @@ def test_threads_leave_busy_processors_alone(processors, load, threads):
 @pytest.mark.parametrize(
     ("command", "given", "added"),
     [
-        ("run", {}, {"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "3"}),
-        ("run", {"OMP_WAIT_POLICY": "ACTIVE"}, {"OMP_NUM_THREADS": "3"}),
+        ("calibrate", {}, {"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "3"}),
+        ("run", {}, {"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "2"}),
+        ("run", {"OMP_WAIT_POLICY": "ACTIVE"}, {"OMP_NUM_THREADS": "2"}),
         ("run", {"GOMP_SPINCOUNT": "5", "MKL_NUM_THREADS": "7"}, {}),
         ("run", {"KMP_BLOCKTIME": "1", "OMP_NUM_THREADS": "7"}, {}),
         ("study", {}, {"OMP_WAIT_POLICY": "PASSIVE"}),
@@ -42,6 +43,14 @@ def test_what_the_user_has_set_stays(command, given, added):
     environ = dict(given)
     settle_threads(command, environ)
     assert environ == given | added
+
+
+@pytest.mark.usefixtures("before_torch")
+def test_a_single_free_processor_is_not_given_away(monkeypatch):
+    monkeypatch.setattr(thread_settings, "free_processors", lambda: 1)
+    environ: dict[str, str] = {}
+    settle_threads("run", environ)
+    assert environ["OMP_NUM_THREADS"] == "1"
 
 
 def test_nothing_changes_where_torch_is_imported():

@@ -7,21 +7,30 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from neusee.nodes import node
+from neusee.workflows.engine.memory_watch import MemoryLimit
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.graph.step_record import StepRecord
 from neusee.workflows.report import drawing_process, files_beside
 from neusee.workflows.report.drawing_process import DrawingProcess, NotDrawn
 from neusee.workflows.report.files_beside import FilesBeside
-from neusee.workflows.report.run_pictures import DerivedFile, Drawing, files_of
+from neusee.workflows.report.graph_ahead import GraphAhead
+from neusee.workflows.report.requirements import Bound
+from neusee.workflows.report.run_pictures import DerivedFile, Drawing, files_of, graphs, states_of
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
+
+HERE = os.getpid()
 
 
 @node()
@@ -169,3 +178,171 @@ def test_a_drawing_is_sent_by_its_name(tmp_path, forks):
     drawer.make(tmp_path / "g.png", drawing, {"sources": {"a": []}, "states": {"a": "run"}})
     drawer.close()
     assert (tmp_path / "g.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_two_threads_take_turns_with_the_process_that_draws(tmp_path, forks):
+    drawer = DrawingProcess()
+    with ThreadPoolExecutor(4) as threads:
+        made = [threads.submit(drawer.make, tmp_path / str(n), sums, {"x": torch.full((9,), n)}) for n in range(40)]
+        for each in made:
+            each.result(30)
+    drawer.close()
+    assert [(tmp_path / str(n)).read_text().split()[1] for n in range(40)] == [str(9 * n) for n in range(40)]
+
+
+def test_a_thread_that_waits_is_the_next(tmp_path, forks):
+    drawer, order = DrawingProcess(), []
+
+    def pictures():
+        for n in range(30):
+            drawer.make(tmp_path / f"picture{n}", short, {"x": torch.ones(3)})
+            order.append("picture")
+
+    with ThreadPoolExecutor(1) as threads:
+        drawing = threads.submit(pictures)
+        waited = []
+        while not drawing.done() and len(waited) < 8:
+            before = len(order)
+            drawer.make(tmp_path / "file", sums, {"x": torch.ones(3)})
+            waited.append(len(order) - before)
+            time.sleep(0.03)
+        drawing.result(60)
+    drawer.close()
+    assert max(waited) <= 2  # the picture that is drawn, and one that was asked for before
+
+
+def short(path: Path, /, **values: torch.Tensor) -> None:
+    time.sleep(0.1)
+    sums(path, **values)
+
+
+def slow(path: Path, /, **values: torch.Tensor) -> None:
+    time.sleep(0.5)
+    sums(path, **values)
+
+
+def test_a_data_file_does_not_wait_for_pictures(tmp_path, forks, monkeypatch):
+    monkeypatch.setattr(files_beside, "Drawing", type(slow))  # functions count as pictures here
+    copies = replace(files(Sums())[1], copied=True)
+    shelf = DerivedFiles(Store(tmp_path / "cache"))
+    with FilesBeside(lambda _: [*files(slow), copies], shelf, 1e12) as beside:
+        run(recipe(), shelf.store, show=beside)
+        copied = [begun for begun, job in beside._begun if job.here]
+        copied[0].result(30)
+        assert [begun.done() for begun, job in beside._begun if not job.here] == [False, False]
+
+
+class Sums:
+    """A function that is no picture."""
+
+    def __call__(self, path: Path, /, **values: torch.Tensor) -> None:
+        sums(path, **values)
+
+
+def test_the_last_pictures_are_drawn_here_while_the_other_process_is_busy(tmp_path, forks, monkeypatch):
+    monkeypatch.setattr(files_beside, "Drawing", type(slow))
+    makers = {}
+    for imported in (True, False):
+        monkeypatch.setattr(files_beside, "_draws_at_once", lambda imported=imported: imported)
+        (paths, missing), early = result_of(tmp_path / str(imported), files(slow))
+        assert (texts(paths), missing, len(early)) == ({"one": "2016", "both": "6048"}, {}, 2)
+        makers[imported] = {name: path.read_text().split()[0] == str(os.getpid()) for name, path in paths.items()}
+    assert makers == {True: {"one": False, "both": True}, False: {"one": False, "both": False}}
+
+
+def test_the_report_makes_the_files_of_a_process_that_was_killed_during_the_run(tmp_path, forks):
+    shelf = DerivedFiles(Store(tmp_path / "cache"))
+    with FilesBeside(lambda _: files(), shelf, 1e12) as beside:
+
+        def show(*shown):
+            beside(*shown)
+            os.kill(beside._drawer._process.pid, signal.SIGKILL)
+
+        result = run(recipe(), shelf.store, show=show)
+        beside.finish()
+    paths, missing = files_of(files(), result, shelf)
+    assert (texts(paths), missing) == ({"one": "2016", "both": "6048"}, {})
+
+
+def exceeds(path: Path, /, **values: torch.Tensor) -> None:
+    time.sleep(0.5)
+    if os.getpid() == HERE:
+        raise MemoryLimit
+    sums(path, **values)
+
+
+@pytest.mark.parametrize("error", [MemoryLimit, ValueError])
+def test_too_little_memory_ends_the_report_and_other_errors_are_met_again(tmp_path, forks, monkeypatch, error):
+    monkeypatch.setattr(files_beside, "Drawing", type(slow))
+    monkeypatch.setattr(files_beside, "_draws_at_once", lambda: True)
+    shelf = DerivedFiles(Store(tmp_path / "cache"))
+    with FilesBeside(lambda _: files(exceeds if error is MemoryLimit else breaks), shelf, 1e12) as beside:
+        run(recipe(), shelf.store, show=beside)
+        beside.add("late", "0" * 32, exceeds if error is MemoryLimit else breaks, {"x": torch.ones(3)})
+        with pytest.raises(MemoryLimit) if error is MemoryLimit else nullcontext():
+            beside.finish()
+
+
+def test_a_picture_that_is_not_stored_is_drawn_in_any_case(tmp_path, forks):
+    shelf, ones = DerivedFiles(Store(tmp_path / "cache")), {"x": torch.ones(3)}
+    with FilesBeside(lambda _: files(), shelf, 1e12) as beside:
+        beside.draw(tmp_path / "before", sums, ones)()  # no process draws yet
+        run(recipe(), shelf.store, show=beside)
+        beside.finish()
+        wait = beside.draw(tmp_path / "there", sums, ones)
+        wait()
+        os.kill(beside._drawer._process.pid, signal.SIGKILL)
+        beside.draw(tmp_path / "killed", sums, ones)()
+        with pytest.raises(ValueError, match="it cannot be drawn"):
+            beside.draw(tmp_path / "wrong", breaks, ones)()
+    here = {name: (tmp_path / name).read_text().split() for name in ("before", "there", "killed")}
+    assert {total for _, total in here.values()} == {"3"}
+    assert [pid == str(os.getpid()) for pid, _ in here.values()] == [True, False, True]
+
+
+def test_what_a_picture_shows_is_not_held_after_it_is_drawn(tmp_path, forks):
+    shelf = DerivedFiles(Store(tmp_path / "cache"))
+    with FilesBeside(lambda _: files(), shelf, 1e12) as beside:
+        run(recipe(), shelf.store, show=beside)
+        for begun, job in beside._begun:
+            begun.result(30)
+            assert job.arguments == {}
+
+
+def test_a_function_of_a_step_is_sent_by_its_name(tmp_path, forks):
+    step = recipe().steps["second"]
+    drawer = DrawingProcess()
+    drawer.make(tmp_path / "f", applied, {"step": Bound(step), "x": torch.ones(4)})
+    drawer.close()
+    assert (tmp_path / "f").read_text() == "8"
+
+
+def applied(path: Path, /, *, step: Bound, x: torch.Tensor) -> None:
+    path.write_text(f"{float(step(x).sum()):.0f}")
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_the_graph_is_begun_when_it_can_be_foreseen(tmp_path, forks, wrong):
+    drawn, done = [], {}
+    shelf = DerivedFiles(Store(tmp_path / "cache"))
+    with FilesBeside(lambda _: files(), shelf, 1e12) as beside:
+        graph = GraphAhead(beside, shelf.store, done)
+
+        def watch(event):
+            if event.done is not None:
+                done[event.step] = event.done
+
+        def show(*shown):
+            beside(*shown)
+            if wrong:  # as if another process had stored the result meanwhile
+                done["second"] = StepRecord("second", "cached", "", 0.0, "")
+            graph(*shown)
+            drawn.append([job.key for _, job in beside._begun if job.name == "graph"])
+
+        result = run(recipe(), shelf.store, watch=watch, show=show)
+        beside.finish()
+        needed = [key for key, _ in graphs(result.recipe, states_of(result.done))]
+        assert len(drawn[0]) == 2  # with the first result, before the second step ran
+        assert (drawn[0] == needed) is not wrong
+        assert drawn[0][1] == needed[1]
+        assert all(shelf.find(key, ".png") for key in drawn[0])

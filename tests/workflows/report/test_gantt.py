@@ -10,6 +10,7 @@ import pytest
 from neusee.workflows.placement.heft_schedule import Cluster, Device, Task, heft
 from neusee.workflows.report.figures import gantt
 from neusee.workflows.report.figures.gantt import timeline
+from neusee.workflows.report.figures.style import styled
 
 
 def planned(count):
@@ -109,3 +110,36 @@ def test_a_plan_of_some_steps_is_not_taken_for_the_whole(drawn):
     rows = [*ran(schedule), ("unknown", "cpu", 0.8, 0.2)]
     _, lanes, _ = drawn(schedule, rows)
     assert lanes.get_title(loc="left") == "planned 700 ms for 9 of 10 steps, took 1 s"
+
+
+@pytest.mark.parametrize("name", ["i" * 60, "W" * 60, "s"])
+def test_names_and_times_stand_beside_the_bars(drawn, name):
+    schedule = planned(9)
+    rows = [(name if n == 4 else step, lane, began, took) for n, (step, lane, began, took) in enumerate(ran(schedule))]
+    with styled():
+        figure, lanes, steps = drawn(schedule, rows)
+        figure.canvas.draw()
+    inside = steps.get_window_extent()
+    assert all(
+        label.get_window_extent().x1 < inside.x0 for label in (*steps.get_yticklabels(), *lanes.get_yticklabels())
+    )
+    assert all(text.get_window_extent().x0 > inside.x1 for text in steps.texts)
+    left = min(label.get_window_extent().x0 for label in steps.get_yticklabels())
+    assert left >= 0 or name[0] == "W"
+    width = struct.unpack(">I", timeline(schedule=schedule, rows=rows)[16:20])[0]
+    assert width >= max(text.get_window_extent().x1 for text in steps.texts) - left
+    assert inside.width > 300
+    assert max(text.get_window_extent().x1 for text in steps.texts) <= figure.bbox.x1
+    title, legend = lanes.get_window_extent(), figure.legends[0].get_window_extent()
+    assert legend.y0 > lanes._left_title.get_window_extent().y1 > title.y1
+    assert steps.xaxis.label.get_window_extent().y0 >= 0
+
+
+@pytest.mark.parametrize("count", [1, 9, 60])
+def test_lanes_and_steps_do_not_overlap(drawn, count):
+    schedule = planned(count)
+    figure, lanes, steps = drawn(schedule, ran(schedule))
+    figure.canvas.draw()
+    head = next(text for text in steps.texts if text.get_text() == "planned → took")
+    assert lanes.get_window_extent().y0 > steps.get_window_extent().y1
+    assert head.get_window_extent().y1 < lanes.get_window_extent().y1

@@ -16,7 +16,6 @@ from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
 from neusee.workflows.report import result_numbers, run_folder, run_html, run_page, run_pictures, run_timing
-from neusee.workflows.report.figures import gantt
 from neusee.workflows.report.run_folder import find_run, new_run
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
@@ -375,7 +374,7 @@ def test_the_plan_is_compared_where_all_that_ran_was_known(tmp_path):
 
     def planned(done, slots):
         told = replace(result, done=done, schedule=Schedule(slots, 3.0, {"cpu": 0.0}, 0.0))
-        return run_page.document(told, [], [], {})["timing"]["planned"]
+        return run_page.document(told, [])["timing"]["planned"]
 
     assert planned(known, slots) == 3.0
     assert planned(known, slots[:1]) is None
@@ -417,36 +416,32 @@ def test_the_run_is_drawn_over_time_unless_nothing_ran(done, tmp_path):
     assert "timeline" not in {f["name"] for f in again.document["figures"]}
 
 
-def test_only_what_was_known_is_drawn_as_the_plan(tmp_path, monkeypatch):
+def test_only_what_was_known_is_drawn_as_the_plan(tmp_path):
     result = recipe().run(Store(tmp_path / "cache"))
     told = {
         "number": replace(result.done["number"], predicted=1.0, began=5.0, seconds=2.0, lane="cpu:1"),
         "truth": replace(result.done["truth"], predicted=None, began=7.0, seconds=1.0, lane="cpu:1"),
     }
     plan = Schedule((Slot("number", "cpu:1", 0.0, 1.0), Slot("truth", "cpu:1", 1.0, 99.0)), 99.0, {"cpu:1": 0.0}, 0.0)
-    seen = {}
-    monkeypatch.setattr(gantt, "timeline", lambda **given: seen.update(given) or b"png")
-    assert run_pictures.timeline(replace(result, done=told, schedule=plan)) == b"png"
+    seen = run_pictures.timeline(replace(result, done=told, schedule=plan))
     assert seen["rows"] == [("number", "cpu:1", 0.0, 2.0), ("truth", "cpu:1", 2.0, 1.0)]
     assert [slot.task for slot in seen["schedule"].slots] == ["number"]
     told = {name: replace(done, predicted=1.5) for name, done in told.items()}
-    run_pictures.timeline(replace(result, done=told, schedule=replace(plan, slots=plan.slots[:1])))
+    seen = run_pictures.timeline(replace(result, done=told, schedule=replace(plan, slots=plan.slots[:1])))
     assert [(s.task, s.device, s.start, s.end, s.after) for s in seen["schedule"].slots] == [
         ("number", "cpu:1", 0.0, 1.5, ""),
         ("truth", "cpu:1", 1.5, 3.0, "number"),
     ]
-    run_pictures.timeline(replace(result, schedule=None))
-    assert seen["schedule"].slots == ()
+    assert run_pictures.timeline(replace(result, schedule=None))["schedule"].slots == ()
+    assert run_pictures.timeline(replace(result, done={})) is None
 
 
-def test_a_guess_leaves_no_gap_in_the_plan_that_is_drawn(tmp_path, monkeypatch):
+def test_a_guess_leaves_no_gap_in_the_plan_that_is_drawn(tmp_path):
     result = recipe().run(Store(tmp_path / "cache"))
     told = {
         "number": replace(result.done["number"], predicted=None, began=5.0, seconds=2.0, lane="cpu"),
         "truth": replace(result.done["truth"], predicted=1.0, began=7.0, seconds=1.0, lane="cpu"),
     }
     plan = Schedule((Slot("number", "cpu", 0.0, 99.0), Slot("truth", "cpu", 99.0, 100.0)), 100.0, {"cpu": 0.0}, 0.0)
-    seen = {}
-    monkeypatch.setattr(gantt, "timeline", lambda **given: seen.update(given) or b"png")
-    run_pictures.timeline(replace(result, done=told, schedule=plan))
+    seen = run_pictures.timeline(replace(result, done=told, schedule=plan))
     assert [(s.task, s.start, s.end) for s in seen["schedule"].slots] == [("truth", 0.0, 1.0)]

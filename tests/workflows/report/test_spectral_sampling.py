@@ -21,7 +21,7 @@ def store(tmp_path_factory):
 
 def document(store, *changes):
     recipe = load("first_light", [*SMALL, *changes])
-    return run_page.document(run(recipe, store, contents.wanted(recipe)), ["neusee", "run"], [], {})
+    return run_page.document(run(recipe, store, contents.wanted(recipe)), ["neusee", "run"])
 
 
 def test_an_error_larger_than_the_tolerance_is_a_warning(store):

@@ -101,7 +101,7 @@ def _edge(ax: Any, start: tuple[float, int], end: tuple[float, int]) -> None:
     bend = 0.0 if end[1] - start[1] == 1 else 0.12 if end[0] <= start[0] else -0.12
     path: dict[str, Any] = {"connectionstyle": f"arc3,rad={bend}", "arrowstyle": "-|>", "mutation_scale": 9}
     a, b = (start[0], start[1] + 0.27), (end[0], end[1] - 0.27)
-    ax.add_patch(FancyArrowPatch(a, b, color="#8a8a8a", linewidth=0.9, shrinkA=0, shrinkB=0, zorder=1, **path))
+    ax.add_artist(FancyArrowPatch(a, b, color="#8a8a8a", linewidth=0.9, shrinkA=0, shrinkB=0, zorder=1, **path))
 
 
 def _box(ax: Any, x: float, y: float, text: str, look: str) -> None:
@@ -109,7 +109,7 @@ def _box(ax: Any, x: float, y: float, text: str, look: str) -> None:
 
     style: dict[str, Any] = {"boxstyle": "round,pad=0.0,rounding_size=0.08", "mutation_aspect": 1.6, "zorder": 2}
     style |= {"facecolor": LOOKS[look][0], "edgecolor": "#444444", "linestyle": "--" if look == "left out" else "-"}
-    ax.add_patch(FancyBboxPatch((x - _INSIDE / 2, y - 0.26), _INSIDE, 0.52, **style))
+    ax.add_artist(FancyBboxPatch((x - _INSIDE / 2, y - 0.26), _INSIDE, 0.52, **style))
     ax.text(x, y, text, ha="center", va="center", fontsize=9.5, zorder=3, linespacing=1.15)
 
 

@@ -6,7 +6,7 @@ import functools
 import io
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, ParamSpec
+from typing import Any, Literal, ParamSpec
 
 import torch
 from torch import Tensor
@@ -37,12 +37,19 @@ _RC: Mapping[str, Any] = {
 }
 
 
-def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Any, Any]:
+def canvas(
+    width: float,
+    height: float,
+    rows: int = 1,
+    columns: int = 1,
+    layout: Literal["constrained"] | None = "constrained",
+    **options: Any,
+) -> tuple[Any, Any]:
     """Return a new matplotlib figure of ``width`` by ``height`` inches, and the array of its axes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
+    figure = Figure(figsize=(width, height), dpi=120, layout=layout)
     FigureCanvasAgg(figure)
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
@@ -80,6 +87,14 @@ def png_of(figure: Any) -> bytes:
     more = {"metadata": {"Software": "neusee"}, "pil_kwargs": {"compress_level": _COMPRESSION}}
     figure.savefig(out, format="png", bbox_inches=drawn_part, **more)
     return out.getvalue()
+
+
+def warm() -> None:
+    """Import what figures need and find the font, so that the first picture takes no longer than others."""
+    with styled():
+        figure, axes = canvas(1.0, 1.0)
+        axes[0, 0].set_title("a")
+        png_of(figure)
 
 
 def picture(axes: Any, image: Any, title: str, **options: Any) -> Any:
