@@ -49,7 +49,7 @@ class Execution:
         wanted: Iterable[str],
         executor: Executor | None,
         memory: int | None,
-        show: Show | None = None,
+        show: Show = lambda *_: None,
         series: RunSeries | None = None,
     ) -> None:
         self.recipe, self.store, self.devices, self.watch, self.show = recipe, store, devices, watch, show
@@ -188,8 +188,7 @@ class Execution:
                 key, sources = outcome.work.key, outcome.work.sources
                 if outcome.value is not None or not outcome.kept:
                     self.values.add(outcome)
-                    if self.show:
-                        self.show(self.recipe, self.keys, outcome.work.step.name, outcome.value)
+                    self.show(self.recipe, self.keys, outcome.work.step.name, outcome.value)
                 uses.subtract(sources)
                 self.values.free([*sources, key], uses, keep)
         for key in targets:

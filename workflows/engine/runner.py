@@ -115,14 +115,14 @@ def run(
         if name not in recipe.steps:
             raise ValueError(unknown_step(name, recipe.steps))
     recipe, store, watch = with_substitutions(recipe, wanted), store or open_store(), watch or (lambda event: None)
-    how = (executor, memory, show, series)
+    how = (executor, memory, show or (lambda *_: None), series)
     attempt = 0
     while True:
         attempt += 1
         work = Execution(recipe, store, device.split(","), watch, wanted, *how)
         try:
             with limited(memory_limit(memory)):
-                return replace(_attempt(work, wanted, began), attempts=attempt)
+                return replace(_attempt(work, wanted, began, show is not None), attempts=attempt)
         except ToleranceNotProven as failed:
             scale = stricter_scale(recipe, failed.over) if attempt == 1 else 0.0  # a third attempt is exact
             whole = recipe.unsubstituted or recipe
@@ -153,7 +153,7 @@ def _futile(stricter: Recipe, work: Execution, wanted: tuple[str, ...]) -> bool:
     return proof(work.recipe, order, wanted, at_best, work.known_facts).over(stricter) > 1.0
 
 
-def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:
+def _attempt(work: Execution, wanted: tuple[str, ...], began: float, shows: bool) -> Result:
     """Run the recipe; raise `ToleranceNotProven` if its errors cannot be proved to be within the tolerance."""
     recipe, store = work.recipe, work.store
     order = needed(recipe, wanted)
@@ -162,8 +162,8 @@ def _attempt(work: Execution, wanted: tuple[str, ...], began: float) -> Result:
         first = tolerance_frontier(recipe, order, wanted)
         missing, targets = work.missing(wanted) if first else set(), [work.keys[name] for name in wanted]
         if early := [name for name in first if work.keys[name] in missing]:
-            shown = _targets_first(work, order, early, wanted, missing) if work.show else early  # a sweep shows nothing
-            work.make([work.keys[name] for name in shown], keep=False, later=targets)
+            early = _targets_first(work, order, early, wanted, missing) if shows else early  # a sweep shows nothing
+            work.make([work.keys[name] for name in early], keep=False, later=targets)
 
         def known(name: str) -> StepRecord:
             return work.done.get(name) or work.asleep(name)

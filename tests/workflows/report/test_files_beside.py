@@ -185,7 +185,7 @@ def test_two_threads_take_turns_with_the_process_that_draws(tmp_path, forks):
     with ThreadPoolExecutor(4) as threads:
         made = [threads.submit(drawer.make, tmp_path / str(n), sums, {"x": torch.full((9,), n)}) for n in range(40)]
         for each in made:
-            each.result(30)
+            each.result(60)
     drawer.close()
     assert [(tmp_path / str(n)).read_text().split()[1] for n in range(40)] == [str(9 * n) for n in range(40)]
 
@@ -228,7 +228,7 @@ def test_a_data_file_does_not_wait_for_pictures(tmp_path, forks, monkeypatch):
     with FilesBeside(lambda _: [*files(slow), copies], shelf, 1e12) as beside:
         run(recipe(), shelf.store, show=beside)
         copied = [begun for begun, job in beside._begun if job.here]
-        copied[0].result(30)
+        copied[0].result(60)
         assert [begun.done() for begun, job in beside._begun if not job.here] == [False, False]
 
 
@@ -305,7 +305,7 @@ def test_what_a_picture_shows_is_not_held_after_it_is_drawn(tmp_path, forks):
     with FilesBeside(lambda _: files(), shelf, 1e12) as beside:
         run(recipe(), shelf.store, show=beside)
         for begun, job in beside._begun:
-            begun.result(30)
+            begun.result(60)
             assert job.arguments == {}
 
 
