@@ -289,14 +289,4 @@ def node(
     )
 
 
-__all__ = [
-    "Check",
-    "Device",
-    "ErrorBound",
-    "Hooks",
-    "Node",
-    "ParameterError",
-    "TensorStats",
-    "node",
-    "registered_nodes",
-]
+__all__ = ["Check", "ErrorBound", "Hooks", "Node", "ParameterError", "TensorStats", "node", "registered_nodes"]
