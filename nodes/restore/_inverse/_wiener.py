@@ -234,14 +234,8 @@ def posed(
     free, trusted, light, wrong = _found_light(electrons, (known, seen), glare, settings)
     picture = electrons - light.sum
     mean = average(picture, trusted)
-    size = torus(frame, bordered(edge(kernels, frame), settings.border))
-    transfer, power = torch.fft.rfft2(wrapped(kernels, size)), fall(size).to(kernels)
-    varying = power
-    if settings.border > 1:
-        power = fall(size, (2 * frame[0], 2 * frame[1])).to(kernels)
-        varying = about_mean(power, frame, size)
     found = average((picture - mean).square(), trusted)
-    passed = expected_variance(transfer, varying, size).clamp_min(1e-6)
+    size, transfer, power, passed = _on_torus(kernels, frame, settings.border)
     told = mean, (found - mean - read**2 - wrong) / passed
     scale = torch.maximum(told[1], 0.01 * found / passed).clamp_min(1e-6).sqrt()
     if scatter and white is not None and light.modes:
@@ -257,6 +251,15 @@ def posed(
     full = float(electrons.detach().max())
     both = told_of_scene(*told, wrong / passed, light, trusted, (some == 0) * full)
     return Scaled(problem, scale, bright, share, kernels, scene_doubt((mean, scale), both, white, full, light))
+
+
+def _on_torus(kernels: Tensor, frame: Size, border: float) -> tuple[Size, Tensor, Tensor, Tensor]:
+    """Return the torus of a picture, the transfer of the PSF, the prior, and the variance that a picture then has."""
+    size = torus(frame, bordered(edge(kernels, frame), border))
+    transfer, wide = torch.fft.rfft2(wrapped(kernels, size)), border > 1
+    power = fall(size, (2 * frame[0], 2 * frame[1]) if wide else None).to(kernels)
+    varying = about_mean(power, frame, size) if wide else power
+    return size, transfer, power, expected_variance(transfer, varying, size).clamp_min(1e-6)
 
 
 def _found_light(
