@@ -15,7 +15,7 @@ from neusee.nodes.restore._inverse._glare import Glare, Light, average, doubted,
 from neusee.nodes.restore._inverse._glare_doubt import likeliest_doubt
 from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_white
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
-from neusee.nodes.restore._inverse._masked_blur import Blurred
+from neusee.nodes.restore._inverse._masked_blur import Blurred, Size
 from neusee.nodes.restore._inverse._picture_scale import (
     about_mean,
     expected_variance,
