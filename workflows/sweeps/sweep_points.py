@@ -30,7 +30,7 @@ from neusee.workflows.recipe.text.composition import Composer
 from neusee.workflows.report.result_numbers import numbers_of
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Point
-from neusee.workflows.sweeps.kept_recipes import KeptRecipe
+from neusee.workflows.sweeps.kept_recipes import KeptRecipe, Same
 from neusee.workflows.sweeps.point_order import PointJob, best_order, work_left
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
@@ -200,6 +200,7 @@ class _Checker:
         self.notes: dict[str, None] = {}
         self.first: Recipe | None = None
         self._same: dict[Any, Any] = {}
+        self._equal = Same()
 
     def every(self, points: Sequence[Point]) -> Iterator[CheckedPoint]:
         """Yield each point that passes all checks, and add the mistakes of the other points to ``diagnostics``."""
@@ -208,7 +209,7 @@ class _Checker:
             try:
                 recipe = check(composer.compose(point.overrides))
                 self.first = self.first or recipe
-                yield CheckedPoint(point, KeptRecipe.of(recipe, self.first), self._job(point, recipe))
+                yield CheckedPoint(point, KeptRecipe.of(recipe, self.first, self._equal), self._job(point, recipe))
             except RecipeError as error:
                 self.diagnostics += error.diagnostics
         self.series.known_keys.code.save()

@@ -8,6 +8,7 @@ import pytest
 from neusee.nodes import node
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.sweeps import kept_recipes
 from neusee.workflows.sweeps.kept_recipes import KeptRecipe
 
 
@@ -33,3 +34,13 @@ def test_what_is_equal_is_shared():
     first = recipe(0.5)
     assert KeptRecipe.of(recipe(0.5), first).steps == {}
     assert KeptRecipe.of(recipe(0.5), first).recipe.steps["a"] is first.steps["a"]
+
+
+def test_a_value_found_equal_is_compared_once(monkeypatch):
+    compared = []
+    equal = kept_recipes._equal
+    monkeypatch.setattr(kept_recipes, "_equal", lambda one, other: compared.append(one) or equal(one, other))
+    first, again, other, same = recipe(0.5), recipe(0.5), recipe(-0.0), kept_recipes.Same()
+    for each in (again, again, replace(again, seed=8), other, again):
+        assert KeptRecipe.of(each, first, same).recipe.steps["a"].params["by"] == each.steps["a"].params["by"]
+    assert compared == [again.steps["a"], other.steps["a"]]
