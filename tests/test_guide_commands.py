@@ -24,7 +24,7 @@ from neusee.workflows.handbook.guide_pages import pictures_of, read_pages
 from neusee.workflows.handbook.site_build import build_handbook
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe import node_families
-from neusee.workflows.report import run_pictures
+from neusee.workflows.report import graph_ahead, run_pictures
 from neusee.workflows.report.figures import style
 from neusee.workflows.report.run_pictures import graphs
 from neusee.workflows.simulation import simulate_recipe
@@ -103,7 +103,7 @@ def carry_out(words: str, place: Path, monkeypatch) -> None:
         patch.setattr(simulate_recipe, "timeline", lambda result: None)  # no page shows it
         patch.setattr(run_pictures, "FIGURES", [f for f in run_pictures.FIGURES if f.name in asked])
         if "graph" not in asked:
-            for module in (run_pictures, simulate_recipe):
+            for module in (run_pictures, simulate_recipe, graph_ahead):
                 patch.setattr(module, "GRAPH_DRAWING", partial(no_picture, place))
                 patch.setattr(module, "graphs", other_graphs)
         arguments = [address if word == "LOCAL" else word for word in typed(words, found)]
@@ -119,9 +119,9 @@ def no_picture(place: Path, file: Path, **_) -> None:
     shutil.copy(place / "no_graph.png", file)
 
 
-def other_graphs(result) -> list:
+def other_graphs(recipe, states) -> list:
     """Return the graphs of a run under keys of their own, so that a page that shows one finds no picture of nothing."""
-    return [(digest("no picture", key), arguments) for key, arguments in graphs(result)]
+    return [(digest("no picture", key), arguments) for key, arguments in graphs(recipe, states)]
 
 
 def shown_by(words: tuple[str, ...], place: Path) -> Path:
