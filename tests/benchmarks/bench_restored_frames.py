@@ -287,19 +287,19 @@ def rows(path):
 
 
 def report(found):
-    """Print the means, and the paired gains of the search with their 95 % intervals."""
+    """Print the means of the methods that were run, and the paired gains of the search with their 95 % intervals."""
+    methods = [m for m in METHODS if any(r["method"] == m for r in found)]
     by = {(r["seed"], r["mask"], r["strength"], r["method"]): r["psnr"] for r in found}
-    print(f"mask, strength: frames, PSNR of {', '.join(METHODS)}; search over nothing, over blind; network so (dB)")
-    for mask in MASKS:
+    whole = {key[:3] for key in by if all((*key[:3], m) in by for m in methods)}
+    print(f"mask, strength: frames, PSNR of {', '.join(methods)}; search over each other (dB)")
+    for mask in (*MASKS, "all"):
         for strength in STRENGTHS:
-            seeds = [
-                s for s in sorted({r["seed"] for r in found}) if all((s, mask, strength, m) in by for m in METHODS)
-            ]
-            if seeds:
-                table = np.array([[by[s, mask, strength, m] for m in METHODS] for s in seeds])
-                gains = [interval(table[:, own] - table[:, k]) for own in (3, 4) for k in (0, 1)]
-                means = " ".join(f"{v:6.2f}" for v in table.mean(0))
-                print(f"{mask:9} {strength:7g}: {len(seeds):3}  {means}   {'  '.join(gains)}")
+            frames = sorted(k for k in whole if k[2] == strength and mask in (k[1], "all"))
+            if frames:
+                table = {m: np.array([by[(*k, m)] for k in frames]) for m in methods}
+                gains = [f"{m} {interval(table['search'] - table[m])}" for m in methods if m != "search"]
+                means = " ".join(f"{v.mean():6.2f}" for v in table.values())
+                print(f"{mask:9} {strength:7g}: {len(frames):3}  {means}   {'  '.join(gains)}")
 
 
 def interval(gain):
