@@ -157,7 +157,7 @@ class Lamp:
         return torch.cat([seen[:2], amounts])
 
     def _slopes(self) -> Iterator[Tensor]:
-        """Give the spectra of the changes with y, x (pixels) and each kind, one after another to save memory."""
+        """Yield the spectra of the changes with y, x (pixels) and each kind, one after another to save memory."""
         (y, x), whole = self.light.torus, self._spectra()
         fy, fx = torch.fft.fftfreq(y).to(self.values)[:, None], torch.fft.rfftfreq(x).to(self.values)
         for frequency in (fy, fx):

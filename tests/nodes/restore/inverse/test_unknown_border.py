@@ -47,25 +47,37 @@ def restored(electrons, kernel, **how):
     return wiener(picture, psf, ONE, channels, BANDS, clipped, read_noise=READ, **how)[0].numpy()
 
 
-def dense(electrons, kernel, scaled):
-    """The mean of the posterior of a scene that does not repeat, for the mean, scale and weights of a posed filter."""
-    covariance = law(2 * SIDE, 64 * SIDE)
-    side = SIDE + 2 * REACH
+def model(scaled):
+    """Prior of a scene that does not repeat, camera and noise as matrices, in the units of a posed filter."""
+    covariance, side = law(2 * SIDE, 64 * SIDE), SIDE + 2 * REACH
     at = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1).reshape(-1, 2)
     apart = at[:, None] - at
-    prior = covariance[apart[..., 0], apart[..., 1]]
-    design = np.zeros((SIDE * SIDE, side * side))
+    camera = np.zeros((SIDE * SIDE, side * side))
     for row, (y, x) in enumerate(np.ndindex(SIDE, SIDE)):
         window = np.zeros((side, side))
-        window[y : y + 2 * REACH + 1, x : x + 2 * REACH + 1] = kernel[::-1, ::-1]
-        design[row] = window.ravel()
+        window[y : y + 2 * REACH + 1, x : x + 2 * REACH + 1] = ring()[::-1, ::-1] / float(scaled.share)
+        camera[row] = window.ravel()
+    return covariance[apart[..., 0], apart[..., 1]], camera, np.diag(1 / scaled.problem.weight[0].numpy().ravel())
+
+
+def inner(values):
+    """The pixels of the frame, from those of the whole scene."""
+    return values.reshape(SIDE + 2 * REACH, -1)[REACH:-REACH, REACH:-REACH]
+
+
+def dense(scaled):
+    """The mean of the posterior of a scene that does not repeat, for the mean, scale and weights of a posed filter."""
+    prior, camera, noise = model(scaled)
     seen = scaled.problem.picture[0].numpy().ravel()
-    noise = np.diag(1 / scaled.problem.weight[0].numpy().ravel())
-    share = float(scaled.share)
-    through = design / share
-    found = prior @ through.T @ np.linalg.solve(through @ prior @ through.T + noise, seen)
-    inner = found.reshape(side, side)[REACH:-REACH, REACH:-REACH]
-    return inner * float(scaled.scale) / share + float(scaled.mean)
+    found = prior @ camera.T @ np.linalg.solve(camera @ prior @ camera.T + noise, seen)
+    return inner(found) * float(scaled.scale) / float(scaled.share) + float(scaled.mean)
+
+
+def dense_variance(scaled):
+    """The mean variance of the pixels of the frame in that posterior."""
+    prior, camera, noise = model(scaled)
+    left = prior - prior @ camera.T @ np.linalg.solve(camera @ prior @ camera.T + noise, camera @ prior)
+    return inner(np.diag(left)).mean() * (float(scaled.scale) / float(scaled.share)) ** 2
 
 
 def frame(seed):
@@ -92,7 +104,7 @@ def test_a_wider_border_comes_nearer_to_a_scene_that_does_not_repeat(seed):
     electrons = frame(seed)
     gaps = []
     for border in (1.01, 2.0, 4.0):
-        exact = dense(electrons, ring(), posed(electrons, border))
+        exact = dense(posed(electrons, border))
         found = restored(electrons, ring(), border=border)
         gaps.append(np.sqrt(np.mean((found - exact) ** 2)) / exact.std())
     assert gaps[1] < 0.5 * gaps[0]
@@ -143,24 +155,5 @@ def test_the_deviation_of_drawn_scenes_is_that_of_the_wider_border():
         ).square().mean()
         for border in (1.0, 2.0)
     ]  # fmt: skip
-    exact = posed(electrons, 2.0)
-    covariance = law(2 * SIDE, 64 * SIDE)
-    assert float(found[1]) == pytest.approx(_posterior_variance(covariance, exact), rel=0.15)
+    assert float(found[1]) == pytest.approx(dense_variance(posed(electrons, 2.0)), rel=0.15)
     assert float(found[0]) < 0.8 * float(found[1])
-
-
-def _posterior_variance(covariance, scaled):
-    """The mean variance of the pixels of the frame, given its picture, from dense matrices."""
-    side = SIDE + 2 * REACH
-    at = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1).reshape(-1, 2)
-    apart = at[:, None] - at
-    prior = covariance[apart[..., 0], apart[..., 1]]
-    design = np.zeros((SIDE * SIDE, side * side))
-    for row, (y, x) in enumerate(np.ndindex(SIDE, SIDE)):
-        window = np.zeros((side, side))
-        window[y : y + 2 * REACH + 1, x : x + 2 * REACH + 1] = ring()[::-1, ::-1] / float(scaled.share)
-        design[row] = window.ravel()
-    noise = np.diag(1 / scaled.problem.weight[0].numpy().ravel())
-    spread = prior - prior @ design.T @ np.linalg.solve(design @ prior @ design.T + noise, design @ prior)
-    inner = np.diag(spread).reshape(side, side)[REACH:-REACH, REACH:-REACH]
-    return inner.mean() * (float(scaled.scale) / float(scaled.share)) ** 2
