@@ -3,6 +3,8 @@
 The sources need only a compiler, no headers of torch or Python. They compile in seconds, and a library works with any
 version of both. A library is compiled in a temporary folder and moved by an atomic rename: two processes that compile
 at once both get a valid library, and a process that is killed leaves no lock behind.
+The variable ``CXX`` names the compiler. Its options come last and so win: ``CXX="g++ -march=x86-64-v3"`` compiles for
+AVX2, and a name that is no program leaves the work to torch.
 """
 
 import ctypes
@@ -16,8 +18,9 @@ import tempfile
 import warnings
 from pathlib import Path
 
-#: compiler and processor change a result within rounding; the module that takes a source declares the source
+#: the processor's FMA changes a result within rounding where a source allows it; each module declares its own sources
 __depends__ = (
+    "_vector.h",
     "unaffected:file",
     "unaffected:CXX",
     "unaffected:XDG_CACHE_HOME",
@@ -28,8 +31,12 @@ __depends__ = (
 )
 FLAGS = (
     *("-std=c++17", "-O3", "-march=native", "-fopenmp", "-fPIC", "-shared", "-w"),
-    *("-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math"),
+    *("-fno-math-errno", "-fno-trapping-math"),
 )
+#: compilers fuse a product and a sum where they like, which rounds once instead of twice
+FUSED, UNFUSED = "-ffp-contract=fast", "-ffp-contract=off"
+#: the header of all sources, with the width of a vector
+VECTOR = Path(__file__).with_name("_vector.h")
 
 
 class NoCompilerError(RuntimeError):
@@ -54,7 +61,7 @@ def _processor() -> str:
     return "\n".join([platform.platform(), platform.machine(), platform.processor(), *facts])
 
 
-def _compile(code: Path, where: Path) -> None:
+def _compile(code: Path, rounding: str, where: Path) -> None:
     """Compile the C++ source to the file ``where``; raise `NoCompilerError` if that fails."""
     compiler = os.environ.get("CXX") or shutil.which("g++") or shutil.which("c++") or shutil.which("clang++")
     if compiler is None:
@@ -63,7 +70,9 @@ def _compile(code: Path, where: Path) -> None:
         where.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=where.parent) as aside:
             library = Path(aside) / where.name
-            command = [*compiler.split(), *FLAGS, str(code), "-o", str(library)]
+            words = compiler.split()
+            options = [word for word in words if word.startswith("-")]
+            command = [*words, *FLAGS, rounding, *options, str(code), "-o", str(library)]
             done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
             if done.returncode:
                 reason = next((x for x in done.stderr.splitlines() if "error" in x), f"exit status {done.returncode}")
@@ -74,13 +83,16 @@ def _compile(code: Path, where: Path) -> None:
 
 
 @functools.cache
-def _library(sources: tuple[Path, ...], build: Path, compiler: str | None) -> ctypes.CDLL | NoCompilerError:
+def _library(
+    sources: tuple[Path, ...], rounding: str, build: Path, compiler: str | None
+) -> ctypes.CDLL | NoCompilerError:
     """Return the compiled library, or the error of the single attempt to compile for this folder and compiler."""
-    words = [*(source.read_text(encoding="utf-8") for source in sources), *FLAGS, compiler or "", _processor()]
+    texts = [source.read_text(encoding="utf-8") for source in (*sources, VECTOR)]
+    words = [*texts, *FLAGS, rounding, compiler or "", _processor()]
     name = f"{sources[0].stem.strip('_')}_{hashlib.sha256(chr(0).join(words).encode()).hexdigest()[:32]}.so"
     try:
         if not (build / name).is_file():
-            _compile(sources[0], build / name)
+            _compile(sources[0], rounding, build / name)
         return ctypes.CDLL(str(build / name))
     except NoCompilerError as error:
         return error
@@ -88,21 +100,22 @@ def _library(sources: tuple[Path, ...], build: Path, compiler: str | None) -> ct
         return NoCompilerError(f"{build / name} cannot be loaded: {error}")
 
 
-def load(*sources: Path) -> ctypes.CDLL:
+def load(*sources: Path, rounding: str = FUSED) -> ctypes.CDLL:
     """Return the library of the first source, compiled if needed, with the other sources as its headers.
 
-    Raises `NoCompilerError` if the source cannot be compiled.
+    With the rounding `UNFUSED`, the result of a source whose vector lanes never meet has the same bits for every width
+    of a vector and every compiler. Raises `NoCompilerError` if the source cannot be compiled.
     """
-    found = _library(sources, folder(), os.environ.get("CXX"))
+    found = _library(sources, rounding, folder(), os.environ.get("CXX"))
     if isinstance(found, NoCompilerError):
         raise found
     return found
 
 
-def compiled(what: str, *sources: Path) -> bool:
+def compiled(what: str, *sources: Path, rounding: str = FUSED) -> bool:
     """Return True if the library of ``what`` is available, compiled if needed; otherwise warn once and return False."""
     try:
-        load(*sources)
+        load(*sources, rounding=rounding)
     except NoCompilerError as error:
         _say_once(what, str(error))
         return False

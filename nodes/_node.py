@@ -18,7 +18,7 @@ generator for a parameter named ``rng``.
     @digitize.work             # memory and number of operations beside what the shapes say
     @digitize.example          # the arguments of one small call, on which `neusee check` tries the node
 
-``digitize.hooks`` has each attached function under the name of its decorator.
+``digitize.hooks`` has each attached function under the name of its decorator; `nodes/_hooks.py` lists all hooks.
 """
 
 from __future__ import annotations
@@ -28,14 +28,16 @@ import importlib
 import inspect
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal, TypeVar, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, create_model
+from pydantic import BaseModel, create_model
 
 from neusee.nodes._error_bound import ErrorBound, TensorStats
+from neusee.nodes._hooks import Check, Hooks
+from neusee.nodes.file_parameters import as_paths, is_file
 from neusee.nodes.own_modules import import_missing, own_files
+from neusee.nodes.parameter_model import ParameterModel
 
 Device = Literal["any", "cpu", "gpu"]
 Fn = TypeVar("Fn", bound=Callable[..., Any])
@@ -52,63 +54,6 @@ class ParameterError(ValueError):
     def __init__(self, parameter: str, message: str) -> None:
         super().__init__(message)
         self.parameter = parameter
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    """One finding about the result of a node, such as ``Check("phase step 0.31 turn < 0.5", True)``."""
-
-    text: str
-    ok: bool = True
-
-
-@dataclass(slots=True)
-class Hooks:
-    """The functions attached to a node (hooks), such as ``check``, which ``@digitize.check`` attaches."""
-
-    #: slow float64 form: same arguments, same result within ``rtol``
-    reference: Callable[..., Any] | None = None
-    #: (`TensorStats` of each input, *, parameters): bound of ``max |with - without| / max |with|`` if the step is left
-    #: out and its first input is used instead; for a random node, in root mean square over the noise
-    skip_bound: Callable[..., float] | None = None
-    #: (`TensorStats` of the first input, *, parameters): the scale of `skip_bound`, such as the full well, because a
-    #: later step cuts off larger values
-    skip_scale: Callable[..., float] | None = None
-    #: (`TensorStats` of each input, None for an absent input, *, parameters): bound of the result's largest element;
-    #: where the bound is 0, the step and the steps that only feed this step are left out
-    zero_bound: Callable[..., float] | None = None
-    #: (`ErrorBound` of each input, *, result: TensorStats, parameters): the error of the result; both errors are
-    #: upper bounds in root mean square; a list input has a list, an absent input None; without this hook the inputs
-    #: must satisfy the tolerance themselves, because the error of the result is not known
-    propagate_error: Callable[..., float] | None = None
-    #: (rms error of the result as `propagate_error` gives it, *, result: TensorStats, parameters): the rms error with
-    #: what rounding to whole numbers adds; an estimate, which a run states and does not hold to the tolerance
-    rounding_error: Callable[..., float] | None = None
-    #: True if `propagate_error` or `approximation_error` gives an estimate and no bound, which a recipe with
-    #: ``estimates: false`` does not use
-    estimated: bool = False
-    #: (result): the error of a cheaper form relative to its largest element, in root mean square and for the largest
-    #: element alone; both include the approximations of the inputs
-    approximation_error: Callable[[Any], tuple[float, float]] | None = None
-    #: (parameters): True if the result is the same for every band
-    band_invariant: Callable[[Mapping[str, Any]], bool] | None = None
-    #: (*, parameters): notes for the user, before anything runs; may raise `ParameterError`; an argument with the name
-    #: of an input receives what is known of that input before the run, as ``shape`` gives it, else None
-    preflight: Callable[..., Sequence[str]] | None = None
-    #: (result, *inputs, **parameters): findings, once after computing
-    check: Callable[..., Sequence[Check]] | None = None
-    #: (what is known of each input, None where nothing is, **parameters): what is known of the result before the run:
-    #: tensors on the device ``meta``, which have a shape and a type but no values; a tensor of few numbers may have
-    #: values. A rule that fails, such as one that needs an unknown input, leaves the result unknown
-    shape: Callable[..., Any] | None = None
-    #: (`TensorStats` of each input, *, parameters): least and largest element of the result as a plan expects them
-    #: before the run, no bound; an input of which nothing is known raises LookupError where it is read
-    expected_range: Callable[..., tuple[float, float]] | None = None
-    #: (): the arguments of one small call by name, on which `neusee check` tries the node
-    example: Callable[[], Mapping[str, Any]] | None = None
-    #: (result, *inputs, **parameters), all as for ``shape``: bytes of memory during the run beside inputs and result,
-    #: and number of operations, both up to a constant factor, which is measured
-    work: Callable[..., tuple[float, float]] | None = None
 
 
 def _attaches(hook: str) -> Callable[[Any, Fn], Fn]:
@@ -171,7 +116,14 @@ class Node:
         _registered[fn.__module__, fn.__name__] = self
 
     def __call__(self, *inputs: Any, **params: Any) -> Any:
-        """Call the function of the node directly, with gradients, without parameter validation and without cache."""
+        """Call the function of the node directly, with gradients, without parameter validation and without cache.
+
+        A text for a parameter that is a file is a path, as in a recipe.
+        """
+        texts = [name for name, value in params.items() if isinstance(value, str | list)]
+        if texts:
+            files = {name: self.hints[name] for name in texts if is_file(self.hints.get(name))}
+            params |= {name: as_paths(hint, params[name]) for name, hint in files.items()}
         return self.fn(*inputs, **params)
 
     def __repr__(self) -> str:
@@ -209,14 +161,15 @@ class Node:
     def params(self) -> type[BaseModel]:
         """Return the pydantic model that validates the parameters of the node and rejects unknown parameters."""
         fields = {p.name: (self.hints[p.name], ... if p.default is p.empty else p.default) for p in self._keyword_only}
-        config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
-        model: type[BaseModel] = create_model(self.fn.__name__, __config__=config, **fields)  # type: ignore[call-overload]
+        model: type[BaseModel] = create_model(self.fn.__name__, __base__=ParameterModel, **fields)  # type: ignore[call-overload]
         return model
 
     reference, preflight, check = _attaches("reference"), _attaches("preflight"), _attaches("check")
     skip_bound, skip_scale, zero_bound = _attaches("skip_bound"), _attaches("skip_scale"), _attaches("zero_bound")
     propagate_error, approximation_error = _attaches("propagate_error"), _attaches("approximation_error")
-    rounding_error, band_invariant = _attaches("rounding_error"), _attaches("band_invariant")
+    propagate_scattered, rounding_error = _attaches("propagate_scattered"), _attaches("rounding_error")
+    propagate_draw, skip_draw = _attaches("propagate_draw"), _attaches("skip_draw")
+    band_invariant = _attaches("band_invariant")
     expected_range = _attaches("expected_range")
     shape, work, example = _attaches("shape"), _attaches("work"), _attaches("example")
 

@@ -2,6 +2,7 @@
 
 import csv
 import functools
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,6 +12,8 @@ from neusee.nodes import ParameterError
 PIXELS = 64_000_000  #: of a picture, at most; a PNG of this size takes 1.3 GB of memory to decode and convert
 VALUES = 1_000_000_000  #: numbers in a cube, a height map or a frame, at most; 4 GB as float32
 ROWS = 1_000_000  #: lines of a table, at most
+__depends__ = ["unaffected:time"]  #: the clock decides whether a file is read again, and no result
+_SETTLED = 2_000_000_000  #: ns after a change of a file in which a second change may not change its times
 _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "vertical bars"}
 
 Result = TypeVar("Result")
@@ -32,20 +35,33 @@ def refuse_large_array(file: Path, shape: Sequence[int]) -> None:
         raise ParameterError("file", text)
 
 
-def once_per_version(check: Callable[..., Result]) -> Callable[..., Result]:
-    """Return a function that remembers the results of ``check`` until the file, its first argument, changes.
+def file_version(file: Path) -> tuple[int, ...] | None:
+    """Return numbers that differ for each version of a file, or None for a file that has just been changed.
 
-    The file counts as unchanged while its size, modification time and inode are the same.
+    The numbers are device, inode, size, and the times of the last change of content and of the entry, which no program
+    can set. A second change within a tick of the clock leaves them as they are, so that a file younger than two seconds
+    has no version yet.
     """
+    about = file.stat()
+    changed = max(about.st_mtime_ns, about.st_ctime_ns)
+    if time.time_ns() - changed < _SETTLED:
+        return None
+    return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns
+
+
+def once_per_version(check: Callable[..., Result]) -> Callable[..., Result]:
+    """Return a function that remembers the results of ``check`` until the file, its first argument, changes."""
 
     @functools.lru_cache(maxsize=256)
-    def remembered(version: tuple[int, int, int], *arguments: Any) -> Result:
+    def remembered(version: tuple[int, ...], *arguments: Any) -> Result:
         return check(*arguments)
 
     @functools.wraps(check)
     def checked(file: Path, *arguments: Any) -> Result:
-        about = file.stat()
-        return remembered((about.st_size, about.st_mtime_ns, about.st_ino), file.absolute(), *arguments)
+        version = file_version(file)
+        if version is None:
+            return check(file.absolute(), *arguments)
+        return remembered(version, file.absolute(), *arguments)
 
     return checked
 

@@ -4,11 +4,19 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
 
 def transformed() -> bool:
     """Return True inside a transform of `torch.func`, which follows tensors whose `requires_grad` is False."""
     return torch._C._are_functorch_transforms_active()
+
+
+def plain(constant: Tensor) -> Tensor:
+    """Return a constant without the wrapper that a transform of `torch.func` gives to every new tensor."""
+    while torch._C._functorch.is_functorch_wrapped_tensor(constant):
+        constant = torch._C._functorch.get_unwrapped(constant)
+    return constant
 
 
 def one_by_one(call: Callable[..., Any], count: int, in_dims: Sequence[int | None], given: Sequence[Any]) -> Any:

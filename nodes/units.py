@@ -3,15 +3,20 @@
 A parameter with a dimension must carry a unit in the recipe, so that no reader mistakes
 micrometres for nanometres. Inside the program every quantity is in SI units, e- or DN.
 A gain is K of EMVA 1288 inside the program, DN/e-; a recipe may also give the reciprocal, ``0.37 e-/DN``.
+
+Every type of a number states its least and its greatest value: what physics allows, or what no camera, laser or optic
+comes near. A value beyond is a mistake of the recipe, such as a unit that slipped, and is refused before any work.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
+from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
@@ -30,6 +35,7 @@ _SCALE: dict[str, dict[str, float]] = {
     "waves": {"waves": 1.0, "wave": 1.0},
     "DN/e-": {"DN/e-": 1.0, "e-/DN": 1.0},
 }
+KNOWN_UNITS = tuple(_SCALE)  #: SI units of the values of a recipe
 _USUAL = {
     "m": "um",
     "s": "ms",
@@ -97,14 +103,33 @@ def read_written(text: Any) -> tuple[float, str, bool]:
     return float(match[1]) * (_SCALE[si][unit] if si else 1.0), si, unit in _RECIPROCAL
 
 
+@dataclass(frozen=True)
+class QuantityReader:
+    """Reader of a quantity with a unit, such as ``550 nm``, which returns the number in the SI unit ``si``."""
+
+    si: str
+
+    def __call__(self, value: Any) -> float:
+        return read_quantity(value, self.si)
+
+
 def _reader(si: str) -> BeforeValidator:
-    return BeforeValidator(lambda value: read_quantity(value, si), json_schema_input_type=str)
+    return BeforeValidator(QuantityReader(si), json_schema_input_type=str)
 
 
-def _finite(value: float) -> float:
-    if not math.isfinite(value):
-        raise ValueError("the number must be finite")
-    return value
+def in_words(number: float, si: str) -> str:
+    """Return a quantity as text in the unit that a reader would use, such as ``10 mm`` for 0.01 m; "" has no unit."""
+    units = {
+        unit: scale for unit, scale in _SCALE.get(si, {}).items() if unit.isascii() and unit not in (*_RECIPROCAL, "cm")
+    }
+    if si == "rad" and abs(number) > 0.1:
+        return f"{math.degrees(number):.6g} deg"
+    fitting = [unit for unit, scale in units.items() if 1 <= abs(number) / scale < 1000]
+    unit = next(iter(fitting), si)
+    return f"{number / units.get(unit, 1.0):.6g} {unit}".strip()
+
+
+_MOST_DARK = 1e12  #: electrons of one exposure, or of a second
 
 
 class ElectronsPerSecond(NamedTuple):
@@ -119,33 +144,113 @@ def _read_dark_current(value: Any) -> float | ElectronsPerSecond:
     found = read_quantity(value, unit) if by_time else read_quantity(value, "e-")
     if found < 0:
         raise ValueError("the dark current must be 0 or more")
+    if found > _MOST_DARK:
+        raise ValueError(f"the dark current must be at most {_MOST_DARK:.0e} e-")
     return ElectronsPerSecond(found) if by_time else found
 
 
 #: electrons of one exposure, or electrons per second
-DarkCurrent = Annotated[float | ElectronsPerSecond, BeforeValidator(_read_dark_current, json_schema_input_type=str)]
-Length = Annotated[float, _reader("m")]  #: metre, any sign
-PositiveLength = Annotated[float, Field(gt=0), _reader("m")]  #: metre
-Wavelength = Annotated[float, Field(ge=100e-9, le=20e-6), _reader("m")]  #: metre, 100 nm to 20 µm
-Time = Annotated[float, Field(gt=0), _reader("s")]  #: second
-Angle = Annotated[float, _reader("rad")]  #: radian
-Temperature = Annotated[float, Field(gt=0), _reader("K")]  #: kelvin
-Electrons = Annotated[float, Field(ge=0), _reader("e-")]  #: electron
-PositiveAngle = Annotated[float, Field(gt=0), _reader("rad")]  #: radian
-Power = Annotated[float, Field(gt=0), _reader("W")]  #: watt
-Energy = Annotated[float, Field(gt=0), _reader("J")]  #: joule
-Frequency = Annotated[float, Field(gt=0), _reader("Hz")]  #: hertz
-Delay = Annotated[float, Field(ge=0), _reader("s")]  #: second, from 0
-Illuminance = Annotated[float, Field(ge=0), _reader("lx")]  #: lux
-Luminance = Annotated[float, Field(ge=0), _reader("cd/m2")]  #: candela per square metre
-Waves = Annotated[float, _reader("waves")]  #: optical path in wavelengths
-Gain = Annotated[float, Field(gt=0, allow_inf_nan=False), _reader("DN/e-")]  #: K of EMVA 1288, DN per electron
+DarkCurrent = Annotated[
+    Annotated[float, Field(ge=0, le=_MOST_DARK)] | ElectronsPerSecond,
+    BeforeValidator(_read_dark_current, json_schema_input_type=str),
+]
+
+# lengths, in metres
+Length = Annotated[float, Field(ge=-1e9, le=1e9), _reader("m")]  #: any sign, to the distance of the Moon
+PositiveLength = Annotated[float, Field(gt=0, le=1e9), _reader("m")]
+Wavelength = Annotated[float, Field(ge=100e-9, le=20e-6), _reader("m")]  #: 100 nm to 20 µm
+Linewidth = Annotated[float, Field(ge=1e-18, le=20e-6), _reader("m")]  #: from 1 kHz of a visible laser to a whole band
+Distance = Annotated[float, Field(ge=1e-6, le=1e9), _reader("m")]  #: from a contact to the distance of the Moon
+Visibility = Annotated[float, Field(ge=1, le=1e6), _reader("m")]  #: dense fog to air without particles, 300 km
+FocalLength = Annotated[float, Field(ge=1e-6, le=1e4), _reader("m")]  #: from a microlens to the largest telescope
+Diameter = Annotated[float, Field(ge=1e-6, le=100), _reader("m")]  #: from a microlens to the largest telescope
+BeamRadius = Annotated[float, Field(ge=10e-9, le=100), _reader("m")]  #: no beam is narrower than its light
+LengthUnit = Annotated[float, Field(ge=1e-15, le=1), _reader("m")]  #: in which a file of heights counts
+PixelPitch = Annotated[float, Field(ge=100e-9, le=10e-3), _reader("m")]  #: pixels of sensors have 0.5 µm to 1 mm
+SensorLength = Annotated[float, Field(ge=1e-9, le=10), _reader("m")]  #: on the sensor
+PupilPitch = Annotated[float, Field(ge=1e-9, le=10), _reader("m")]  #: between samples of a pupil
+Depth = Annotated[float, Field(ge=1e-10, le=10e-3), _reader("m")]  #: of a relief, from one atom on
+Height = Annotated[float, Field(ge=-10e-3, le=10e-3), _reader("m")]  #: of a surface, or an optical path, any sign
+
+# times, in seconds
+Time = Annotated[float, Field(ge=1e-18, le=1e9), _reader("s")]  #: from an attosecond pulse to 30 years
+Exposure = Annotated[float, Field(ge=1e-12, le=1e6), _reader("s")]  #: from the fastest gated sensor to 12 days
+Delay = Annotated[float, Field(ge=0, le=1e9), _reader("s")]  #: from 0
+Frequency = Annotated[float, Field(ge=1e-9, le=1e12), _reader("Hz")]  #: hertz
+
+# angles, in radians
+Angle = Annotated[float, Field(ge=-math.tau, le=math.tau), _reader("rad")]  #: one turn to each side
+PositiveAngle = Annotated[float, Field(ge=1e-9, le=math.pi), _reader("rad")]  #: from the largest telescope's on
+
+# light, temperature and charge
+Temperature = Annotated[float, Field(ge=1, le=1e6), _reader("K")]  #: kelvin
+Power = Annotated[float, Field(ge=1e-18, le=1e16), _reader("W")]  #: watt, from a few photons to the strongest pulse
+Energy = Annotated[float, Field(ge=1e-21, le=1e7), _reader("J")]  #: joule, from a part of a photon to the largest laser
+Illuminance = Annotated[float, Field(ge=0, le=1e8), _reader("lx")]  #: lux; the sun gives 1.3e5
+Luminance = Annotated[float, Field(ge=0, le=1e11), _reader("cd/m2")]  #: candela per square metre; the sun has 1.6e9
+Electrons = Annotated[float, Field(ge=0, le=1e12), _reader("e-")]  #: electron
+Gain = Annotated[float, Field(ge=1e-9, le=1e6), _reader("DN/e-")]  #: K of EMVA 1288, DN per electron
+
+# numbers without a unit
+Waves = Annotated[float, Field(ge=-1e5, le=1e5), _reader("waves")]  #: optical path in wavelengths
+Slope = Annotated[float, Field(ge=-1e5, le=1e5)]  #: optical path in wavelengths that a mask adds at its rim
+Charge = Annotated[int, Field(ge=-1000, le=1000)]  #: turns of phase around the axis of a vortex
 Fraction = Annotated[float, Field(ge=0, le=1)]  #: number in [0, 1]
 Transmittance = Annotated[float, Field(gt=0, le=1)]  #: share of the light that passes, above 0
-Efficiency = Annotated[float, Field(gt=0, le=1)]  #: electrons per photon
-Count = Annotated[int, Field(ge=1)]  #: whole number from 1
-Real = Annotated[float, AfterValidator(_finite)]  #: finite number
-Shape = tuple[Count, Count]  #: (y, x) in pixels
+Efficiency = Annotated[float, Field(ge=1e-6, le=1)]  #: electrons per photon; far beyond its band a sensor has 1e-6
+Strength = Annotated[float, Field(ge=0, le=1e18)]  #: multiple of what saturates a pixel
+Ratio = Annotated[float, Field(gt=0, le=1e9)]  #: of two quantities of one kind, such as a contrast or a weight
+Spread = Annotated[float, Field(ge=0, le=100)]  #: standard deviation over its mean
+Count = Annotated[int, Field(ge=1, le=10**9)]  #: whole number from 1
+Layers = Annotated[int, Field(ge=1, le=4096)]  #: of a network: channels, blocks or states
+Real = Annotated[float, Field(ge=-1e15, le=1e15)]  #: number of any sign
+Pixels = Annotated[int, Field(ge=1, le=10**6)]  #: along an axis
+Shape = tuple[Pixels, Pixels]  #: (y, x) in pixels
+
+
+@dataclass(frozen=True)
+class NumberRange:
+    """Least and greatest value that a number may have; None where nothing is stated."""
+
+    least: float | None
+    greatest: float | None
+    si: str = ""  #: unit of both, "" for none
+
+
+def number_ranges(hint: Any) -> Iterator[NumberRange]:
+    """Yield the range of each number that a type annotation of a parameter contains.
+
+    A number of a tuple, a list, a mapping or a union counts by itself; True and False are no numbers.
+    """
+    yield from _ranges(hint, ())
+
+
+def _ranges(hint: Any, metadata: tuple[Any, ...]) -> Iterator[NumberRange]:
+    if get_origin(hint) is Annotated:
+        yield from _ranges(get_args(hint)[0], (*metadata, *_constraints(hint)))
+    elif hint in (int, float):
+        limits = [(name, getattr(part, name)) for part in metadata for name in _LIMITS if hasattr(part, name)]
+        least = [value for name, value in limits if name in ("ge", "gt")]
+        greatest = [value for name, value in limits if name in ("le", "lt")]
+        yield NumberRange(max(least, default=None), min(greatest, default=None), _unit_of(metadata))
+    elif get_origin(hint) is not Literal:
+        for part in get_args(hint):
+            yield from _ranges(part, () if get_origin(hint) in _CONTAINERS else metadata)
+
+
+_LIMITS = ("ge", "gt", "le", "lt")
+_CONTAINERS = (tuple, list, dict)
+
+
+def _constraints(hint: Any) -> Iterator[Any]:
+    """Yield the single constraints of an annotated type; `Field` holds several."""
+    for part in hint.__metadata__:
+        yield from getattr(part, "metadata", None) or (part,)
+
+
+def _unit_of(metadata: tuple[Any, ...]) -> str:
+    readers = [part.func for part in metadata if isinstance(part, BeforeValidator)]
+    return next((reader.si for reader in readers if isinstance(reader, QuantityReader)), "")
 
 
 class IsFile:
@@ -163,13 +268,13 @@ def _existing(path: Path) -> Path:
 DataFile = Annotated[Path, AfterValidator(_existing), IsFile()]  #: path of a file that exists
 
 
-def _files(written: Any) -> list[Path]:
+def files_of(written: Any) -> list[Path]:
     """Return all files given by a path, a pattern, a folder or a list.
 
     The files of a pattern or a folder are sorted by name.
     """
     if isinstance(written, list | tuple):
-        return [path for each in written for path in _files(each)]
+        return [path for each in written for path in files_of(each)]
     path = Path(written)
     if path.is_file():
         return [path]
@@ -181,4 +286,4 @@ def _files(written: Any) -> list[Path]:
 
 
 #: one or more files: a path, a folder, a pattern such as ``dark/*.png``, or a list of these
-DataFiles = Annotated[tuple[Path, ...], BeforeValidator(_files, json_schema_input_type=str | list[str]), IsFile()]
+DataFiles = Annotated[tuple[Path, ...], BeforeValidator(files_of, json_schema_input_type=str | list[str]), IsFile()]

@@ -85,6 +85,7 @@ class Pupil(NamedTuple):
     wavelengths: Tensor  #: (band,) float64, m
     pitch: Tensor  #: () float64, m between samples, both axes
     notches: Tensor = torch.zeros(0, 3, dtype=torch.float64)  #: (notch, 3) of `Shade`; no row: no notch filter
+    diameter: Tensor = torch.zeros((), dtype=torch.float64)  #: () float64, m, of the clear aperture; 0: not known
 
 
 class Psf(NamedTuple):
@@ -92,6 +93,10 @@ class Psf(NamedTuple):
 
     intensity: Tensor  #: (band, y, x); the sum over an infinite plane is the transmitted share
     clear_peak: Tensor  #: (band,) float64: pixel on the axis for the same lens without mask, dirt and aberrations
+    #: (band,) float64, highest spatial frequency that the clear aperture passes, cycles per pixel; empty: not known
+    cut_off: Tensor = torch.zeros(0, dtype=torch.float64)
+    #: (band,) float64, side in pixels of the square over which each pixel averages; 0: points; empty: points
+    averaged: Tensor = torch.zeros(0, dtype=torch.float64)
 
 
 class LowRankCube(NamedTuple):
@@ -222,3 +227,8 @@ BAND_FIELDS: dict[type, tuple[str, ...]] = {
     Pupil: ("index", "wavelengths"),
     Psf: Psf._fields,
 }
+
+
+def band_names(value: object) -> list[str]:
+    """Return the names of the fields with one entry per band; a field of values that are not known is empty."""
+    return [name for name in BAND_FIELDS.get(type(value), ()) if getattr(value, name).numel()]

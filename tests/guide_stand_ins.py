@@ -135,10 +135,7 @@ FEW_STOPS = {"protection.protection_result:_RATIO": 0.5, "protection.protection_
 SMALL_FRAME = ("scene.shape=[40, 40]", "sensor.shape=[32, 32]")
 
 STAND_INS = {
-    "run demonstration": StandIn(
-        "the trained mask has the 540 samples of the full pupil", more=(
-            "+steps.height.with.pitch=14.96 um", "+steps.height.with.between=nearest", *SMALL_FRAME)
-    ),
+    "run demonstration": StandIn("a frame of 256 x 256 pixels takes a minute", more=SMALL_FRAME),
     "run first_light doe=pixelwise doe.file=mask.npy": FULL_MASK,
     "run doe=pixelwise doe.file=mask.npy": FULL_MASK,
     "run paper_table1": StandIn(
@@ -231,7 +228,11 @@ STAND_INS = {
         "safety_car_lidar_1550", "safety_car_lidar_1550 --json")},
     **{f"safety {words}": StandIn("fine grids, and a thousand draws", more=(*SAFETY, *DAZZLE)) for words in (
         "safety_pointer", "safety_car_lidar", "safety_drone_dazzler", "safety_laboratory", "safety_show",
-        "my/pointer.yaml", 'safety_show safety.protection.filter=1e-3 "lasers.show.distance=20 m"')},
+        "my/pointer.yaml", 'safety_show safety.protection.filter=1e-3 "lasers.show.distance=20 m"',
+        'safety_show safety.eye.dazzle.contrast=0.5 "safety.eye.dazzle.backgrounds=[1 cd/m2]"',
+        "safety_car_lidar safety.damage.file=my/sensor/shots.csv")},
+    "safety safety_pointer safety.protection.mask=null +safety.lens.focus=laser "
+    "+safety.lens.scatter.share=0.002": StandIn("a thousand draws", more=SAFETY[:1]),
     "safety first_light laser=pointer +safety=camera": StandIn("a thousand draws", more=SAFETY[:1]),
     'safety first_light laser=pointer +safety=camera doe=vortex "lasers.pointer.power=uniform(1 mW, 5 mW)"': StandIn(
         "a thousand draws", more=SAFETY[:1]),

@@ -53,6 +53,7 @@ COMMANDS = (
 )  # fmt: skip
 ACROSS = {
     ("simulation", "explain"): "a run says why each of its steps ran",
+    ("training", "explain"): "a training says why it begins anew, in the words that say why a step runs again",
     ("studies", "calibration"): "the study of calibration judges the posterior that this room computes",
 }
 
@@ -79,7 +80,7 @@ MEASURED = {
     "centres",
 }  #: fields of neusee.nodes.values that formulas of optics are made of
 
-MOST_LINES = 5000  #: of a room with its inner rooms
+MOST_LINES = 6800  #: of a room with its inner rooms
 
 # --- what a file says -------------------------------------------------------------------------------------------------
 
@@ -360,7 +361,16 @@ HOUSE_RULES = (classes, names, places, lengths, offers)
 #: modules of nodes/ itself, each with the modules of neusee.nodes that it may import
 BELOW = {
     **{name: set() for name in ("units.py", "constants.py", "values.py", "_error_bound.py", "own_modules.py")},
-    "_node.py": {"neusee.nodes._error_bound", "neusee.nodes.own_modules"},
+    "parameter_model.py": set(),
+    "file_parameters.py": {"neusee.nodes.units"},
+    "_hooks.py": {"neusee.nodes._error_bound"},
+    "_node.py": {
+        "neusee.nodes._error_bound",
+        "neusee.nodes._hooks",
+        "neusee.nodes.file_parameters",
+        "neusee.nodes.own_modules",
+        "neusee.nodes.parameter_model",
+    },
 }
 
 

@@ -33,3 +33,11 @@ def test_no_default_test_compares_a_time_of_the_clock():
     compared = re.compile(r"assert .*(?:perf_counter|monotonic|time\.time)\(\).*<\s*[\d.]+\s*(?:#.*)?$", re.MULTILINE)
     found = {path.name: compared.findall(path.read_text(encoding="utf-8")) for path in TESTS.rglob("test_*.py")}
     assert {name: lines for name, lines in found.items() if lines} == {}
+
+
+def test_no_test_compares_a_duration_with_a_number_of_seconds():
+    """A slower processor is no fault either: a test compares two durations of one run, or counts what is done."""
+    duration = r"(?:process_time\(\)|\.seconds|\[\"seconds\"\])"
+    compared = re.compile(rf"assert .*{duration}[^\n]*<=?\s*[\d.]+\s*(?:#.*)?$", re.MULTILINE)
+    found = {path.name: compared.findall(path.read_text(encoding="utf-8")) for path in TESTS.rglob("test_*.py")}
+    assert {name: lines for name, lines in found.items() if lines} == {}

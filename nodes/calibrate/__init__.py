@@ -19,12 +19,14 @@ from neusee.nodes.calibrate._frames._emva_descriptor import (
     descriptor_series,
     refuse_descriptor,
 )
-from neusee.nodes.calibrate._frames._frame_headers import FrameHeader, frame_header, frame_means
+from neusee.nodes.calibrate._frames._frame_headers import FrameHeader, frame_divisor, frame_header, frame_means
 from neusee.nodes.calibrate._frames._frame_statistics import levels, reduce
+from neusee.nodes.calibrate._frames._hot_pixels import hot_pixels
 from neusee.nodes.calibrate._frames._level_frames import frames
 from neusee.nodes.calibrate._frames._moment_table import table
+from neusee.nodes.calibrate._frames._saturation_signal import SaturationSignal, saturation_signal
 from neusee.nodes.calibrate._frames._simulated_frames import expose
-from neusee.nodes.calibrate._likelihood._camera_likelihood import camera
+from neusee.nodes.calibrate._likelihood._camera_likelihood import camera, expected_levels
 from neusee.nodes.calibrate._likelihood._likelihood_node import density
 from neusee.nodes.calibrate._likelihood._linear_sensor import Likelihood
 from neusee.nodes.calibrate._likelihood._sufficient_statistics import Sufficient, sufficient
@@ -48,13 +50,14 @@ from neusee.nodes.calibrate._sheet._patterns import (
 )
 from neusee.nodes.calibrate._sheet._quantity import Quantity
 from neusee.nodes.calibrate._sheet._sheet import EmvaSheet, emva_sheet
-from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Stack, uncorrected
-from neusee.nodes.calibrate._validity._hidden_faults import Correction, Hidden, corrections
+from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Stack
+from neusee.nodes.calibrate._validity._hidden_faults import CLEAN_PAIRS, Hidden, open_errors
 from neusee.nodes.calibrate._validity._inspection import inspect_frames
 from neusee.nodes.calibrate._validity._number_tests import coarse
 
 __all__ = [
     "CAMERA_NAMES",
+    "CLEAN_PAIRS",
     "COVERAGE",
     "MODEL",
     "NAMES",
@@ -66,7 +69,6 @@ __all__ = [
     "CameraCoordinates",
     "Contribution",
     "Coordinates",
-    "Correction",
     "DefectHistogram",
     "EmvaSheet",
     "FrameHeader",
@@ -81,6 +83,7 @@ __all__ = [
     "Quantity",
     "Ridge",
     "Rings",
+    "SaturationSignal",
     "ScatterCoordinates",
     "SpatialSeries",
     "Spectrogram",
@@ -91,7 +94,6 @@ __all__ = [
     "camera_prior",
     "camera_sources",
     "coarse",
-    "corrections",
     "defects",
     "density",
     "descriptor",
@@ -99,7 +101,9 @@ __all__ = [
     "descriptor_release",
     "descriptor_series",
     "emva_sheet",
+    "expected_levels",
     "expose",
+    "frame_divisor",
     "frame_header",
     "frame_means",
     "frames",
@@ -107,15 +111,18 @@ __all__ = [
     "guess",
     "guess_camera",
     "guess_scatter",
+    "hot_pixels",
     "inspect_frames",
     "laboratory_contributions",
     "least_squares",
     "levels",
+    "open_errors",
     "point_source",
     "prior",
     "profiles",
     "reduce",
     "refuse_descriptor",
+    "saturation_signal",
     "sheet_budgets",
     "source_freedom",
     "spatial_series",
@@ -124,7 +131,6 @@ __all__ = [
     "stray_prior",
     "sufficient",
     "table",
-    "uncorrected",
     "variance_shares",
     "without_trend",
 ]

@@ -6,7 +6,7 @@ from neusee.nodes.doe._equal_filter import equal_filter
 from neusee.nodes.doe._fabrication_limits import fabricate
 from neusee.nodes.doe._glass_table import index_rows
 from neusee.nodes.doe._height_error import height_error
-from neusee.nodes.doe._height_map_files import read_height_map
+from neusee.nodes.doe._height_map_files import read_height_map, size_metadata
 from neusee.nodes.doe._minimum_feature import smooth
 from neusee.nodes.doe._parametrisations import PARAMETRISATIONS, Drawn, Modes, Pixels, Rings, Written
 from neusee.nodes.doe._polynomial_height_maps import LearntStop, Polynomials, Streak
@@ -41,6 +41,7 @@ __all__ = [
     "pixelwise",
     "read_height_map",
     "shade",
+    "size_metadata",
     "smooth",
     "spiral_axicon",
     "unet",

@@ -15,7 +15,7 @@ from neusee.nodes.doe._height_from_phase import height_checks, height_from_phase
 from neusee.nodes.doe._refractive_index import AnyGlass, Glass, refuse_material
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, polar
 from neusee.nodes.optics._zernike import surface
-from neusee.nodes.units import Angle, Count, Length, Real, Wavelength
+from neusee.nodes.units import Angle, Charge, Count, Height, Slope, Wavelength
 from neusee.nodes.values import Stop
 
 
@@ -32,7 +32,7 @@ def flat(stop: Stop) -> Tensor:
 
 
 @node()
-def vortex(stop: Stop, *, charge: int, wavelength: Wavelength = 550e-9, material: Glass = "fused silica") -> Tensor:
+def vortex(stop: Stop, *, charge: Charge, wavelength: Wavelength = 550e-9, material: Glass = "fused silica") -> Tensor:
     """Return the height map of a vortex, phi = charge * theta, whose phase ramp has its step on the -u axis.
 
     Shapes: stop -> (v, u).
@@ -45,7 +45,7 @@ def vortex(stop: Stop, *, charge: int, wavelength: Wavelength = 550e-9, material
 
 
 @node()
-def axicon(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material: Glass = "fused silica") -> Tensor:
+def axicon(stop: Stop, *, waves: Slope, wavelength: Wavelength = 550e-9, material: Glass = "fused silica") -> Tensor:
     """Return the height map of an axicon, phi = 2 pi waves r, which turns the focal spot into a ring.
 
     Shapes: stop -> (v, u).
@@ -59,7 +59,7 @@ def axicon(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material
 
 @node()
 def spiral_axicon(
-    stop: Stop, *, waves: Real, charge: int, wavelength: Wavelength = 550e-9, material: Glass = "fused silica"
+    stop: Stop, *, waves: Slope, charge: Charge, wavelength: Wavelength = 550e-9, material: Glass = "fused silica"
 ) -> Tensor:
     """Return the height map of an axicon with a vortex: phi = 2 pi waves r + charge * theta.
 
@@ -74,7 +74,7 @@ def spiral_axicon(
 
 
 @node()
-def cubic(stop: Stop, *, waves: Real, wavelength: Wavelength = 550e-9, material: Glass = "fused silica") -> Tensor:
+def cubic(stop: Stop, *, waves: Slope, wavelength: Wavelength = 550e-9, material: Glass = "fused silica") -> Tensor:
     """Return the height map of phi = 2 pi waves (u**3 + v**3), which gives an MTF without zeros over a long focus.
 
     Shapes: stop -> (v, u).
@@ -102,7 +102,7 @@ def _half_rings(grid: PupilGrid, waves: tuple[float, ...], alternate: bool, orie
 def half_rings(
     stop: Stop,
     *,
-    waves: Annotated[tuple[Real, ...], Field(min_length=1)],
+    waves: Annotated[tuple[Slope, ...], Field(min_length=1)],
     alternate: bool = True,
     orientation: Angle = 0.0,
     wavelength: Wavelength = 550e-9,
@@ -126,7 +126,7 @@ def half_rings(
 def zernike(
     stop: Stop,
     *,
-    coefficients: dict[Count, Length],
+    coefficients: dict[Count, Height],
     wavelength: Wavelength = 550e-9,
     material: Glass = "fused silica",
 ) -> Tensor:

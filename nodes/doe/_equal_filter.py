@@ -1,5 +1,6 @@
 """The grey filter that protects the sensor as well as a mask does: the rival that anyone can buy."""
 
+import math
 from typing import Any
 
 import torch
@@ -30,9 +31,17 @@ def equal_filter(light: Tensor, lsr: Tensor, bands: Bands, lines: list[Bands] | 
 
 @equal_filter.propagate_error
 def _(light: ErrorBound, *others: ErrorBound | None, result: TensorStats, **params: Any) -> float:
-    """Return an error bound from the relative errors of the light and of the ratio."""
+    """Return an error bound from the relative error of the light and the error of the ratio.
+
+    The filter takes the ratio of one band, which may have all of the error of the ratios. The two errors multiply too.
+    """
     ratio = others[0] if others else None
-    return (light.share + (ratio.share if ratio else 0.0)) * result.max
+    if light.stats is None or (ratio is not None and ratio.rms and ratio.stats is None):
+        return math.inf
+    largest = max(abs(result.min), abs(result.max))
+    passed = largest / light.top if light.top > 0 else 1.0
+    off = ratio.rms * math.sqrt(math.prod(ratio.stats.shape)) if ratio and ratio.stats else 0.0
+    return light.rms * (passed + off) + off * light.top
 
 
 @equal_filter.check

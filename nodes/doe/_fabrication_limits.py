@@ -10,9 +10,9 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import refuse_half
 from neusee.nodes.doe._refractive_index import AnyGlass, Glass, nearest_known, refuse_material, wave_height
-from neusee.nodes.units import PositiveLength, Wavelength
+from neusee.nodes.units import Depth, Wavelength
 
-Levels = Annotated[int, Field(ge=2)]
+Levels = Annotated[int, Field(ge=2, le=65536)]
 _VIOLET = 400e-9  #: m, wavelength at which a change of height is converted to a change of phase
 
 
@@ -45,7 +45,7 @@ def fabricate(
     material: Glass = "fused silica",
     wrap_at: Wavelength | None = None,
     levels: Levels | None = None,
-    max_height: PositiveLength | None = None,
+    max_height: Depth | None = None,
 ) -> Tensor:
     """Wrap the height map at one wave of ``wrap_at`` or limit it to ``max_height``, then round to ``levels`` heights.
 

@@ -35,6 +35,11 @@ class MapHeader(NamedTuple):
     stated: dict[str, float]  #: some of ``unit``, ``depth`` and ``pitch``
 
 
+def size_metadata(pitch: float) -> dict[str, str]:
+    """Return the metadata of a .safetensors file whose samples are ``pitch`` m apart, as `map_header` reads it."""
+    return {"pitch": f"{pitch * 1e6:.12g} um"}
+
+
 @once_per_version
 def map_header(file: Path) -> MapHeader:
     """Return the header of a height map in a file without reading the heights."""

@@ -10,14 +10,14 @@ from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_half
 from neusee.nodes.doe._height_from_phase import height_checks
 from neusee.nodes.optics._pupil_grid import grid_of, refuse_other_grid
-from neusee.nodes.units import PositiveLength
+from neusee.nodes.units import PupilPitch
 from neusee.nodes.values import Stop
 
 _REACH = 6.0  #: standard deviations beyond which the spot holds 1e-9 of its dose
 
 
 @node(rtol=1e-5)
-def smooth(height: Tensor, stop: Stop, *, feature: PositiveLength) -> Tensor:
+def smooth(height: Tensor, stop: Stop, *, feature: PupilPitch) -> Tensor:
     """Average the height map over the round Gaussian spot of a tool, whose full width at half maximum is ``feature``.
 
     Depth follows dose, and dose is the wanted height averaged over the spot: steps get flanks of ``feature``, pillars

@@ -14,11 +14,13 @@ from neusee.nodes.doe._map_resampling import Between, coarser, jump, resampled, 
 from neusee.nodes.input_files import once_per_version
 from neusee.nodes.optics._phase_screen import screen
 from neusee.nodes.optics._pupil_grid import PupilGrid, grid_of
-from neusee.nodes.units import DataFile, PositiveLength
+from neusee.nodes.units import DataFile, Depth, LengthUnit, PupilPitch
 from neusee.nodes.values import Stop
 
 Scale = Annotated[float, Field(gt=0, le=1)]  #: share of the pupil's diameter
 _DEPTH = 1.2e-6  #: m, height of white where neither the recipe nor the file says
+_ROUNDED = 1e-3  #: relative difference of a pitch that is written with four digits
+_SAME = 1e-6  #: relative difference of two pitches that counts as rounding
 _TALLEST = 0.01  #: m; a higher mask is a mistake of the unit
 
 
@@ -27,9 +29,10 @@ def pixelwise(
     stop: Stop,
     *,
     file: DataFile | None = None,
-    depth: PositiveLength | None = None,
-    unit: PositiveLength | None = None,
-    pitch: PositiveLength | None = None,
+    depth: Depth | None = None,
+    unit: LengthUnit | None = None,
+    pitch: PupilPitch | None = None,
+    pupil_pitch: PupilPitch | None = None,
     between: Between = "linear",
     scale: Scale = 0.1,
     rng: torch.Generator,
@@ -38,8 +41,9 @@ def pixelwise(
 
     The file is a .npy, .safetensors, .exr or .mat file whose value 1 is the height ``unit`` (1 m unless stated), or a
     grey .png whose white is ``depth`` (1.2 um unless stated). A file with samples ``pitch`` apart is interpolated to
-    the pupil grid; without ``pitch`` it has the samples of the pupil grid. The header of a file other than .npy may
-    state the three.
+    the pupil grid, and keeps its size; without ``pitch`` it has the samples of the pupil grid. The header of a file
+    other than .npy may state the three. ``pupil_pitch`` is the pitch for which a recipe writes its pupil: a file
+    without a pitch is refused where the grid has another one, because its size is then not known.
 
     The features of the random height map are ``scale`` diameters wide. It is a start for training: a flat height map
     is a saddle point, where the suppression has no gradient.
@@ -57,7 +61,7 @@ def pixelwise(
         noise = screen(grid_of(stop), scale, rng)
         return (height_range(None, depth) * torch.sigmoid(1.5 * noise)).to(torch.float32)
     lengths = _lengths(file, depth, unit, pitch)
-    own = _fits(file, map_header(file).shape, grid_of(stop), lengths["pitch"])
+    own = _fits(file, grid_of(stop), lengths["pitch"], pupil_pitch)
     height = read_height_map(file, lengths["depth"], lengths["unit"])
     if problem := _wrong(file, height):
         raise ValueError(problem)
@@ -100,14 +104,16 @@ def _lengths(file: Path, depth: float | None, unit: float | None, pitch: float |
     return lengths
 
 
-def _fits(file: Path, shape: tuple[int, ...], grid: PupilGrid, pitch: float | None) -> float | None:
+def _fits(file: Path, grid: PupilGrid, pitch: float | None, pupil_pitch: float | None) -> float | None:
     """Return the pitch from which a height map is interpolated, or None if it has the samples of the pupil grid.
 
-    Raises ParameterError for another size than the pupil needs.
+    Raises ParameterError for another size than the pupil needs, and for a size that nothing states.
     """
-    samples = grid.samples
+    samples, shape = grid.samples, map_header(file).shape
     same = shape == (samples, samples)
-    if same and (pitch is None or abs(pitch / grid.pitch - 1) <= 1e-6):
+    if same and pitch is None:
+        _refuse_unknown_size(file, grid, pupil_pitch)
+    if same and (pitch is None or abs(pitch / grid.pitch - 1) <= _SAME):
         return None
     if len(shape) != 2 or min(shape) < 2:
         raise ParameterError("file", f"{file.name} is {shape}, not the pupil grid ({samples}, {samples}), nor a height "
@@ -128,6 +134,7 @@ def _(
     depth: float | None = None,
     unit: float | None = None,
     pitch: float | None = None,
+    pupil_pitch: float | None = None,
     between: Between = "linear",
     **_: Any,
 ) -> list[str]:
@@ -135,10 +142,10 @@ def _(
         return []
     _refuse_unused(file, depth, unit)
     lengths = _lengths(file, depth, unit, pitch)
-    own = None if stop is None else _fits(file, map_header(file).shape, grid_of(stop), lengths["pitch"])
+    own = None if stop is None else _fits(file, grid_of(stop), lengths["pitch"], pupil_pitch)
     if problem := _wrong_heights(file, lengths["depth"], lengths["unit"]):
         raise ParameterError("file", problem)
-    notes = _white_note(file, depth)
+    notes = _white_note(file, depth) + _size_note(file, stop, lengths["pitch"], pupil_pitch)
     if own is None or stop is None:
         return notes
     if between == "linear" and (step := _jump(file, lengths["depth"], lengths["unit"], own, grid_of(stop))):
@@ -146,6 +153,28 @@ def _(
         raise ParameterError("file", f"{file.name}: {step}, which linear interpolation makes a ramp: {fix}")
     note = coarser(own, grid_of(stop))
     return [*notes, *([f"{file.name}: {note}"] if note else [])]
+
+
+def _refuse_unknown_size(file: Path, grid: PupilGrid, pupil_pitch: float | None) -> None:
+    """Raise ParameterError for a file without a pitch where the pupil has another pitch than the recipe writes."""
+    if pupil_pitch is None or abs(pupil_pitch / grid.pitch - 1) <= _ROUNDED:
+        return
+    written = f"written as {pupil_pitch * 1e6:.4g} um"
+    apart = f"the samples of the pupil are {grid.pitch * 1e6:.4g} um apart and {written}"
+    fix = f"give pitch, {grid.pitch * 1e6:.6g} um for a map as wide as the pupil"
+    raise ParameterError("pitch", f"{file.name} states no pitch, and {apart}: {fix}")
+
+
+def _size(grid: PupilGrid) -> str:
+    """Return the pitch and the width of a pupil grid as text."""
+    return f"{grid.pitch * 1e6:.4g} um apart, {grid.samples * grid.pitch * 1e3:.4g} mm wide"
+
+
+def _size_note(file: Path, stop: Stop | None, pitch: float | None, pupil_pitch: float | None) -> list[str]:
+    """Return a note on a file of which nothing states the distance of its samples."""
+    if stop is None or pitch is not None or pupil_pitch is not None:
+        return []
+    return [f"{file.name} states no pitch: its samples count as those of the pupil, {_size(grid_of(stop))}"]
 
 
 def _white_note(file: Path, depth: float | None) -> list[str]:
@@ -199,6 +228,7 @@ def _(
     depth: float | None = None,
     unit: float | None = None,
     pitch: float | None = None,
+    pupil_pitch: float | None = None,
     between: Between = "linear",
     **_: Any,
 ) -> list[Check]:
@@ -206,10 +236,10 @@ def _(
     if file is None:
         return checks
     lengths, grid = _lengths(file, depth, unit, pitch), grid_of(stop)
-    shape = map_header(file).shape
-    own = _fits(file, shape, grid, lengths["pitch"])
+    own = _fits(file, grid, lengths["pitch"], pupil_pitch)
     if own is None:
-        return checks
+        return [*checks, Check(f"{file.name}: {grid.samples} x {grid.samples} samples, {_size(grid)}")]
+    shape = map_header(file).shape
     height = read_height_map(file, lengths["depth"], lengths["unit"])
     text = f"{file.name} resampled from {' x '.join(map(str, shape))} samples {own * 1e6:.4g} um apart"
     if between == "linear":

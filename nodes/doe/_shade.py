@@ -7,7 +7,7 @@ from pydantic import Field
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.optics._pupil_grid import axes, grid_of
-from neusee.nodes.units import Fraction, PositiveLength, Wavelength
+from neusee.nodes.units import Fraction, Linewidth, Wavelength
 from neusee.nodes.values import Shade, Stop
 
 Share = Annotated[float, Field(gt=0, le=1)]  #: number above 0, at most 1
@@ -20,7 +20,7 @@ def shade(
     transmittance: Share = 1.0,
     diameter: Share = 1.0,
     notches: tuple[Wavelength, ...] = (),
-    width: PositiveLength = 20e-9,
+    width: Linewidth = 20e-9,
     depth: Fraction = 0.99,
 ) -> Shade:
     """Shade one arm by a grey filter of a ``transmittance``, by a smaller stop and by notch filters.

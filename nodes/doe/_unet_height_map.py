@@ -13,7 +13,7 @@ from neusee.nodes import node
 from neusee.nodes.bicubic_resize import enlarge
 from neusee.nodes.doe._height_from_phase import height_checks
 from neusee.nodes.network_weights import loaded, same_layout
-from neusee.nodes.units import Count, DataFile, PositiveLength
+from neusee.nodes.units import Count, DataFile, Depth, Layers
 from neusee.nodes.values import Stop
 
 PITCH = 15.0  #: frequency of the first layer's sines: about four periods across the pupil at the start
@@ -88,15 +88,16 @@ def fresh(width: int, grid: int, rng: torch.Generator) -> HeightNet:
 def unet(
     stop: Stop,
     *,
-    max_height: PositiveLength = 1.2e-6,
+    max_height: Depth = 1.2e-6,
     grid: Count = 270,
-    width: Count = 32,
+    width: Layers = 32,
     weights: DataFile | None = None,
     rng: torch.Generator,
 ) -> Tensor:
     """Compute the height map by a UNet of the pupil coordinates: max_height * sigmoid(UNet(u, v)).
 
     The network has ``grid`` samples. The bicubic resampling precedes the sigmoid, which keeps all heights in range.
+    The coordinates are relative, so that the height map is as wide as the pupil: ``weights`` state no size.
 
     Shapes: stop -> (v, u).
     Units:  m.
@@ -109,10 +110,14 @@ def unet(
 
 
 @unet.preflight
-def _(*, width: int, weights: Path | None, **_: Any) -> list[str]:
-    if weights is not None:
-        same_layout(partial(HeightNet, width), weights, width)
-    return []
+def _(*, width: int, weights: Path | None, stop: Stop | None = None, **_: Any) -> list[str]:
+    if weights is None:
+        return []
+    same_layout(partial(HeightNet, width), weights, width)
+    if stop is None or stop.pitch.is_meta:
+        return []
+    span = float(stop.samples * stop.pitch) * 1e3
+    return [f"{weights.name} states no size: its height map is as wide as the pupil, {span:.4g} mm"]
 
 
 unet.check(height_checks)

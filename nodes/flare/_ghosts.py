@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, TensorStats, node
 from neusee.nodes._half_precision import single
-from neusee.nodes.units import Fraction, PositiveLength
+from neusee.nodes.units import FocalLength, Fraction, PixelPitch, SensorLength
 from neusee.nodes.values import Bands
 
 _SMALLEST = 0.1  #: least radius of a ghost, relative to the largest
@@ -28,12 +28,12 @@ def ghosts(
     bands: Bands,
     direction: Tensor,
     *,
-    focal_length: PositiveLength,
-    pixel_pitch: PositiveLength,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
     count: Annotated[int, Field(ge=0, le=1000)] = 8,
     energy: Fraction = 1e-4,
     spread: Annotated[float, Field(gt=0, le=10)] = 2.0,
-    radius: PositiveLength = 300e-6,
+    radius: SensorLength = 300e-6,
     rng: torch.Generator,
 ) -> Tensor:
     """Return the reflections of a laser spot in the lens: discs on the line through the spot and the optical axis.

@@ -22,7 +22,8 @@ def _(stop: Stop, **params: Any) -> Dirt:
 
 @stray_light.shape
 def _(psf: Psf, pupil: Pupil, *direction: Any, **params: Any) -> Psf:
-    return Psf(blank(*psf.intensity.shape, dtype=at_least_single(psf.intensity)), double(len(psf.intensity)))
+    intensity = blank(*psf.intensity.shape, dtype=at_least_single(psf.intensity))
+    return psf._replace(intensity=intensity, clear_peak=double(len(psf.intensity)))
 
 
 @stray_light.work

@@ -13,11 +13,12 @@ from typing_extensions import TypedDict
 
 from neusee.nodes import Check, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import refuse_not_finite, single
-from neusee.nodes.flare._harvey_shack import NEAR, Lobe, lobe, on_pixels, scattered_share
-from neusee.nodes.units import Angle, PositiveLength, Wavelength
+from neusee.nodes.flare._harvey_shack import NEAR, Lobe, lobe, on_far_pixels, on_pixels, scattered_share
+from neusee.nodes.optics._f_number import refuse_impossible_f_number
+from neusee.nodes.units import Angle, BeamRadius, Diameter, FocalLength, PixelPitch, Wavelength
 from neusee.nodes.values import Psf, Pupil
 
-Brightness = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: multiple of saturation
+Brightness = Annotated[float, Field(ge=0, le=1e18)]  #: multiple of saturation
 Scaling = Literal["none", "roughness"]
 
 
@@ -25,12 +26,13 @@ class Surface(TypedDict):
     """A scattering surface: Harvey and Shack's b0 (1/sr), l and s, and the radius of the beam on the surface."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")  # type: ignore[misc]
-    b0: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    b0: Annotated[float, Field(ge=0, le=1e9)]
     l: Annotated[float, Field(gt=0, le=10)]  # noqa: E741
     s: Annotated[float, Field(ge=-10, le=0)]
-    radius: NotRequired[PositiveLength | None]
+    radius: NotRequired[BeamRadius | None]
 
 
+_ROUNDED = 1e-3  #: relative difference of two diameters that is rounding
 Surfaces = Annotated[dict[str, Surface], Field(min_length=1)]
 
 
@@ -60,9 +62,9 @@ def stray_light(
     direction: Tensor | None = None,
     *,
     surfaces: Surfaces,
-    focal_length: PositiveLength,
-    pixel_pitch: PositiveLength,
-    diameter: PositiveLength,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
+    diameter: Diameter,
     angle: tuple[Angle, Angle] = (0.0, 0.0),
     wavelength: Wavelength = 550e-9,
     scaling: Scaling = "none",
@@ -107,7 +109,7 @@ def stray_light(
         core = single(psf.intensity[band])
         intensity.append(core * (1 - scattered).to(core) + (share * veil).to(core))
         peaks.append(psf.clear_peak[band] * (1 - scattered) + axis[0, 0])
-    return Psf(torch.stack(intensity), torch.stack(peaks))
+    return psf._replace(intensity=torch.stack(intensity), clear_peak=torch.stack(peaks))
 
 
 @node()
@@ -117,9 +119,9 @@ def stray_shares(
     pupil: Pupil,
     *,
     surfaces: Surfaces,
-    focal_length: PositiveLength,
-    pixel_pitch: PositiveLength,
-    diameter: PositiveLength,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
+    diameter: Diameter,
     wavelength: Wavelength = 550e-9,
     scaling: Scaling = "none",
 ) -> StrayShares:
@@ -153,14 +155,28 @@ def _(
     diameter: float,
     wavelength: float,
     scaling: Scaling,
+    pupil: Pupil | None = None,
     **_: Any,
 ) -> list[str]:
+    refuse_impossible_f_number(focal_length, diameter, "diameter")
     lens = _Lens(surfaces, focal_length, pixel_pitch, diameter, wavelength, scaling)
     try:
         total = float(_total(_lobes(lens, wavelength)))
     except ValueError as error:
         raise ParameterError("surfaces", str(error)) from None
-    return [f"the lens scatters {total:.2%} of the light at {wavelength * 1e9:.4g} nm"] if total > 0.1 else []
+    notes = [f"the lens scatters {total:.2%} of the light at {wavelength * 1e9:.4g} nm"] if total > 0.1 else []
+    return [*notes, *_narrowed(pupil, diameter)]
+
+
+def _narrowed(pupil: Pupil | None, diameter: float) -> list[str]:
+    """Return a note on a lens that scatters as a wider one than its pupil, which a reading of the aperture narrowed."""
+    if pupil is None or pupil.pitch.is_meta:
+        return []
+    span = float(pupil.pitch) * pupil.aperture.shape[-1]
+    if diameter <= span * (1 + _ROUNDED):
+        return []
+    text = f"the lens scatters as one of {diameter * 1e3:.4g} mm, and its pupil has {span * 1e3:.4g} mm"
+    return [f"{text}: see reading.aperture"]
 
 
 @stray_light.skip_bound
@@ -171,8 +187,9 @@ def _(
     strength: float | None = None,
     **params: Any,
 ) -> float:
-    """Return a bound of what a picture lacks without stray light, relative to its brightest or its saturated pixel.
+    """Return an estimate of what a picture lacks without stray light, relative to its brightest or saturated pixel.
 
+    It is no bound: points of light that fill a window, each dimmer than the brightest, add their veils.
     What is not taken from the core is TIS. A scene of equal brightness lacks a veil of TIS times its mean; a source of
     ``strength`` saturations, whose own picture is cut off, lacks a veil of ``strength`` times the pixel on the axis.
     """
@@ -185,6 +202,9 @@ def _(
     total, peak = float(_total(lobes)), float(_veil(lobes, (0.0, 0.0), (1, 1)))
     core = psf.sum / psf.shape[0] if psf.shape else 1.0
     return total / (1 - total) * (1 + 1 / core) + max(strength, 1.0) * peak / psf.max
+
+
+stray_light.hooks.skip_estimated = True
 
 
 @stray_light.check
@@ -252,3 +272,41 @@ def _same_bands(psf: Psf, pupil: Pupil) -> None:
             f"PSF {tuple(psf.intensity.shape)} and pupil of {len(pupil.wavelengths)} bands must have the same bands: "
             "give the pupil from which the PSF was computed"
         )
+
+
+def veil_at(
+    radius: Tensor,
+    *,
+    surfaces: Mapping[str, Mapping[str, Any]],
+    focal_length: float,
+    pixel_pitch: float,
+    diameter: float,
+) -> tuple[Tensor, Tensor]:
+    """Return the light that the surfaces of a lens scatter into pixels at a distance from the spot, and their share.
+
+    ``surfaces`` are those of `stray_light`. The source lies in the middle of a pixel.
+
+    Shapes: radius (any) pixels -> veil of the same shape, share of the light that passes the lens per pixel, and ().
+    Units:  pixels; lengths m.
+    Error:  3e-6 of a pixel from 16 pixels on; nearer, the mean over the directions in which pixels lie.
+    Raises: ValueError for surfaces that scatter all light, and for a beam that is only some pixels wide on the sensor.
+    Source: as `stray_light`.
+    """
+    lobes = _lobes(_Lens(surfaces, focal_length, pixel_pitch, diameter, 1.0, "none"), 1.0)
+    window = _veil(lobes, (float(NEAR), float(NEAR)), (2 * NEAR + 1, 2 * NEAR + 1)).flatten()
+    at = torch.arange(-NEAR, NEAR + 1, dtype=torch.float64)
+    places = (at[:, None].square() + at.square()).flatten()
+    square = radius.double().square()
+    distances, which = torch.unique(places, return_inverse=True)
+    near = torch.zeros_like(distances).scatter_reduce_(0, which, window, "mean", include_self=False)
+    index = torch.searchsorted(distances, square.flatten().contiguous()).clamp(1, len(distances) - 1)
+    low, high = distances[index - 1], distances[index]
+    part = ((square.flatten() - low) / (high - low)).clamp(0, 1)
+    inside = (near[index - 1] * (1 - part) + near[index] * part).reshape(square.shape)
+    far = torch.stack([left * _beyond(light, square) for left, light, _ in lobes]).sum(0)
+    return torch.where(square <= NEAR**2, inside, far), _total(lobes)
+
+
+def _beyond(light: Lobe, square: Tensor) -> Tensor:
+    """Return the light of a lobe at squared distances, which ends where the direction cosine is 1."""
+    return on_far_pixels(light, square) * (light.end - square.sqrt() + 0.5).clamp(0, 1)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import ParameterError
+from neusee.nodes.laser._round_spot import spot_peak
 
 Number = TypeVar("Number", float, Tensor)
 Convention = Literal["1/e2", "1/e"]
@@ -209,6 +210,48 @@ def sensor_density(
     share = share_through(beam, distance, diameter, transmittance)
     clear = math.pi * diameter**2 / 4 / (beam.wavelength * focal_length) ** 2
     return lens_transmittance * clear * share * underfilled(diameter**2 / (4 * _radius_squared(beam, distance)))
+
+
+def defocus_at(
+    beam: Beam, distance: Number, diameter: Number, focus: float = math.inf, lens_defocus: float = 0.0
+) -> Number:
+    """Return the waves of defocus at the rim of a lens for a beam from a distance.
+
+    D^2 / (8 lambda) (1 / R' - 1 / R0), with the radius R' of the wavefront (`curvature_radius`) and the distance R0 on
+    which the lens is focused, and ``lens_defocus``, in m of path at the rim.
+    """
+    bend = 1 / curvature_radius(beam, distance) - 1 / focus
+    return (diameter**2 / 8 * bend + lens_defocus) / beam.wavelength
+
+
+def density_in_spot(
+    beam: Beam, distance: Tensor, diameter: Tensor, focal_length: Tensor, waves: Tensor, within: float = 0.0
+) -> Tensor:
+    """Return the share of a beam's power per m2 at the brightest point behind a clear round lens with defocus.
+
+    The lens and the air pass all light. 2 / (pi w^2) (pi D^2 / (4 lambda f))^2 times `spot_peak` of the fill
+    (D / (2 w))^2 and of the ``waves`` of defocus, with ``within`` as there. In focus it is `sensor_density`.
+    """
+    gain = (math.pi * diameter**2 / (4 * beam.wavelength * focal_length)) ** 2
+    fill = diameter**2 / (4 * _radius_squared(beam, distance))
+    return axis_density(beam, distance) * gain * spot_peak(fill, waves, within)
+
+
+def scintillation(wavelength: float, distance: float | Tensor, cn2: float | Tensor, worst: float) -> Tensor:
+    """Return the factor on the mean irradiance that turbulent air stays below for the share ``worst`` of the time.
+
+    The irradiance at a point is lognormal, with the variance of its logarithm 1.23 Cn2 k^(7/6) R^(11/6) (Rytov, plane
+    wave, weak turbulence) and the mean of still air. It is an upper bound: a lens averages over its aperture, a
+    diverging beam fluctuates less, and strong turbulence saturates.
+    Source: Tatarskii, Wave Propagation in a Turbulent Medium (1961); Andrews, Phillips, Hopen, Al-Habash, J. Opt. Soc.
+    Am. A 16, 1417 (1999).
+    """
+    wavenumber = 2 * math.pi / wavelength
+    quantile = float(torch.special.ndtri(torch.tensor(worst, dtype=torch.float64)))
+    variance = 1.23 * cn2 * wavenumber ** (7 / 6) * torch.as_tensor(distance, dtype=torch.float64) ** (11 / 6)
+    # a wider spread has a smaller factor again: the largest is the bound, that of still air below half of the time
+    spread = variance.sqrt().clamp_max(max(quantile, 0.0))
+    return torch.exp(quantile * spread - spread.square() / 2)
 
 
 def peak_on_sensor(

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any
-
-import torch
 
 _SAMPLES = 400  #: distances at which a margin is looked at first
 _ROUNDS = 60  #: halvings of an interval, to the last bit of a distance
 _GOLDEN = (math.sqrt(5) - 1) / 2
-_POINTS = 32  #: of the quadrature over the pupil in focus, doubled with the defocus
-_MOST_WAVES = 50.0  #: of defocus for which the integral over the pupil is computed
 
 
 def sensor_gain(
@@ -58,32 +52,6 @@ def defocus_of_source(distance: float, diameter: float, wavelength: float, focus
     ``distance`` is the radius of the wavefront at the lens, which for a distant laser is the distance.
     """
     return diameter**2 / (8 * wavelength) * (1 / distance - 1 / focused_at)
-
-
-def defocused_peak(waves: float) -> float:
-    """Return the largest irradiance behind a clear round pupil with defocus, over that of the focused pupil.
-
-    It is the largest value at any radius, not that on the axis, which is sinc^2(waves) and has zeros. Beyond 50 waves
-    it is the upper bound 1 / (pi waves)^2, which the axis reaches at half-integer defocus.
-    """
-    waves = abs(waves)
-    if waves > _MOST_WAVES:
-        return 1 / (math.pi * waves) ** 2
-    at, weights = (torch.from_numpy(x) for x in _legendre(_POINTS << math.ceil(waves / 6).bit_length()))
-    square = (at + 1) / 2  #: of the radius in the pupil
-    radius = torch.linspace(0, 4 * math.pi * waves + 4, 64 + math.ceil(50 * waves), dtype=torch.float64)
-    bessel = torch.special.bessel_j0(radius[:, None] * square.sqrt())
-    turns = 2 * math.pi * waves * square
-    real, imaginary = (bessel @ (weights / 2 * part) for part in (torch.cos(turns), torch.sin(turns)))
-    return float((real.square() + imaginary.square()).max())
-
-
-@functools.cache
-def _legendre(count: int) -> tuple[Any, Any]:
-    """Return the nodes and the weights of a Gauss-Legendre quadrature between -1 and 1."""
-    import numpy as np
-
-    return np.polynomial.legendre.leggauss(count)
 
 
 def distance_intervals(

@@ -12,6 +12,7 @@ from neusee.nodes._half_precision import single
 from neusee.nodes.laser._damage_laws import KINDS, Kind
 from neusee.nodes.laser._damage_spot import SpotDamage
 from neusee.nodes.sensor._digitization import Bits, crop
+from neusee.nodes.sensor._room_for_light import refuse_without_steps
 from neusee.nodes.sensor._saturation import Well
 from neusee.nodes.units import Gain
 
@@ -58,6 +59,12 @@ def damaged_pixels(
 def _of(pattern: Tensor, kind: Kind) -> Tensor:
     """Return True for the pixels (y, x) of a pattern that have a kind of damage."""
     return (pattern & (1 << KINDS.index(kind))) > 0
+
+
+@damaged_pixels.preflight
+def _(*, full_well: float, gain: float, bits: int = 16, **params: object) -> list[str]:
+    refuse_without_steps(full_well, gain=gain, bits=bits)
+    return []
 
 
 @damaged_pixels.check

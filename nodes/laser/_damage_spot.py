@@ -1,8 +1,9 @@
-"""Damage of a sensor by the light of a laser on it: how near each kind of damage is, and with which probability."""
+"""Damage of a sensor by the light of a laser on it: every part of the light is judged, or it is said why not."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -12,27 +13,46 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.input_files import once_per_version
-from neusee.nodes.laser._damage_laws import DIFFUSIVITY, KINDS, DamageLaw, damage_at, matching_laws
-from neusee.nodes.laser._damage_published import PUBLISHED_DAMAGE
+from neusee.nodes.laser._damage_laws import KINDS, DamageLaw, damage_at
+from neusee.nodes.laser._damage_parts import DamagePart, LightInTime, damage_parts, state_of, worst_state
 from neusee.nodes.laser._damage_table import read_damage_laws
 from neusee.nodes.spectra._bands import mean_wavelength
-from neusee.nodes.units import DataFile, PositiveLength, Time
+from neusee.nodes.units import DataFile, Exposure, Frequency, PixelPitch, Ratio, Time
 from neusee.nodes.values import Bands, LaserLight
 
 Thresholds = Literal["published"] | DataFile
-_FAR = 10.0  #: least reach of heat, in diameters of the published spot, of a law that is scaled by its steady heat
+Exponent = Annotated[float, Field(ge=0, le=1)]
+_UNITS = {"irradiance": "W/cm2", "fluence": "J/cm2"}
+_NO_PULSE = "no pulse falls into the exposure, yet every pulse hits the sensor: give the laser a pulse_delay of 0"
+_VERDICTS = {
+    "above": "damage is expected",
+    "not judged": "damage is not judged: a part of the light has no law",
+    "within": "damage cannot be excluded: a part of the light is within the bracket of its threshold",
+    "below": "no damage is expected: every part of the light is judged and below the bracket of its threshold",
+}
 
 
 class SpotDamage(NamedTuple):
-    """How near a laser is to each kind of damage of a sensor, one entry for each law that holds for it."""
+    """How near each part of a laser's light is to damaging a sensor: pulse, mean, accumulation, incubation, others."""
 
-    ratio: Tensor  #: (law,) float64, exposure of the worst pixel over the threshold of the median device
-    probability: Tensor  #: (law,) float64, share of devices that are damaged; -1 for a law without a spread
-    low: Tensor  #: (law,) float64, lower end of the 90 % interval of the probability; -1 for a law without a spread
-    high: Tensor  #: (law,) float64, upper end; -1 for a law without a spread
-    peak: Tensor  #: (law,) float64, W/m2, or J/m2 of one pulse, in the brightest pixel
-    threshold: Tensor  #: (law,) float64, W/m2 or J/m2 in the brightest pixel at the threshold of the median device
+    ratio: Tensor  #: (part,) float64, exposure of the worst pixel over the threshold; NaN for a part that no law judges
+    least: Tensor  #: (part,) float64, the same over the upper end of the threshold's bracket
+    most: Tensor  #: (part,) float64, the same over the lower end; infinite where no lower end is known
+    probability: Tensor  #: (part,) float64, share of devices that are damaged; -1 without device data behind the law
+    low: Tensor  #: (part,) float64, lower end of the 90 % interval of the probability; -1 without device data
+    high: Tensor  #: (part,) float64, upper end; -1 without device data
+    peak: Tensor  #: (part,) float64, W/m2, or J/m2 of one pulse, in the brightest pixel
+    threshold: Tensor  #: (part,) float64, W/m2 or J/m2; NaN for a part that no law judges
     pattern: Tensor  #: (y, x) uint8, sum of 2^k over the kinds of damage k of `KINDS` in each pixel
+
+
+@dataclass(frozen=True)
+class _Exposed:
+    """The light of a laser on the sensor."""
+
+    fluence: Tensor | None  #: (y, x) J/m2 of one pulse; None for continuous light
+    irradiance: Tensor  #: (y, x) W/m2, mean over the dwell time
+    time: LightInTime
 
 
 @node(rtol=1e-5)
@@ -41,45 +61,117 @@ def damage(
     line: Bands,
     light: LaserLight | None = None,
     *,
-    pixel_pitch: PositiveLength,
-    exposure: Time,
+    pixel_pitch: PixelPitch,
+    exposure: Exposure,
     dwell: Time,
     pulse_duration: Time | None = None,
+    repetition_rate: Frequency | None = None,
     device: str = "CMOS",
     thresholds: Thresholds = "published",
-    resilience: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
+    small_spot_exponent: Exponent = 0.0,
+    resilience: Ratio = 1.0,
 ) -> SpotDamage:
-    """Compare the irradiance, or the fluence of a pulse, that a laser brings to the sensor with thresholds of damage.
+    """Compare the light that a laser brings to the sensor with thresholds of damage, one part of the light after other.
 
-    A threshold of continuous light belongs to a spot of a stated diameter. It is compared with the spot that heats the
-    worst pixel equally in the steady state: the sum of E dA / (2 pi r) over all pixels. A small diffraction-limited
-    spot so needs more irradiance, inversely to its diameter. A fluence is compared pixel by pixel. A pulse train is
-    judged by both, the mean irradiance and the fluence of one pulse. ``thresholds`` are the published laws, or a CSV
-    file of your own; ``dwell`` is how long the laser stays on the spot. Gain, full well, quantum efficiency and the
+    The parts are one pulse, the mean over ``dwell`` (how long the laser stays on the spot), the accumulation of the
+    heat of both, the incubation of many pulses, and further kinds of damage by one pulse. A part without a law is not
+    judged and has a ratio of NaN. Laws of a CSV file in ``thresholds`` count where they hold, and elsewhere the
+    published curve does: 0.1 J/cm2 for 10 ns, interpolated to continuous light in W/cm2, from 400 to 1100 nm. Each
+    threshold has a bracket; a probability is stated for a law with data of devices alone. A spot that is wider than the
+    published one warms more at equal irradiance, by the sum of E dA / (2 pi r) over all pixels, and lowers the
+    threshold; a narrower one raises it only with ``small_spot_exponent``. Gain, full well, quantum efficiency and the
     exposure time of a continuous laser do not enter. The pattern is that of one device, whose threshold is
-    ``resilience`` times that of the median device.
+    ``resilience`` times the stated one.
 
-    Shapes: spot (band, y, x), line (band,) -> six of (law,) float64, and the pattern (y, x).
+    Shapes: spot (band, y, x), line (band,) -> eight of (part,) float64, and the pattern (y, x).
     Units:  spot W/m2, mean over the exposure; result W/m2 or J/m2.
     Error:  of continuous light 1.4 % too little heat for a spot of 5 pixels and 0.6 % for one of 9; pixels must resolve
-            the spot, lambda N / p above 1, else the peak at a point is higher. Heat outside the window, heat that
-            pulses add up, and several lasers at once are left out. The laws are those of few devices: an estimate, no
-            certificate.
-    Raises: ParameterError before the run where no law holds for device, wavelength and duration, and for a mistake in
-            the file of thresholds; ValueError for a pulsed laser of which no pulse falls into the exposure.
+            the spot, lambda N / p above 1, else the peak at a point is higher. Heat outside the window and several
+            lasers at once are left out. Thresholds are those of few devices: an estimate, no certificate.
+    Raises: ParameterError before the run for a mistake in the file of thresholds.
     Source: the source of each law; Carslaw, Jaeger, Conduction of Heat in Solids, 2nd ed., ch. 10 (steady heat).
     """
-    rows, pattern = [], torch.zeros(spot.shape[-2:], dtype=torch.uint8, device=spot.device)
-    for law in laws_of(mean_wavelength(line), _is_train(light), dwell, pulse_duration, device, thresholds):
-        image = exposed(spot, light, law, exposure)
-        level = _equivalent(image, law, pixel_pitch, dwell)
-        top, worst = float(image.max()), float(level.max())
-        found = damage_at(law, worst)
-        chances = (-1.0 if x is None else x for x in found[1:])
-        pattern |= (level >= law.median * resilience).to(torch.uint8) << KINDS.index(law.damage)
-        rows.append((found.ratio, *chances, top, top / found.ratio if worst > 0 else math.inf))
-    ratio, chance, low, high, peak, threshold = torch.tensor(rows, dtype=torch.float64).reshape(-1, 6).T.contiguous()
-    return SpotDamage(ratio, chance, low, high, peak, threshold, pattern)
+    choice = {
+        "dwell": dwell,
+        "pulse_duration": pulse_duration,
+        "repetition_rate": repetition_rate,
+        "device": device,
+        "thresholds": thresholds,
+        "small_spot_exponent": small_spot_exponent,
+    }
+    exposed = _exposed(spot, line, light, exposure, choice)
+    diameter = heated_spot(exposed.irradiance, pixel_pitch)
+    parts = _parts(exposed.time, choice, diameter)
+    missed = exposed.fluence is not None and light is not None and _caught(light) <= 0
+    pattern = torch.zeros(spot.shape[-2:], dtype=torch.uint8, device=spot.device)
+    rows = []
+    for part in parts:
+        fluence = part.quantity == "fluence"
+        image = exposed.fluence if fluence and exposed.fluence is not None else exposed.irradiance
+        rows.append(_row(part, math.nan if missed else float(image.max())))
+        if part.threshold is not None and not missed:
+            above = image >= float(part.threshold.middle) * resilience
+            pattern |= above.to(torch.uint8) << KINDS.index(part.kind)
+    columns = torch.tensor(rows, dtype=torch.float64).reshape(-1, 8).T.contiguous()
+    return SpotDamage._make([*columns, pattern])
+
+
+def _row(part: DamagePart, peak: float) -> tuple[float, ...]:
+    """Return ratios, probability with its ends, peak and threshold of one part of the light."""
+    none = (-1.0, -1.0, -1.0)
+    if part.threshold is None or math.isnan(peak):
+        return (math.nan, math.nan, math.nan, *none, peak, math.nan)
+    low, middle, high = (float(end) for end in (part.threshold.low, part.threshold.middle, part.threshold.high))
+    if part.law is not None:
+        of_law = damage_at(part.law, peak / middle * part.law.median)
+        none = (of_law.probability, of_law.low, of_law.high)  # type: ignore[assignment]
+    return (peak / middle, peak / high, peak / low if low > 0 else math.inf, *none, peak, middle)
+
+
+def _caught(light: LaserLight) -> float:
+    """Return the number of pulses in an exposure; 1 for a laser that is given by its strength."""
+    return float(light.pulses) if float(light.pulse_fluence) > 0 else 1.0
+
+
+def _exposed(spot: Tensor, line: Bands, light: LaserLight | None, exposure: float, choice: dict[str, Any]) -> _Exposed:
+    """Return the fluence of one pulse and the mean irradiance over the dwell time, in each pixel."""
+    image = spot.detach().sum(0, dtype=torch.float64)
+    time = _in_time(line, light, exposure, choice)
+    if choice["pulse_duration"] is None:
+        return _Exposed(None, image, time)
+    pulses = 1.0 if light is None else _caught(light)
+    fluence = image * (exposure / pulses if pulses > 0 else math.nan)
+    return _Exposed(fluence, fluence * float(time.rate * time.caught), time)
+
+
+def _in_time(line: Bands, light: LaserLight | None, exposure: float, choice: dict[str, Any]) -> LightInTime:
+    """Return the light of a laser in time; a train without a rate has the pulses that fall into the exposure."""
+    rate = choice["repetition_rate"]
+    if rate is None and light is not None and not light.pulses.is_meta and float(light.pulses) > 1:
+        rate = float(light.pulses) / exposure
+    return LightInTime(
+        wavelength=mean_wavelength(line),
+        dwell=choice["dwell"],
+        pulse_duration=choice["pulse_duration"],
+        repetition_rate=None if choice["pulse_duration"] is None else rate,
+        small_spot_exponent=choice["small_spot_exponent"],
+    )
+
+
+def _parts(time: LightInTime, choice: dict[str, Any], diameter: float | None = None) -> tuple[DamagePart, ...]:
+    """Return the parts of the light with their thresholds for a heated spot of a diameter in m."""
+    return damage_parts(
+        LightInTime(
+            wavelength=time.wavelength,
+            dwell=time.dwell,
+            pulse_duration=time.pulse_duration,
+            repetition_rate=time.repetition_rate,
+            spot=diameter,
+            small_spot_exponent=time.small_spot_exponent,
+        ),
+        choice["device"],
+        own_laws(choice["thresholds"]),
+    )
 
 
 @damage.preflight
@@ -87,81 +179,100 @@ def _(
     *,
     line: Bands | None = None,
     light: LaserLight | None = None,
-    dwell: float,
-    pulse_duration: float | None = None,
-    device: str = "CMOS",
+    exposure: float = 1.0,
     thresholds: Thresholds = "published",
     **params: Any,
 ) -> list[str]:
-    every = _known(thresholds)
+    own_laws(thresholds)
     if line is None or line.centres.is_meta:
         return []
-    choice = {"dwell": dwell, "pulse_duration": pulse_duration, "device": device, "thresholds": thresholds}
-    laws = laws_before(line, light, **choice)
-    if not any(law.quantity == ("irradiance" if pulse_duration is None else "fluence") for law in laws):
-        raise ParameterError(*_no_law(every, mean_wavelength(line), dwell, pulse_duration, device))
-    return [f"{law.damage} of a {law.device}: {law.median / 1e4:.4g} {law.unit}, {law.source}" for law in laws]
+    parts = parts_before(line, light, exposure=exposure, thresholds=thresholds, **params)
+    continuous = params.get("pulse_duration") is None
+    return [_threshold_text(part, continuous) for part in parts if _has_sentence(part, continuous)]
+
+
+def _has_sentence(part: DamagePart, continuous: bool) -> bool:
+    """Return True for a part with a sentence of its own: of continuous light, which has equal parts, the mean alone."""
+    return part.part == "mean" or not continuous
+
+
+def _name(part: DamagePart, continuous: bool) -> str:
+    """Return the part of the light and the kind of damage, as sentences name them."""
+    return f"{'continuous light' if continuous else part.part}, {part.kind}"
+
+
+def _threshold_text(part: DamagePart, continuous: bool) -> str:
+    """Return the threshold of a part of the light in one sentence, or why the part is not judged."""
+    name = _name(part, continuous)
+    if part.threshold is None:
+        return f"{name}: not judged: {part.reason}"
+    low, middle, high = (float(end) / 1e4 for end in (part.threshold.low, part.threshold.middle, part.threshold.high))
+    unit = _UNITS[part.quantity]
+    if part.open_below:
+        return f"{name}: at most {high:.3g} {unit}, not judged from below: {part.reason}; {part.source}"
+    note = f" ({part.note})" if part.note else ""
+    return f"{name}: {middle:.3g} ({low:.3g} to {high:.3g}) {unit}{note}, {part.source}"
 
 
 @damage.check
-def _(result: SpotDamage, spot: Tensor, line: Bands, light: LaserLight | None = None, **params: Any) -> list[Check]:
-    rows = zip(*(column.tolist() for column in result[:6]), strict=True)
-    laws = laws_before(line, light, **params)
-    return [Check(_sentence(law, list(row)), row[0] < 1) for law, row in zip(laws, rows, strict=True)]
+def _(
+    result: SpotDamage, spot: Tensor, line: Bands, light: LaserLight | None = None, *, exposure: float, **params: Any
+) -> list[Check]:
+    parts = parts_before(line, light, exposure=exposure, **params)
+    rows = list(zip(*(column.tolist() for column in result[:8]), strict=True))
+    states = [state_of(row[1], row[2], part.open_below) for part, row in zip(parts, rows, strict=True)]
+    verdict = worst_state(states)
+    checks = [Check(_VERDICTS[verdict], verdict == "below")]
+    continuous = params.get("pulse_duration") is None
+    for part, row, state in zip(parts, rows, states, strict=True):
+        if _has_sentence(part, continuous):
+            checks.append(Check(_sentence(part, row, continuous), state == "below"))
+    return checks
 
 
-def _sentence(law: DamageLaw, row: list[float]) -> str:
-    ratio, chance, low, high, peak, threshold = row
-    text = f"{law.damage} damage: {peak / 1e4:.3g} of {threshold / 1e4:.3g} {law.unit}, {ratio:.3g} times the threshold"
+def _sentence(part: DamagePart, row: tuple[float, ...], continuous: bool) -> str:
+    """Return what is said of one part of the light: exposure, threshold, ratio with its bracket, and probability."""
+    ratio, least, most, chance, low, high, peak, threshold = row
+    name = _name(part, continuous)
+    if math.isnan(ratio):
+        return f"{name}: not judged: {part.reason or _NO_PULSE}"
+    unit = _UNITS[part.quantity]
+    if part.open_below:
+        at_least = f"at least {least:.3g} times the threshold"
+        return f"{name}: {peak / 1e4:.3g} {unit}, {at_least}; not judged from below: {part.reason}"
+    bracket = f" ({least:.3g} to {most:.3g})" if most > least else ""
+    text = f"{name}: {peak / 1e4:.3g} of {threshold / 1e4:.3g} {unit}, {ratio:.3g}{bracket} times the threshold"
     if chance < 0:
-        return f"{text}; no probability, because the source states no spread"
+        return text
     return f"{text}; {chance:.2g} of devices damaged (90 % interval {low:.2g} to {high:.2g})"
 
 
-def laws_of(
-    wavelength: float,
-    train: bool,
-    dwell: float,
-    pulse_duration: float | None = None,
-    device: str = "CMOS",
-    thresholds: Thresholds = "published",
-) -> tuple[DamageLaw, ...]:
-    """Return the laws that hold for a laser: those of continuous light, those of a pulse, or both for a pulse train."""
-    every = _known(thresholds)
-    pulses = () if pulse_duration is None else matching_laws(every, device, wavelength, pulse_duration, "fluence")
-    steady = matching_laws(every, device, wavelength, dwell, "irradiance") if pulse_duration is None or train else ()
-    return (*steady, *pulses)
+def parts_before(
+    line: Bands, light: LaserLight | None, *, exposure: float = 1.0, **params: Any
+) -> tuple[DamagePart, ...]:
+    """Return the parts of the light with their thresholds for the published spot, from the parameters of the step."""
+    choice = {
+        "dwell": params["dwell"],
+        "pulse_duration": params.get("pulse_duration"),
+        "repetition_rate": params.get("repetition_rate"),
+        "device": params.get("device", "CMOS"),
+        "thresholds": params.get("thresholds", "published"),
+        "small_spot_exponent": params.get("small_spot_exponent", 0.0),
+    }
+    return _parts(_in_time(line, light, exposure, choice), choice)
 
 
-def laws_before(line: Bands, light: LaserLight | None, **params: Any) -> tuple[DamageLaw, ...]:
-    """Return the laws for a laser, from the parameters of the step; a laser that is not yet known may be a train."""
-    choice = {name: params[name] for name in ("dwell", "pulse_duration", "device", "thresholds") if name in params}
-    unknown = light is not None and light.pulses.is_meta
-    return laws_of(mean_wavelength(line), unknown or _is_train(light), **choice)
+def heated_spot(image: Tensor, pitch: float, lost: float = 0.0) -> float | None:
+    """Return the 1/e2 diameter in m of the Gaussian spot that heats as an image of equal peak; None without light.
 
-
-def exposed(spot: Tensor, light: LaserLight | None, law: DamageLaw, exposure: float) -> Tensor:
-    """Return the irradiance in W/m2, or the fluence of one pulse in J/m2, of each pixel (y, x) of a laser spot."""
-    image = spot.detach().sum(0, dtype=torch.float64)
-    if law.quantity == "irradiance":
-        return image
-    if light is None or not float(light.pulse_fluence) > 0:  # a laser that is given by its strength
-        return image * exposure
-    pulses = float(light.pulses)
-    if not pulses > 0:
-        text = "no pulse falls into the exposure, yet every pulse hits the sensor"
-        raise ValueError(f"{text}: give the laser a pulse_delay of 0 to judge its damage")
-    return image * (exposure / pulses)
-
-
-def _equivalent(image: Tensor, law: DamageLaw, pitch: float, dwell: float) -> Tensor:
-    """Return the peak (y, x) of the spot of a law's own diameter that heats each pixel as the image does.
-
-    A spot that heat does not leave within the dwell time, such as that of one pulse, is compared as it is.
+    ``lost`` is the light beyond the window, in the unit of the image: it counts as if it fell on the rim of the window.
     """
-    if law.quantity == "fluence" or law.spot is None or math.sqrt(8 * DIFFUSIVITY * dwell) < _FAR * law.spot:
-        return image
-    return steady_heat(image, pitch) / (law.spot / 2 * math.sqrt(math.pi / 8))
+    peak = float(image.max())
+    if not peak > 0:
+        return None
+    rim = min(image.shape) / 2 * pitch
+    heat = float(steady_heat(image, pitch).max()) + lost * pitch**2 / (2 * math.pi * rim)
+    return 2 * heat / (peak * math.sqrt(math.pi / 8))
 
 
 def steady_heat(image: Tensor, pitch: float) -> Tensor:
@@ -179,14 +290,10 @@ def steady_heat(image: Tensor, pitch: float) -> Tensor:
     return heat[:rows, :columns].clamp_min(0) * (pitch / (2 * math.pi))
 
 
-def _is_train(light: LaserLight | None) -> bool:
-    """Return True if more than one pulse of a laser falls into an exposure."""
-    return light is not None and float(light.pulses) > 1
-
-
-def _known(thresholds: Thresholds) -> tuple[DamageLaw, ...]:
+def own_laws(thresholds: Thresholds) -> tuple[DamageLaw, ...]:
+    """Return the laws in the file of a user; raise ParameterError for a mistake in the file."""
     if not isinstance(thresholds, Path):
-        return PUBLISHED_DAMAGE
+        return ()
     try:
         return _from_file(thresholds)
     except ValueError as error:
@@ -196,17 +303,3 @@ def _known(thresholds: Thresholds) -> tuple[DamageLaw, ...]:
 @once_per_version
 def _from_file(file: Path) -> tuple[DamageLaw, ...]:
     return read_damage_laws(file)
-
-
-def _no_law(
-    laws: tuple[DamageLaw, ...], wavelength: float, dwell: float, pulse_duration: float | None, device: str
-) -> tuple[str, str]:
-    """Return the parameter and the message for a laser that no law covers."""
-    kind = f"light that stays {dwell:.3g} s" if pulse_duration is None else f"pulses of {pulse_duration:.3g} s"
-    text = f"no threshold of damage for the device {device} at {wavelength * 1e9:.5g} nm and {kind}"
-    devices = sorted({law.device for law in laws})
-    if device.casefold() not in {name.casefold() for name in devices}:
-        return "device", f"{text}: there are laws for {', '.join(devices)}"
-    ends = [min(law.wavelengths[0] for law in laws), max(law.wavelengths[1] for law in laws)]
-    known = f"the laws reach from {ends[0] * 1e9:.4g} to {ends[1] * 1e9:.4g} nm"
-    return "thresholds", f"{text} ({known}): give a file of your own thresholds"

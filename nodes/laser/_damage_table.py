@@ -1,4 +1,7 @@
-"""CSV files of damage thresholds of a user: one law a row, and a header that names quantity and unit of each column."""
+"""CSV files of damage thresholds of a user: one law a row, or the shots at one level a row, from which laws are fitted.
+
+The header names quantity and unit of each column.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,11 @@ from typing import Any, NamedTuple, cast
 
 from neusee.nodes.input_files import csv_rows
 from neusee.nodes.laser._damage_laws import KINDS, DamageLaw, Kind, Quantity
+from neusee.nodes.laser._hit_and_miss import Shots, fit_shots
 from neusee.nodes.spectra._table_files import Column, place
 
 _LENGTHS = {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "m": 1.0}
-_TIMES = {"ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0}
+_TIMES = {"fs": 1e-15, "ps": 1e-12, "ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0}
 _IRRADIANCES = {"W/m2": 1.0, "W/cm2": 1e4, "kW/cm2": 1e7, "MW/cm2": 1e10}
 _FLUENCES = {"J/m2": 1.0, "mJ/cm2": 10.0, "J/cm2": 1e4}
 _NONE: dict[str, float] = {"": 1.0, "1": 1.0}
@@ -25,14 +29,23 @@ _UNITS: dict[str, dict[str, float]] = {
     "duration from": _TIMES,
     "duration to": _TIMES,
     "threshold": _IRRADIANCES | _FLUENCES,
+    "low": _IRRADIANCES | _FLUENCES,
+    "high": _IRRADIANCES | _FLUENCES,
+    "level": _IRRADIANCES | _FLUENCES,
+    "shots": _NONE,
+    "damaged": _NONE,
     "factor": _NONE,
     "median factor": _NONE,
     "spot": _LENGTHS,
 }
-_OPTIONAL = ("factor", "median factor", "spot")
+_OPTIONAL = ("low", "high", "factor", "median factor", "spot")
+_COUNTS = ("shots", "damaged")
+_SHARED = tuple(name for name in _UNITS if name not in ("threshold", "level", *_COUNTS, *_OPTIONAL))
 _FORM = (
     "write a header such as device,damage,wavelength from (nm),wavelength to (nm),duration from (s),duration to (s),"
-    "threshold (kW/cm2),factor,median factor,spot (um),source"
+    "threshold (kW/cm2),low (kW/cm2),high (kW/cm2),factor,median factor,spot (um),source, "
+    "or with level (J/cm2),shots,damaged in place of the "
+    "threshold and its factors"
 )
 
 
@@ -45,16 +58,21 @@ class _Cell(NamedTuple):
 
 
 def read_damage_laws(file: Path) -> tuple[DamageLaw, ...]:
-    """Read laws of damage from a CSV file with one law a row.
+    """Read laws of damage from a CSV file with one law a row, or with the shots at one level a row.
 
     Columns, in any order: device; damage (point, line, cross, destruction or frame); wavelength from and to; duration
     from and to; threshold, in W/cm2 or kW/cm2 for continuous light and in J/cm2 or mJ/cm2 for a pulse, of the median
-    device; factor, the geometric standard deviation from device to device; median factor, that of the median; spot, the
-    1/e2 diameter with which the threshold was measured; source. The last four but the source may be empty. A file with
-    both kinds of light has two columns of thresholds, of which each row fills one.
+    device; low and high, the ends of a bracket around a threshold without data of devices; factor, the geometric
+    standard deviation from device to device; median factor, that of the median; spot, the 1/e2 diameter with which the
+    threshold was measured; source. Low, high, the factors and the spot may be empty or left out. A file with both kinds
+    of light has two columns of thresholds, of which each row fills one.
+
+    A table of shots has the columns level, shots and damaged in place of the threshold and its factors. Rows that agree
+    in all other columns are one test, and `fit_shots` makes one law of each test.
 
     Raises ValueError, with line and column, for a column or a unit that is missing or unknown, for a cell that is not a
-    positive number, for a range whose end is before its start, and for a factor without a median factor.
+    positive number, for a range whose end is before its start, for a factor without a median factor, for a bracket that
+    does not hold its threshold, for more damage than shots, and for shots that show no threshold.
     """
     if file.suffix.lower() in (".yaml", ".yml", ".json", ".xlsx"):
         raise ValueError(f"{file.name} is no CSV file: thresholds are read from a table with one law a row; {_FORM}")
@@ -62,17 +80,31 @@ def read_damage_laws(file: Path) -> tuple[DamageLaw, ...]:
     if len(rows) < 2:
         raise ValueError(f"{file.name} has no laws of damage below a header: {_FORM}")
     columns = [_heading(file, rows[0][0], index, cell) for index, cell in enumerate(rows[0][1])]
-    missing = [name for name in _UNITS if name not in _OPTIONAL and name not in {c.quantity for c in columns}]
+    names = {column.quantity for column in columns}
+    has_shots = bool(names & {"level", *_COUNTS})
+    _refuse_columns(file, names, has_shots)
+    table = [_cells(file, columns, line, cells) for line, cells in rows[1:]]
+    return _fitted_laws(table) if has_shots else tuple(map(_law, table))
+
+
+def _refuse_columns(file: Path, names: set[str], has_shots: bool) -> None:
+    """Raise ValueError for a column that is missing, and for thresholds beside shots."""
+    needed = (*_SHARED, "level", *_COUNTS) if has_shots else (*_SHARED, "threshold")
+    missing = [name for name in needed if name not in names]
     if missing:
         raise ValueError(f"{file.name}: no column {missing[0]}: {_FORM}")
-    laws = []
-    for line, cells in rows[1:]:
-        if len(cells) != len(columns):
-            text = f"{len(cells)} columns in place of {len(columns)}, the number of headings"
-            raise ValueError(f"{file.name}:{line}: {text}: write one cell for each heading")
-        both = enumerate(zip(columns, cells, strict=True))
-        laws.append(_law([_Cell(cell.strip(), place(file, line, i, column), column) for i, (column, cell) in both]))
-    return tuple(laws)
+    beside = sorted(names & {"threshold", "low", "high", "factor", "median factor"})
+    if has_shots and beside:
+        raise ValueError(f"{file.name}: the column {beside[0]} beside shots: the threshold is fitted to the shots")
+
+
+def _cells(file: Path, columns: list[Column], line: int, cells: list[str]) -> list[_Cell]:
+    """Return the cells of a row with their places; raise ValueError for another number of cells than headings."""
+    if len(cells) != len(columns):
+        text = f"{len(cells)} columns in place of {len(columns)}, the number of headings"
+        raise ValueError(f"{file.name}:{line}: {text}: write one cell for each heading")
+    both = enumerate(zip(columns, cells, strict=True))
+    return [_Cell(cell.strip(), place(file, line, index, column), column) for index, (column, cell) in both]
 
 
 def _heading(file: Path, line: int, index: int, cell: str) -> Column:
@@ -91,33 +123,127 @@ def _heading(file: Path, line: int, index: int, cell: str) -> Column:
 
 def _law(cells: list[_Cell]) -> DamageLaw:
     """Return the law of one row."""
-    values = {cell.column.quantity: _value(cell) for cell in cells if cell.column.quantity != "threshold"}
-    given = [cell for cell in cells if cell.column.quantity == "threshold" and cell.text]
-    if len(given) != 1:
-        where = next(cell.where for cell in cells if cell.column.quantity == "threshold")
-        text = f"{len(given)} thresholds in this row"
-        raise ValueError(f"{where}: {text}: give one, an irradiance for continuous light or a fluence for a pulse")
+    values = _values(cells, "threshold")
+    threshold = _filled(cells, "threshold")
     by_name = {cell.column.quantity: cell for cell in cells}
-    for name in ("wavelength", "duration"):
-        if values[f"{name} to"] < values[f"{name} from"]:
-            raise ValueError(f"{by_name[f'{name} to'].where}: the range ends before it starts: swap the two {name}s")
     if (values.get("factor") is None) != (values.get("median factor") is None):
         cell = by_name.get("factor") or by_name["median factor"]
         text = "one of factor and median factor is given: a probability needs both, so give both or neither"
         raise ValueError(f"{cell.where}: {text}")
-    quantity: Quantity = "irradiance" if given[0].column.unit in _IRRADIANCES else "fluence"
+    low, high = _bracket(by_name, values, threshold)
     return DamageLaw(
-        cast(str, values["device"]),
-        cast(Kind, values["damage"]),
-        quantity,
-        cast(float, _value(given[0])),
-        values.get("factor"),
-        values.get("median factor"),
-        (values["wavelength from"], values["wavelength to"]),
-        (values["duration from"], values["duration to"]),
-        values.get("spot"),
-        cast(str, values["source"]),
+        **_described(values),
+        quantity=_quantity(threshold),
+        median=cast(float, _value(threshold)),
+        factor=values.get("factor"),
+        median_factor=values.get("median factor"),
+        low=low,
+        high=high,
     )
+
+
+def _bracket(cells: dict[str, _Cell], values: dict[str, Any], threshold: _Cell) -> tuple[float | None, float | None]:
+    """Return the ends of the bracket of a row, or None twice; raise ValueError for one that does not fit."""
+    low, high = values.get("low"), values.get("high")
+    if low is None and high is None:
+        return None, None
+    cell = cells["high"] if low is None else cells["low"]
+    if low is None or high is None:
+        raise ValueError(f"{cell.where}: one end of a bracket is given: give low and high, or neither")
+    if values.get("factor") is not None:
+        raise ValueError(f"{cell.where}: a bracket beside a factor: give the bracket or the spread of devices")
+    if {_quantity(cells[name]) for name in ("low", "high")} != {_quantity(threshold)}:
+        raise ValueError(f"{cell.where}: the bracket has another quantity than the threshold of this row")
+    if not low <= cast(float, _value(threshold)) <= high:
+        raise ValueError(f"{cell.where}: the bracket does not hold the threshold: give low <= threshold <= high")
+    return low, high
+
+
+def _values(cells: list[_Cell], *but: str) -> dict[str, Any]:
+    """Return the values of a row by quantity, without some quantities; raise ValueError for a range that falls."""
+    values = {cell.column.quantity: _value(cell) for cell in cells if cell.column.quantity not in but}
+    by_name = {cell.column.quantity: cell for cell in cells}
+    for name in ("wavelength", "duration"):
+        if values[f"{name} to"] < values[f"{name} from"]:
+            raise ValueError(f"{by_name[f'{name} to'].where}: the range ends before it starts: swap the two {name}s")
+    return values
+
+
+def _filled(cells: list[_Cell], name: str) -> _Cell:
+    """Return the only filled cell of the columns of a quantity; raise ValueError for none and for several."""
+    filled = [cell for cell in cells if cell.column.quantity == name and cell.text]
+    if len(filled) != 1:
+        where = next(cell.where for cell in cells if cell.column.quantity == name)
+        text = f"{len(filled)} {name}s in this row"
+        raise ValueError(f"{where}: {text}: give one, an irradiance for continuous light or a fluence for a pulse")
+    return filled[0]
+
+
+def _quantity(cell: _Cell) -> Quantity:
+    """Return whether a threshold or a level is an irradiance or a fluence, by its unit."""
+    return "irradiance" if cell.column.unit in _IRRADIANCES else "fluence"
+
+
+def _described(values: dict[str, Any]) -> dict[str, Any]:
+    """Return what a law says beside its threshold, from the values of a row."""
+    return {
+        "device": values["device"],
+        "damage": cast(Kind, values["damage"]),
+        "wavelengths": (values["wavelength from"], values["wavelength to"]),
+        "durations": (values["duration from"], values["duration to"]),
+        "spot": values.get("spot"),
+        "source": values["source"],
+    }
+
+
+def _fitted_laws(table: list[list[_Cell]]) -> tuple[DamageLaw, ...]:
+    """Return the law of each test in a table of shots; raise ValueError, with the first row, for a test without one."""
+    tests: dict[tuple[Any, ...], list[list[_Cell]]] = {}
+    for cells in table:
+        described = _described(_values(cells, "level", *_COUNTS))
+        key = (*described.values(), _quantity(_filled(cells, "level")))
+        tests.setdefault(key, []).append(cells)
+    return tuple(_fitted_law(rows) for rows in tests.values())
+
+
+def _fitted_law(rows: list[list[_Cell]]) -> DamageLaw:
+    """Return the law that is fitted to the shots of one test."""
+    first = _filled(rows[0], "level")
+    try:
+        fitted = fit_shots([_shots(cells) for cells in rows])
+    except _AtCell as error:
+        raise ValueError(str(error)) from None
+    except ValueError as error:
+        raise ValueError(f"{first.where}: {error}") from None
+    return DamageLaw(
+        **_described(_values(rows[0], "level", *_COUNTS)),
+        quantity=_quantity(first),
+        median=fitted.median,
+        factor=fitted.factor,
+        median_factor=fitted.median_factor,
+        low=fitted.low,
+        high=fitted.high,
+    )
+
+
+class _AtCell(ValueError):
+    """A mistake in one cell, which the message names."""
+
+
+def _shots(cells: list[_Cell]) -> Shots:
+    """Return the shots of one row; raise `_AtCell` for more damage than shots."""
+    by_name = {cell.column.quantity: cell for cell in cells}
+    count, damaged = (_count(by_name[name]) for name in _COUNTS)
+    if not count > 0 or damaged > count:
+        raise _AtCell(f"{by_name['damaged'].where}: {damaged} damaged of {count} shots: give at most as many as shots")
+    return Shots(cast(float, _value(_filled(cells, "level"))), count, damaged)
+
+
+def _count(cell: _Cell) -> int:
+    """Return a whole number, 0 or more; raise `_AtCell` for another text."""
+    if not (cell.text.isascii() and cell.text.isdigit()):
+        raise _AtCell(f"{cell.where}: {cell.text!r} is no whole number of shots")
+    return int(cell.text)
 
 
 def _value(cell: _Cell) -> Any:

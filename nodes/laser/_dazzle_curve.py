@@ -11,10 +11,12 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_not_finite
+from neusee.nodes.optics._lens_band import cut_off
 from neusee.nodes.torch_func import transformed
+from neusee.nodes.units import Ratio
 from neusee.nodes.values import Bands, Psf
 
-Strengths = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...], Field(min_length=1)]
+Strengths = Annotated[tuple[Annotated[float, Field(gt=0, le=1e18)], ...], Field(min_length=1)]
 DECADES = tuple(10 ** (k / 4) for k in range(4, 25))  #: 10 to 1e6
 
 
@@ -33,13 +35,14 @@ def dazzle_curve(
     bands: Bands,
     *,
     strengths: Strengths = DECADES,
-    level: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
+    level: Ratio = 1.0,
 ) -> DazzleCurve:
     """Count the pixels in which a laser exceeds saturation, for each of several strengths.
 
     A strength is the irradiance of the brightest pixel behind the clear lens in multiples of saturation. ``level`` is
     the share of saturation at which a pixel counts: 1 for saturated pixels, less for pixels that are veiled. `clear` is
-    the closed form pi (lambda N / (pi p))^2 (4 S / pi)^(2/3), with lambda N / p from the peak of the clear lens.
+    the closed form pi (lambda N / (pi p))^2 (4 S / pi)^(2/3), with lambda N / p from the cut-off of the lens. Where
+    pixels average, S is that at a point.
 
     Shapes: psf.intensity (band, y, x), bands (band,) -> four of (strength,) float64.
     Units:  none, and pixels.
@@ -59,9 +62,9 @@ def dazzle_curve(
     at = torch.tensor(strengths, dtype=torch.float64)
     ordered = light.sort().values.cpu()
     pixels = (len(ordered) - torch.searchsorted(ordered, level * peak / at)).double()
-    one = float(psf.clear_peak.detach().mean())
-    spread = math.sqrt(math.pi / (4 * one))
-    clear = spread**2 / math.pi * (4 / math.pi * at / level).pow(2 / 3)
+    cut = float(cut_off(psf).mean())
+    averaged_away = math.pi / 4 * cut**2 / float(psf.clear_peak.detach().mean())
+    clear = (4 / math.pi * at / level * averaged_away).pow(2 / 3) / (math.pi * cut**2)
     return DazzleCurve(at, pixels, pixels / len(ordered), clear.where(at > level, 0.0))
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-from pydantic import Field
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -13,9 +12,10 @@ from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_not_finite
 from neusee.nodes.laser._dazzle_area import Rule, veil_limit
 from neusee.nodes.sensor._digitization import crop
+from neusee.nodes.sensor._room_for_light import refuse_without_room
 from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.torch_func import transformed
-from neusee.nodes.units import Count, Electrons, Shape
+from neusee.nodes.units import Count, Electrons, Ratio, Shape
 
 
 class Dazzle(NamedTuple):
@@ -39,9 +39,9 @@ def dazzle(
     read_noise: Electrons,
     offset: Electrons = 0.0,
     feature: Count = 10,
-    contrast: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.2,
+    contrast: Ratio = 0.2,
     rule: Rule = "snr",
-    threshold: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 5.0,
+    threshold: Ratio = 5.0,
 ) -> Dazzle:
     """Count the pixels that lasers saturate, and those where their light hides a feature of a stated size and contrast.
 
@@ -80,8 +80,16 @@ def dazzle(
 def _over_feature(image: Tensor, size: int) -> Tensor:
     """Return the mean of an image (channel, y, x) over a square of ``size`` pixels around each pixel."""
     rows, columns = image.shape[-2:]
-    mean = avg_pool2d(image[None], size, stride=1, padding=size // 2, count_include_pad=False)[0]
-    return mean[..., :rows, :columns]
+    mean, half = image[None], size // 2
+    for window, padding in (((size, 1), (half, 0)), ((1, size), (0, half))):
+        mean = avg_pool2d(mean, window, stride=1, padding=padding, count_include_pad=False)
+    return mean[0, ..., :rows, :columns]
+
+
+@dazzle.preflight
+def _(*, full_well: float, offset: float = 0.0, read_noise: float, **params: object) -> list[str]:
+    refuse_without_room(full_well, offset=offset, read_noise=read_noise)
+    return []
 
 
 @dazzle.check

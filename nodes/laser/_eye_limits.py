@@ -2,12 +2,13 @@
 
 The limits are those of IEC 60825-1:2014, Table A.1 (ICNIRP 2013, ANSI Z136.1-2014): a source that the eye sees under
 less than 1.5 mrad. They are written out here from the formulas, and are an estimate, no certificate. Ultraviolet light,
-pulses below 10 ps and extended sources are refused.
+pulses below 10 ps and extended sources are refused. Trains of pulses are in `_eye_trains`.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from neusee.nodes import ParameterError
 from neusee.nodes.laser._beam import Beam
@@ -34,12 +35,45 @@ def eye_mpe(wavelength: float, duration: float) -> float:
     Raises ParameterError for a wavelength or a duration beyond these formulas.
     Source: IEC 60825-1:2014, Tables A.1 and A.5; ICNIRP, Health Phys. 105, 271 (2013).
     """
+    return _strictest(wavelength, duration).limit
+
+
+def eye_mpe_formula(wavelength: float, duration: float) -> str:
+    """Return the formula of `eye_mpe` that holds, in J/m2, with its numbers put in: ``18 * 1 * 0.25**0.75``.
+
+    Raises ParameterError as `eye_mpe` does.
+    """
+    return _strictest(wavelength, duration).formula
+
+
+class _Law(NamedTuple):
+    """A limit of the radiant exposure in J/m2, and its formula with the numbers put in."""
+
+    limit: float
+    formula: str
+
+
+def _strictest(wavelength: float, duration: float) -> _Law:
+    """Return the law that limits the exposure of the eye at a wavelength in m for a duration in s."""
     _refuse(wavelength, duration)
     nm = wavelength * 1e9
     if nm >= 1400:
         return _cornea(nm, duration)
     retina = _retina(nm, duration)
     return retina if nm < 700 else min(retina, _skin(nm, duration))
+
+
+def _power_law(factor: float, weight: float, duration: float, exponent: float) -> _Law:
+    """Return factor x weight x duration^exponent."""
+    limit = factor * weight * math.pow(duration, exponent)
+    return _Law(limit, f"{factor:g} * {weight:.7g} * {duration:.7g}**{exponent:g}")
+
+
+def _constant(factor: float, weight: float, duration: float, full: float) -> _Law:
+    """Return factor x weight, for durations shorter than ``full`` s less in proportion."""
+    if duration >= full:
+        return _Law(factor * weight, f"{factor:g} * {weight:.7g}")
+    return _Law(factor * weight * duration / full, f"{factor:g} * {weight:.7g} * {duration:.7g} / {full:g}")
 
 
 def _refuse(wavelength: float, duration: float) -> None:
@@ -60,36 +94,36 @@ def _near_infrared(nm: float) -> tuple[float, float]:
     return absorbed, math.pow(10, 0.018 * (nm - 1150)) if nm < 1200 else 8 + math.pow(10, 0.04 * (nm - 1250))
 
 
-def _retina(nm: float, duration: float) -> float:
+def _retina(nm: float, duration: float) -> _Law:
     """Return the limit in J/m2 from 400 to 1400 nm for a small source: heat, and photochemistry below 500 nm."""
     absorbed, spread = _near_infrared(nm)
     if duration >= 10:
-        heat = 10 * absorbed * spread * duration
-        blue = math.pow(10, 0.02 * max(0.0, nm - 450))
-        return heat if nm >= 500 else min(heat, blue * max(100.0, duration))
+        heat = _power_law(10, absorbed * spread, duration, 1)
+        blue = _power_law(1, math.pow(10, 0.02 * max(0.0, nm - 450)), max(100.0, duration), 1)
+        return heat if nm >= 500 else min(heat, blue)
     if nm < 1050:
-        return absorbed * (2e-3 if duration <= 5e-6 else 18 * math.pow(duration, 0.75))
-    return spread * (2e-2 if duration <= 13e-6 else 90 * math.pow(duration, 0.75))
+        return _constant(2e-3, absorbed, 1, 0) if duration <= 5e-6 else _power_law(18, absorbed, duration, 0.75)
+    return _constant(2e-2, spread, 1, 0) if duration <= 13e-6 else _power_law(90, spread, duration, 0.75)
 
 
-def _skin(nm: float, duration: float) -> float:
+def _skin(nm: float, duration: float) -> _Law:
     """Return the limit of the skin in J/m2 from 700 to 1400 nm."""
     absorbed, _ = _near_infrared(nm)
     if duration >= 10:
-        return 2000 * absorbed * duration
+        return _power_law(2000, absorbed, duration, 1)
     if duration >= 1e-7:
-        return 1.1e4 * absorbed * math.pow(duration, 0.25)
-    return 200 * absorbed * min(1.0, duration / 1e-9)
+        return _power_law(1.1e4, absorbed, duration, 0.25)
+    return _constant(200, absorbed, duration, 1e-9)
 
 
-def _cornea(nm: float, duration: float) -> float:
+def _cornea(nm: float, duration: float) -> _Law:
     """Return the limit in J/m2 from 1400 nm on."""
     if duration >= 10:
-        return 1000 * duration
+        return _power_law(1000, 1, duration, 1)
     flat, until = (1e4, 10.0) if 1500 <= nm < 1800 else (100.0, 1e-7) if nm >= 2600 else (1e3, 1e-3)
     if duration <= until:
-        return flat * min(1.0, duration / 1e-9)
-    return 5600 * math.pow(duration, 0.25)
+        return _constant(flat, 1, duration, 1e-9)
+    return _power_law(5600, 1, duration, 0.25)
 
 
 def eye_aperture(wavelength: float, duration: float) -> float:
@@ -102,29 +136,6 @@ def eye_aperture(wavelength: float, duration: float) -> float:
     if wavelength < 1400e-9:
         return 7e-3
     return 1e-3 if duration <= 0.35 else 1e-3 * min(3.5, 1.5 * math.pow(duration, 0.375))
-
-
-def eye_mpe_train(wavelength: float, pulse_duration: float, repetition_rate: float, duration: float) -> float:
-    """Return the largest permissible radiant exposure of the eye in J/m2 by each pulse of a train.
-
-    It is the least of three: that of one pulse, that of the whole exposure over the number of pulses, and, up to 1400
-    nm, that of one pulse times N^(-1/4). Pulses that follow within 5 us (13 us from 1050 nm) count as one. The standard
-    of 2014 lets the third rule go for many small sources; it is kept here, because no limit is less strict with it.
-
-    Raises ParameterError for a pulse that is longer than the exposure or the period.
-    Source: IEC 60825-1:2014, A.3; the factor N^(-1/4) for every train as in IEC 60825-1:2007.
-    """
-    if not pulse_duration < min(duration, 1 / repetition_rate):
-        text = f"a pulse of {pulse_duration:g} s, every {1 / repetition_rate:g} s, in an exposure of {duration:g} s"
-        raise ParameterError("pulse_duration", f"{text}: the pulse is too long")
-    count = max(1.0, duration * repetition_rate)
-    least = min(eye_mpe(wavelength, pulse_duration), eye_mpe(wavelength, duration) / count)
-    if wavelength >= 1400e-9:
-        return least
-    together = 5e-6 if wavelength < 1050e-9 else 13e-6
-    grouped = min(count, max(1.0, together * repetition_rate))
-    group = together if grouped > 1 else pulse_duration
-    return min(least, eye_mpe(wavelength, max(group, pulse_duration)) / grouped * math.pow(count / grouped, -0.25))
 
 
 def hazard_distance(beam: Beam, limit: float, aperture: float = 0.0, transmittance: float = 1.0) -> float:
@@ -141,27 +152,16 @@ def hazard_distance(beam: Beam, limit: float, aperture: float = 0.0, transmittan
     if aperture == 0:
         squared = 2 * emitted / (math.pi * limit)
     else:
-        share = math.pi * aperture**2 / 4 * limit / emitted
+        share = eye_share(limit, aperture, emitted)
         if share >= 1:
             return 0.0
         squared = -(aperture**2) / 2 / math.log1p(-share)
     return 2 * math.sqrt(max(0.0, squared - beam.waist**2)) / beam.divergence
 
 
-def eye_limit(beam: Beam, duration: float) -> float:
-    """Return the limit of the eye for a beam: W/m2 if it is continuous, J/m2 for each pulse if it is pulsed."""
-    if beam.pulse_energy is None or beam.pulse_duration is None:
-        return eye_mpe(beam.wavelength, duration) / duration
-    if beam.repetition_rate is None or duration * beam.repetition_rate <= 1:
-        return eye_mpe(beam.wavelength, beam.pulse_duration)
-    return eye_mpe_train(beam.wavelength, beam.pulse_duration, beam.repetition_rate, duration)
+def eye_share(limit: float, aperture: float, emitted: float) -> float:
+    """Return the share of a power in W, or of an energy in J, that fills a round aperture in m with a limit.
 
-
-def nominal_ocular_hazard_distance(beam: Beam, duration: float = BLINK, transmittance: float = 1.0) -> float:
-    """Return the distance in m beyond which a beam does not exceed the limit of the unaided eye for an exposure in s.
-
-    The exposure is averaged over the limiting aperture. Use 0.25 s for visible light that a person turns away from,
-    and 10 s or 100 s for invisible light. Optical instruments such as binoculars are not part of it.
+    ``limit`` is in W/m2 or J/m2.
     """
-    averaged = duration if beam.pulse_duration is None else beam.pulse_duration
-    return hazard_distance(beam, eye_limit(beam, duration), eye_aperture(beam.wavelength, averaged), transmittance)
+    return math.pi * aperture**2 / 4 * limit / emitted

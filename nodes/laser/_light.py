@@ -16,16 +16,28 @@ from neusee.nodes.laser._beam import (
     beam_radius,
     curvature_radius,
     plain,
-    sensor_density,
-    share_through,
 )
-from neusee.nodes.optics._pupil_grid import clear_area
+from neusee.nodes.optics._f_number import refuse_impossible_f_number
+from neusee.nodes.optics._pupil_grid import clear_area, gaussian_over
 from neusee.nodes.spectra._bands import mean_wavelength
-from neusee.nodes.units import Delay, Energy, Frequency, PositiveAngle, PositiveLength, Power, Time, Transmittance
+from neusee.nodes.units import (
+    BeamRadius,
+    Delay,
+    Distance,
+    Energy,
+    Exposure,
+    FocalLength,
+    Frequency,
+    PositiveAngle,
+    Power,
+    Time,
+    Transmittance,
+    Visibility,
+)
 from neusee.nodes.values import Bands, LaserLight, Stop, Wavefront
 
-Quality = Annotated[float, Field(ge=1, allow_inf_nan=False)]  #: M2 of a beam
-Multiple = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Quality = Annotated[float, Field(ge=1, le=1e6)]  #: M2 of a beam
+Multiple = Annotated[float, Field(ge=0, le=1e18)]
 _NEAR = 0.25  #: waves of defocus at 550 nm from which a near laser is worth a note
 _RIM = 1.5  #: largest error of the spot by the staircase rim of the pupil, over waves of defocus / samples
 _WAVE = 550e-9  #: m; the wavelength in which waves of defocus are counted
@@ -45,11 +57,11 @@ class _Geometry(NamedTuple):
 def wavefront(
     line: Bands,
     *,
-    waist: PositiveLength | None = None,
+    waist: BeamRadius | None = None,
     divergence: PositiveAngle | None = None,
     m_squared: Quality | None = None,
     convention: Convention = "1/e2",
-    distance: PositiveLength | None = None,
+    distance: Distance | None = None,
 ) -> Wavefront:
     """Compute the taper and the curvature of a Gaussian beam in the pupil of a lens at a distance from the laser.
 
@@ -86,8 +98,8 @@ def light(
     line: Bands,
     stop: Stop,
     *,
-    focal_length: PositiveLength,
-    exposure: Time,
+    focal_length: FocalLength,
+    exposure: Exposure,
     lens_transmittance: Transmittance = 1.0,
     strength: Multiple | None = None,
     power: Power | None = None,
@@ -95,13 +107,13 @@ def light(
     pulse_duration: Time | None = None,
     repetition_rate: Frequency | None = None,
     pulse_delay: Delay = 0.0,
-    waist: PositiveLength | None = None,
+    waist: BeamRadius | None = None,
     divergence: PositiveAngle | None = None,
     m_squared: Quality | None = None,
     convention: Convention = "1/e2",
-    distance: PositiveLength | None = None,
+    distance: Distance | None = None,
     air_transmittance: Transmittance | None = None,
-    visibility: PositiveLength | None = None,
+    visibility: Visibility | None = None,
     haze: Law | None = None,
 ) -> LaserLight:
     """Compute the light that a laser in watts or joules sends through a lens, and its peak on the sensor.
@@ -130,12 +142,12 @@ def light(
     pulses = pulses_within(found, exposure, pulse_delay)
     mean = found.power if found.pulse_energy is None else found.pulse_energy * pulses / exposure
     assert mean is not None
-    diameter = min(float(stop.diameter), float(stop.samples * stop.pitch))
     irradiance = mean * axis_density(found, distance, air)
     flux = irradiance * clear_area(stop) * lens_transmittance
-    even = flux * clear_area(stop) / (found.wavelength * focal_length) ** 2
-    peak = sensor_density(found, distance, diameter, focal_length, lens_transmittance, air)
-    through = mean * share_through(found, distance, diameter, air)
+    spot, width = (found.wavelength * focal_length) ** 2, beam_radius(found, distance)
+    even = flux * clear_area(stop) / spot
+    through = irradiance * gaussian_over(stop, width / math.sqrt(2))  # of the irradiance of a Gaussian beam
+    peak = axis_density(found, distance, air) * lens_transmittance * gaussian_over(stop, width) ** 2 / spot  # its field
     values = (even, flux, irradiance, through, mean * peak, pulses, (found.pulse_energy or 0.0) * peak)
     return LaserLight(*(torch.as_tensor(value, dtype=torch.float64) for value in values))
 
@@ -197,43 +209,49 @@ def _air(wavelength: float, distance: float, share: float | None, visibility: fl
 _BEAM = ("waist", "divergence", "m_squared")
 _PULSE = ("pulse_energy", "pulse_duration", "repetition_rate")
 _AIR = ("air_transmittance", "visibility", "haze")
+_ABSOLUTE = ("power", *_PULSE, *_BEAM, "distance", *_AIR)  #: settings that state the light in watts and metres
 
 
 @light.preflight
 def _(*, line: Bands | None = None, stop: Stop | None = None, **params: Any) -> list[str]:
-    given = [name for name in ("power", *_PULSE, *_BEAM, "distance", *_AIR) if params[name] is not None]
-    strength = params["strength"]
-    if strength is not None:
-        _refuse_beside_strength(given)
+    stated = [name for name in _ABSOLUTE if params[name] is not None]
+    if params["strength"] is not None:
+        _refuse_beside_strength(stated)
         return []
-    if "power" not in given and "pulse_energy" not in given:
-        text = "the light of this laser is not known: give strength, or power (or pulse_energy) with distance"
-        raise ParameterError(given[0] if given else "line.wavelength", text)
-    if "distance" not in given:
-        raise ParameterError(given[0], "a laser in watts needs its distance from the camera, such as distance: 100 m")
-    _refuse_air(given)
+    _refuse_unknown_light(stated)
+    _refuse_air(stated)
     if line is None or stop is None or line.centres.is_meta or stop.diameter.is_meta:
         return []
+    refuse_impossible_f_number(params["focal_length"], float(stop.diameter), "focal_length")
     try:
         return [*_out_of_focus(line, stop, params), *_pulse_notes(light(line, stop, **params), params)]
     except ParameterError as error:
-        name = error.parameter if error.parameter in given else given[0]
+        name = error.parameter if error.parameter in stated else stated[0]
         raise ParameterError(name, str(error)) from None
 
 
-def _refuse_beside_strength(given: list[str]) -> None:
+def _refuse_unknown_light(stated: list[str]) -> None:
+    """Raise ParameterError for a laser in absolute units without its power or energy, or without its distance."""
+    if "power" not in stated and "pulse_energy" not in stated:
+        text = "the light of this laser is not known: give strength, or power (or pulse_energy) with distance"
+        raise ParameterError(stated[0] if stated else "line.wavelength", text)
+    if "distance" not in stated:
+        raise ParameterError(stated[0], "a laser in watts needs its distance from the camera, such as distance: 100 m")
+
+
+def _refuse_beside_strength(stated: list[str]) -> None:
     """Raise ParameterError for a laser that has a strength and statements in absolute units."""
-    if given:
-        other = f"{', '.join(given)} state{'s' * (len(given) == 1)} its light in absolute units"
+    if stated:
+        other = f"{', '.join(stated)} state{'s' * (len(stated) == 1)} its light in absolute units"
         text = f"a strength states the light of the laser at the sensor, but {other}: leave strength or the rest out"
         raise ParameterError("strength", text)
 
 
-def _refuse_air(given: list[str]) -> None:
+def _refuse_air(stated: list[str]) -> None:
     """Raise ParameterError for air that is stated twice, or by a law without a visibility."""
-    if "air_transmittance" in given and ("visibility" in given or "haze" in given):
+    if "air_transmittance" in stated and ("visibility" in stated or "haze" in stated):
         raise ParameterError("air_transmittance", "the air is stated twice: leave air_transmittance or visibility out")
-    if "haze" in given and "visibility" not in given:
+    if "haze" in stated and "visibility" not in stated:
         raise ParameterError("haze", "a law of haze needs the visibility, such as visibility: 5 km")
 
 

@@ -5,9 +5,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neusee.nodes.laser._bright_pixels import RANKS, BrightPixels, bright_pixels
+from neusee.nodes.laser._bright_pixels import PARTS, RINGS, BrightPixels, bright_pixels
 from neusee.nodes.laser._damage_pixels import damaged_pixels
-from neusee.nodes.laser._damage_spot import SpotDamage, damage, laws_before
+from neusee.nodes.laser._damage_spot import SpotDamage, damage, parts_before
 from neusee.nodes.laser._dazzle_curve import DECADES, DazzleCurve, dazzle_curve
 from neusee.nodes.laser._dazzle_picture import Dazzle, dazzle
 from neusee.nodes.laser._light import light, wavefront
@@ -31,8 +31,8 @@ def _(line: Bands, stop: Stop, **params: Any) -> LaserLight:
 
 @damage.shape
 def _(spot: Tensor, line: Bands, light: LaserLight | None = None, **params: Any) -> SpotDamage:
-    laws = double(len(laws_before(line, light, **params)))
-    return SpotDamage(laws, laws, laws, laws, laws, laws, blank(*spot.shape[-2:], dtype=torch.uint8))
+    column = double(len(parts_before(line, light, **params)))
+    return SpotDamage._make([*[column] * 8, blank(*spot.shape[-2:], dtype=torch.uint8)])
 
 
 @damage.work
@@ -60,8 +60,8 @@ def _(result: DazzleCurve, psf: Psf, *inputs: Any, **params: Any) -> tuple[float
 
 @bright_pixels.shape
 def _(psf: Psf, bands: Bands, **params: Any) -> BrightPixels:
-    column = double(RANKS)
-    return BrightPixels(column, column, column, column)
+    column = double(RINGS * PARTS)
+    return BrightPixels(column, column, column, column, double(3))
 
 
 @bright_pixels.work

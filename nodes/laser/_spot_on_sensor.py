@@ -1,5 +1,6 @@
 """Spot of a laser on the sensor: its size, and the mean power of a frame in which at least one pulse falls."""
 
+import math
 from typing import TypeVar
 
 from torch import Tensor
@@ -38,3 +39,18 @@ def heated_diameter(beam: Beam, distance: Number, diameter: Number, focal_length
     overfilled: Number = airy_diameter(beam.wavelength, focal_length / diameter)  # type: ignore[assignment,arg-type]
     wider: Number = underfilled(filled) ** -0.5
     return overfilled * wider
+
+
+def widest_heated_diameter(clear: Number, peak_ratio: Number) -> Number:
+    """Return an upper bound of the 1/e2 diameter in m of the Gaussian spot that heats as a spot behind a mask.
+
+    ``clear`` is `heated_diameter` of the clear lens, and ``peak_ratio`` the peak behind the mask over that of the clear
+    lens. Of all spots with equal power and equal peak, an evenly lit disc heats its centre most: 1.178 times the Airy
+    spot, and the inverse root of the peak.
+
+    Source: rearrangement inequality for the integral of E / r over the plane; our derivation.
+    """
+    airy = 16 / (3 * math.pi**2)  # of the integral of E along a radius, in wavelengths times f-number and peaks
+    disc = 2 / math.pi  # radius of the disc of equal power and peak, in the same unit
+    wider: Number = clear * (disc / airy) / peak_ratio**0.5
+    return wider

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from neusee.nodes import node
 from neusee.nodes._half_precision import single
+from neusee.nodes.optics._lens_band import cut_off
 from neusee.nodes.values import Psf
 
 _DARK = 1e-30  #: share of the light below which a band counts as dark
@@ -35,14 +36,14 @@ def contrast(psf: Psf, *, floor: ContrastFloor = 1e-4, up_to: HighestFrequency |
             band without light (1e-30) counts as contrast 0, and has no gradient.
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF, cut-off); the mean of logarithms is ours.
     """
-    bands = zip(single(psf.intensity), psf.clear_peak.tolist(), strict=True)
-    return torch.stack([_lost(kernel, peak, floor, up_to) for kernel, peak in bands]).sum()
+    bands = zip(single(psf.intensity), cut_off(psf).tolist(), strict=True)
+    return torch.stack([_lost(kernel, cut, floor, up_to) for kernel, cut in bands]).sum()
 
 
-def _lost(kernel: Tensor, clear_peak: float, floor: float, up_to: float | None) -> Tensor:
+def _lost(kernel: Tensor, passed: float, floor: float, up_to: float | None) -> Tensor:
     y, x = kernel.shape
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in (y, x))
-    cut = min(math.sqrt(4.0 * clear_peak / math.pi), up_to or math.inf)  # cycles per pixel, for a round aperture
+    cut = min(passed, up_to or math.inf)  # cycles per pixel
     inside = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= cut
     light = kernel.sum()
     dark = light.detach() <= _DARK  # false for NaN, so that NaN reaches the result
@@ -56,11 +57,11 @@ def _lost(kernel: Tensor, clear_peak: float, floor: float, up_to: float | None) 
 @contrast.reference
 def _(psf: Psf, *, floor: float = 1e-4, up_to: float | None = None) -> Tensor:
     total = torch.zeros((), dtype=torch.float64)
-    for kernel, peak in zip(psf.intensity.double(), psf.clear_peak.tolist(), strict=True):
+    for kernel, cut in zip(psf.intensity.double(), cut_off(psf).tolist(), strict=True):
         y, x = kernel.shape
         otf = torch.fft.fft2(kernel)[:, : x // 2 + 1]
         fy, fx = torch.fft.fftfreq(y, dtype=torch.float64), torch.fft.rfftfreq(x, dtype=torch.float64)
-        inside = fy[:, None].square() + fx.square() <= 4.0 * peak / math.pi
+        inside = fy[:, None].square() + fx.square() <= cut**2
         if up_to is not None:
             inside &= fy[:, None].square() + fx.square() <= up_to**2
         whole = otf[0, 0].real

@@ -22,13 +22,14 @@ from neusee.nodes.losses._filtered_picture import (
     quanta,
     round_mtf,
 )  # fmt: skip
+from neusee.nodes.optics._lens_band import averaging, cut_off, round_lens, stop_width
 from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_shares
 from neusee.nodes.units import Electrons, Fraction
 from neusee.nodes.values import Bands, Psf
 
 PeakLimit = Annotated[float, Field(gt=0, le=1)]  #: of the LSR
 ContrastVariance = Annotated[float, Field(gt=0, le=1)]
-SceneLight = Annotated[Electrons, Field(gt=0, allow_inf_nan=False)]
+SceneLight = Annotated[Electrons, Field(gt=0)]
 _STOPS = 24  #: diameters that are tried, and again on each side of the best
 NormPower = Annotated[float, Field(ge=8, le=256)]
 
@@ -197,25 +198,41 @@ def best_stop(
 ) -> tuple[float, float, float]:
     """Return the least loss of a round stop with a grey filter at the same limit, its diameter and transmittance.
 
-    The diameter is a share of that of the clear aperture, whose cut-off follows from ``plain.clear_peak``. The peak of
-    a stop falls with the fourth power of its diameter and its light with the second power. ``measure`` names the loss:
-    ``filtered_error`` or ``information``.
+    The diameter is a share of that of the clear aperture, whose cut-off is that of ``plain``. The peak of a stop falls
+    with the fourth power of its diameter, but for what pixels average away, and its light with the second power.
+    ``measure`` names the loss: ``filtered_error`` or ``information``.
     """
     size, grey = _size(plain), grey_shares(illuminant, responses, bands)
-    cuts = (4 * plain.clear_peak.double().cpu() / math.pi).sqrt()
+    cuts, sides = cut_off(plain).cpu(), averaging(plain).cpu()
+    blur = _pixel_contrast(size, float(sides.max()))
     spectrum = natural_spectrum(size, contrast, cuts)
     counted, at = _counted(size, up_to, cuts), frequencies(size, cuts)
 
     def loss_of(width: float) -> tuple[float, float, float]:
-        filtered = filter_of(torch.tensor(width, dtype=torch.float64) ** 4, limit)
+        filtered = filter_of(_stop_peak(width, cuts, sides), limit)
         exposure = Exposure(light, read_noise, veil, width**2)
-        snr = quanta((width**2 * round_mtf(at, width * cuts, grey)).square(), exposure, filtered) * spectrum
+        snr = quanta((width**2 * blur * round_mtf(at, width * cuts, grey)).square(), exposure, filtered) * spectrum
         lost = error_share(snr, spectrum, size, counted).clamp_min(1e-30).log()
         loss = lost if measure == "filtered_error" else -bits(snr, size, counted)
         return float(loss.mean()), width, float(filtered)
 
-    narrowest = (limit or 1.0) ** 0.25  # a narrower stop loses light and contrast, and protects more than is asked
+    # a narrower stop loses light and contrast, and protects more than is asked
+    narrowest = float(stop_width(torch.full_like(cuts, limit or 1.0), cuts, sides).min())
     coarse = min(loss_of(1.0 + i / (_STOPS - 1) * (narrowest - 1.0)) for i in range(_STOPS))
     step = (1.0 - narrowest) / (_STOPS - 1)
     near = (coarse[1] + i / (_STOPS - 1) * step for i in range(1 - _STOPS, _STOPS))
     return min([coarse, *(loss_of(width) for width in near if narrowest <= width <= 1.0)])
+
+
+def _stop_peak(width: float, cuts: Tensor, sides: Tensor) -> Tensor:
+    """Return the largest LSR of any band of a stop, whose pixels average less of a wider spot away."""
+    ratios = round_lens(width * cuts, sides).peak / round_lens(cuts, sides).peak
+    return width**4 * ratios.max()
+
+
+def _pixel_contrast(size: tuple[int, int], side: float) -> Tensor | float:
+    """Return the transfer function of pixels that average, at the frequencies of `frequencies`."""
+    if not side:
+        return 1.0
+    fy, fx = torch.fft.fftfreq(size[0], dtype=torch.float64), torch.fft.rfftfreq(size[1], dtype=torch.float64)
+    return torch.sinc(side * fy)[:, None] * torch.sinc(side * fx)

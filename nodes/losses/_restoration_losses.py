@@ -20,7 +20,7 @@ def charbonnier(
     estimate: Tensor,
     truth: Tensor,
     *,
-    epsilon: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-6,
+    epsilon: Annotated[float, Field(ge=1e-12, le=1e3)] = 1e-6,
     reduction: Reduction = "mean",
 ) -> Tensor:
     """Average sqrt(difference^2 + epsilon), an absolute difference of pictures that is smooth at 0.

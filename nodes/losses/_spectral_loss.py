@@ -12,9 +12,7 @@ from neusee.nodes.metrics._picture_quality import require_same_shape
 
 
 @node()
-def mrae(
-    estimate: Tensor, truth: Tensor, *, floor: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.02
-) -> Tensor:
+def mrae(estimate: Tensor, truth: Tensor, *, floor: Annotated[float, Field(ge=1e-12, le=1)] = 0.02) -> Tensor:
     """Average the absolute error of spectra, divided by the true value or by `floor`, whichever is larger.
 
     Without a floor a black of 1e-4 has ten thousand times the gradient of white, and training fits the noise of the

@@ -15,7 +15,7 @@ from neusee.nodes.restore._inverse._picture_scale import fall
 from neusee.nodes.values import Bands, Psf
 
 OneBandShare = Annotated[float, Field(ge=0, le=1)]
-NoiseVariance = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NoiseVariance = Annotated[float, Field(ge=1e-12, le=1e12)]
 
 
 @node()

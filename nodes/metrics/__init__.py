@@ -22,7 +22,7 @@ from neusee.nodes.metrics._picture_spectrum import (
     radial_contrast,
     remaining_error,
 )
-from neusee.nodes.metrics._protection_bounds import ProtectionBounds, largest_glare, protection_bounds
+from neusee.nodes.metrics._protection_bounds import ProtectionBounds, largest_glare, protection_bounds, stop_diameter
 from neusee.nodes.metrics._psf_contrast import Mtf, encircled, encircled_curve, mtf, over_clear_peak
 from neusee.nodes.metrics._saturated_pixels import Saturated, saturated
 from neusee.nodes.metrics._spectral_error import spectral_error
@@ -74,4 +74,5 @@ __all__ = [
     "remaining_error",
     "saturated",
     "spectral_error",
+    "stop_diameter",
 ]

@@ -8,16 +8,16 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.units import PositiveLength, Time
+from neusee.nodes.units import PixelPitch, Time
 from neusee.nodes.values import Psf
 
-Diffusivity = Annotated[float, Field(gt=0, allow_inf_nan=False)]  #: m2/s
+Diffusivity = Annotated[float, Field(ge=1e-9, le=1)]  #: m2/s
 SILICON = 8.8e-5  #: m2/s, thermal diffusivity of silicon at 300 K
 
 
 @node(rtol=1e-6)
 def heat_ratio(
-    psf: Psf, plain_psf: Psf, *, pixel_pitch: PositiveLength, dwell: Time, diffusivity: Diffusivity = SILICON
+    psf: Psf, plain_psf: Psf, *, pixel_pitch: PixelPitch, dwell: Time, diffusivity: Diffusivity = SILICON
 ) -> Tensor:
     """Compute the temperature rise of the hottest pixel after a dwell time, divided by that behind the clear lens.
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
+from neusee.nodes.optics._lens_band import cut_off
 from neusee.nodes.values import Psf
 
 _DARK = 1e-30  #: share of the light below which a band counts as dark
@@ -83,13 +84,10 @@ def most_unsuppressed(psf: Psf) -> Tensor:
 
 
 def shares(psf: Psf) -> Tensor:
-    """Return the share of the sampled spatial frequencies below the cut-off of the lens: (band,) float64.
-
-    The cut-off is sqrt(4 p0 / pi) cycles per pixel, where p0 is the peak of the clear lens.
-    """
+    """Return the share of the sampled spatial frequencies below the cut-off of the lens: (band,) float64."""
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in psf.intensity.shape[-2:])
     radius = torch.hypot(fy[:, None], fx)
-    return torch.stack([(radius <= math.sqrt(4.0 * float(p) / math.pi)).double().mean() for p in psf.clear_peak])
+    return torch.stack([(radius <= cut).double().mean() for cut in cut_off(psf).tolist()])
 
 
 def most_contrast(unsuppressed: float, lsr: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ def quality(
     estimate: Tensor,
     truth: Tensor,
     *,
-    border: Annotated[int, Field(ge=0)] = 0,
+    border: Annotated[int, Field(ge=0, le=10**6)] = 0,
     domain: Literal["linear", "encoded"] = "encoded",
 ) -> Quality:
     """Compare a picture with the true picture by mean absolute difference, PSNR and SSIM.

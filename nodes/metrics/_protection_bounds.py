@@ -9,6 +9,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.metrics._filtered_picture import Light
+from neusee.nodes.optics._lens_band import averaging, cut_off, round_lens, stop_width
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Psf
 
@@ -50,7 +51,8 @@ def protection_bounds(
     c = 0.4596. A mask therefore has at most L / c of the clear lens's mean MTF**2 over the whole lens band. Its mean
     NEQ over that band is at most (L n + s**2) / (c L (n + g + s**2)) times that of a grey filter of the same peak,
     with n electrons of the scene, g of glare and the read noise s. A stop of the diameter L**(1/4) has another such
-    bound. The mean of a logarithm is at most the logarithm of the mean.
+    bound. Where pixels average, c and the peaks of lens and stop are those behind the pixels. The mean of a logarithm
+    is at most the logarithm of the mean.
 
     Shapes: psf.intensity (band, y, x) -> ten of (band,) float64.
     Units:  electrons, read_noise and glare e- a pixel.
@@ -61,29 +63,51 @@ def protection_bounds(
     """
     p0 = psf.clear_peak.double().cpu()
     peak = psf.intensity.amax((-2, -1)).double().cpu()
-    rows = [_contrast(one.double(), float(p)) for one, p in zip(psf.intensity.cpu(), p0, strict=True)]
+    cuts, sides = cut_off(psf).cpu(), averaging(psf).cpu()
+    rows = [_contrast(one.double(), float(cut)) for one, cut in zip(psf.intensity.cpu(), cuts, strict=True)]
     power, whole, logs = (torch.stack(column) for column in zip(*rows, strict=True))
     lsr, noise = peak / p0, electrons + glare + read_noise**2
-    grey = _rival(lsr**2, lsr, electrons, read_noise)
-    stop = _rival(lsr**1.5, lsr.sqrt(), electrons, read_noise)
-    mask, most = electrons**2 * whole / noise, electrons**2 * lsr / (4 * noise)
+    lens = round_lens(cuts, sides)
+    clear = torch.where(sides > 0, lens.power, CLEAR / 4)
+    width = stop_width(lsr, cuts, sides)
+    narrow = torch.where(sides > 0, width**6 * round_lens(width * cuts, sides).power, lsr**1.5 * CLEAR / 4)
+    grey = _rival(lsr**2 * clear, lsr, electrons, read_noise)
+    stop = _rival(narrow, width.square(), electrons, read_noise)
+    largest = lsr * lens.peak / 4  # mean of |OTF|**2 over the lens band, by Parseval
+    mask, most = electrons**2 * whole / noise, electrons**2 * largest / noise
     better = torch.maximum(grey, stop)
-    contrast = 4 * whole / CLEAR
+    contrast = whole / clear
     scale = math.log(electrons**2 / noise)
-    each = (power, peak, contrast, lsr / CLEAR, mask / grey, most / grey, mask / better, most / better)
+    each = (power, peak, contrast, largest / clear, mask / grey, most / grey, mask / better, most / better)
     return ProtectionBounds(*each, logs + scale, most.log())
 
 
 def _rival(power: Tensor, passed: Tensor, electrons: float, read_noise: float) -> Tensor:
-    """Return the mean NEQ over the lens band of a clear pupil with the given mean |OTF|**2, relative to c / 4."""
-    return electrons**2 * power * (CLEAR / 4) / (electrons * passed + read_noise**2)
+    """Return the mean NEQ over the lens band of a clear pupil with the mean |OTF|**2 ``power``."""
+    return electrons**2 * power / (electrons * passed + read_noise**2)
 
 
-def _contrast(kernel: Tensor, clear_peak: float) -> tuple[Tensor, Tensor, Tensor]:
+def stop_diameter(psf: Psf, lsr: float) -> Tensor:
+    """Compute the diameter of the round stop that lowers the brightest pixel to a share ``lsr`` of that of the lens.
+
+    Without an average over pixels it is lsr**(1/4). Pixels average more of the lens's peak away than of the wider spot
+    of a stop, so that a stop of this diameter lowers the brightest pixel less than it should.
+
+    Shapes: of psf the cut-off and the average over pixels (band,) -> (band,) float64.
+    Units:  lsr 1; result 1, the diameter of the lens.
+    Error:  1e-4, for a round aperture without aberrations.
+    Raises: nothing.
+    Source: the peak of a round pupil goes with its area squared, times what `nodes.optics` says pixels leave of it.
+    """
+    cuts, sides = cut_off(psf).cpu(), averaging(psf).cpu()
+    return stop_width(torch.full_like(cuts, lsr), cuts, sides)
+
+
+def _contrast(kernel: Tensor, cut: float) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean of |OTF|**2 over all frequencies and over the lens band, and the mean of its logarithm there."""
     square = torch.fft.fft2(kernel).abs().square()
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in kernel.shape)
-    inside = torch.hypot(fy[:, None], fx) <= math.sqrt(4 * clear_peak / math.pi)
+    inside = torch.hypot(fy[:, None], fx) <= cut
     return square.mean(), square[inside].mean(), square[inside].clamp_min(1e-30).log().mean()
 
 

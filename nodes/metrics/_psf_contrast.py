@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.units import PositiveLength
+from neusee.nodes.optics._lens_band import cut_off
+from neusee.nodes.units import PixelPitch, SensorLength
 from neusee.nodes.values import Psf
 
 _DARK = 1e-30  #: share of the light below which a band counts as dark
@@ -25,25 +26,26 @@ class Mtf(NamedTuple):
 def mtf(psf: Psf) -> Mtf:
     """Compute statistics of the contrast |OTF| / OTF(0) over all frequencies up to the cut-off of the clear aperture.
 
-    The cut-off D / (wavelength x f) follows from the peak of the clear lens p0: sqrt(4 p0 / pi) cycles per pixel.
+    The cut-off D / (wavelength x f) in cycles per pixel is that of the PSF, or sqrt(4 p0 / pi) with p0 the peak of the
+    clear lens where the PSF does not name it. A PSF that is averaged over pixels has the contrast behind the pixels.
     Parseval: no mask has an rms contrast (over all frequencies that the pixels sample) above sqrt(LSR p0 / light kept).
 
     Shapes: psf.intensity (band, y, x) -> three of (band,) float64.
     Units:  none.
     Error:  round-off 1e-7, plus the error of the window: light outside the window counts as lost, and the window sets
-            the frequencies. The cut-off holds for a round aperture and a PSF sampled at points. Without light (1e-30)
-            the contrast is 0. Only `rms` has a gradient: a median depends on one frequency, whose choice among equal
+            the frequencies. The cut-off is that of the round aperture of the same area. Without light (1e-30) the
+            contrast is 0. Only `rms` has a gradient: a median depends on one frequency, whose choice among equal
             values is arbitrary.
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF as autocorrelation of the pupil).
     """
-    rows = [_contrast(one, float(p)) for one, p in zip(psf.intensity, psf.clear_peak, strict=True)]
+    rows = [_contrast(one, cut) for one, cut in zip(psf.intensity, cut_off(psf).tolist(), strict=True)]
     return Mtf(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
-def _contrast(kernel: Tensor, clear_peak: float) -> tuple[Tensor, Tensor, Tensor]:
+def _contrast(kernel: Tensor, cut: float) -> tuple[Tensor, Tensor, Tensor]:
     y, x = kernel.shape
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in (y, x))
-    inside = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= math.sqrt(4.0 * clear_peak / math.pi)
+    inside = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= cut
     otf = torch.fft.rfft2(kernel.double())
     whole = otf[0, 0].abs()
     dark = whole <= _DARK
@@ -66,7 +68,7 @@ def _(result: Mtf, *inputs: Psf) -> list[Check]:
 
 
 @node(rtol=1e-6)
-def encircled(psf: Psf, *, pixel_pitch: PositiveLength, radius: PositiveLength) -> Tensor:
+def encircled(psf: Psf, *, pixel_pitch: PixelPitch, radius: SensorLength) -> Tensor:
     """Compute the share of the light, relative to the clear pupil, that falls within a radius around the axis.
 
     Shapes: psf.intensity (band, y, x) -> (band,) float64.

@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.sensor._digitization import Bits
+from neusee.nodes.sensor._digitization import Bits, clipping_number
+from neusee.nodes.sensor._room_for_light import refuse_without_steps
 from neusee.nodes.sensor._saturation import Well
 from neusee.nodes.units import Gain
 
@@ -31,6 +32,12 @@ def saturated(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> S
     return Saturated(pixels, pixels / full.numel())
 
 
+@saturated.preflight
+def _(*, full_well: float, gain: float, bits: int = 16, **params: object) -> list[str]:
+    refuse_without_steps(full_well, gain=gain, bits=bits)
+    return []
+
+
 @saturated.check
 def _(result: Saturated, *inputs: Tensor, **params: Any) -> list[Check]:
     return [Check(f"{int(result.pixels)} saturated pixels, {float(result.share):.2%} of all pixels")]
@@ -38,6 +45,5 @@ def _(result: Saturated, *inputs: Tensor, **params: Any) -> list[Check]:
 
 def clipped(raw: Tensor, *, full_well: float, gain: float, bits: int) -> Tensor:
     """Return True for raw values in DN at the full well or at the largest output of the converter, and for NaN."""
-    full = int(full_well * gain - 0.5)
-    marked: Tensor = ~(raw < max(1, min(2**bits - 1, full)))  # NaN counts as clipped
+    marked: Tensor = ~(raw < clipping_number(full_well, gain, bits))  # NaN counts as clipped
     return marked

@@ -10,7 +10,8 @@ from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_half
 from neusee.nodes.optics import psf as focus
 from neusee.nodes.optics import pupil_has_large_steps
-from neusee.nodes.units import PositiveLength
+from neusee.nodes.optics._psf_definition import SensorSampling
+from neusee.nodes.units import FocalLength, PixelPitch
 from neusee.nodes.values import Bands, Psf, Pupil
 
 _SIDE = 256  #: pixels; the light within this square about the axis is compared
@@ -26,8 +27,9 @@ def spectral_error(
     illuminant: Tensor | None = None,
     responses: Tensor | None = None,
     *,
-    focal_length: PositiveLength,
-    pixel_pitch: PositiveLength,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
+    sensor: SensorSampling = "point",
 ) -> Tensor:
     """Estimate the error that the number of bands causes in the PSF of a white point, or of a laser line.
 
@@ -54,7 +56,7 @@ def spectral_error(
     few = few._replace(index=index, wavelengths=torch.cat([few.wavelengths, more]))
     limit = float(few.wavelengths.min()) * focal_length / (2 * float(few.pitch) * pixel_pitch)
     side = max(1, min(_SIDE, math.floor(2 * limit)))
-    lens = {"focal_length": focal_length, "pixel_pitch": pixel_pitch}
+    lens = {"focal_length": focal_length, "pixel_pitch": pixel_pitch, "sensor": sensor}
     found: Psf = focus(few, **lens, shape=(side, side), precision="double")
     light = found.intensity.flatten(1)
     whole, off = (_norms(w.to(light) @ light[: w.shape[1]]) for w in (weights, difference))

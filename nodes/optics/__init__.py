@@ -1,6 +1,7 @@
 """Optical nodes: stop, pupil function, point-spread function, image and laser spot."""
 
 from neusee.nodes.optics import _result_shapes  # noqa: F401  attaches the shape rules
+from neusee.nodes.optics._f_number import refuse_impossible_f_number
 from neusee.nodes.optics._imaging._band_image import image
 from neusee.nodes.optics._imaging._channel_image import image_channels
 from neusee.nodes.optics._imaging._few_bands import few_bands, few_bands_checked, pupil_of_bands
@@ -25,6 +26,7 @@ __all__ = [
     "pupil",
     "pupil_has_large_steps",
     "pupil_of_bands",
+    "refuse_impossible_f_number",
     "stop",
     "white_irradiance",
 ]

@@ -7,7 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.units import Angle, Fraction, PositiveLength, Shape
+from neusee.nodes.units import Angle, FocalLength, Fraction, PixelPitch, Shape
 
 _WIDEST = 1.0  #: rad; an angle counts as its direction cosine, which is below 1
 _SMALL = 0.01  #: relative difference of an angle and its sine, above which a note says the difference
@@ -18,8 +18,8 @@ Rule = Literal["width_over_focal_length", "focal_length_over_width"]
 def direction(
     *,
     angle: tuple[Angle, Angle] | None = None,
-    focal_length: PositiveLength,
-    pixel_pitch: PositiveLength,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
     shape: Shape,
     share: Fraction = 0.36,
     rule: Rule = "width_over_focal_length",

@@ -10,7 +10,7 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.sensor._saturation import Efficiency, Well, photons_that_fill, saturation
-from neusee.nodes.units import PositiveLength, Time
+from neusee.nodes.units import Exposure, PixelPitch
 from neusee.nodes.values import Bands, LaserLight, Psf
 
 Meaning = Literal["first_channel", "irradiance"]
@@ -27,20 +27,21 @@ def laser_irradiance(
     responses: Tensor | None = None,
     light: LaserLight | None = None,
     *,
-    strength: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None,
+    strength: Annotated[float, Field(ge=0, le=1e18)] | None = None,
     meaning: Meaning = "irradiance",
     full_well: Well,
     quantum_efficiency: Efficiency,
-    pixel_pitch: PositiveLength,
-    exposure: Time,
+    pixel_pitch: PixelPitch,
+    exposure: Exposure,
 ) -> Tensor:
     """Scale the PSF of a laser so that its peak behind the clear lens, on axis, is ``strength`` times saturation.
 
     By the meaning `first_channel` a laser of strength 1 fills the pixel at that peak in the channel that it fills
     first, at the nominal exposure. By the meaning `irradiance` of the paper that peak is the sum of I / I_sat over the
-    wavelengths of the line, before the channels. Without a strength the irradiance is that of the `light` in watts.
-    Each wavelength sends its share of the energy (``bands.weights``) through the pupil. The spot is added to the image
-    of the scene and is not convolved.
+    wavelengths of the line, before the channels. The nominal exposure is ``exposure``, at which a strength is defined;
+    a sensor that exposes longer collects more of the same light. Without a strength the irradiance is that of the
+    `light` in watts. Each wavelength sends its share of the energy (``bands.weights``) through the pupil. The spot is
+    added to the image of the scene and is not convolved.
 
     Shapes: psf.intensity (band, y, x), bands (band,), responses (channel, band) -> (band, y, x).
     Units:  result W/m2 of each sub-band, mean over the exposure; strength is a plain multiple.
@@ -164,12 +165,12 @@ def _(
     **sensor: float,
 ) -> list[Check]:
     wells = 1.0 / saturation(bands, **sensor)
-    peak = float(torch.tensordot(wells.to(result), result, 1).max())
+    peak = float(result.sum(0).max())
+    watts, at = f"peak of the spot {peak:.4g} W/m2", f"at the nominal exposure of {sensor['exposure']:g} s"
     if strength is not None:
-        return [Check(f"peak of the spot {peak:.3g} I_sat, strength {strength:g} I_sat", math.isfinite(peak))]
-    watts = f"peak of the spot {float(result.sum(0).max()):.4g} W/m2, {peak:.3g} I_sat"
+        return [Check(f"{watts}, strength {strength:g} {at}", math.isfinite(peak))]
     if light is None or (meaning == "first_channel" and (responses is None or not float(responses.max()) > 0)):
         return [Check(watts, math.isfinite(peak))]
     clear = light.peak / light.even_peak.clamp_min(1e-300) * light.flux / sensor["pixel_pitch"] ** 2
     strength = float(clear * unit(psf.clear_peak, bands, wells, responses, meaning))
-    return [Check(f"{watts}, which is a strength of {strength:.4g}", math.isfinite(peak))]
+    return [Check(f"{watts}, which is a strength of {strength:.4g} {at}", math.isfinite(peak))]

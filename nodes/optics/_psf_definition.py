@@ -5,12 +5,14 @@ gradient is independent too.
 """
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from neusee.nodes.values import Psf, Pupil
+
+SensorSampling = Literal["point", "integrated", "point_as_printed"]
 
 
 class Geometry(NamedTuple):
@@ -27,11 +29,14 @@ class Geometry(NamedTuple):
 def by_definition(pupil: Pupil, camera: Geometry) -> Psf:
     """Return the PSF of a pupil in float64, by one matrix of phases for each axis, band by band."""
     screens = {"height": pupil.height.new_zeros(()), "path": pupil.path.new_zeros(())}
-    clear = pupil._replace(amplitude=pupil.aperture, notches=pupil.notches[:0], **screens)
+    clear = pupil._replace(amplitude=pupil.aperture.detach(), notches=pupil.notches[:0], **screens)
     centre = camera._replace(shape=(1, 1), angle=(0.0, 0.0))
     count = range(len(pupil.wavelengths))
     peaks = [_intensity(clear, centre, band)[0, 0] for band in count]
-    return Psf(torch.stack([_intensity(pupil, camera, band) for band in count]), torch.stack(peaks).detach())
+    points = [_intensity(clear, centre._replace(sensor="point"), band)[0, 0] for band in count]
+    cut_off = (torch.stack(points) * (4 / math.pi)).sqrt()
+    sides = torch.full_like(cut_off, 1.0 if camera.sensor == "integrated" else 0.0)
+    return Psf(torch.stack([_intensity(pupil, camera, band) for band in count]), torch.stack(peaks), cut_off, sides)
 
 
 def _intensity(pupil: Pupil, camera: Geometry, band: int) -> Tensor:

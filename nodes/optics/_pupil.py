@@ -9,9 +9,17 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_half
 from neusee.nodes.optics._phase_steps import LARGE_STEPS, phase_steps
-from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, inside, opening, refuse_other_grid, stripes
-from neusee.nodes.optics._zernike import surface
-from neusee.nodes.units import Count, Length, Waves
+from neusee.nodes.optics._pupil_grid import (
+    PupilGrid,
+    axes,
+    clear_diameter,
+    grid_of,
+    opening,
+    refuse_other_grid,
+    stripes,
+)
+from neusee.nodes.optics._zernike import combine
+from neusee.nodes.units import Count, Height, Waves
 from neusee.nodes.values import Bands, Dirt, Pupil, Shade, Stop, Wavefront
 
 DEFOCUS_WAVELENGTH = 550e-9  #: m; the wavelength in which waves of defocus are counted
@@ -29,7 +37,7 @@ def pupil(
     shade: Shade | None = None,
     *,
     defocus: Waves = 0.0,
-    aberrations: dict[Count, Length] = {},  # noqa: B006 (read only)
+    aberrations: dict[Count, Height] = {},  # noqa: B006 (read only)
 ) -> Pupil:
     """Build the pupil function from stop, mask, defocus, aberrations, dirt and shade, all in one plane.
 
@@ -47,31 +55,58 @@ def pupil(
     """
     grid = grid_of(stop)
     _shapes(height, index, bands, grid, dirt, shade)
-    clear = opening(grid, height.dtype, height.device)
-    sag: float | Tensor = defocus * DEFOCUS_WAVELENGTH
-    if wavefront is not None and bool(wavefront.curvature):
-        sag = sag + wavefront.curvature.to(height.device) * grid.diameter**2 / 8
-    path = _lens_path(grid, sag, aberrations, height)
+    device = height.device
+    clear = opening(grid, height.dtype, device)
+    sag = defocus * DEFOCUS_WAVELENGTH + _beam_sag(grid, wavefront, device)
+    notches = torch.zeros(0, 3, dtype=torch.float64) if shade is None else shade.notches
+    return Pupil(
+        aperture=clear,
+        amplitude=_amplitude(grid, clear, dirt, wavefront, shade),
+        height=height,
+        path=_path(_lens_path(grid, sag, aberrations, height), dirt, height),
+        index=index,
+        wavelengths=bands.centres,
+        pitch=stop.pitch.to(device),
+        notches=notches.to(device),
+        diameter=clear_diameter(stop).to(device),
+    )
+
+
+def _beam_sag(grid: PupilGrid, wavefront: Wavefront | None, device: torch.device) -> float | Tensor:
+    """Return the path (m) by which the curvature of a beam differs from a plane wave at the rim of the stop."""
+    if wavefront is None or not bool(wavefront.curvature):
+        return 0.0
+    return wavefront.curvature.to(device) * grid.diameter**2 / 8
+
+
+def _path(lens: Tensor | None, dirt: Dirt | None, like: Tensor) -> Tensor:
+    """Return the path of lens and dirt together; None is a lens without a path of its own."""
+    if dirt is None:
+        return torch.zeros_like(like) if lens is None else lens
+    return dirt.path if lens is None else lens + dirt.path
+
+
+def _amplitude(
+    grid: PupilGrid, clear: Tensor, dirt: Dirt | None, wavefront: Wavefront | None, shade: Shade | None
+) -> Tensor:
+    """Return the amplitude behind dirt, the taper of the beam and shade; ``clear`` itself where none is there."""
+    amplitude = clear
     if dirt is not None:
-        path = dirt.path if path is None else path + dirt.path
-    if path is None:
-        path = torch.zeros_like(height)
-    amplitude = clear if dirt is None else clear * dirt.amplitude
+        amplitude = amplitude * dirt.amplitude
     if wavefront is not None and bool(wavefront.taper):
-        amplitude = amplitude * _taper(grid, wavefront.taper.to(height.device) * grid.diameter**2 / 4, height)
+        amplitude = amplitude * _taper(grid, wavefront.taper, clear)
     if shade is not None:
         amplitude = amplitude * shade.amplitude
-    notches = torch.zeros(0, 3, dtype=torch.float64) if shade is None else shade.notches
-    there = (each.to(height.device) for each in (stop.pitch, notches))
-    return Pupil(clear, amplitude, height, path, index, bands.centres, *there)
+    return amplitude
 
 
-def _taper(grid: PupilGrid, exponent: Tensor, like: Tensor) -> Tensor:
-    """Return the amplitude exp(-exponent r^2) of a Gaussian beam, with r = 1 at the rim of the stop."""
+def _taper(grid: PupilGrid, taper: Tensor, like: Tensor) -> Tensor:
+    """Return the amplitude (v, u) of a Gaussian beam with the ``taper`` (1/m2) of a `Wavefront`."""
+    exponent = taper.to(like.device) * grid.diameter**2 / 4  # at the rim of the stop, where v^2 + u^2 = 1
+    along_v, along_u = (torch.exp(-exponent * line.square()) for line in axes(grid, like.device))
     amplitude = torch.empty_like(like)
-    v, u = axes(grid, like.device)
     for rows in stripes(grid):
-        amplitude[rows] = torch.exp(-exponent * (v[rows].square() + u.square()))
+        amplitude[rows] = along_v[rows] * along_u
     return amplitude
 
 
@@ -79,13 +114,17 @@ def _lens_path(
     grid: PupilGrid, defocus: float | Tensor, aberrations: Mapping[int, float], like: Tensor
 ) -> Tensor | None:
     """Return the optical path of defocus and aberrations, or None for a lens without both; ``defocus`` is in m."""
-    if not bool(defocus) and not any(aberrations.values()):
+    bent = any(aberrations.values())
+    if not bool(defocus) and not bent:
         return None
-    path, device = torch.empty_like(like), like.device
-    v, u = axes(grid, device)
+    path = torch.empty_like(like)
+    v, u = axes(grid, like.device)
     for rows in stripes(grid):
-        bowl = torch.where(inside(grid, device, rows), v[rows].square() + u.square(), 0.0)
-        path[rows] = defocus * bowl + surface(aberrations, grid, device, rows)
+        square = v[rows].square() + u.square()
+        surface = defocus * square
+        if bent:
+            surface = surface + combine(aberrations, v[rows], u)
+        path[rows] = surface.masked_fill_(square > 1, 0.0)
     return path
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -12,7 +12,9 @@ from neusee.nodes.values import Stop
 
 _ALL = slice(None)
 _STRIPE = 1 << 16  #: samples of the pupil worked on at a time
-Aperture = Literal["inscribed", "clipped", "stretched"]
+_SAME = 1e-9  #: relative difference of two lengths that counts as rounding
+Aperture = Literal["held", "stretched", "inscribed", "clipped"]
+Number = TypeVar("Number", float, Tensor)
 
 
 class PupilGrid(NamedTuple):
@@ -28,22 +30,45 @@ def grid_of(stop: Stop) -> PupilGrid:
     return PupilGrid(int(stop.samples), float(stop.pitch), float(stop.diameter))
 
 
-def pupil_grid(samples: int, pitch: float, diameter: float, aperture: Aperture = "inscribed") -> PupilGrid:
-    """Return the pupil grid, with the diameter or the pitch adjusted if the aperture is wider than the grid.
+def pupil_grid(samples: int, pitch: float | None, diameter: float, aperture: Aperture = "held") -> PupilGrid:
+    """Return the pupil grid of an aperture; without a ``pitch`` the grid is as wide as the aperture.
 
-    `inscribed` narrows the disc to the grid, `clipped` lets the square grid cut the disc, `stretched` widens the pitch.
+    ``aperture`` says what happens where grid and aperture differ in width. `held`: a wider aperture is refused.
+    `stretched`: the pitch is changed so that the grid is as wide as the aperture. `inscribed`: a wider aperture is
+    narrowed to the grid. `clipped`: the square grid cuts a wider aperture.
 
-    Raises: ParameterError where no sample lies inside the aperture.
+    Raises: ParameterError where no sample lies inside the aperture, and for `held` where the aperture is wider than
+            the grid.
     """
-    if aperture == "stretched":
+    if pitch is None or (aperture == "stretched" and not math.isclose(samples * pitch, diameter, rel_tol=_SAME)):
         return PupilGrid(samples, diameter / samples, diameter)
+    span = samples * pitch
     nearest = 0.0 if samples % 2 else pitch * math.sqrt(0.5)
     if diameter < 2 * nearest:
         needed = f"{2 * nearest * 1e6:.3g} um"
         raise ParameterError(
             "diameter", f"{diameter * 1e6:.3g} um holds no pupil sample: give {needed} or more, or a finer pitch"
         )
-    return PupilGrid(samples, pitch, diameter if aperture == "clipped" else min(diameter, samples * pitch))
+    if aperture == "held" and is_wider(diameter, span):
+        text = f"{millimetres(diameter)} is wider than the pupil grid of {samples} x {pitch * 1e6:.4g} um"
+        fix = f"give samples: {math.ceil(diameter / pitch * (1 - _SAME))}, leave the pitch out, or choose"
+        raise ParameterError("diameter", f"{text} = {millimetres(span)}: {fix} aperture: stretched")
+    return PupilGrid(samples, pitch, diameter if aperture == "clipped" else min(diameter, span))
+
+
+def is_wider(diameter: float, span: float) -> bool:
+    """Return True if an aperture is wider than a grid by more than rounding."""
+    return diameter > span * (1 + _SAME)
+
+
+def millimetres(length: float) -> str:
+    """Return a length as text in mm with four digits."""
+    return f"{length * 1e3:.4g} mm"
+
+
+def clear_diameter(stop: Stop) -> Tensor:
+    """Return the diameter of the clear aperture along the axes, which the grid may cut: () float64, m."""
+    return torch.minimum(stop.diameter.double(), stop.samples * stop.pitch.double())
 
 
 def clear_area(stop: Stop) -> float:
@@ -55,6 +80,37 @@ def clear_area(stop: Stop) -> float:
         return 4 * half**2
     angle = math.acos(half / radius)
     return math.pi * radius**2 - 4 * (radius**2 * angle - half * math.sqrt(radius**2 - half**2))
+
+
+def gaussian_over(stop: Stop, width: Number) -> Number:
+    """Return the integral of exp(-(r / width)^2) over the clear pupil in m2, with r from the axis.
+
+    The pupil is the disc of the stop, cut by the square of the grid where the disc is wider. Integrated over r in
+    closed form, and over one eighth of the azimuth by Gauss and Legendre, to 1e-13. A tensor receives its gradient.
+    """
+    radius, half = float(stop.diameter) / 2, float(stop.samples * stop.pitch) / 2
+    if half >= radius:
+        return math.pi * width**2 * _share_within(radius, width)
+    corner = min(math.acos(half / radius), math.pi / 4)
+    straight = corner / 2 * sum(weight * _share_within(edge, width) for edge, weight in _edges(half, corner))
+    curved = (math.pi / 4 - corner) * _share_within(radius, width)
+    whole: Number = 4 * width**2 * (straight + curved)
+    return whole
+
+
+def _share_within(radius: float, width: Number) -> Number:
+    """Return 1 - exp(-(radius / width)^2), exact where it is small."""
+    square = (radius / width) ** 2
+    share: Number = -torch.expm1(-square) if isinstance(square, Tensor) else -math.expm1(-square)
+    return share
+
+
+def _edges(half: float, corner: float) -> list[tuple[float, float]]:
+    """Return the distances of a straight edge of the grid from the axis, up to a corner angle, with their weights."""
+    import numpy as np
+
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    return list(zip((half / np.cos(corner * (nodes + 1) / 2)).tolist(), weights.tolist(), strict=True))
 
 
 def axes(grid: PupilGrid, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
@@ -79,8 +135,9 @@ def inside(grid: PupilGrid, device: torch.device | None = None, rows: slice = _A
 def opening(grid: PupilGrid, dtype: torch.dtype, device: torch.device | None = None) -> Tensor:
     """Return the transmission (v, u) of the stop: 1 inside, 0 outside."""
     clear = torch.empty(grid.samples, grid.samples, dtype=dtype, device=device)
+    v, u = (line.square() for line in axes(grid, device))
     for rows in stripes(grid):
-        clear[rows] = inside(grid, device, rows)
+        clear[rows] = v[rows] + u <= 1
     return clear
 
 

@@ -10,14 +10,17 @@ from neusee.nodes.optics._imaging._channel_image import image_channels
 from neusee.nodes.optics._imaging._few_bands import few_bands, few_bands_checked, pupil_of_bands
 from neusee.nodes.optics._laser_direction import direction
 from neusee.nodes.optics._laser_spot import laser_irradiance
-from neusee.nodes.optics._psf import _nodes, psf
+from neusee.nodes.optics._pixel_average import FINE_SAMPLES, fine_axes
+from neusee.nodes.optics._psf import psf
 from neusee.nodes.optics._pupil import pupil
+from neusee.nodes.optics._pupil_grid import clear_diameter
 from neusee.nodes.optics._transform._fused_plan import expected_seconds
 from neusee.nodes.optics._transform._sample_axis import Axis
 from neusee.nodes.optics._white_irradiance import white_irradiance
 from neusee.nodes.shape_rules import at_least_single, blank, double, known, transform_operations
 from neusee.nodes.values import Bands, Channels, FewBands, LowRankCube, Psf, Pupil, Stop, Wavefront
 
+_FILTER_SECONDS = 1.2e-9  #: of one thread, to write a sample of the intensity and to filter it
 _SHORT, _FINE = 400e-9, 4e-6  #: m, wavelength and pupil pitch where no value is known
 
 
@@ -37,15 +40,15 @@ def _(
     wave = double(len(bands.centres))
     even = wavefront is None or (known(wavefront.taper) and not float(wavefront.taper))
     open_ = clear if dirt is None and shade is None and even else amplitude
-    found = Pupil(clear, open_, relief, path, wave, bands.centres, stop.pitch)
-    return found if shade is None else found._replace(notches=shade.notches)
+    notches = double(0, 3) if shade is None else shade.notches
+    return Pupil(clear, open_, relief, path, wave, bands.centres, stop.pitch, notches, clear_diameter(stop))
 
 
 @psf.shape
 def _(pupil: Pupil, *direction: Any, shape: tuple[int, int], precision: str = "single", **params: Any) -> Psf:
     dtype = torch.float64 if precision == "double" else torch.float32
     bands = len(pupil.wavelengths)
-    return Psf(blank(bands, *shape, dtype=dtype), double(bands))
+    return Psf(blank(bands, *shape, dtype=dtype), double(bands), double(bands), double(bands))
 
 
 @psf.work
@@ -55,11 +58,19 @@ def _(result: Psf, pupil: Pupil, *direction: Any, focal_length: float, pixel_pit
     pitch = float(pupil.pitch) if known(pupil.pitch) else _FINE
     alpha = pitch * pixel_pitch / (wavelength * focal_length)
     bands, *size = result.intensity.shape
-    axes = [Axis(n, k, alpha) for n, k in zip(pupil.height.shape, size, strict=True)]
-    integrated = params.get("sensor") == "integrated"
-    views = len(_nodes(max(pupil.height.shape) * alpha)[0]) ** 2 if integrated else 1
-    field = 8.0 * (pupil.height.numel() + axes[0].n_in * axes[1].n_out)
-    return field, bands * views * 1e9 * expected_seconds(*axes)
+    samples = (pupil.height.shape[0], pupil.height.shape[1])
+    points = [Axis(n, k, alpha) for n, k in zip(samples, size, strict=True)]
+    if params.get("sensor") != "integrated":
+        return _field_bytes(points), bands * 1e9 * expected_seconds(*points)
+    fine = fine_axes(samples, (size[0], size[1]), alpha, result.intensity.dtype)
+    axes = [Axis(n, grid.samples, alpha / grid.per_pixel) for n, grid in zip(samples, fine, strict=True)]
+    average = _FILTER_SECONDS * axes[0].n_out * axes[1].n_out
+    strip = 8.0 * min(FINE_SAMPLES, axes[0].n_out * axes[1].n_out)
+    return _field_bytes(axes) + strip, bands * 1e9 * (expected_seconds(*axes) + average)
+
+
+def _field_bytes(axes: list[Axis]) -> float:
+    return 8.0 * axes[0].n_in * (axes[1].n_in + axes[1].n_out)
 
 
 @image.shape

@@ -9,7 +9,14 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.optics._pupil_grid import clear_area
 from neusee.nodes.spectra._illuminant import Kind, luminous_share
-from neusee.nodes.units import DataFile, Illuminance, Luminance, PositiveLength, Temperature, Transmittance
+from neusee.nodes.units import (
+    DataFile,
+    FocalLength,
+    Illuminance,
+    Luminance,
+    Temperature,
+    Transmittance,
+)
 from neusee.nodes.values import Bands, Stop
 
 _EQUAL = 1e-6  #: largest relative difference of widths of bands that count as equal
@@ -24,7 +31,7 @@ def white_irradiance(
     luminance: Luminance | None = None,
     kind: Kind | DataFile = "daylight",
     temperature: Temperature = 6504.0,
-    focal_length: PositiveLength,
+    focal_length: FocalLength,
     lens_transmittance: Transmittance = 1.0,
 ) -> Tensor:
     """Compute the irradiance of one band on the sensor, for a scene of relative radiance 1 without a mask.

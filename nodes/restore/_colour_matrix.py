@@ -11,7 +11,7 @@ from neusee.nodes.scene._grey import luminance
 from neusee.nodes.sensor._exposure import channel_weights
 from neusee.nodes.sensor._saturation import Efficiency
 from neusee.nodes.spectra._spectral_tables import paints, to_srgb
-from neusee.nodes.units import PositiveLength, Time
+from neusee.nodes.units import Exposure, PixelPitch
 from neusee.nodes.values import Bands
 
 
@@ -22,8 +22,8 @@ def colour_matrix(
     responses: Tensor,
     level: Tensor,
     *,
-    pixel_pitch: PositiveLength,
-    exposure: Time,
+    pixel_pitch: PixelPitch,
+    exposure: Exposure,
     quantum_efficiency: Efficiency,
 ) -> Tensor:
     """Compute the matrix from electrons to linear sRGB with the least mean square error over measured paints.
@@ -62,16 +62,21 @@ def _(result: Tensor, *inputs: Any, **params: float) -> list[Check]:
 
 @colour_matrix.propagate_error
 def _(bands: ErrorBound, illuminant: ErrorBound, responses: ErrorBound, level: ErrorBound, **params: Any) -> float:
-    """Return an error bound of the matrix, which is inversely proportional to the factor `level`."""
+    """Return an error bound of the matrix, which is inversely proportional to the factor `level`.
+
+    An error of the level that differs from band to band changes the matrix in other ways, so that it has no bound.
+    """
     result: TensorStats = params["result"]
     if any(given.rms for given in (bands, illuminant, responses)) or level.share >= 1.0:
         return math.inf
-    return level.share / (1.0 - level.share) * max(abs(result.min), abs(result.max))
+    if level.rms and (level.stats is None or level.stats.min < level.stats.max):
+        return math.inf
+    return level.share / (1.0 - level.share) * result.largest_rms
 
 
 @colour_matrix.expected_range
 def _(*inputs: Any, **params: Any) -> tuple[float, float]:
-    """Return a range whose size does not matter: the error of the matrix is relative to its largest element."""
+    """Return a range whose size does not matter: the colours are relative to the largest element of the matrix."""
     return 0.0, 1.0
 
 

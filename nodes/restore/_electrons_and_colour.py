@@ -1,20 +1,24 @@
 """Nodes that convert digital numbers to electrons, and electrons to colour."""
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import ErrorBound, TensorStats, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.metrics._saturated_pixels import clipped as at_the_end
 from neusee.nodes.sensor._digitization import Bits
+from neusee.nodes.sensor._room_for_light import refuse_without_steps
 from neusee.nodes.sensor._saturation import Well
 from neusee.nodes.units import Electrons, Gain
 from neusee.nodes.values import Shading
 
-_GAIN = 2.0  #: relative error of the colours over that of the channels; at most 1.6 in first_light
+Brightness = Annotated[float, Field(gt=0, le=1e18)]
+_GAIN = 2.0  #: relative error of the colours over that of the channels, for errors that are like the light
+_BRIGHTEST = 0.5  #: brightest colour over largest weight and brightest channel: 0.25 to 0.6 in shipped recipes
 
 
 @node()
@@ -68,9 +72,18 @@ def clipped(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Ten
     return at_the_end(raw, full_well=full_well, gain=gain, bits=bits)
 
 
+@clipped.preflight
+def _(*, full_well: float, gain: float, bits: int = 16, **params: object) -> list[str]:
+    refuse_without_steps(full_well, gain=gain, bits=bits)
+    return []
+
+
 @node()
-def colour(channels: Tensor, matrix: Tensor) -> Tensor:
+def colour(channels: Tensor, matrix: Tensor, *, brightness: Brightness = 1.0) -> Tensor:
     """Convert the channels of the sensor to linear sRGB by a colour matrix.
+
+    ``brightness`` multiplies the picture: 1 over the share of the light that a filter passes gives a picture behind
+    this filter an exposure of its own.
 
     Shapes: channels (..., channel, y, x), matrix (3, channel) -> (..., 3, y, x).
     Units:  channels e-; result linear sRGB, white 1; colours out of gamut below 0.
@@ -84,13 +97,13 @@ def colour(channels: Tensor, matrix: Tensor) -> Tensor:
             "compute both from the same `responses` step"
         )
     channels = single(channels)
-    flat = matrix.to(channels) @ channels.flatten(-2)
+    flat = brightness * matrix.to(channels) @ channels.flatten(-2)
     return flat.reshape(*flat.shape[:-1], *channels.shape[-2:])
 
 
 @colour.reference
-def _(channels: Tensor, matrix: Tensor) -> Tensor:
-    return torch.stack(
+def _(channels: Tensor, matrix: Tensor, *, brightness: float = 1.0) -> Tensor:
+    return brightness * torch.stack(
         [sum(m * c for m, c in zip(row, channels.double().unbind(-3), strict=True)) for row in matrix], -3
     )
 
@@ -108,6 +121,18 @@ def _(channels: ErrorBound, matrix: ErrorBound, *, result: TensorStats, **params
 colour.hooks.estimated = True
 
 
+@colour.propagate_scattered
+def _(
+    channels: ErrorBound, matrix: ErrorBound, *, result: TensorStats, brightness: float = 1.0, **params: Any
+) -> float:
+    """Return a bound of the error by noise in the channels, which the matrix enlarges by its Frobenius norm at most."""
+    if channels.stats is None or matrix.stats is None:
+        return math.inf
+    # Frobenius norm over root mean square, times the root of channels over colours
+    return brightness * matrix.stats.shape[-1] * (matrix.stats.largest_rms + matrix.rms) * channels.rms
+
+
 @colour.expected_range
-def _(*inputs: Any) -> tuple[float, float]:
-    return 0.0, 1.0
+def _(channels: TensorStats, matrix: TensorStats, *, brightness: float = 1.0) -> tuple[float, float]:
+    """Return the brightest colour relative to matrix and channels, as in photographs in daylight."""
+    return 0.0, brightness * _BRIGHTEST * max(channels.max, -channels.min) * max(matrix.max, -matrix.min)

@@ -60,7 +60,7 @@ def _(raw: Tensor, **params: Any) -> Tensor:
 
 
 @colour.shape
-def _(channels: Tensor, matrix: Tensor) -> Tensor:
+def _(channels: Tensor, matrix: Tensor, **params: Any) -> Tensor:
     return blank(*channels.shape[:-3], 3, *channels.shape[-2:], dtype=at_least_single(channels))
 
 

@@ -9,13 +9,14 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
+from neusee.nodes.restore._colour_matrix import colour_matrix
 from neusee.nodes.restore._inverse._grey_psf import effective_psf
 from neusee.nodes.sensor._exposure import channel_weights
 from neusee.nodes.sensor._saturation import Efficiency, Well
-from neusee.nodes.units import PositiveLength, Time
+from neusee.nodes.units import Exposure, PixelPitch
 from neusee.nodes.values import Bands, MeasuredPsf, Psf
 
-White = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+White = Annotated[float, Field(ge=1e-30, le=1e30)]
 _BRIGHT = 0.995  #: quantile of the unclipped pixels that counts as white
 _SAMPLE = 2**22  #: pixels whose quantile is taken, at most
 
@@ -28,22 +29,26 @@ def white_level(
     bands: Bands,
     illuminant: Tensor,
     responses: Tensor,
+    restored: Tensor | None = None,
     *,
     white: White | None = None,
     full_well: Well,
     quantum_efficiency: Efficiency,
-    pixel_pitch: PositiveLength,
-    exposure: Time,
+    pixel_pitch: PixelPitch,
+    exposure: Exposure,
 ) -> Tensor:
     """Compute the level of the light in a frame of an unknown scene, so that `restore.colour_matrix` knows its white.
 
-    A white surface gives ``white`` full wells in the brightest channel. Without ``white``, the pixel at the 99.5 %
-    quantile of the unclipped pixels counts as white. This choice sets how bright the picture is shown and nothing else.
+    A white surface gives ``white`` full wells in the brightest channel. Without ``white``, a quantile counts as white:
+    in the channels of the ``restored`` picture, that of 99.5 % of the unclipped pixels by their brightest colour, so
+    that 0.5 % of these pixels are brighter than 1 in the picture; without it, that of the frame by its brightest
+    channel. This choice sets how bright the picture is shown and nothing else.
 
-    Shapes: signal and clipped (channel, y, x), psf (band,) or measured, illuminant (band,), responses (channel, band)
-            -> (band,) float64.
-    Units:  signal e-; white full wells; result W/m2 per unit of the illuminant, as `sensor.level`.
-    Error:  a choice, not a measurement: a scene without white is shown too bright, and a blurred one too bright too.
+    Shapes: signal, clipped and restored (channel, y, x), psf (band,) or measured, illuminant (band,), responses
+            (channel, band) -> (band,) float64.
+    Units:  signal and restored e-; white full wells; result W/m2 per unit of the illuminant, as `sensor.level`.
+    Error:  a choice, not a measurement: a scene without white is shown too bright. In the frame a blurred scene is
+            darker than it is, so that its restored picture would be shown too bright.
     Raises: ValueError where bands or channels differ.
     Source: white-patch assumption, Land and McCann, J. Opt. Soc. Am. 61, 1 (1971), with a quantile for the maximum.
     """
@@ -53,13 +58,22 @@ def white_level(
     counts = weights.sum(-1) * quantum_efficiency
     if white is not None:
         return one * (white * full_well / float(counts.max()))
+    if restored is not None:
+        light_of = {"pixel_pitch": pixel_pitch, "exposure": exposure, "quantum_efficiency": quantum_efficiency}
+        matrix = colour_matrix(bands, illuminant, responses, one, **light_of)
+        brightness = (matrix.to(restored.device) @ single(restored).double().flatten(-2)).amax(-2)
+        return one * _bright_quantile(brightness.reshape(restored.shape[-2:]), clipped)
     passed = _passed(psf, bands, illuminant, responses)
     whole = (counts * passed).clamp_min(1e-300).to(signal.device)
-    known = ~clipped.any(-3)
-    shown = (single(signal).double() / whole[:, None, None]).amax(-3)
-    found = shown[known] if bool(known.any()) else shown.flatten()
-    sample = found[:: max(1, len(found) // _SAMPLE)]
-    return one * torch.quantile(sample, _BRIGHT).clamp_min(1e-300).cpu()
+    return one * _bright_quantile((single(signal).double() / whole[:, None, None]).amax(-3), clipped)
+
+
+def _bright_quantile(brightness: Tensor, clipped: Tensor) -> Tensor:
+    """Return the quantile of the unclipped pixels (y, x) that counts as white, or of all if all are clipped."""
+    unclipped = ~clipped.any(-3)
+    pixels = brightness[unclipped] if bool(unclipped.any()) else brightness.flatten()
+    sample = pixels[:: max(1, len(pixels) // _SAMPLE)]
+    return torch.quantile(sample, _BRIGHT).clamp_min(1e-300).cpu()
 
 
 def _passed(psf: Psf | MeasuredPsf, bands: Bands, illuminant: Tensor, responses: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from neusee.nodes.scene._large_picture import Linear, bands_of, linear_light
 from neusee.nodes.scene._spectral_exr import PartHeader, exr_parts, part_headers
 from neusee.nodes.units import DataFile, Shape
 
-White = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+White = Annotated[float, Field(ge=1e-30, le=1e30)]
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  #: of a file whose header has no primaries
 
 

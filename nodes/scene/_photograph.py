@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.input_files import once_per_version, refuse_large_picture
-from neusee.nodes.scene._crop_to_frame import enlarged, framed
+from neusee.nodes.scene._crop_to_frame import DrawnCrop, drawn_crop, enlarged, framed
 from neusee.nodes.scene._large_picture import Codes, linear_light
 from neusee.nodes.units import DataFile, Shape
 
@@ -22,8 +22,11 @@ _ROTATED = range(5, 9)  #: EXIF orientations that exchange width and height
 
 
 @node(rtol=1e-5)
-def photograph(*, file: DataFile, shape: Shape | None = None) -> Tensor:
+def photograph(*, file: DataFile, shape: Shape | None = None, crop: DrawnCrop | None = None) -> Tensor:
     """Read a photograph as linear light: decode the sRGB curve, turn the picture upright, then scale and crop.
+
+    ``crop`` has a seed and the number of a scene: the part of the photograph that an evaluation with this seed shows in
+    this scene, at full size, in place of the scaled centre.
 
     Shapes: -> (3, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped at the centre).
     Units:  linear sRGB, 1 = the white of the file.
@@ -33,17 +36,24 @@ def photograph(*, file: DataFile, shape: Shape | None = None) -> Tensor:
             and for more than 64 million pixels.
     Source: IEC 61966-2-1:1999 (sRGB); EXIF 2.3, tag Orientation.
     """
-    return linear_light(_codes(file), _linear, shape)
+    if crop is None or shape is None:
+        return linear_light(_codes(file), _linear, shape)
+    return drawn_crop(linear_light(_codes(file), _linear, None), (shape[0], shape[1]), *crop)
 
 
 @photograph.reference
-def _(*, file: Path, shape: Shape | None = None) -> Tensor:
+def _(*, file: Path, shape: Shape | None = None, crop: DrawnCrop | None = None) -> Tensor:
     codes = _scaled(_codes(file)).double()
-    return framed(torch.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4), shape)
+    linear = torch.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+    if crop is None or shape is None:
+        return framed(linear, shape)
+    return drawn_crop(linear, (shape[0], shape[1]), *crop)
 
 
 @photograph.preflight
-def _(*, file: Path, shape: Shape | None = None) -> list[str]:
+def _(*, file: Path, shape: Shape | None = None, crop: DrawnCrop | None = None) -> list[str]:
+    if crop is not None and shape is None:
+        raise ParameterError("crop", "the part of a photograph has no size: give shape, such as [768, 768]")
     profile, turned, size = read_header(file)
     if problem := _damage(file):
         raise ParameterError("file", problem)

@@ -11,14 +11,15 @@ import numpy as np
 from torch import Tensor
 
 from neusee.nodes import ParameterError
-from neusee.nodes.bicubic_resize import resize
-from neusee.nodes.scene._crop_to_frame import covering
+from neusee.nodes.input_files import file_version
+from neusee.nodes.scene._crop_to_frame import drawn_crop
 from neusee.nodes.scene._photograph import photograph, read_header
 
+__depends__ = ["unaffected:_pictures"]  #: what is in memory changes no result
 _PICTURES = frozenset({".png", ".jpg", ".jpeg", ".jpe", ".webp", ".tif", ".tiff", ".bmp", ".gif"})
 _ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}  #: first bytes of a format -> end mark of a file of this format
 _TAIL = 1 << 16  #: bytes at the end of a file that must contain the end mark: some cameras write more after it
-_ORDER, _PART, _DRAW = 0, 1, 2  #: random streams of one seed
+_ORDER, _DRAW = 0, 2  #: random streams of one seed; the position of a part is another
 _KEPT = 1 << 30  #: bytes of decoded photographs that a process keeps
 _TRIES = 100  #: broken photographs in a row, after which drawing stops with an error
 
@@ -68,26 +69,25 @@ def choose_photograph(paths: Sequence[Path], seed: int, index: int) -> Path:
 def crop_photograph(path: Path, shape: tuple[int, int], seed: int, index: Index) -> Tensor:
     """Crop a photograph, linear sRGB (3, y, x), at a position that depends only on the seed and the index.
 
-    A smaller photograph is first enlarged by the bicubic kernel in linear light until it just covers ``shape``;
-    negative results of the kernel become black.
+    A smaller photograph is enlarged first, as `drawn_crop` does. ``scene.photograph`` with ``crop`` gives the same.
     """
-    picture = _decoded(path)
-    size = (picture.shape[-2], picture.shape[-1])
-    if any(have < want for have, want in zip(size, shape, strict=True)):
-        size = covering(size, shape)
-        picture = resize(picture, *size).clamp_min(0.0)
-    draw = np.random.default_rng([seed, _PART, *_indices(index)])
-    top, left = (int(draw.integers(0, have - want + 1)) for have, want in zip(size, shape, strict=True))
-    return picture[:, top : top + shape[0], left : left + shape[1]].contiguous()
+    return drawn_crop(_decoded(path), shape, seed, index)
 
 
-_pictures: dict[Path, Tensor] = {}  #: the decoded photographs, the last used one last
+_pictures: dict[tuple[int, ...], Tensor] = {}  #: the decoded photographs by version, the last used one last
 
 
 def _decoded(path: Path) -> Tensor:
-    """Return a photograph as linear sRGB (3, y, x), from memory if it is one of the last that were used."""
-    picture: Tensor = _pictures.pop(path) if path in _pictures else photograph(file=path)
-    _pictures[path] = picture
+    """Return a photograph as linear sRGB (3, y, x), from memory if it is one of the last that were used.
+
+    A photograph that has changed since is decoded again, whatever its name.
+    """
+    version = file_version(path)
+    if version is None:
+        just_changed: Tensor = photograph(file=path)
+        return just_changed
+    picture: Tensor = _pictures.pop(version) if version in _pictures else photograph(file=path)
+    _pictures[version] = picture
     while len(_pictures) > 1 and sum(map(_size, _pictures.values())) > _KEPT:
         del _pictures[next(iter(_pictures))]
     return picture

@@ -26,7 +26,7 @@ def _(*, shape: Size, **params: Any) -> Tensor:
 
 
 @photograph.shape
-def _(*, file: Path, shape: Size | None = None) -> Tensor:
+def _(*, file: Path, shape: Size | None = None, **params: Any) -> Tensor:
     return blank(3, *(shape or read_header(file)[2]))
 
 

@@ -10,14 +10,33 @@ from torch import Generator, Tensor
 
 from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import single
+from neusee.nodes.sensor._draw_limits import rare_events
+from neusee.nodes.sensor._room_for_light import refuse_below_one_electron
 from neusee.nodes.sensor._saturation import Well
 from neusee.nodes.torch_func import transformed
 from neusee.nodes.units import Gain, Shape
 
 Rounding = Literal["nearest", "dithered_floor", "truncation"]
-_SURE = math.log(1e4)  #: negative logarithm of the probability that more pixels change than an estimate says
 _BLOCK = 2**18  #: pixels that are converted at a time, so that their float64 numbers stay in the cache of the processor
 Bits = Annotated[int, Field(ge=1, le=16)]
+
+
+def clipping_number(full_well: float, gain: float, bits: int) -> int:
+    """Return the smallest digital number that counts as clipped: of a full well, or the largest of the converter."""
+    return max(1, min((1 << bits) - 1, int(full_well * gain - 0.5)))
+
+
+def electrons_to_clip(full_well: float, gain: float, bits: int, offset: float = 0.0) -> float:
+    """Return the electrons of light that fill a pixel: its digital number, rounded to the nearest, counts as clipped.
+
+    The converter may end below the full well, and an ``offset`` that is added before uses a part of it.
+
+    Shapes: scalars.
+    Units:  full_well, offset and result e-; gain DN/e-.
+    Error:  exact without noise and dark current; 0 or less where the offset alone fills a pixel.
+    Source: NeuSee, Eq. (SensorImage).
+    """
+    return (clipping_number(full_well, gain, bits) - 0.5) / gain - offset
 
 
 @node(rtol=0.0)
@@ -142,29 +161,18 @@ def _(rms: float, *, result: TensorStats, **params: Any) -> float:
     """Return an estimate of the rms error in DN after rounding.
 
     A small error e (DN) moves a value across the edge between two numbers with the probability e, and changes its
-    number by 1: the mean square grows by e - e^2, and by 1/4 at most. This holds where noise spreads the values over at
-    least one number. An even area without noise may change as a whole, by one number more.
+    number by 1: the mean square grows by e - e^2, and by 1/4 at most. The number of such pixels is that which one of
+    10 000 pictures exceeds. This holds where noise spreads the values over at least one number. An even area without
+    noise may change as a whole, by one number more.
     """
     pixels = max(1, math.prod(result.shape))
     share = rms * (1.0 - rms) if rms < 0.5 else 0.25
-    return math.sqrt(rms**2 + _seldom_more(share * pixels) / pixels)
-
-
-def _seldom_more(mean: float) -> float:
-    """Return the number of independent rare events, ``mean`` in the mean, that is exceeded in one of 10 000 cases.
-
-    Source: union bound for few events; Bernstein's inequality: Boucheron, Lugosi and Massart, Concentration
-    Inequalities, section 2.7 (2013).
-    """
-    most, chance = 0, mean  # P(more than n events) <= mean^(n + 1) / (n + 1)!
-    while mean < 1.0 and chance > math.exp(-_SURE):
-        most += 1
-        chance *= mean / (most + 1)
-    return most if mean < 1.0 else mean + math.sqrt(2.0 * mean * _SURE) + 2.0 / 3.0 * _SURE
+    return math.sqrt(rms**2 + rare_events(share * pixels) / pixels)
 
 
 @digitize.preflight
 def _(*, gain: float, bits: int = 16, **params: object) -> list[str]:
+    refuse_below_one_electron(gain=gain, bits=bits)
     top = 2**bits - 1
     return [f"the largest digital number is {top} DN = {top / gain:.0f} e-"]
 

@@ -13,10 +13,10 @@ from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import refuse_not_finite, single
 from neusee.nodes.sensor._channel_sums import weighted
 from neusee.nodes.sensor._saturation import Efficiency, Well, photons_per_joule, photons_that_fill, saturation
-from neusee.nodes.units import PositiveLength, Time
+from neusee.nodes.units import Exposure, PixelPitch
 from neusee.nodes.values import Bands, Channels
 
-Strength = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: multiple of the exposure that saturates a pixel
+Strength = Annotated[float, Field(ge=0, le=1e18)]  #: multiple of the exposure that saturates a pixel
 
 
 @node(accepts_channel_sums=("irradiance",), needs_band_invariant=("level",))
@@ -26,8 +26,8 @@ def expose(
     responses: Tensor,
     level: Tensor | None = None,
     *,
-    pixel_pitch: PositiveLength,
-    exposure: Time,
+    pixel_pitch: PixelPitch,
+    exposure: Exposure,
 ) -> Tensor:
     """Compute the photons in each colour channel of each pixel from the irradiance in each band.
 
@@ -74,10 +74,15 @@ def _(result: Tensor, *inputs: object, **params: object) -> list[Check]:
 def _(irradiance: ErrorBound, *others: ErrorBound | None, result: TensorStats, **params: Any) -> float:
     """Return an error bound of the photons from the relative errors of the irradiance and of the factor `level`.
 
-    No channel has a larger relative error, because light is not negative.
+    No channel has a larger relative error, because the share of `Channels` holds for each of its rows. The errors of
+    the two factors multiply too. Bands of an image have no such share: a channel may see only the darker ones,
+    and the error is unknown.
     """
+    if irradiance.rms and irradiance.peak is None:
+        return math.inf
     level = others[2] if len(others) > 2 else None
-    return (irradiance.share + (level.share if level else 0.0)) * result.max
+    light, factor = irradiance.share, level.share if level else 0.0
+    return (light + factor + light * factor) * max(abs(result.min), abs(result.max))
 
 
 def channel_weights(
@@ -105,8 +110,8 @@ def level(
     strength: Strength | None = None,
     full_well: Well,
     quantum_efficiency: Efficiency,
-    pixel_pitch: PositiveLength,
-    exposure: Time,
+    pixel_pitch: PixelPitch,
+    exposure: Exposure,
     rule: Literal["channel_sum", "per_band"] = "channel_sum",
 ) -> Tensor:
     """Compute the factor that scales an image to irradiance, so that the brightest pixel has ``strength`` full wells.
@@ -156,9 +161,14 @@ def _(params: Mapping[str, Any]) -> bool:
 
 @level.propagate_error
 def _(plain_image: ErrorBound, *others: object, result: TensorStats, **params: Any) -> float:
-    """Return an error bound of the scale factor `level` from the error of the brightest pixel of the image."""
+    """Return an error bound of the scale factor `level` from the error of the brightest pixel of the image.
+
+    The brightest pixels of single bands may be off by more.
+    """
     if params["strength"] is None:
         return 0.0
+    if params.get("rule", "channel_sum") == "per_band":
+        return math.inf
     share = plain_image.largest
     return result.max * share / (1.0 - share) if share < 1.0 else math.inf
 

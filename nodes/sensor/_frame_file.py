@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -12,37 +12,43 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.input_files import once_per_version, refuse_large_array, refuse_large_picture
 from neusee.nodes.sensor._digitization import Bits
+from neusee.nodes.sensor._tone_curve import tone_curve_sign
 from neusee.nodes.units import DataFile, Shape
 
+Curve = Literal["linear"]  #: what a user states of the tone curve of numbers that have a sign of one
 _DAMAGED = "{name} is damaged or no picture ({error}): copy the file again"
+_STATE = "frame.curve=linear"
 _COLOURS = {0: 1, 2: 3}  #: channels of a PNG by its colour type
 _ARRAY = "(y, x), (y, x, 3) or (3, y, x)"
 
 
 @node(rtol=0.0)
-def frame(responses: Tensor, *, file: DataFile, shape: Shape, bits: Bits = 16) -> Tensor:
+def frame(responses: Tensor, *, file: DataFile, shape: Shape, bits: Bits = 16, curve: Curve | None = None) -> Tensor:
     """Read a frame that a camera took: the digital numbers of each channel, unchanged.
 
     The file is a PNG or TIFF of 8 or 16 bits, an OpenEXR picture, or a NumPy array. No tone curve is undone: the
     numbers must be those of the converter, from 0 to 2**bits - 1, so that `restore.electrons` can divide them by the
-    gain and subtract the offset of the sensor.
+    gain and subtract the offset of the sensor. A file with a sign of a tone curve (8 bits, a stated gamma, a colour
+    profile, 8 bits stretched to 16) is refused, unless ``curve`` states that its numbers are linear in the light.
 
     Shapes: responses (channel, band), of which only the number of channels counts -> (channel, y, x) float32.
     Units:  DN.
     Error:  none: whole numbers are exact. An orientation in EXIF is ignored, as the sensor does not turn.
     Raises: ParameterError before the run for a file that is damaged or of another format, and for a size, channels,
-            depth or numbers that do not fit the sensor.
+            depth or numbers that do not fit the sensor, and for a sign of a tone curve without a statement.
     Source: EMVA Standard 1288, release 4.0 (digital numbers of a camera).
     """
-    if problem := frame_problem(file, len(responses), tuple(shape), bits):
+    if problem := frame_problem(file, len(responses), tuple(shape), bits, curve):
         raise ParameterError("file", problem)
     return torch.from_numpy(np.ascontiguousarray(read_frame(file).values, dtype=np.float32))
 
 
 @frame.preflight
-def _(*, responses: Tensor | None = None, file: Path, shape: Shape, bits: int = 16) -> list[str]:
+def _(
+    *, responses: Tensor | None = None, file: Path, shape: Shape, bits: int = 16, curve: Curve | None = None
+) -> list[str]:
     channels = None if responses is None else len(responses)
-    if problem := frame_problem(file, channels, tuple(shape), bits):
+    if problem := frame_problem(file, channels, tuple(shape), bits, curve):
         raise ParameterError("file", problem)
     return []
 
@@ -59,7 +65,9 @@ class FrameNumbers(NamedTuple):
 
 
 @once_per_version
-def frame_problem(file: Path, channels: int | None, shape: tuple[int, int], bits: int) -> str:
+def frame_problem(
+    file: Path, channels: int | None, shape: tuple[int, int], bits: int, curve: Curve | None = None
+) -> str:
     """Return why a file is no frame of this sensor, in one sentence, or an empty text."""
     try:
         values, depth = read_frame(file)
@@ -74,7 +82,11 @@ def frame_problem(file: Path, channels: int | None, shape: tuple[int, int], bits
             f"{name} has {found[0]} x {found[1]} pixels (y, x), but sensor.shape is {list(shape)}: give the whole "
             f'frame of this sensor, or "sensor.shape={size}" if this window around its centre was read out'
         )
-    return _other_depth(name, depth, bits) or _other_numbers(name, values, bits)
+    return (
+        _other_depth(name, depth, bits, curve)
+        or _other_numbers(name, values, bits)
+        or ("" if curve == "linear" else _curved(name, tone_curve_sign(file, values, depth, bits)))
+    )
 
 
 def _other_channels(name: str, found: int, channels: int) -> str:
@@ -86,13 +98,23 @@ def _other_channels(name: str, found: int, channels: int) -> str:
     return f"{name} has {found} channels, but the camera has {channels}: give a frame of the channels of sensor.camera"
 
 
-def _other_depth(name: str, depth: int | None, bits: int) -> str:
+def _other_depth(name: str, depth: int | None, bits: int, curve: Curve | None) -> str:
     if depth is not None and depth < bits and depth == 8:
+        linear = "" if curve == "linear" else f" and {_STATE}, if they have no tone curve (sRGB, gamma)"
         return (
-            f"{name} has 8 bits, but sensor.bits is {bits}: save the numbers of the camera in 16 bits, or give "
-            "sensor.bits=8 with the gain of these numbers"
+            f"{name} has 8 bits, but sensor.bits is {bits}: save the raw numbers of the camera in 16 bits, or give "
+            f"sensor.bits=8 with the gain of these numbers{linear}"
         )
     return ""
+
+
+def _curved(name: str, sign: str) -> str:
+    if not sign:
+        return ""
+    return (
+        f"{name} {sign}, but a restoration needs numbers in proportion to the light: save the raw numbers of the "
+        f"camera, without tone curve and white balance; or state {_STATE}, if these numbers are linear in the light"
+    )
 
 
 def _other_numbers(name: str, values: NDArray[Any], bits: int) -> str:

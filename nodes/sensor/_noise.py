@@ -1,5 +1,6 @@
 """Noise of the sensor: photon noise, dark current and read noise."""
 
+import functools
 import math
 from collections.abc import Callable
 from itertools import pairwise
@@ -11,15 +12,17 @@ from torch import Generator, Tensor
 
 from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import single
+from neusee.nodes.sensor._draw_limits import SURE, amplitude_error, amplitude_error_drawn, chi_square_limit, poisson_rms
+from neusee.nodes.sensor._room_for_light import refuse_without_room
 from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.torch_func import transformed
-from neusee.nodes.units import DarkCurrent, Electrons, ElectronsPerSecond, Fraction, Time
+from neusee.nodes.units import DarkCurrent, Electrons, ElectronsPerSecond, Exposure, Fraction
 
 Distribution = Literal["gaussian", "poisson"]
 _PART = 1 << 15  #: elements; torch splits larger arrays among threads, which is slow on a busy machine
 _DARK = 1e-30  #: e-; smaller numbers count as 0, because the gradient of the square root is unbounded near 0
 _MOST = 5.0  #: largest ratio of a sampled mean of the dark current to the given mean, 8 standard deviations above
-Spread = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Spread = Annotated[float, Field(ge=0, le=100)]
 
 
 @node()
@@ -73,22 +76,37 @@ def _(result: Tensor, photons: Tensor, **params: Any) -> list[Check]:
 
 
 @photon_noise.propagate_error
-def _(
-    photons: ErrorBound, *, result: TensorStats, quantum_efficiency: float, spread: float = 1.0, **params: Any
-) -> float:
+def _(photons: ErrorBound, *, result: TensorStats, **params: Any) -> float:
     """Return the error bound of the electrons: the error of the mean plus the error of the noise amplitude.
 
     The noise amplitude is the square root of the mean: |sqrt(a) - sqrt(b)| <= sqrt|a - b| and <= |a - b| / sqrt(a).
     Poisson numbers are drawn anew for another mean, so their error has no bound.
     """
+    return _electrons_error(photons, amplitude_error, **params)
+
+
+@photon_noise.propagate_draw
+def _(photons: ErrorBound, *, result: TensorStats, **params: Any) -> float:
+    """Return the error bound of the electrons of one draw, which one of 10 000 draws exceeds."""
+    pixels = max(1, math.prod(result.shape))
+    return _electrons_error(photons, functools.partial(amplitude_error_drawn, pixels=pixels), **params)
+
+
+def _electrons_error(
+    photons: ErrorBound,
+    amplitude: Callable[[float, float], float],
+    *,
+    quantum_efficiency: float,
+    spread: float = 1.0,
+    **params: Any,
+) -> float:
     if params["distribution"] == "poisson" and photons.rms > 0:
         return math.inf
     drawn = photons.rms * (quantum_efficiency if params["drawn_in"] == "electrons" else 1.0)
     kept = params["mean_shift"] + (params["mean"] == "additive")
     electrons: float = 1.0 if params["drawn_in"] == "electrons" else quantum_efficiency
     darkest = photons.stats.min * drawn / photons.rms if photons.stats and photons.rms > 0 else 0.0
-    root = math.sqrt(drawn) if darkest <= drawn else drawn / math.sqrt(darkest)
-    total: float = electrons * (abs(kept) * drawn + spread * root)
+    total: float = electrons * (abs(kept) * drawn + spread * amplitude(drawn, darkest))
     return total
 
 
@@ -131,7 +149,7 @@ def dark_current(
     electrons: Tensor,
     *,
     mean: DarkCurrent,
-    exposure: Time | None = None,
+    exposure: Exposure | None = None,
     full_well: Well | None = None,
     mean_of: Literal["sensor", "exposure"] = "sensor",
     rng: Generator,
@@ -177,8 +195,10 @@ def dark_electrons(mean: float | ElectronsPerSecond, exposure: float | None) -> 
 
 
 @dark_current.preflight
-def _(*, mean: float | ElectronsPerSecond, exposure: float | None, **params: object) -> list[str]:
-    dark_electrons(mean, exposure)
+def _(
+    *, mean: float | ElectronsPerSecond, exposure: float | None, full_well: float | None = None, **params: object
+) -> list[str]:
+    refuse_without_room(math.inf if full_well is None else full_well, dark=dark_electrons(mean, exposure))
     return []
 
 
@@ -199,6 +219,21 @@ def _(
     total = dark_electrons(mean, exposure)
     most = total if mean_of == "sensor" else _MOST * total
     return _share(most, math.sqrt(most), electrons, full_well)
+
+
+@dark_current.skip_draw
+def _(
+    electrons: TensorStats,
+    *,
+    mean: float | ElectronsPerSecond,
+    exposure: float | None = None,
+    mean_of: str = "sensor",
+    **params: Any,
+) -> float:
+    total = dark_electrons(mean, exposure)
+    most = total if mean_of == "sensor" else _MOST * total
+    usual = math.sqrt(most + most**2)
+    return poisson_rms(most, max(1, math.prod(electrons.shape))) / usual if usual > 0 else 1.0
 
 
 @node()
@@ -224,9 +259,25 @@ def read_noise(
     return _by_parts(with_read_noise, single(electrons), rng)
 
 
+@read_noise.preflight
+def _(*, offset: float, read_noise: float, full_well: float | None = None, **params: object) -> list[str]:
+    refuse_without_room(math.inf if full_well is None else full_well, offset=offset, read_noise=read_noise)
+    return []
+
+
 @read_noise.skip_bound
 def _(electrons: TensorStats, *, offset: float, read_noise: float, full_well: float | None) -> float:
     return _share(offset, read_noise, electrons, full_well)
+
+
+@read_noise.skip_draw
+def _(electrons: TensorStats, *, offset: float, read_noise: float, **params: Any) -> float:
+    pixels, variance = max(1, math.prod(electrons.shape)), read_noise**2
+    sure = SURE + math.log(2.0)  # half of the probability is for the mean of the noise, half for its square
+    mean = abs(offset) * read_noise * math.sqrt(2.0 * sure / pixels)
+    square = chi_square_limit(pixels * variance, variance, sure) / pixels
+    usual = math.hypot(offset, read_noise)
+    return math.sqrt(offset**2 + 2.0 * mean + square) / usual if usual > 0 else 1.0
 
 
 @dark_current.skip_scale

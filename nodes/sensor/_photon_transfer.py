@@ -5,11 +5,12 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from neusee.nodes import Check, node
+from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.sensor._digitization import Bits, Rounding, digitize, full_well
 from neusee.nodes.sensor._noise import Distribution, dark_current, dark_electrons, photon_noise, read_noise
+from neusee.nodes.sensor._room_for_light import refuse_without_room, refuse_without_steps
 from neusee.nodes.sensor._saturation import Efficiency, Well
-from neusee.nodes.units import Count, DarkCurrent, Electrons, Gain, Time
+from neusee.nodes.units import Count, DarkCurrent, Electrons, ElectronsPerSecond, Exposure, Gain
 
 well_of, read_of = full_well, read_noise  # parameters below have the same names
 
@@ -25,7 +26,7 @@ def photon_transfer(
     offset: Electrons,
     read_noise: Electrons,
     dark: DarkCurrent,
-    exposure: Time | None = None,
+    exposure: Exposure | None = None,
     distribution: Distribution = "gaussian",
     levels: Count = 24,
     pixels: Count = 16384,
@@ -70,6 +71,27 @@ def _rise(top: float, first: float, levels: int) -> list[float]:
 def _pair(one: Tensor, two: Tensor) -> tuple[float, float]:
     """Return the mean of two frames, and the temporal variance from the difference of the frames."""
     return float((one + two).mean() / 2), float((one - two).square().mean() / 2)
+
+
+@photon_transfer.preflight
+def _(
+    *,
+    full_well: float,
+    gain: float,
+    bits: int,
+    offset: float,
+    read_noise: float,
+    dark: float | ElectronsPerSecond,
+    exposure: float | None = None,
+    **params: object,
+) -> list[str]:
+    try:
+        electrons = dark_electrons(dark, exposure)
+    except ParameterError as error:
+        raise ParameterError("dark", str(error)) from None
+    refuse_without_room(full_well, offset=offset, read_noise=read_noise, dark=electrons)
+    refuse_without_steps(full_well, gain=gain, bits=bits)
+    return []
 
 
 @photon_transfer.check

@@ -9,10 +9,10 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes.constants import PLANCK, SPEED_OF_LIGHT
 from neusee.nodes.units import Efficiency as Efficiency
-from neusee.nodes.units import Electrons, PositiveLength, Time
+from neusee.nodes.units import Electrons, Exposure, PixelPitch
 from neusee.nodes.values import Bands
 
-Well = Annotated[Electrons, Field(gt=0)]  #: electrons that fill a pixel
+Well = Annotated[Electrons, Field(ge=1)]  #: electrons that fill a pixel
 
 
 def photons_per_joule(centres: Tensor) -> Tensor:
@@ -25,9 +25,34 @@ def photons_that_fill(full_well: float, quantum_efficiency: float) -> float:
     return full_well / quantum_efficiency
 
 
+def line_saturation(
+    line: Bands,
+    responses: Tensor,
+    *,
+    electrons: float,
+    quantum_efficiency: float,
+    pixel_pitch: float,
+    exposure: float,
+) -> float:
+    """Return the irradiance of a laser line that fills a pixel of the channel that saturates first.
+
+    A channel c of the response r turns one joule into sum over bands of r_c weight lambda / (h c) times the quantum
+    efficiency electrons. A line that no channel sees gives infinity.
+
+    Shapes: line (band,), responses (channel, band) -> ().
+    Units:  electrons of a full pixel e-; pixel_pitch m; exposure s; result W/m2 of the whole line.
+    Error:  exact for a fill factor of 1.
+    Source: EMVA Standard 1288, release 4.0, of the channel whose quantum efficiency is the largest at the line.
+    """
+    share = line.weights.double() / line.weights.double().sum()
+    each = (responses.double() * (share * photons_per_joule(line.centres))).sum(-1) * quantum_efficiency
+    largest = float(each.amax())
+    return electrons / (largest * exposure * pixel_pitch**2) if largest > 0 else math.inf
+
+
 @node(rtol=1e-12)
 def saturation(
-    bands: Bands, *, full_well: Well, quantum_efficiency: Efficiency, pixel_pitch: PositiveLength, exposure: Time
+    bands: Bands, *, full_well: Well, quantum_efficiency: Efficiency, pixel_pitch: PixelPitch, exposure: Exposure
 ) -> Tensor:
     """Compute the saturation irradiance at each wavelength, which fills a pixel within one exposure.
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
+from neusee.nodes.sensor._room_for_light import refuse_without_room
 from neusee.nodes.sensor._saturation import Efficiency, Well, photons_that_fill
 from neusee.nodes.units import Electrons
 
@@ -31,6 +32,12 @@ def limits(*, full_well: Well, quantum_efficiency: Efficiency, read_noise: Elect
     decibels = 20.0 * math.log10(full_well / max(read_noise, 1.0))
     values = (photons_that_fill(full_well, quantum_efficiency), math.sqrt(full_well), decibels)
     return Limits(*(torch.tensor(v, dtype=torch.float64) for v in values))
+
+
+@limits.preflight
+def _(*, full_well: float, read_noise: float, **params: object) -> list[str]:
+    refuse_without_room(full_well, read_noise=read_noise)
+    return []
 
 
 @limits.check

@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.units import Count, Fraction, PositiveLength, Wavelength
+from neusee.nodes.units import Count, Fraction, Linewidth, Wavelength
 from neusee.nodes.values import Bands as Samples
 
 _MOST = 100_000  #: bands, at most; 0.003 nm each from 400 to 700 nm
@@ -62,7 +62,7 @@ def _(result: Samples, **params: Any) -> list[Check]:
 def filters(
     *,
     centres: Annotated[tuple[Wavelength, ...], Field(min_length=1)],
-    widths: Annotated[tuple[PositiveLength, ...], Field(min_length=1)],
+    widths: Annotated[tuple[Linewidth, ...], Field(min_length=1)],
 ) -> Samples:
     """Return spectral bands with individual centres and widths, such as the passbands of a filter set.
 
@@ -96,9 +96,9 @@ def _(result: Samples, **params: Any) -> list[Check]:
 def line(
     *,
     wavelength: Wavelength,
-    fwhm: PositiveLength = 10e-9,
+    fwhm: Linewidth = 10e-9,
     count: Count = 5,
-    span: PositiveLength | None = None,
+    span: Linewidth | None = None,
     floor: Fraction = 1e-3,
     sampling: Literal["integrated", "point"] = "integrated",
 ) -> Samples:

@@ -23,7 +23,7 @@ def leaves(
     bands: Bands,
     *,
     shape: Shape,
-    smallest: Annotated[float, Field(ge=0.5)] = 2.0,
+    smallest: Annotated[float, Field(ge=0.5, le=1e6)] = 2.0,
     darkest: Annotated[float, Field(gt=0, le=1)] = 0.1,
     texture: Fraction = 0.3,
     shade: Fraction = 0.5,

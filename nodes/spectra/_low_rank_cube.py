@@ -10,7 +10,7 @@ from neusee.nodes import Check, node
 from neusee.nodes.spectra._principal_planes import Source, few_planes
 from neusee.nodes.values import LowRankCube
 
-Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: relative to the largest element
+Share = Annotated[float, Field(ge=0, le=1)]  #: relative to the largest element
 
 
 @node(rtol=1e-6)

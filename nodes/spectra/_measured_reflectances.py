@@ -1,6 +1,5 @@
 """Measured reflectances from colour-science and from the user's files."""
 
-import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.input_files import once_per_version
 from neusee.nodes.spectra._linear_lift import inside_charts
 from neusee.nodes.spectra._spectral_tables import Table, gamut_samples, paints, require_range
 from neusee.nodes.spectra._spectrum_tables import Numbers, csv_spectra, wrong_wavelengths
@@ -79,13 +79,9 @@ _SETS: dict[str, Callable[[], tuple[Table, ...]]] = {
 # --- files ----------------------------------------------------------------------------------------------------------
 
 
+@once_per_version
 def _read(file: Path) -> Table:
-    return _known(file, file.stat().st_mtime_ns)
-
-
-@functools.lru_cache(maxsize=32)
-def _known(file: Path, stamp: int) -> Table:
-    """Read the spectra of a file, or return them from memory while the modification time ``stamp`` is unchanged."""
+    """Read the spectra of a file, or return them from memory while the file is unchanged."""
     reader = {".csv": csv_spectra, ".npz": _npz, ".mat": _mat}.get(file.suffix.lower())
     if reader is None:
         raise ParameterError("files", f"{file.name} holds no reflectances: {_FILES}")

@@ -32,7 +32,7 @@ from neusee.workflows.training.training_pictures import HELD_OUT, TrainingStream
 
 ROOT = Path(__file__).parents[2]
 DESIGNED = ROOT / "recipes" / "samples" / "demonstration_mask.png"
-PEAK = 0.0121247  #: of the laser behind the designed mask at the worst wavelength, over that behind the plain lens
+PEAK = 0.0121764  #: brightest pixel behind the designed mask at the worst wavelength, over that behind the plain lens
 IN_TURN = (0.0, 1e4, 1e1, 1e5, 1e2, 1e6, 0.0, 1e3)  #: strengths of the frames
 WEAK, STRONG = (0.0, 1e1, 1e2), (1e3, 1e4, 1e5, 1e6)
 MASKS = ("plain", "half_ring", "designed")
@@ -47,8 +47,8 @@ OTHERS = {  #: cameras beside that of the training, by name: the mask, and what 
     "second half_ring": ("half_ring", SECOND),
     "larger half_ring": ("half_ring", ("scene.shape=[352, 352]", "sensor.shape=[288, 288]", *FINER)),
 }
-STOP = PEAK**0.25  #: the peak falls with the fourth power of the diameter, the light with its square
-BACKGROUND, DIAMETER = 0.7, 11.0
+STOP = 0.3237  #: diameter whose brightest pixel is PEAK at 400 nm, its worst; without an average it were PEAK**0.25
+BACKGROUND, DIAMETER = 0.7, 8.0784
 EACH = 3  #: photographs, of which one is seen by the rivals and by the other cameras too
 NO_POOL = ("+mismatch=usual", "train.augment.pooled=none", "train.pool=null")
 METHODS = ("developed", "told", "likeliest", "uncertain", "network")
@@ -129,8 +129,17 @@ def words(mask):
     return [*doe, *light, *more, "train.cameras=[]", "train.network={kind: nafnet, width: 16}", *NO_POOL]
 
 
-def run(folder, pictures, count):
-    """Simulate and filter the frames that the folder lacks."""
+def strengths_of(number, masks):
+    """The strengths of the frames of a photograph, by those of the named masks, rivals and cameras that it has."""
+    strengths = {mask: IN_TURN[(3 * number + m) % len(IN_TURN)] for m, mask in enumerate(MASKS)}
+    if number % EACH == 0:
+        strengths |= dict.fromkeys(RIVALS, STRONG[number // EACH % len(STRONG)])
+        strengths |= {name: IN_TURN[(number // EACH + m) % len(IN_TURN)] for m, name in enumerate(OTHERS)}
+    return {mask: strength for mask, strength in strengths.items() if mask in masks}
+
+
+def run(folder, pictures, count, masks):
+    """Simulate and filter the frames behind the named masks, rivals and cameras that the folder lacks."""
     photographs = Photographs.under(pictures)
     held_out = photographs.paths[:count]
     folder.mkdir(exist_ok=True)
@@ -138,11 +147,7 @@ def run(folder, pictures, count):
     recipe_file, store, streams = folder / "judged.yaml", Store(folder / "cache"), {}
     recipe_file.write_text((ROOT / "recipes" / "train_informed.yaml").read_text() + STEPS)
     for number, photograph in enumerate(held_out):
-        frames = {mask: IN_TURN[(3 * number + m) % len(IN_TURN)] for m, mask in enumerate(MASKS)}
-        if number % EACH == 0:
-            frames |= dict.fromkeys(RIVALS, STRONG[number // EACH % len(STRONG)])
-            frames |= {name: IN_TURN[(number // EACH + m) % len(IN_TURN)] for m, name in enumerate(OTHERS)}
-        for mask, strength in frames.items():
+        for mask, strength in strengths_of(number, masks).items():
             if (photograph.name, mask, strength) in done:
                 continue
             if mask not in streams:
@@ -224,12 +229,14 @@ if __name__ == "__main__":
     parser.add_argument("folder", type=Path)
     parser.add_argument("--pictures", type=Path, help="folder of photographs that no training saw")
     parser.add_argument("--count", type=int, default=37)
+    every = (*MASKS, *RIVALS, *OTHERS)
+    parser.add_argument("--masks", nargs="+", default=every, choices=every, help="masks, rivals and cameras")
     parser.add_argument("--weights", type=Path, help="of the network: best.safetensors of a training")
     parser.add_argument("--width", type=int, default=12)
     parser.add_argument("--report", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
     if given.pictures:
-        run(given.folder, given.pictures, given.count)
+        run(given.folder, given.pictures, given.count, given.masks)
     if given.report:
         report(judged(given.folder, given.weights, given.width))

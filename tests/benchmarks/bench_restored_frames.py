@@ -80,6 +80,7 @@ defaults: [small]
 sensor:
   shape: [{SIDE}, {SIDE}]
   pixel_pitch: {own.PITCH * 1e6} um
+  sampling: point
   camera: own.csv
   full_well: {own.WELL} e-
   read_noise: {own.READ} e-

@@ -1,5 +1,6 @@
 """Draws the picture of the README from a real run: ``python tests/benchmarks/draw_first_light.py``."""
 
+import inspect
 from pathlib import Path
 
 import torch
@@ -16,7 +17,7 @@ CURVE = "irradiance, in units of saturation", "pixels from the laser\n(brightest
 
 def irradiance(result, step, arm):
     """Return the irradiance on the sensor, scene and laser, as a multiple of what saturates a pixel."""
-    sensor = {name: value for name, value in step.params.items() if name != "damage"}
+    sensor = {name: step.params[name] for name in inspect.signature(saturation).parameters if name != "bands"}
     scene = saturation(result["bands"], **sensor) / result["level"]
     laser = saturation(result["line[green]"], **sensor)
     lit = (result[f"image[{arm}]"], scene), (result[f"spot[{arm},green]"], laser)

@@ -13,7 +13,7 @@ import torch
 from neusee.nodes import doe, optics
 from neusee.nodes.values import Bands
 
-STOP = optics.stop(samples=2160, pitch=3.74e-6, diameter=11e-3)
+STOP = optics.stop(samples=2160, pitch=3.74e-6, diameter=8.0784e-3)
 SMALL = optics.stop(samples=32, pitch=1e-5, diameter=3.2e-4)
 CAMERA = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
 AREA = math.pi * (2160 * 3.74e-6) ** 2 / 4  #: m2, of the pupil

@@ -30,7 +30,8 @@ def pupil(n, bands, height=1e-6, path=0.0):
 
 
 def as_psf(bands, *shape, dtype=torch.float32):
-    return Psf(rand(bands, *shape, dtype=dtype), rand(bands, dtype=torch.float64))
+    peak, cut, side = (rand(bands, dtype=torch.float64) for _ in range(3))
+    return Psf(rand(bands, *shape, dtype=dtype), peak, cut, side)
 
 
 CASES = {

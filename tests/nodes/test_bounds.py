@@ -138,7 +138,10 @@ def shining(draw):
     height = relief(draw, samples)
     pupil = optics.pupil(height, spectra_index(line), line, stop)
     camera = {"focal_length": 0.1, "pixel_pitch": draw.decades(1e-6, 3e-5), "shape": (8, 8), "pixel": "zoh"}
-    psf = optics.psf(pupil, **camera, sensor=draw.one_of("point", "integrated"))
+    sensor = draw.one_of("point", "integrated")
+    if camera["pixel_pitch"] * samples * pitch > 0.1 * float(line.centres.min()):
+        sensor = "integrated"  # points further apart than wavelength x f-number are refused
+    psf = optics.psf(pupil, **camera, sensor=sensor)
     power = {**SENSOR, "pixel_pitch": camera["pixel_pitch"], "exposure": draw.decades(1e-6, 1e3)}
     seen, watts = None, None
     if draw.uniform() < 0.3:
@@ -193,7 +196,7 @@ def soiling(draw):
     marks = {"dust": draw.one_of(0.0, 0.0, draw.decades(0.1, 10)), "scratches": draw.one_of(0.0, 0.0, 3.0)}
     film = {"grease": draw.one_of(0.0, draw.decades(1e-9, 1.0)), "grease_scale": draw.uniform(0.02, 1)}
     soft = {"smudges": draw.one_of(0.0, draw.decades(1e-9, 1.0)), "dents": draw.one_of(0.0, draw.decades(1e-9, 1.0))}
-    stop = optics.stop(samples=int(draw.uniform(8, 33)), pitch=1e-4, diameter=3e-3)
+    stop = optics.stop(samples=int(draw.uniform(8, 33)), pitch=1e-4, diameter=3e-3, aperture="inscribed")
     dirt = flare.dirt(stop, **marks, **film, **soft, rng=draw.rng)
     turns = dirt.path.double() / draw.uniform(400e-9, 700e-9)
     field = torch.polar(dirt.amplitude.double(), 2 * torch.pi * turns)

@@ -324,8 +324,8 @@ def averaged(height, stop, *, feature):
 
 
 def pulse_over_thresholds(spot, line, exposure, **_):
-    """The fluence of one pulse over the published thresholds of a CMOS, in J/m2 from J/cm2."""
-    thresholds = [L("0.1"), L("100"), L("0.0789"), L("0.2419"), L("2.0054")]
+    """The fluence of one pulse over the published thresholds of a CMOS, in J/m2 from J/cm2: first traces and others."""
+    thresholds = [L("0.1"), L("100"), L("0.2419"), L("2.0054")]
     return np.array([exact(spot).sum(0).max() * L(exposure) / (threshold * 10_000) for threshold in thresholds])
 
 
@@ -429,7 +429,8 @@ CASES = [
     case(metrics.light_outside, (PSF, PUPIL), outside),
     case(metrics.limits, (WIDE,), limits, take=torch.stack),
     case(laser.damage, (IMAGE, spectra.line(wavelength=532e-9)), pulse_over_thresholds,
-         {"pixel_pitch": 2.9e-6, "exposure": 0.1, "dwell": 0.1, "pulse_duration": 1e-8}, take=lambda d: d.ratio),
+         {"pixel_pitch": 2.9e-6, "exposure": 0.1, "dwell": 0.1, "pulse_duration": 1e-8},
+         take=lambda d: d.ratio[[0, 4, 5, 6]]),
     case(metrics.lsr, (PSF,), lambda p: exact(p.intensity).max((1, 2)) / exact(p.clear_peak)),
     case(metrics.mtf, (WIDE,), mtf_rms),
     case(metrics.peak_bsr, (IMAGE, SCENE), lambda x, y: exact(x).max((-2, -1)) / exact(y).max((-2, -1))),
@@ -488,8 +489,8 @@ _ELSEWHERE = {
         "restore.wiener_spread", "sensor.dark_current", "sensor.digitize", "sensor.photon_noise",
         "sensor.photon_transfer", "sensor.read_noise",
         "spectra.grain", "spectra.leaves", "spectra.metamers"),
-    "reads tables or files": ("calibrate.descriptor", "calibrate.frames", "calibrate.point_source", "calibrate.table",
-        "restore.colour_matrix", "sensor.frame",
+    "reads tables or files": ("calibrate.descriptor", "calibrate.frames", "calibrate.hot_pixels",
+        "calibrate.point_source", "calibrate.table", "restore.colour_matrix", "sensor.frame",
         "spectra.illuminant", "spectra.lift_lmmse", "spectra.lift_lmmse_mixture", "spectra.lift_mallett",
         "spectra.lift_mallett_mixture", "spectra.line_table", "spectra.reflectances", "spectra.render",
         "optics.white_irradiance", "spectra.responses"),

@@ -38,8 +38,8 @@ def test_a_gain_in_either_unit_is_one_number(k):
         (0.37, "needs a unit: write 0.37 e-/DN or 0.37 DN/e-"),
         ("0.37 e-", "has the wrong unit 'e-': write one of DN/e-, e-/DN"),
         ("0 e-/DN", "must be greater than 0"),
-        ("0 DN/e-", "greater than 0"),
-        ("-1 e-/DN", "greater than 0"),
+        ("0 DN/e-", "greater than or equal to 0.000000001"),
+        ("-1 e-/DN", "greater than or equal to 0.000000001"),
         ("1e999 e-/DN", "must be finite"),
     ],
 )

@@ -336,6 +336,7 @@ NOTHING_TO_FOLLOW = {
     "calibrate.camera_prior": "states the prior that a recipe writes",
     "calibrate.descriptor": "reads a file",
     "calibrate.frames": "reads files",
+    "calibrate.hot_pixels": "reads files",
     "calibrate.point_source": "reads files",
     "calibrate.prior": "states the prior that a recipe writes",
     "calibrate.stray_prior": "states the prior that a recipe writes",

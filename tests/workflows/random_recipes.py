@@ -76,12 +76,94 @@ def _lasers(rng):
 
 
 def _sensor(rng):
-    return [
-        f"sensor.read_noise={rng.choice((0, 2, 10.5, 100))} e-",
-        f"sensor.dark_current={rng.choice((0, 0.002, 1, 30))} e-",
-        f"sensor.offset={rng.choice((0, 390))} e-",
+    read_noise, dark, offset = (rng.choice(of) for of in ((0, 2, 10.5, 100), (0, 0.002, 1, 30), (0, 390)))
+    changes = [
+        f"sensor.read_noise={read_noise} e-",
+        f"sensor.dark_current={dark} e-",
+        f"sensor.offset={offset} e-",
         f"sensor.background={rng.choice((0, 0.01, 0.7, 2))}",
         f"sensor.exposure={10 ** rng.uniform(-6, 2):.3g} s",
-        f"sensor.full_well={rng.choice((100, 2000, 25500, 100000))} e-",
-        f"sensor.bits={rng.choice((8, 12, 16))}",
     ]
+    full_well = rng.choice((100, 2000, 25500, 100000))
+    room = 600 if full_well <= max(read_noise, dark + offset) else full_well  # a smaller well records no light
+    return [*changes, f"sensor.full_well={room} e-", f"sensor.bits={rng.choice((8, 12, 16))}"]
+
+
+# Recipes over every shipped group, for the errors that a run states.
+
+MASKS = (
+    "axicon", "axicon_and_filter", "axicon_and_notch", "axicon_and_stop", "cubic", "demonstration", "five_half_rings",
+    "flat", "grey_filter", "half_ring", "notch", "pixelwise", "small_stop", "spiral_axicon", "stop_and_filter", "unet",
+    "vortex", "zernike",
+)  # fmt: skip
+SENSORS = ("neusee", "night", "small")
+FLARES = ("clean", "dirty_stray_light", "dirty_windshield", "stray_light")
+ALL_LASERS = ("drawn", "green", "none", "pointer", "red", "six", "violet")
+CAMERAS = ("CIE 1931", "Nikon 5100", "Sigma SDMerill")
+OUTPUTS = (
+    "[raw, developed]", "[raw, photons, developed]", "[raw, photons, developed]", "[photons, charge, read]",
+    "[raw, lsr, bsr]", "[raw, developed, developed_quality]",
+)  # fmt: skip
+
+
+def any_changes(seed):
+    """Return the changes of `plain_lens` that make the recipe of a seed, over all shipped groups."""
+    rng = random.Random(f"any {seed}")
+    groups = _any_groups(rng)
+    changes = [*groups, *_any_optics(rng, "laser=six" in groups), *_any_sensor(rng)]
+    changes += [f"tolerance={10 ** rng.uniform(-5, -1):.6g}", f"seed={rng.randrange(1000)}"]
+    changes += [f"outputs={rng.choice(OUTPUTS)}", f"estimates={rng.choice(('true', 'true', 'true', 'false'))}"]
+    return changes
+
+
+def draw_any(seed):
+    """Return the recipe of a seed over all shipped groups; raises `RecipeError` where a group refuses the others."""
+    return load("plain_lens", any_changes(seed))
+
+
+def _any_groups(rng):
+    mask, flare, laser = rng.choice(MASKS), rng.choice(FLARES), rng.choice(ALL_LASERS)
+    groups = [f"scene={rng.choice(SCENES)}", f"doe={mask}", f"flare={flare}", f"laser={laser}", "optics=small"]
+    groups += [f"sensor={rng.choice(SENSORS)}", f"lift={rng.choice(LIFTS)}"]
+    groups += [f"illuminant={rng.choice(('daylight', 'a', 'equal_energy'))}"]
+    groups += [f"reading={rng.choice(('coherent', 'coherent', 'coherent', 'as_printed'))}"]
+    if "stray" in flare:
+        groups += [f"stray_light.surfaces.lens.b0={10 ** rng.uniform(-5, 0):.4g}"]
+        groups += [f"stray_light.surfaces.lens.l={10 ** rng.uniform(-3, -1):.4g}"]
+        groups += [f"stray_light.strength={rng.choice((1, 1, 3, 100))}"]
+    if laser == "drawn":
+        groups += ["lasers.drawn.angle=[0.3 mrad, -0.5 mrad]"]
+    if mask == "demonstration":
+        groups += ["steps.height.with.between=nearest"]
+    if laser in ("green", "red", "violet"):
+        groups += [f"lasers.{laser}.strength={rng.choice((0, 1e-6, 1e-3, 1, 1e3, 1e6))}"]
+        groups += [f"lasers.{laser}.angle=[{rng.uniform(-1, 1):.3f} mrad, {rng.uniform(-1, 1):.3f} mrad]"]
+    return groups
+
+
+def _any_optics(rng, far):
+    """Return optics of small size; a laser ``far`` from the axis needs more samples of the pupil."""
+    samples, bands = 270 if far else rng.choice((64, 90, 135)), rng.choice((5, 7, 11, 16, 31))
+    rows, columns = rng.choice(SIDES), rng.choice(SIDES)
+    high, wide = (rng.randint(20, side) for side in (rows, columns))
+    changes = [f"optics.samples={samples}", f"optics.pitch={8100 / samples} um", "optics.diameter=8 mm"]
+    changes += [f"optics.window=[{rng.choice(SIDES)}, {rng.choice(SIDES)}]", f"optics.bands={bands}"]
+    changes += [f"optics.border={rng.choice(('zero', 'reflect'))}", f"scene.shape=[{rows}, {columns}]"]
+    changes += [f"optics.defocus={rng.choice((0, 0, 0.5, 3))} waves", f"sensor.shape=[{high}, {wide}]"]
+    return changes
+
+
+def _any_sensor(rng):
+    changes = [f"sensor.read_noise={rng.choice((0, 2, rng.uniform(0.5, 100))):.4g} e-"]
+    changes += [
+        f"sensor.dark_current={rng.choice((0, 0.002, 1, 30))} e-",
+        f"sensor.offset={rng.choice((0, 60, 390))} e-",
+    ]
+    changes += [f"sensor.background={rng.choice((0.01, rng.random(), rng.random(), 2)):.5g}"]
+    changes += [
+        f"sensor.exposure={10 ** rng.uniform(-4, 1):.4g} s",
+        f"sensor.full_well={rng.choice((2000, 12000, 25500))} e-",
+    ]
+    changes += [f"sensor.bits={rng.choice((8, 12, 16))}", f"sensor.camera={rng.choice(CAMERAS)}"]
+    changes += [f"sensor.arrivals={rng.choice(('gaussian', 'gaussian', 'gaussian', 'poisson'))}"]
+    return changes

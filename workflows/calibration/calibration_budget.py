@@ -23,7 +23,7 @@ from neusee.nodes.calibrate import (
     variance_shares,
 )
 from neusee.nodes.values import Levels
-from neusee.workflows.calibration.frame_validity import changes_by_faults
+from neusee.workflows.calibration.frame_validity import errors_of_parameters
 from neusee.workflows.calibration.laboratory import EFFICIENCY
 from neusee.workflows.calibration.model_spread import TERMS
 from neusee.workflows.recipe.distributions.joint import Z_90
@@ -93,8 +93,8 @@ def _of_model(name: str, found: _Estimate, unit: str) -> Contribution:
 def _of_tests(result: CalibrationResult, row: ParameterEstimate, value: float) -> Contribution:
     if len(result.frames) < 2:
         return Contribution(_TESTS, "B", reason=f"{NOT_STATED}: only moments are given")
-    changes = changes_by_faults(result.frames, result.problem.coordinates.prior.may_hide)
-    width = changes[row.name].sd if row.name in changes else 0.0
+    errors = errors_of_parameters(result.frames, result.problem.coordinates.prior.may_hide)
+    width = errors.get(row.name, 0.0)
     if not width:
         return Contribution(_TESTS, "B", reason=NOT_INVOLVED)
     return Contribution(_TESTS, "B", "normal", width, "relative", value)

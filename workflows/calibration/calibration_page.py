@@ -14,12 +14,13 @@ from neusee.workflows.calibration.budget_page import budget_picture, budget_sect
 from neusee.workflows.calibration.frame_validity import frame_section
 from neusee.workflows.calibration.identifiability import KINDS, Identifiability
 from neusee.workflows.calibration.laboratory import RELATIVE, stated
+from neusee.workflows.calibration.level_misfit import is_camera
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import IntervalEstimate, ModelSpread
 from neusee.workflows.calibration.picture_sections import chains_section, corner_section, curve_section, words
 from neusee.workflows.calibration.posterior_checks import Check, count_failures
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
-from neusee.workflows.calibration.standard_fit import least_squares_section
+from neusee.workflows.calibration.standard_fit import Comparison, comparisons, least_squares_section
 from neusee.workflows.report.study_page import Mark, Section, with_uncertainty
 
 if TYPE_CHECKING:
@@ -88,6 +89,14 @@ class CalibrationResult:
     def budget_picture(self) -> bytes | None:
         """Return the picture of the uncertainty budgets, or None where nothing has a value."""
         return budget_picture(self.budgets) if self.budgets else None
+
+    @cached_property
+    def beside(self) -> Sequence[Comparison]:
+        """Return the least squares of EMVA 1288 beside the posterior; none for a lens."""
+        if self.problem.measured is None:
+            return []
+        camera = self.params if is_camera(self.problem) else None
+        return comparisons(self.problem.measured, self.rows(), camera)
 
     @property
     def walked(self) -> Chains:
@@ -172,7 +181,7 @@ def sections(result: CalibrationResult) -> list[Section]:
 
 def _standard(result: CalibrationResult) -> Section:
     assert result.problem.measured is not None
-    return least_squares_section(result.problem.measured, result.rows())
+    return least_squares_section(result.problem.measured, result.rows(), result.beside)
 
 
 def _frames(result: CalibrationResult) -> Section:

@@ -24,7 +24,6 @@ from neusee.nodes.calibrate import (
     reduce,
     refuse_descriptor,
     spatial_series,
-    uncorrected,
 )
 from neusee.nodes.values import Levels
 from neusee.workflows.engine.runner import run
@@ -108,6 +107,7 @@ def frames_of_recipe(recipe: Recipe, store: Store, release: Release | None = Non
 
 
 _READERS = ("calibrate.descriptor", "calibrate.reduce", "calibrate.table")
+_FITTED = 0.7  #: share of saturation up to which the sheet fits its lines
 _SCATTER: dict[Release, Any] = {"4": "steady", "3": "temporal"}  #: parameter of the nodes that reduce frames
 
 
@@ -116,7 +116,7 @@ def _described(step: Step, scatter: Any) -> EmvaFrames:
     found = descriptor(file=files, scatter=scatter)
     series = [spatial_series(*each) for each in descriptor_series(files)]
     stacks = (Stack(name, light, time, scatter, frames) for name, light, time, frames in descriptor_frames(files))
-    return EmvaFrames(found, _nearest_half(series, found), 2, [*map(uncorrected, inspect_frames(stacks, exact=False))])
+    return EmvaFrames(found, _nearest_half(series, found), 2, inspect_frames(stacks, False, _FITTED))
 
 
 def _reduced(recipe: Recipe, store: Store, steps: Sequence[Step], scatter: Any) -> EmvaFrames:
@@ -132,7 +132,7 @@ def _reduced(recipe: Recipe, store: Store, steps: Sequence[Step], scatter: Any) 
     pair = _dark_and_half([_of(step) for step in chosen], found)
     series = (spatial_series(*_of(chosen[i]), _frames(recipe, store, chosen[i])) for i in pair)
     stacks = (Stack(step.name, *_of(step), scatter, _frames(recipe, store, step)) for step in steps)
-    return EmvaFrames(found, _pair(series), min(counts), [*map(uncorrected, inspect_frames(stacks, exact=False))])
+    return EmvaFrames(found, _pair(series), min(counts), inspect_frames(stacks, False, _FITTED))
 
 
 def _of(step: Step) -> tuple[float, float]:
@@ -140,7 +140,7 @@ def _of(step: Step) -> tuple[float, float]:
 
 
 def _frames(recipe: Recipe, store: Store, step: Step) -> Any:
-    (source,) = step.sources
+    source = str(step.wires["frames"])
     return run(recipe, store, (source,)).values[source]
 
 

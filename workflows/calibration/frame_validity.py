@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from neusee.nodes.calibrate import (
-    Correction,
+    CLEAN_PAIRS,
     FrameTest,
     Hidden,
     Stack,
     coarse,
-    corrections,
     descriptor_frames,
     inspect_frames,
+    open_errors,
 )
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration.log_posterior import SensorPosterior, only_step
@@ -50,11 +50,18 @@ def inspect_recipe(recipe: Recipe, store: Store) -> list[FrameTest]:
     steps = list(_upstream(recipe, weighing))
     exact = weighing.node.path == "calibrate.density"
     if any(step.node.path in ("calibrate.reduce", "calibrate.descriptor") for step in steps):
-        return inspect_frames(_stacks(recipe, store, steps), exact)
+        return inspect_frames(_stacks(recipe, store, steps), exact, _share(weighing, steps))
     source = str(weighing.wires[weighing.node.inputs[0]])
     levels = run(recipe, store, (source,)).values[source]
     dark = levels.variance[levels.photons == 0] if isinstance(levels, Levels) else torch.zeros(0)
     return [coarse(float(dark.min()), exact)] if len(dark) else []
+
+
+def _share(weighing: Step, steps: Sequence[Step]) -> float | None:
+    """Return the share of saturation above which the likelihood leaves levels out, or None if it uses all levels."""
+    reduced = next((step for step in steps if step.node.path == "calibrate.sufficient"), weighing)
+    share = reduced.params.get("share")
+    return None if share is None else float(share)
 
 
 def _upstream(recipe: Recipe, step: Step) -> Iterator[Step]:
@@ -71,12 +78,18 @@ def _stacks(recipe: Recipe, store: Store, steps: Sequence[Step]) -> Iterator[Sta
     for step in steps:
         scatter: Any = step.params.get("scatter")
         if step.node.path == "calibrate.reduce":
-            (source,) = step.sources
-            frames = run(recipe, store, (source,)).values[source]
-            yield Stack(step.name, step.params["photons"], step.params["exposure"], scatter, frames)
+            light = step.params["photons"], step.params["exposure"]
+            yield Stack(step.name, *light, scatter, *frames_and_mask(recipe, store, step))
         elif step.node.path == "calibrate.descriptor":
             for name, photons, exposure, frames in descriptor_frames(step.params["file"]):
                 yield Stack(name, photons, exposure, scatter, frames)
+
+
+def frames_and_mask(recipe: Recipe, store: Store, step: Step) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Return the frames that a step of `calibrate.reduce` receives, and the mask of its hot pixels if it has one."""
+    source, mask = str(step.wires["frames"]), step.wires.get("mask")
+    values = run(recipe, store, (source, str(mask)) if mask else (source,)).values
+    return values[source], values[str(mask)] if mask else None
 
 
 def lines(tests: Sequence[FrameTest]) -> Iterator[str]:
@@ -99,14 +112,29 @@ def frame_checks(tests: Sequence[FrameTest], given: bool = True) -> list[Check]:
 
 
 def hidden_checks(tests: Sequence[FrameTest], may_hide: Container[str]) -> list[Check]:
-    """Return what faults that the frames have or may hide change, as a check that cannot fail; none without frames."""
-    found = hidden_faults(tests, may_hide)
-    if not found:
+    """Return what faults that the frames have or may hide leave open, as a check that cannot fail."""
+    hidden = hidden_faults(tests, may_hide)
+    if not hidden:
         return []
-    words = (f"{name} by {100 * x.mean:+.2g} % ± {100 * x.sd:.2g} %" for name, x in corrections(found).items() if x.sd)
-    faults = " and ".join(sorted({h.fault for h in found}))
+    words = [f"{name} by {100 * size:.2g} %" for name, size in open_errors(hidden).items() if size]
+    faults = " and ".join(sorted({fault.fault for fault in hidden}))
     bar = "more pixels hide less; a fault that the camera cannot have is `none` in the step of the priors"
-    return [Check(f"intervals include {faults}", f"{' and '.join(words)}, as the frames show or may hide", bar, "pass")]
+    text = f"{' and '.join(words)}, which the frames show or may hide; nothing is corrected"
+    return [Check(f"intervals include {faults}", text, bar, "pass")]
+
+
+def data_check(pairs: float) -> Check:
+    """Return if the frames have the least data of a clean statement, as a check that warns.
+
+    ``pairs`` is the number of pairs of pixels in the lit levels that the fit uses.
+    """
+    side = 10 * math.ceil(math.sqrt(CLEAN_PAIRS / 10) / 10)
+    text = f"{pairs:.3g} pairs of pixels in the lit levels of the fit"
+    enough = pairs >= CLEAN_PAIRS
+    if not enough:
+        text += ": intervals are wider than by statistics alone, because so few may hide mixing and lag"
+    bar = f"at least {CLEAN_PAIRS:.2g}, such as 10 levels of 2 frames of {side} x {side} pixels"
+    return Check("the frames are numerous enough", text, bar, "pass" if enough else "warn")
 
 
 def _bar(test: FrameTest) -> str:
@@ -115,11 +143,11 @@ def _bar(test: FrameTest) -> str:
 
 def frame_section(tests: Sequence[FrameTest]) -> Section:
     """Return the section of a calibration's page with the tests of its frames."""
-    text = """Each test asks if the frames are such as the likelihood describes. Modelled: the likelihood describes it,
-        or the posterior is corrected by what the frames show, with the uncertainty of this correction.
-        Widened: the intervals include the error that may follow. Refused: the error may exceed 2 %, or is unknown.
+    text = """Each test asks if the frames are such as the likelihood describes. Modelled: the likelihood describes it.
+        Widened: the intervals include the error that may follow, and no value is corrected. Refused: the error may
+        exceed 2 %, or is unknown. Only levels that the fit uses are tested.
         Numbers and limits of noise and patterns are in standard deviations of chance; all tests together fail for
-        frames without fault in less than 2 % of all measurements (1 of 400)."""
+        frames without fault in less than 2 % of all measurements."""
     if len(tests) < 2:
         text = "Only moments are given, so that noise, patterns and numbers of the frames are not tested."
     rows = [(t.name, abs(t.number), abs(t.limit), t.verdict, t.sentence) for t in tests]
@@ -144,18 +172,16 @@ def relative_shifts(tests: Iterable[FrameTest]) -> dict[str, float]:
 
 
 def widened(problem: SensorPosterior, chains: Chains, tests: Sequence[FrameTest], seed: int) -> Chains:
-    """Return the draws of a posterior, changed by the faults that frames have or may hide, as independent draws.
+    """Return the draws of a posterior with the errors that frames leave open, as independent normal draws.
 
-    A change of the gain changes all values in electrons inversely.
+    An error of the gain changes all values in electrons inversely. No mean is changed.
     """
-    hidden, shifts = hidden_faults(tests, problem.coordinates.prior.may_hide), relative_shifts(tests)
-    if not hidden and max(shifts.values()) < _SMALL:
+    errors = open_by_tests(tests, problem.coordinates.prior.may_hide)
+    if max(errors.values()) < _SMALL:
         return chains
-    generator, count = torch.Generator().manual_seed(seed), chains.log.size
-    drawn = [each.draw(count, generator) for each in hidden]
-    normal = torch.randn(2, count, generator=generator, dtype=torch.float64)
-    drawn.append((shifts["gain"] * normal[0], shifts["noise"] * normal[1]))
-    gain, noise = (torch.stack(each).sum(0).view(chains.log.shape) for each in zip(*drawn, strict=True))
+    generator = torch.Generator().manual_seed(seed)
+    normal = torch.randn(2, chains.log.size, generator=generator, dtype=torch.float64)
+    gain, noise = (errors[n] * x.view(chains.log.shape) for n, x in zip(("gain", "noise"), normal, strict=True))
     values = problem.parameters(chains.draws)
     if "gain" in values:
         values["gain"] = values["gain"] * gain.exp()
@@ -167,27 +193,30 @@ def widened(problem: SensorPosterior, chains: Chains, tests: Sequence[FrameTest]
 def widened_models(
     models: Iterable[ModelSpread], tests: Sequence[FrameTest], may_hide: Container[str]
 ) -> list[ModelSpread]:
-    """Return the intervals to report with the changes by faults that frames have or may hide."""
-    change = changes_by_faults(tests, may_hide)
-    return [replace(m, stated=wider(m.stated, *reversed(change[m.name]))) if m.name in change else m for m in models]
+    """Return the intervals to report with the errors that the frames leave open."""
+    errors = errors_of_parameters(tests, may_hide)
+    return [replace(m, stated=wider(m.stated, errors[m.name])) if m.name in errors else m for m in models]
 
 
-def changes_by_faults(tests: Iterable[FrameTest], may_hide: Container[str]) -> dict[str, Correction]:
-    """Return the change of the logarithm that faults of the frames cause or may cause, by the parameter."""
+def open_by_tests(tests: Iterable[FrameTest], may_hide: Container[str]) -> dict[str, float]:
+    """Return the relative standard deviations of gain and of dark noise in DN that tests and hidden faults leave."""
     tests = list(tests)
-    found, shifts = corrections(hidden_faults(tests, may_hide)), relative_shifts(tests)
-    gain, noise = (Correction(found[n].mean, math.hypot(found[n].sd, shifts[n])) for n in ("gain", "noise"))
-    electrons = Correction(-gain.mean, gain.sd)
-    both = Correction(noise.mean - gain.mean, math.hypot(gain.sd, noise.sd))
-    return {"gain": gain, **dict.fromkeys(_IN_ELECTRONS, electrons), **dict.fromkeys(_NOISES, both)}
+    hidden, shifts = open_errors(hidden_faults(tests, may_hide)), relative_shifts(tests)
+    return {name: math.hypot(hidden[name], shifts[name]) for name in ("gain", "noise")}
 
 
-def wider(interval: IntervalEstimate, shift: float, moved: float = 0.0) -> IntervalEstimate:
-    """Return an interval of a positive value with a further relative standard deviation, its logarithm ``moved``."""
+def errors_of_parameters(tests: Iterable[FrameTest], may_hide: Container[str]) -> dict[str, float]:
+    """Return the relative standard deviation that the frames leave open, by the parameter."""
+    errors = open_by_tests(tests, may_hide)
+    gain, noise = errors["gain"], math.hypot(errors["gain"], errors["noise"])
+    return {"gain": gain, **dict.fromkeys(_IN_ELECTRONS, gain), **dict.fromkeys(_NOISES, noise)}
+
+
+def wider(interval: IntervalEstimate, shift: float) -> IntervalEstimate:
+    """Return an interval of a positive value with a further relative standard deviation."""
     if shift < _SMALL:
         return interval
-    value = interval.value * math.exp(moved)
     factors = [
         math.exp(math.hypot(math.log(interval.value / end), Z_90 * shift)) for end in (interval.low, interval.high)
     ]
-    return IntervalEstimate(value, value / factors[0], value * factors[1])
+    return IntervalEstimate(interval.value, interval.value / factors[0], interval.value * factors[1])

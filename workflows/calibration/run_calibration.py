@@ -26,6 +26,7 @@ from neusee.workflows.calibration.calibration_page import (
 )
 from neusee.workflows.calibration.frame_validity import (
     as_rows,
+    data_check,
     frame_checks,
     frame_section,
     hidden_checks,
@@ -43,11 +44,12 @@ from neusee.workflows.calibration.laboratory import (
     with_laboratory_models,
     without_efficiency,
 )
+from neusee.workflows.calibration.level_misfit import is_camera
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import compare_models
-from neusee.workflows.calibration.posterior_checks import arviz, checks, count_failures, importance_samples
-from neusee.workflows.calibration.posterior_mode import search_mode
-from neusee.workflows.calibration.standard_fit import compared
+from neusee.workflows.calibration.posterior_checks import Check, arviz, checks, count_failures, importance_samples
+from neusee.workflows.calibration.posterior_mode import LaplaceFit, search_mode
+from neusee.workflows.calibration.standard_fit import agreement, compared
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.engine_digest import engine
@@ -134,10 +136,21 @@ def find_posterior(
     models = compare_models(recipe, store, recipe.seed) if isinstance(problem.levels, Levels) else []
     tested = [
         *frame_checks(tests, not isinstance(problem.levels, Rings)),
-        *hidden_checks(tests, problem.coordinates.prior.may_hide),
+        *_data_checks(problem, mode, tests),
         *checks(problem, mode, identifiability, chains, law),
     ]
-    return _widened(CalibrationResult(problem, mode, identifiability, chains, tested, models, tests), laboratory)
+    result = _widened(CalibrationResult(problem, mode, identifiability, chains, tested, models, tests), laboratory)
+    return replace(result, checks=[*tested, *agreement(result.beside)]) if is_camera(problem) else result
+
+
+def _data_checks(problem: SensorPosterior, mode: LaplaceFit, tests: Sequence[FrameTest]) -> list[Check]:
+    """Return what the frames may hide, and if they have the least data of a clean statement; none without frames."""
+    found = hidden_checks(tests, problem.coordinates.prior.may_hide)
+    if not found or not isinstance(problem.levels, Levels):
+        return found
+    levels = problem.levels
+    used = problem.likelihood(mode.theta[None]).degrees_of_freedom > 0
+    return [*found, data_check(float(levels.degrees_of_freedom[used & (levels.photons > 0)].sum()))]
 
 
 def _widened(result: CalibrationResult, laboratory: Laboratory) -> CalibrationResult:
@@ -199,7 +212,7 @@ def _document(result: CalibrationResult) -> dict[str, Any]:
             "covariance": np.cov(flat[:, told].T).reshape(len(told), -1).tolist(),
         },
         "stated": {model.name: asdict(model.stated) for model in estimated_models(result)},
-        "least_squares": compared(problem.measured, result.rows()) if problem.measured is not None else {},
+        "least_squares": compared(result.beside),
         "frames": as_rows(result.frames),
         "not told": list(result.identifiability.directions),
         "checks": [asdict(check) for check in result.checks],

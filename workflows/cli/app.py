@@ -6,10 +6,12 @@ import gc
 import os
 import sys
 import warnings
+from io import TextIOWrapper
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.cli.command_list import BAD, COLUMNS, DONE, FAILED, INTERRUPTED, REPEATED, TYPED, help_page
+from neusee.workflows.cli.interrupt_signal import Interrupts, said, say_stopped
 
 if TYPE_CHECKING:
     import typer
@@ -27,21 +29,41 @@ def __getattr__(name: str) -> Any:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit; print an error as one line, or with ``--debug`` as a traceback."""
+    interrupts = Interrupts()
+    if arguments is None:  # else a caller inside Python, whose signals are its own
+        interrupts.watch()
     arguments = sys.argv[1:] if arguments is None else arguments
     TYPED[:] = arguments
+    said.clear()
     gc.disable()  # a search for garbage among imported modules takes a tenth of the start-up time
+    _print_any_character()
     try:
-        sys.exit(_run(arguments))
+        code = _run(arguments)
+        if code == INTERRUPTED or (interrupts.came and code != DONE):  # typer, too, ends at an interrupt
+            code = _stopped()
     except BrokenPipeError:
         sys.stderr.close()
-        sys.exit(DONE)
+        code = DONE
     except KeyboardInterrupt:
-        print("stopped; finished results are kept, and the same command goes on from there", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+        code = _stopped()
     except Exception as error:
         if "--debug" in arguments:
             raise
-        sys.exit(_explained(error))
+        code = _stopped() if interrupts.came else _explained(error)
+    interrupts.end()
+    sys.exit(code)
+
+
+def _print_any_character() -> None:
+    """Print characters that the terminal lacks, such as µ on one of ASCII, as escapes in place of an error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _stopped() -> int:
+    say_stopped()
+    return INTERRUPTED
 
 
 def _run(arguments: list[str]) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, split, the_store
+from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, say_line, split, the_store
 from neusee.workflows.cli.command_list import FAILED, MISSED
 from neusee.workflows.cli.command_options import AsJson, Debug, FewLines, Out, Quiet, Words, option_words
 from neusee.workflows.cli.interruption import kept_in, resumable, say_folder
@@ -21,14 +21,18 @@ if TYPE_CHECKING:
 
 def calibrate(
     words: Words = None,
-    walkers: Annotated[int, typer.Option("--walkers", min=16, help="Walkers in each of the four ensembles.")] = 64,
+    walkers: Annotated[
+        int, typer.Option("--walkers", min=16, max=100_000, help="Walkers in each of the four ensembles.")
+    ] = 64,
     move: Annotated[
         str, typer.Option("--move", help="Move of the walkers: de (differential evolution) or stretch.")
     ] = "de",
     sensor: Annotated[
         str, typer.Option("--sensor", help="Of a folder of frames: also write the sensor group sensor/NAME.yaml here.")
     ] = "",
-    draws: Annotated[int, typer.Option("--draws", min=100, help="Least number of independent draws.")] = 1000,
+    draws: Annotated[
+        int, typer.Option("--draws", min=100, max=10_000_000, help="Least number of independent draws.")
+    ] = 1000,
     quiet: Quiet = False,
     as_json: AsJson = False,
     debug: Debug = False,
@@ -42,7 +46,7 @@ def calibrate(
     again to continue. Needs: pip install -e ".[calibrate]".
     """
     store, target = the_store(), _target(sensor)
-    recipe, command, is_folder = _loaded(words, store)
+    recipe, command, is_folder = _loaded(words, store, quiet or as_json)
     from neusee.workflows.api import verbs
     from neusee.workflows.calibration.run_calibration import CalibrationRefused
     from neusee.workflows.graph.run_error import RunError
@@ -85,15 +89,18 @@ def _target(sensor: str) -> Path | None:
         return sensor_target(sensor, Path.cwd())
 
 
-def _loaded(words: list[str] | None, store: Store) -> tuple[Recipe, list[str], bool]:
+def _loaded(words: list[str] | None, store: Store, quiet: bool) -> tuple[Recipe, list[str], bool]:
     """Return the recipe of a folder of frames or the named recipe, the command line, and True for a folder."""
     name, changes, _ = split(words)
     if not Path(name).is_dir() or _is_recipe(name):
         return *load(words, "calibrate"), False
     from neusee.workflows.frames.folder_recipe import recipe_of_folder
+    from neusee.workflows.report.study_folder import silent
 
     with failing(ValueError, before="nothing was drawn: "), refusing():
-        return recipe_of_folder(Path(name), store, changes), ["neusee", "calibrate", name, *changes], True
+        told = silent if quiet else say_line
+        recipe = recipe_of_folder(Path(name), store, changes, told)
+        return recipe, ["neusee", "calibrate", name, *changes], True
 
 
 def _is_recipe(name: str) -> bool:

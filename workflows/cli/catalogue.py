@@ -23,26 +23,41 @@ if TYPE_CHECKING:
     from neusee.workflows.recipe.node_families import Own
 
 #: how the help on a node describes a type of `neusee.nodes.units`
-_UNITS_IN_WORDS = {
-    "PositiveLength": "length > 0, such as 2.9 um",
-    "Length": "length, such as 50 nm",
-    "Wavelength": "wavelength from 100 nm to 20 um, such as 550 nm",
-    "Time": "time > 0, such as 100 ms",
-    "Delay": "time >= 0, such as 1 ms",
-    "Frequency": "frequency > 0, such as 1 kHz",
-    "Power": "power > 0, such as 5 mW",
-    "Energy": "energy > 0, such as 1 uJ",
-    "Illuminance": "illuminance >= 0, such as 1000 lx",
-    "Luminance": "luminance >= 0, such as 300 cd/m2",
-    "PositiveAngle": "angle > 0, such as 1 mrad",
-    "Angle": "angle, such as 1 mrad",
-    "Temperature": "temperature > 0, such as 6504 K",
-    "Electrons": "charge >= 0, such as 390 e-",
-    "DarkCurrent": "charge >= 0 of one exposure, such as 0.002 e-, or by time, such as 0.02 e-/s",
-    "Gain": "gain > 0, such as 2.7 DN/e- or 0.37 e-/DN",
-    "Waves": "wavelengths of path, such as 2 waves",
+_TYPES_IN_WORDS = {
+    "DarkCurrent": "charge from 0 of one exposure, such as 0.002 e-, or by time, such as 0.02 e-/s",
     "DataFile": "a file",
     "DataFiles": "files: a path, a folder, a pattern such as dark/*.png, or a list of these",
+}
+#: name of a quantity and an example, by its SI unit
+_QUANTITIES = {
+    "m": ("length", "2.9 um"),
+    "s": ("time", "100 ms"),
+    "rad": ("angle", "1 mrad"),
+    "K": ("temperature", "6504 K"),
+    "e-": ("charge", "390 e-"),
+    "e-/s": ("dark current", "0.02 e-/s"),
+    "W": ("power", "5 mW"),
+    "J": ("energy", "1 uJ"),
+    "Hz": ("frequency", "1 kHz"),
+    "lx": ("illuminance", "1000 lx"),
+    "cd/m2": ("luminance", "300 cd/m2"),
+    "waves": ("optical path", "2 waves"),
+    "DN/e-": ("gain", "2.7 DN/e- or 0.37 e-/DN"),
+}
+
+
+#: examples of types of `neusee.nodes.units` whose usual values are far from the example of their unit
+_EXAMPLES = {
+    "Wavelength": "550 nm",
+    "Linewidth": "10 nm",
+    "Distance": "100 m",
+    "Visibility": "10 km",
+    "FocalLength": "50 mm",
+    "Diameter": "25 mm",
+    "BeamRadius": "1 mm",
+    "Depth": "1.2 um",
+    "Height": "50 nm",
+    "Delay": "1 ms",
 }
 
 
@@ -174,12 +189,14 @@ def _kind(hint: Any) -> str:
     """Describe a parameter's type in words: its unit, its allowed texts, or the range of its numbers."""
     from neusee.nodes import units
 
-    for name, words in _UNITS_IN_WORDS.items():
+    for name, words in _TYPES_IN_WORDS.items():
         if hint == getattr(units, name):
             return words
     metadata, arguments = getattr(hint, "__metadata__", ()), get_args(hint)
     if any(isinstance(extra, units.IsFile) for extra in metadata):
-        return _UNITS_IN_WORDS["DataFile"]
+        return _TYPES_IN_WORDS["DataFile"]
+    if metadata and (words := _quantity(hint)):
+        return words
     if metadata:
         return f"{_kind(arguments[0])} {_limits(hint)}".strip()
     if arguments:
@@ -187,6 +204,22 @@ def _kind(hint: Any) -> str:
     names = {"int": "whole number", "float": "number", "bool": "true | false", "NoneType": "none", "str": "text",
              "Any": "any value", "Architecture": "a network class of yours, such as mynet.SmallUNet"}  # fmt: skip
     return names.get(getattr(hint, "__name__", ""), str(hint))
+
+
+def _quantity(hint: Any) -> str:
+    """Describe a quantity by its name, its range and an example, or return "" for a number without a unit."""
+    from neusee.nodes import units
+    from neusee.nodes.units import in_words, number_ranges
+
+    found = next(number_ranges(hint), None)
+    if found is None or not found.si or found.least is None or found.greatest is None:
+        return ""
+    name, usual = _QUANTITIES[found.si]
+    example = next((text for kind, text in _EXAMPLES.items() if hint == getattr(units, kind)), usual)
+    greatest = in_words(found.greatest, found.si)
+    if found.least == 0:
+        return f"{name} {'above' if 'gt=0' in repr(hint) else 'from'} 0 to {greatest}, such as {example}"
+    return f"{name} from {in_words(found.least, found.si)} to {greatest}, such as {example}"
 
 
 def _limits(hint: Any) -> str:

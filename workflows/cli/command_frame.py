@@ -123,6 +123,11 @@ def say(lines: list[str]) -> None:
     print(*lines, sep="\n", flush=True)
 
 
+def say_line(line: str) -> None:
+    """Print one line to stdout."""
+    say([line])
+
+
 def fail(message: str, code: int = BAD) -> NoReturn:
     """Print a message to stderr and end the command."""
     print(message, file=sys.stderr)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, split, the_store
+from neusee.workflows.cli.command_frame import fail, failing, refusing, split, the_store
 from neusee.workflows.cli.command_list import FAILED
 from neusee.workflows.cli.command_options import (
     AsJson,
@@ -33,6 +33,8 @@ EqualPeak = Annotated[
     float | None,
     typer.Option("--equal-protection", help="Peak of a laser to which filters and stops bring each pipeline, 0 to 1."),
 ]
+Scenes = Annotated[int | None, typer.Option("--scenes", min=1, max=1_000_000, help="Number of scenes, else 20.")]
+Small = Annotated[int, typer.Option("--small", min=11, max=100_000, help="Shorter side of the reduced pictures.")]
 By = Annotated[str | None, typer.Option("--by", help="What brings it there: best (stop and filter), filter or stop.")]
 
 
@@ -40,9 +42,9 @@ def evaluate(
     words: Words = None,
     pipelines: Pipelines = None,
     data: Annotated[str, typer.Option("--data", help="Folder of photographs; else the recipe's own scene.")] = "",
-    scenes: Annotated[int | None, typer.Option("--scenes", min=1, help="Number of scenes, else 20.")] = None,
+    scenes: Scenes = None,
     strengths: Strengths = "0,1e1,1e2,1e3,1e4,1e5,1e6",
-    small: Annotated[int, typer.Option("--small", min=11, help="Shorter side of the reduced pictures.")] = 256,
+    small: Small = 256,
     reference: Reference = "",
     equal_protection: EqualPeak = None,
     by: By = None,
@@ -90,7 +92,7 @@ def _evaluate(name: str, **options: Any) -> Path:
     from neusee.workflows.graph.run_error import RunError
 
     kept = resumable(lambda: kept_in(store, "the points that are finished are"))
-    with kept, failing(EvaluationRefused), failing(RunError, code=FAILED):
+    with kept, failing(EvaluationRefused), failing(RunError, code=FAILED), refusing():
         return verbs.evaluate(name, store=store, **options)
 
 

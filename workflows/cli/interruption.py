@@ -10,8 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import typer
+
 from neusee.workflows.cli.command_frame import fail, say
 from neusee.workflows.cli.command_list import FAILED, INTERRUPTED, TYPED
+from neusee.workflows.cli.interrupt_signal import say_stopped
 from neusee.workflows.report.json_output import json_line
 
 if TYPE_CHECKING:
@@ -32,7 +35,8 @@ def resumable(kept: Callable[[], str]) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        fail(f"stopped: {kept()}; to go on: {typed_command()}", INTERRUPTED)
+        say_stopped(f"stopped: {kept()}; to go on: {typed_command()}")
+        raise typer.Exit(INTERRUPTED) from None
     except OSError as error:
         if isinstance(error, BrokenPipeError) or "--debug" in TYPED:
             raise

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, split, the_store
+from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, say_line, split, the_store
 from neusee.workflows.cli.command_list import FAILED, MISSED
 from neusee.workflows.cli.command_options import AsJson, Debug, Out, Quiet, Words, option_words
 from neusee.workflows.cli.interruption import say_folder
@@ -59,7 +59,7 @@ def sheet(
     from neusee.workflows.calibration.run_sheet import write_sheet
     from neusee.workflows.graph.run_error import RunError
 
-    recipe, command = _loaded(words)
+    recipe, command = _loaded(words, quiet or as_json)
     said = [word for fact in state or () for word in ("--state", fact)]
     chosen: Release | None = None if release is None else "3" if release is StandardRelease.three else "4"
     command += [*option_words({"release": chosen, "relative": relative}), *said]
@@ -73,7 +73,7 @@ def sheet(
         fail(f"{document['fails']} See {folder / 'report.html'}", MISSED)
 
 
-def _loaded(words: list[str] | None) -> tuple[Recipe, list[str]]:
+def _loaded(words: list[str] | None, quiet: bool) -> tuple[Recipe, list[str]]:
     """Return the recipe of a descriptor or the named recipe, and the command line."""
     name, changes, _ = split(words)
     if Path(name).suffix.lower() != ".txt" and not Path(name).is_dir():
@@ -81,10 +81,13 @@ def _loaded(words: list[str] | None) -> tuple[Recipe, list[str]]:
     from neusee.workflows.calibration.emva_frames import descriptor_recipe
     from neusee.workflows.frames.descriptor_file import descriptor_of, descriptors_in
     from neusee.workflows.frames.folder_recipe import recipe_of_folder
+    from neusee.workflows.report.study_folder import silent
 
     with failing(ValueError, before="nothing was computed: "), refusing():
         if Path(name).is_dir() and not descriptors_in(Path(name)):
-            return recipe_of_folder(Path(name), the_store(), changes), ["neusee", "sheet", name, *changes]
+            told = silent if quiet else say_line
+            recipe = recipe_of_folder(Path(name), the_store(), changes, told, every_pixel=True)
+            return recipe, ["neusee", "sheet", name, *changes]
         return descriptor_recipe(descriptor_of(Path(name)), changes), ["neusee", "sheet", name, *changes]
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, load, the_store
-from neusee.workflows.cli.command_list import FAILED
+from neusee.workflows.cli.command_frame import fail, failing, load, refusing, the_store
+from neusee.workflows.cli.command_list import BAD, FAILED
 from neusee.workflows.cli.command_options import (
     AsJson,
     Debug,
@@ -22,9 +22,13 @@ from neusee.workflows.cli.command_options import (
     progress_lines,
 )
 from neusee.workflows.cli.interruption import kept_in, resumable, say_folder
+from neusee.workflows.graph.diagnostics import nearest
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from neusee.workflows.api.verbs import Kind
+    from neusee.workflows.graph.recipe_graph import Recipe
 
 study = typer.Typer(
     help="Study how accurate, stable and certain a recipe's numbers are.",
@@ -57,7 +61,9 @@ class Light(StrEnum):
 @study.command()
 def accuracy(
     words: Words = None,
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Number of noise draws for the error bars.")] = 3,
+    seeds: Annotated[
+        int, typer.Option("--seeds", min=1, max=1_000_000, help="Number of noise draws for the error bars.")
+    ] = 3,
     quick: Annotated[bool, typer.Option("--quick", help="Use fewer points.")] = False,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -107,7 +113,7 @@ def leave_out(
 def calibration(
     words: Words = None,
     simulations: Annotated[
-        int, typer.Option("--simulations", min=20, help="Number of sensors drawn from the prior.")
+        int, typer.Option("--simulations", min=20, max=10_000_000, help="Number of sensors drawn from the prior.")
     ] = 200,
     move: Annotated[Move, typer.Option("--move", help="Move of the walkers.")] = Move.DE,
     quiet: Quiet = False,
@@ -131,7 +137,7 @@ def uncertainty(
         float,
         typer.Option("--error", min=1e-3, max=1.0, help="Relative error of each standard deviation at which to stop."),
     ] = 0.05,
-    most: Annotated[int, typer.Option("--most", min=64, help="Largest number of draws.")] = 1000,
+    most: Annotated[int, typer.Option("--most", min=64, max=10_000_000, help="Largest number of draws.")] = 1000,
     points: Annotated[
         Points, typer.Option("--points", help="Independent draws, or a Sobol sequence, which needs fewer.")
     ] = Points.DRAWS,
@@ -140,7 +146,10 @@ def uncertainty(
         typer.Option("--until", metavar="NAME", help="Output or quantity that decides when to stop; may be repeated."),
     ] = None,
     workers: Annotated[
-        int, typer.Option("--workers", min=0, help="Number of draws computed at the same time; 0: by free processors.")
+        int,
+        typer.Option(
+            "--workers", min=0, max=10_000, help="Number of draws computed at the same time; 0: by free processors."
+        ),
     ] = 0,
     device: OneDevice = "cpu",
     quiet: Quiet = False,
@@ -152,25 +161,33 @@ def uncertainty(
 
     Uncertain are values given as distributions, such as "normal(1 e-, 0.1 e-)", and those of a `posterior`. Draws
     go on until each standard deviation, or each that --until names, is known to --error; the page says which input
-    causes the scatter. Run the same command again to continue. Needs: pip install -e ".[uncertainty]".
+    causes the scatter. Run the same command again to continue.
     """
     check_device(device)
     how: dict[str, Any] = {"error": error, "most": most, "points": points.value, "workers": workers, "device": device}
     how["until"] = tuple(until or ())
-    _run("uncertainty", words, quiet, as_json, out, **how)
+    _run("uncertainty", words, quiet, as_json, out, _refuse_unknown_until, **how)
 
 
 @study.command()
 def protection(
     words: Words = None,
     draws: Annotated[
-        int, typer.Option("--draws", min=2, help="Number of draws of wavelength, direction, defocus, dirt and scatter.")
+        int,
+        typer.Option(
+            "--draws",
+            min=2,
+            max=10_000_000,
+            help="Number of draws of wavelength, direction, defocus, dirt and scatter.",
+        ),
     ] = 12,
-    bands: Annotated[int, typer.Option("--bands", min=1, help="Number of the recipe's bands in use.")] = 7,
+    bands: Annotated[
+        int, typer.Option("--bands", min=1, max=100_000, help="Number of bands of the scene; the laser may have all.")
+    ] = 7,
     light: Annotated[
         Light, typer.Option("--light", help="Equal peak for a pulse, or equal heat for continuous light.")
     ] = Light.PULSE,
-    size: Annotated[float, typer.Option("--size", min=5.0, help="Height of the targets in pixels.")] = 14.0,
+    size: Annotated[float, typer.Option("--size", min=5.0, max=1e5, help="Height of the targets in pixels.")] = 14.0,
     prnu: Annotated[
         float, typer.Option("--prnu", min=0.0, max=1.0, help="Relative spread of the sensitivity of pixels.")
     ] = 0.01,
@@ -187,12 +204,34 @@ def protection(
     For a quiet frame and under attack: error of the filtered picture, information, NEQ, and detection of details, over
     scene light and protection, with the bounds of every mask. The page begins with a paragraph to quote.
     """
-    how = {"draws": draws, "bands": bands, "light": light.value, "size": size, "prnu": prnu, "residual": residual}
+    how: dict[str, Any] = {"draws": draws, "bands": bands, "light": light.value, "size": size}
+    how |= {"prnu": prnu, "residual": residual}
     _run("protection", words, quiet, as_json, out, **how)
 
 
-def _run(kind: Kind, words: list[str] | None, quiet: bool, as_json: bool, out: Path, **options: Any) -> None:
+def _refuse_unknown_until(recipe: Recipe, options: dict[str, Any]) -> None:
+    """End the command for a name in ``--until`` that is of no output."""
+    for name in options["until"]:
+        outputs = {output.partition("[")[0] for output in recipe.outputs}
+        if name.partition("[")[0].partition(".")[0] not in outputs:
+            fail(f"--until {name}: no output of {recipe.name} has this name; {nearest(name, outputs)}")
+
+
+def _any_recipe(recipe: Recipe, options: dict[str, Any]) -> None:
+    """Refuse nothing: the study itself knows what it needs."""
+
+
+def _run(
+    kind: Kind,
+    words: list[str] | None,
+    quiet: bool,
+    as_json: bool,
+    out: Path,
+    refuse: Callable[[Recipe, dict[str, Any]], None] = _any_recipe,
+    **options: Any,
+) -> None:
     recipe, command = load(words, "study", kind)
+    refuse(recipe, options)
     store = the_store()
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
@@ -201,7 +240,7 @@ def _run(kind: Kind, words: list[str] | None, quiet: bool, as_json: bool, out: P
     command += option_words(options)
     progress = progress_lines(quiet or as_json)
     kept = resumable(lambda: kept_in(store, "the parts that are finished are"))
-    with kept, failing(RunError, ValueError, ImportError, code=FAILED):
+    with kept, failing(RunError, ImportError, code=FAILED), failing(ValueError, code=BAD), refusing():
         folder = verbs.study(recipe, kind=kind, store=store, out=out, command=command, progress=progress, **options)
     say_folder(folder, as_json)
     if count := count_failures(folder):

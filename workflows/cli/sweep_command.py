@@ -21,7 +21,10 @@ def sweep(
         str, typer.Option("--on-error", help="After a failed point: stop, or continue with the next.")
     ] = "stop",
     workers: Annotated[
-        int, typer.Option("--workers", min=0, help="Number of points that run at the same time; 0: by free processors.")
+        int,
+        typer.Option(
+            "--workers", min=0, max=10_000, help="Number of points that run at the same time; 0: by free processors."
+        ),
     ] = 0,
     netcdf: Annotated[bool, typer.Option("--netcdf", help="Write sweep.nc too (needs neusee[xarray]).")] = False,
     as_json: AsJson = False,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, load, say, the_store
+from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, the_store
 from neusee.workflows.cli.command_list import FAILED
 from neusee.workflows.cli.command_options import AsJson, Debug, Out, ProgressLines, Words, check_device, progress_lines
 from neusee.workflows.cli.interruption import kept_training, resumable, say_json
@@ -76,6 +76,7 @@ def train(
         resumable(lambda: kept_training(out, recipe.name)),
         failing(RunError, ValueError, ArithmeticError, code=FAILED, before=who),
         failing(MeshError, before=who),
+        refusing(),
         joined(mesh, device) as processes_here,
         _loss_bar(silent, lengths) as watch,
     ):
@@ -104,6 +105,7 @@ def _lift(recipe: Recipe, command: list[str], out: Path, device: str, quiet: boo
     with (
         resumable(lambda: kept_training(out, recipe.name)),
         failing(RunError, ValueError, ArithmeticError, code=FAILED),
+        refusing(),
         _loss_bar(silent, lengths) as watch,
     ):
         folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(silent),

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.autograd.gradcheck import GradcheckError, gradcheck
 
 from neusee.nodes import Node, TensorStats
-from neusee.nodes.values import BAND_FIELDS
+from neusee.nodes.values import band_names
 from neusee.workflows.contract.finding import Finding
 from neusee.workflows.store.serialization import each_tensor, tensors_in
 from neusee.workflows.store.stored_types import fits
@@ -211,7 +211,7 @@ def _first_band(value: Any, axis: int) -> Any:
     """Return a value with its first band alone; of a named tuple, the fields that have bands are cut."""
     if isinstance(value, Tensor):
         return value.narrow(axis, 0, 1)
-    fields = {name: getattr(value, name) for name in BAND_FIELDS.get(type(value), ())}
+    fields = {name: getattr(value, name) for name in band_names(value)}
     cut = {name: x.narrow(axis, 0, 1) for name, x in fields.items() if x is not None}
     return value._replace(**cut) if cut else value
 

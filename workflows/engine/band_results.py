@@ -17,7 +17,7 @@ import xxhash
 from torch import Tensor
 
 from neusee.nodes import Node
-from neusee.nodes.values import BAND_FIELDS
+from neusee.nodes.values import BAND_FIELDS, band_names
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import digest, plain
 from neusee.workflows.store.band_files import Blobs, Damaged, Stacked, bytes_of
@@ -109,14 +109,14 @@ def band_tensors(value: Any) -> list[Tensor]:
     """Return the tensors of a result that have an axis of wavelength bands."""
     if isinstance(value, Tensor):
         return [value]
-    return [getattr(value, name) for name in BAND_FIELDS[type(value)]]
+    return [getattr(value, name) for name in band_names(value)]
 
 
 def with_band_tensors(value: Any, tensors: Sequence[Tensor]) -> Any:
     """Return ``value`` with ``tensors`` in place of its tensors that have an axis of wavelength bands."""
     if isinstance(value, Tensor):
         return tensors[0]
-    return value._replace(**dict(zip(BAND_FIELDS[type(value)], tensors, strict=True)))
+    return value._replace(**dict(zip(band_names(value), tensors, strict=True)))
 
 
 def _without_bands(value: Any) -> Any:

@@ -15,7 +15,7 @@ def check_devices(text: str) -> None:
         try:
             place = torch.empty(0, device=name).device
         except (RuntimeError, AssertionError) as error:
-            raise ValueError(f"{name}: {str(error).partition(chr(10))[0]}") from error
+            raise ValueError(f"{name}: {_reason(str(error))}") from error
         if place.type == "meta":
             raise ValueError(f"{name}: a tensor there has a shape and no values: write cpu or cuda")
         lane = place.type, torch.device(name).index or place.index or 0
@@ -25,3 +25,10 @@ def check_devices(text: str) -> None:
                 f"{text}: names a device twice ({again}): name each device once; cpu:0,cpu:1 are two lanes"
             )
         found[lane] = name
+
+
+def _reason(text: str) -> str:
+    """Return why a device cannot compute here, from the error of torch, without the names of its operators."""
+    if "aten::" in text:
+        return "this build of PyTorch cannot compute there: write cpu, or cuda on a machine with a GPU of NVIDIA"
+    return text.partition("\n")[0]

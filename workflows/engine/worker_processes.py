@@ -19,7 +19,7 @@ import threading
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from typing import Generic, TypeVar
 
@@ -31,6 +31,22 @@ from neusee.workflows.store.lease import retire
 T = TypeVar("T")
 _OWN = ("MainThread", "neusee")  #: how the names of threads of this program begin
 _PARENT_DIES = 1  #: PR_SET_PDEATHSIG of Linux
+
+
+@contextmanager
+def deaf_fork() -> Iterator[None]:
+    """Hold Ctrl-C back while the ``with`` block forks, so that it reaches the fork only after `ignore_interrupts`."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def ignore_interrupts() -> None:
+    """Ignore Ctrl-C in a fork: the parent decides what an interrupt ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def workers_for(pieces: int, asked: int = 0) -> int:
@@ -122,7 +138,7 @@ class _Team(Generic[T]):
         arguments = (there, [*self._pipes, mine], self._work, os.getpid())
         process = context.Process(target=_serve, args=arguments, name=f"neusee worker {index}", daemon=True)
         try:
-            with warnings.catch_warnings():  # Python 3.12 warns of every fork beside a thread
+            with warnings.catch_warnings(), deaf_fork():  # Python 3.12 warns of every fork beside a thread
                 warnings.simplefilter("ignore", DeprecationWarning)
                 process.start()
         except OSError:  # no memory or no permission: the others do the work, or this process
@@ -162,7 +178,7 @@ def _serve(pipe: Connection, others: Sequence[Connection], work: Callable[[int],
     """Do the pieces of work that the pipe names, until its other end closes."""
     for other in others:
         other.close()  # else the pipes of a killed process stay open
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt ends
+    ignore_interrupts()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_PARENT_DIES, signal.SIGKILL)

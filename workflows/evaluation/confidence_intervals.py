@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Numbers = NDArray[np.float64]
 CONFIDENCE = 0.95
 FEW = 5  #: smallest number of photographs for the bootstrap
-METRICS = ("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "saturated", "peak", "damaged")
+METRICS = ("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "saturated", "peak", "above")
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from neusee.workflows.report.study_page import Section
 from neusee.workflows.store.result_store import Store
 
 _BANDS = 7  #: wavelengths at which stops are compared
-COLUMNS = ("pipeline", "mask alone", "stop", "filter", "peak")
+COLUMNS = ("pipeline", "mask alone", "stop", "filter", "exposure", "peak")
 
 
 def read_protection(level: float | None, way: str) -> EqualProtection | None:
@@ -104,12 +104,14 @@ def as_document(result: EvaluationResult) -> dict[str, Any]:
 
 
 def protection_rows(result: EvaluationResult) -> list[Sequence[Any]]:
-    """Return mask alone, stop, filter and the peak with all of them, for each pipeline."""
-    return [
-        (p.name, p.shade.alone, p.shade.diameter, p.shade.transmittance, float(result.masks[p.front].lsr.max()))
-        for p in result.pipelines
-        if p.shade is not None
-    ]
+    """Return mask alone, stop, filter, exposure and the peak with all of them, for each pipeline."""
+    rows: list[Sequence[Any]] = []
+    for pipeline in result.pipelines:
+        shade = pipeline.shade
+        if shade is not None:
+            peak = float(result.masks[pipeline.front].lsr.max())
+            rows.append((pipeline.name, shade.alone, shade.diameter, shade.transmittance, shade.brightness, peak))
+    return rows
 
 
 def protection_section(result: EvaluationResult) -> list[Section]:
@@ -123,6 +125,8 @@ def protection_section(result: EvaluationResult) -> list[Section]:
     }
     text = f"""Every pipeline of this table lowers the peak of a laser to {result.protection.level:g} of that behind the
         plain lens, at the worst wavelength: each has {ways[result.protection.way]}. Mask alone: its peak without them.
-        Stop: diameter relative to the lens. Filter: transmittance. A picture that is not restored is as dark as its
-        filter makes it; a Wiener filter knows the PSF with filter and stop, and brightens it."""
+        Stop: diameter relative to the lens. Filter: transmittance. Exposure: no
+        picture is scored as dark as filter and stop make it. One that is not restored is brightened by this factor, 1
+        over the light that they pass, which makes its noise brighter too; a Wiener filter knows the PSF with filter and
+        stop, and brightens its picture itself."""
     return [Section("Equal protection", text, COLUMNS, protection_rows(result))]

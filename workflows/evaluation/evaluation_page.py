@@ -13,6 +13,7 @@ from neusee.workflows.evaluation.confidence_intervals import METRICS, Interval, 
 from neusee.workflows.evaluation.equal_protection import protection_section
 from neusee.workflows.evaluation.paired_intervals import gains_by_strength
 from neusee.workflows.evaluation.pipelines import CASES, DRAWN
+from neusee.workflows.evaluation.point_commands import shown_commands
 from neusee.workflows.report.study_page import Mark, Section
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ _EACH = ("mean", "low", "high")
 COLUMNS = ("pipeline", "mask", "restorer", "scenes", *(f"{m} {e}" for m in METRICS for e in _EACH),
            *(f"{name} {e}" for name in ("l1 less", "l1 gain", "l1 small gain") for e in _EACH))  # fmt: skip
 _COARSE = 1.05  #: tolerance of a bound, because a circular aperture is sampled on a square grid of frequencies
-_DIGITS = {"psnr": ".2f", "l1": ".4f", "ssim": ".3f", "saturated": ".0f", "damaged": ".2f"}
+_DIGITS = {"psnr": ".2f", "l1": ".4f", "ssim": ".3f", "saturated": ".0f", "above": ".2f"}
 
 
 def draw_pictures(result: EvaluationResult) -> dict[str, bytes]:
@@ -152,8 +153,9 @@ def _with_interval(x: Interval, metric: str) -> str:
 def _numbers(result: EvaluationResult) -> Section:
     text = f"""Mean and 95 % interval over scenes. Small: the picture that a display shows, reduced to {result.small}
         pixels of its shorter side in linear light, antialiased. Saturated: number of saturated pixels of the raw
-        picture. Damaged: fraction of the points whose brightest pixel exceeds `sensor.damage` times saturation, which
-        is the threshold of the paper and no damage in W/cm2. PSNR is a mean of decibels."""
+        picture. Above: fraction of the points whose brightest pixel exceeds `reading.damage_multiple`
+        times saturation, where the paper expects damage: a reading of the paper and no verdict, because 1e6 are
+        2 W/cm2 at its exposure, which damages nothing that is known. PSNR is a mean of decibels."""
     metrics = [metric for metric in METRICS if metric != "peak"]
     columns = ("pipeline", *(_column(metric) for metric in metrics))
     listed = [
@@ -243,12 +245,29 @@ def _plane(result: EvaluationResult, picture: bytes) -> Section:
     return Section("Suppression and contrast", text, columns, listed, picture, marks)
 
 
+def _commands(result: EvaluationResult) -> list[Section]:
+    """Return the section with the command of one point of each pipeline, beside the numbers that it gives."""
+    listed: list[Sequence[Any]] = []
+    for name, place, strength, command in shown_commands(result.commands):
+        point = result.points[name][place][strength]
+        numbers = (f"{point['l1']:.6g}", f"{point['psnr']:.6g}", f"{point['ssim']:.6g}", f"{point['saturated']:.0f}")
+        said = command or "no command: a random part of the camera, such as dirt, has the seed of the evaluation"
+        listed.append((name, result.scenes[place].number, f"{strength:g}", *numbers, said))
+    if not listed:
+        return []
+    text = """One point of each pipeline, with the command that gives its numbers at full size, in the folder in which
+        this evaluation was started: `metrics.csv` of the run has them. Each point has its command in `points.csv`. The
+        same recipe with another seed, another part of the photograph, or another direction of the laser gives other
+        numbers."""
+    columns = ("pipeline", "scene", "strength", "L1", "PSNR", "SSIM", "saturated", "command")
+    return [Section("The same numbers again", text, columns, listed)]
+
+
 def _data(result: EvaluationResult) -> list[Section]:
     text = """Scenes in the order of their numbers. The seed of the recipe chooses part of a photograph for each scene.
-        The seed of a scene decides the direction of the laser and the noise, which are the same for every pipeline. A
-        run of the recipe with this seed and scene gives the same numbers."""
+        The seed of a scene decides the direction of the laser and the noise, which are the same for every pipeline."""
     listed = [(s.number, s.name, s.case, s.seed) for s in result.scenes]
-    parts = [Section("Scenes", text, ("scene", "photograph", "laser", "seed"), listed)]
+    parts = [Section("Scenes", text, ("scene", "photograph", "laser", "seed"), listed), *_commands(result)]
     if result.broken:
         broken = [(path.name, reason) for path, reason in result.broken]
         parts.append(Section("Photographs that cannot be read", "", ("file", "why"), broken))

@@ -24,7 +24,7 @@ from neusee.workflows.graph.told_copies import TOLD
 from neusee.workflows.keys.cache_key import device_kind, digest, key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
+from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs, NothingDrawn
 from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -101,6 +101,14 @@ class EvaluationPoints:
     def key(self, pipeline: PipelineRecipes, point: PointRequest) -> str:
         """Return the cache key of an evaluation point from the keys of its steps and the settings of the comparison."""
         recipe, outputs = pipeline.recipe(point.lit), pipeline.pipeline.outputs
+        keys = self.point_keys(pipeline, point, outputs)
+        within = [recipe.tolerance, recipe.exact, recipe.estimates, device_kind(self.device), self.small]
+        own = [self._code.digest(used.__module__) for used in (quality, resize)]
+        return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
+
+    def point_keys(self, pipeline: PipelineRecipes, point: PointRequest, outputs: Sequence[str]) -> dict[str, str]:
+        """Return the cache keys of the steps of an evaluation point."""
+        recipe = pipeline.recipe(point.lit)
         params: dict[str, dict[str, Any]] = {}
         for name, value in self._changed(pipeline, point, outputs).items():
             step, _, param = name.rpartition(".")
@@ -109,12 +117,9 @@ class EvaluationPoints:
             name: replace(recipe.steps[name], params={**recipe.steps[name].params, **changed})
             for name, changed in params.items()
         }
-        keys = self._keys(replace(recipe, steps={**recipe.steps, **steps}), outputs, point.scene)
-        within = [recipe.tolerance, recipe.exact, recipe.estimates, device_kind(self.device), self.small]
-        own = [self._code.digest(used.__module__) for used in (quality, resize)]
-        return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
+        return self.keys(replace(recipe, steps={**recipe.steps, **steps}), outputs, point.scene)
 
-    def _keys(self, recipe: Recipe, outputs: Iterable[str], scene: Scene | None = None) -> dict[str, str]:
+    def keys(self, recipe: Recipe, outputs: Iterable[str], scene: Scene | None = None) -> dict[str, str]:
         """Return the cache key of each step, with the seed of the scene for all steps that depend on the scene."""
         keys = {"scene": scene.key(self._code)} if scene else {}
         live = dependents(recipe, keys)
@@ -131,10 +136,10 @@ class EvaluationPoints:
             recipe = replace(pipeline.recipe(case), estimates=False)  # one PSF for all scenes
             whole = with_substitutions(recipe, outputs)  # as in `run`, but the scene is an argument
             steps = set(needed(whole, outputs))
-            inputs = self._inputs(pipeline, case, outputs)
+            inputs = self.inputs(pipeline, case, outputs)
             free = ["scene", *(r for r in (inputs.readers if inputs else ()) if r.rpartition(".")[0] in steps)]
             if case != NONE:
-                free += [f"direction[{BEAM}].angle", *(f"{spot}.strength" for spot in _spots(recipe, outputs))]
+                free += [f"direction[{BEAM}].angle", *(f"{spot}.strength" for spot in spots(recipe, outputs))]
             free += [TOLD + name for name in free if TOLD + name.rpartition(".")[0] in steps]
             caller = self._kept.caller(dependents(whole, list(filter(_is_moved, whole.steps))))
             ways: dict[str, Any] = {"store": self.store, "device": self.device, "caller": caller}
@@ -148,17 +153,17 @@ class EvaluationPoints:
         A copy of a step from which the restorer is told gets the same values, with the error of the pipeline.
         """
         recipe = pipeline.recipe(point.lit)
-        inputs = self._inputs(pipeline, point.lit, outputs)
+        inputs = self.inputs(pipeline, point.lit, outputs)
         changed = inputs.theta(point.scene.draw(inputs)) if inputs else {}
         if point.lit != NONE:
             changed[f"direction[{BEAM}].angle"] = point.scene.angle(recipe)
-            changed |= {f"{spot}.strength": point.strength for spot in _spots(recipe, outputs)}
+            changed |= {f"{spot}.strength": point.strength for spot in spots(recipe, outputs)}
         copies = {name: value for name, value in changed.items() if TOLD + name.rpartition(".")[0] in recipe.steps}
         wrong = {name: value for name, value in pipeline.error.items() if value is not None}
         told = {TOLD + name: shifted(x, wrong[name]) if name in wrong else x for name, x in copies.items()}
         return changed | told
 
-    def _inputs(self, pipeline: PipelineRecipes, case: str, outputs: Sequence[str]) -> Inputs | None:
+    def inputs(self, pipeline: PipelineRecipes, case: str, outputs: Sequence[str]) -> Inputs | None:
         """Return the uncertain inputs of a pipeline, or None if no output depends on an uncertain input.
 
         A restorer that is told an error gets the values of the recipe without the error, whose steps it copies.
@@ -169,13 +174,13 @@ class EvaluationPoints:
         key = (id(recipe), tuple(outputs))
         if key not in self._drawn:
             self._drawn[key] = (recipe, None)
-            with suppress(ValueError):  # no output depends on an uncertain input
+            with suppress(NothingDrawn):  # no output depends on an uncertain input
                 self._drawn[key] = (recipe, Inputs.of(recipe, outputs))
         return self._drawn[key][1]
 
     def _share(self, function: Any, recipe: Recipe) -> None:
         """Replace constant results in a recipe function by the equal results of an earlier function, to save memory."""
-        keys = self._keys(recipe, function.fixed)
+        keys = self.keys(recipe, function.fixed)
         for name, value in function.fixed.items():
             function.fixed[name] = self._fixed.setdefault(keys[name], value)
 
@@ -191,7 +196,7 @@ class EvaluationPoints:
             **{f"{name} small": float(value) for name, value in small._asdict().items()},
             "saturated": float(saturated.pixels),
             "peak": float(peak.irradiance),
-            "damaged": float(peak.damaged),
+            "above": float(peak.above),
             "bsr": values["bsr[mask]"].tolist(),
         }
 
@@ -243,7 +248,8 @@ def _is_moved(step: str) -> bool:
     return step.partition("[")[0].removeprefix(TOLD) in _MOVED
 
 
-def _spots(recipe: Recipe, outputs: Sequence[str]) -> list[str]:
+def spots(recipe: Recipe, outputs: Sequence[str]) -> list[str]:
+    """Return the names of the steps that have the strength of a laser."""
     return [name for name in needed(recipe, outputs) if name.startswith("spot[")]
 
 

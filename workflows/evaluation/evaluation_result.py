@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from neusee.workflows.evaluation.comparison_pictures import Panel
@@ -47,6 +47,7 @@ class EvaluationResult:
     mistold: Sequence[MistoldPoint] = ()
     protection: EqualProtection | None = None  #: if pipelines were brought to one peak
     wavelengths: Sequence[float | None] = ()  #: of the laser of each scene, in m
+    commands: Mapping[str, Sequence[Mapping[float, str]]] = field(default_factory=dict)  #: as `points`, one each
 
     @property
     def reference(self) -> str:

@@ -20,10 +20,10 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.input_file_digest import file_digest
-from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
+from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs, NothingDrawn
 from neusee.workflows.store.result_store import Store
 
-_PHOTOGRAPH = "scene.photograph"
+PHOTOGRAPH = "scene.photograph"
 
 
 class UnreadablePhotograph(EvaluationRefused):
@@ -101,7 +101,7 @@ def scenes(
     broken: list[tuple[Path, str]] = []
     own = recipe.steps["scene"]
     shape = _shape(recipe)
-    paths: Sequence[Path] = [own.params["file"]] if own.node.path == _PHOTOGRAPH else []
+    paths: Sequence[Path] = [own.params["file"]] if own.node.path == PHOTOGRAPH else []
     if root is not None:
         if not root.is_dir():
             raise EvaluationRefused(f"--data {root}: this folder does not exist")
@@ -120,10 +120,12 @@ def scenes(
 def photographs(shown: Sequence[Scene]) -> list[int]:
     """Return the number of the photograph of each scene, over which intervals are drawn.
 
-    Scenes that are all of one photograph differ in laser and noise only; each then counts as one draw.
+    Equal files are one photograph, whatever their names. Scenes that are all of one photograph differ in laser and
+    noise only; each then counts as one draw.
     """
-    names = list(dict.fromkeys(scene.name for scene in shown))
-    return [names.index(scene.name) for scene in shown] if len(names) > 1 else list(range(len(shown)))
+    contents = [scene.name if scene.path is None else file_digest(scene.path) for scene in shown]
+    different = list(dict.fromkeys(contents))
+    return [different.index(content) for content in contents] if len(different) > 1 else list(range(len(shown)))
 
 
 def wavelengths(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> list[float | None]:
@@ -131,7 +133,7 @@ def wavelengths(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> list[float
     inputs: dict[str, Inputs | None] = {}
     for case in {scene.case for scene in shown if scene.case != NONE}:
         inputs[case] = None
-        with suppress(ValueError):  # nothing is drawn
+        with suppress(NothingDrawn):
             inputs[case] = Inputs.of(pipeline.recipe(case), pipeline.pipeline.outputs)
     return [
         scene.wavelength(pipeline.recipe(scene.case), inputs[scene.case]) if scene.case != NONE else None
@@ -162,7 +164,7 @@ def refuse_directions(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> None
 def _shape(recipe: Recipe) -> tuple[int, int]:
     """Return the size (y, x) of the scene in pixels; raise `EvaluationRefused` if the recipe sets no size."""
     shape = recipe.steps["scene"].params.get("shape")
-    if shape is None and recipe.steps["scene"].node.path == _PHOTOGRAPH:
+    if shape is None and recipe.steps["scene"].node.path == PHOTOGRAPH:
         raise EvaluationRefused("scene.shape is missing: write the size to crop from photographs, such as [768, 768]")
     if shape is None:
         raise EvaluationRefused("scene.shape is missing: write the size of the scene in pixels, such as [768, 768]")

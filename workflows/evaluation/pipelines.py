@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,7 +33,7 @@ CASES: dict[str, float | None] = {
 DRAWN = "drawn"  #: name of a laser whose wavelength follows the law of the recipe
 #: lasers of the figure with six lasers, with wavelengths in m
 SIX: dict[str, float | None] = {"violet": 405e-9, "blue": 450e-9, "cyan": 488e-9, **dict(list(CASES.items())[2:])}
-_WAVELENGTHS = {name: metres for name, metres in SIX.items() if metres is not None}
+WAVELENGTHS = {name: metres for name, metres in SIX.items() if metres is not None}
 _PIPELINE = re.compile(r"(?P<mask>[\w-]+)(?:@(?P<height>[^+]+))?\+(?P<restorer>[\w-]+)(?:@(?P<weights>.+))?")
 _HOW = "write MASK+RESTORER, such as flat+none, five_half_rings+wiener or pixelwise@mask.npy+nafnet@net.safetensors"
 
@@ -50,6 +51,8 @@ class Pipeline:
     height_file: Path | None = None
     weights: Path | None = None
     shade: EqualShade | None = None  #: filter and stop that make the protection of all pipelines equal
+    height_name: str = ""  #: of the height map; empty: the name of its file
+    weights_name: str = ""  #: of the weights; empty: the name of their file
 
     @property
     def name(self) -> str:
@@ -61,7 +64,7 @@ class Pipeline:
     @property
     def front(self) -> str:
         """Return the name of the mask with that of its file, or in words with the filter and the stop that it has."""
-        file = f"@{self.height_file.name}" if self.height_file else ""
+        file = f"@{self.height_name or self.height_file.name}" if self.height_file else ""
         if self.shade is None:
             return self.mask + file
         spoken = "plain lens" if self.mask == FLAT else self.mask.replace("half_ring", "half-ring").replace("_", " ")
@@ -70,7 +73,7 @@ class Pipeline:
     @property
     def back(self) -> str:
         """Return the name of the restorer, followed by the name of its file if it has a file."""
-        return self.restorer + (f"@{self.weights.name}" if self.weights else "")
+        return self.restorer + (f"@{self.weights_name or self.weights.name}" if self.weights else "")
 
     @property
     def picture(self) -> str:
@@ -97,6 +100,8 @@ class PipelineRecipes:
     told: str = ""  #: the error in what the restorer is told, as text
     error: Mapping[str, Any] = field(default_factory=dict)  #: what is added to which parameters of what it is told
     true: Callable[..., Recipe] | None = None  #: the same without the error
+    words: tuple[str, ...] = ()  #: arguments that make its mask and restorer from the recipe of the evaluation
+    fwhm: float = 10e-9  #: spectral width of its lasers in m
 
     @property
     def name(self) -> str:
@@ -115,6 +120,7 @@ def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
         height, weights = (folder / Path(x).expanduser() if (x := match[k]) else None for k in ("height", "weights"))
         found.append(Pipeline(match["mask"], match["restorer"], height, weights))
         wrong += [f"{word}: no such file: {path}" for path in (height, weights) if path and not path.is_file()]
+    found = named_apart(found)
     twice = {p.name for p in found if [q.name for q in found].count(p.name) > 1}
     wrong += [f"{name} is listed twice: remove one" for name in sorted(twice)]
     if not found and not wrong:
@@ -122,6 +128,27 @@ def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
     if wrong:
         raise EvaluationRefused("\n".join(wrong))
     return found
+
+
+def named_apart(pipelines: Sequence[Pipeline]) -> list[Pipeline]:
+    """Return pipelines in which different files have different names: with as many folders as that needs."""
+    files = [file for p in pipelines for file in (p.height_file, p.weights) if file is not None]
+    names = _shortest_names(files)
+    return [
+        replace(p, height_name=names.get(p.height_file, ""), weights_name=names.get(p.weights, "")) for p in pipelines
+    ]
+
+
+def _shortest_names(files: Sequence[Path]) -> dict[Path | None, str]:
+    """Return the shortest end of each path that no other file has; equal paths are one file."""
+    places = {file: Path(os.path.abspath(file)) for file in files}
+    names: dict[Path | None, str] = {}
+    for file, place in places.items():
+        others = [other for other in places.values() if other != place]
+        ends = (Path(*place.parts[-count:]) for count in range(1, len(place.parts) + 1))
+        shortest = next(end for end in ends if not any(other.parts[-len(end.parts) :] == end.parts for other in others))
+        names[file] = shortest.as_posix()
+    return names
 
 
 def compose_pipelines(
@@ -133,11 +160,11 @@ def compose_pipelines(
     wrong: dict[str, None] = {}
     for pipeline in pipelines:
         try:
-            words = [*changes, *_words(pipeline, partial(_takes, recipe, changes, folder))]
-            recipe_of = cache(partial(_with_laser, recipe, words, own, folder))
+            words = _words(pipeline, partial(_takes, recipe, changes, folder))
+            recipe_of = cache(partial(_with_laser, recipe, [*changes, *words], own, folder))
             for case in (NONE, next(iter(CASES))):
                 _check(recipe_of(case), pipeline)
-            found.append(PipelineRecipes(pipeline, recipe_of))
+            found.append(PipelineRecipes(pipeline, recipe_of, words=tuple(words), fwhm=own.fwhm))
         except RecipeError as error:
             wrong |= dict.fromkeys(f"{pipeline.name}: {one_line(problem)}" for problem in error.diagnostics)
         except EvaluationRefused as error:
@@ -191,11 +218,16 @@ def _with_laser(
     """Load a recipe with the laser ``case``; its strength, and usually its direction, is set later for each point."""
     laser = ""
     if case != NONE:
-        metres = wavelength or _WAVELENGTHS.get(case)
-        line = own.drawn if metres is None else f"wavelength: {metres * 1e9:.12g} nm, fwhm: {own.fwhm * 1e9:g} nm"
+        metres = wavelength or WAVELENGTHS.get(case)
+        line = own.drawn if metres is None else laser_line(metres, own.fwhm)
         angle = "null" if direction is None else f"[{direction[0]!r} rad, {direction[1]!r} rad]"
         laser = f"{BEAM}: {{{line}, strength: 1, angle: {angle}}}"
     return load(recipe, [*words, f"lasers={{{laser}}}"], folder)
+
+
+def laser_line(wavelength: float, fwhm: float) -> str:
+    """Return wavelength and spectral width of a laser, in m, as they are written in a recipe."""
+    return f"wavelength: {wavelength * 1e9:.12g} nm, fwhm: {fwhm * 1e9:g} nm"
 
 
 class _OwnLaser(NamedTuple):

@@ -10,6 +10,7 @@ all points, so that an interrupted evaluation continues.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +39,11 @@ from neusee.workflows.evaluation.pipelines import (
     PipelineRecipes,
     base_recipe,
     compose_pipelines,
+    named_apart,
     read_pipelines,
     refuse_fixed_laser,
 )
+from neusee.workflows.evaluation.point_commands import PointCommands
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.protection.equal_shade import EqualProtection
@@ -94,6 +97,7 @@ def evaluate(
     place = folder or Path.cwd()
     base, settings = base_recipe(recipe, changes, place), read_settings(recipe, changes, place)
     asked = AskedCamera(recipe, changes, place, store or open_store(), settings, progress)
+    pipelines = named_apart(pipelines)
     bare = compose_pipelines(recipe, changes, pipelines, place)
     strengths, reference = _strengths(strengths), _reference(reference, pipelines)
     study_run = StudyRun("evaluate", base, command)
@@ -107,6 +111,8 @@ def evaluate(
     found = measure(asked, bench, each, shown, strengths)
     waves = tuple(wavelengths(bare[0], found.scenes))
     result = _result(base, strengths, small, references, found, [p.pipeline for p in each], equal, broken, waves)
+    commands = PointCommands(recipe, changes, place, bench).commands(each, found.scenes, strengths)
+    result = replace(result, commands=commands)
     document = study_run.document(_document(result, bench))
     return study_run.write(runs, digest(document["summary"]), document, _report(result))
 
@@ -225,7 +231,7 @@ def _report(result: EvaluationResult) -> StudyReport:
 
     pictures = draw_pictures(result)
     tables: dict[str, CsvTable] = {
-        "points.csv": ((*_POINT, *METRICS), _point_rows(result)),
+        "points.csv": ((*_POINT, *METRICS, "command"), _point_rows(result)),
         "table.csv": (COLUMNS, rows(result)),
         "mistold.csv": ((*_POINT[:1], "told", *_POINT[3:6], *_POINT[7:], *METRICS), mistold_rows(result.mistold)),
         "suppression.csv": (("mask", "wavelength (nm)", "lsr", "bsr", "floor"), _curve_rows(result)),
@@ -243,9 +249,11 @@ _POINT = ("pipeline", "mask", "restorer", "scene", "photograph", "laser", "wavel
 def _point_rows(result: EvaluationResult) -> list[Sequence[Any]]:
     waves = ["" if metres is None else f"{metres * 1e9:.6g}" for metres in result.wavelengths]
     return [
-        (p.name, p.front, p.back, s.number, s.name, s.case, nm, f"{k:g}", *(point[metric] for metric in METRICS))
+        (p.name, p.front, p.back, s.number, s.name, s.case, nm, f"{k:g}", *(point[m] for m in METRICS), commands[k])
         for p in result.pipelines
-        for s, at, nm in zip(result.scenes, result.points[p.name], waves, strict=True)
+        for s, at, nm, commands in zip(
+            result.scenes, result.points[p.name], waves, result.commands[p.name], strict=True
+        )
         for k, point in at.items()
     ]
 

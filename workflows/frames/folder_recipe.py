@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from neusee.nodes.calibrate import LeastSquares, least_squares, refuse_descriptor
+import numpy as np
+
+from neusee.nodes.calibrate import LeastSquares, frame_divisor, hot_pixels, least_squares, refuse_descriptor
 from neusee.workflows.engine.runner import run
 from neusee.workflows.frames.descriptor_file import descriptor_of, descriptors_in, quoted
 from neusee.workflows.frames.frame_folder import FolderLevel, FolderLevels, FolderRefused, find_levels
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
+from neusee.workflows.report.study_folder import Progress, silent
 from neusee.workflows.store.result_store import Store
 
+_BITS = (8, 10, 12, 14)  #: of converters whose numbers are shifted to the left in files of 16 bits
 _EFFICIENCY = 0.5  #: electrons per photon, which relative light is scaled to
 _DESCRIBED = """# The sensor of the frames in {folder}, as the descriptor {name} describes them.
 steps:
@@ -23,11 +28,11 @@ _READ = """# The sensor of the frames in {folder}, found by {source}.
 levels:
 {levels}
 steps:
-  frames: {{node: calibrate.frames, each: levels, with: {{files: "${{item.files}}"}}}}
-  level:
+  frames: {{node: calibrate.frames, each: levels, with: {{files: "${{item.files}}"{divisor}}}}}
+{hot}  level:
     node: calibrate.reduce
     each: levels
-    from: frames
+    from: {source_of_level}
     with: {{photons: "${{item.photons}}", exposure: "${{item.exposure}}", scatter: steady}}
   measured: {{node: calibrate.levels, from: level}}
 """
@@ -69,13 +74,28 @@ camera:                    # first estimates by least squares; the frames decide
   drift: {drift:.3g}
 {traced}outputs: [measured, least_squares, camera]
 """
+_HOT = """  hot: {{node: calibrate.hot_pixels, with: {{files: [{files}]{divisor}}}}}   # in the longest dark exposure
+"""
 _RELATIVE = """traceability:
   photons: {known: relative}   # no radiometry: no quantum efficiency is told
 """
 
 
-def recipe_of_folder(folder: Path, store: Store, changes: Sequence[str] = ()) -> Recipe:
+@dataclass(frozen=True)
+class _Corrections:
+    """What the frames of a folder need before they are reduced."""
+
+    divisor: int  #: 1 for numbers that are not shifted
+    hot: tuple[Path, ...]  #: dark frames that show hot pixels; none without hot pixels
+
+
+def recipe_of_folder(
+    folder: Path, store: Store, changes: Sequence[str] = (), progress: Progress = silent, every_pixel: bool = False
+) -> Recipe:
     """Return the recipe of a calibration of the frames in a folder; the frames are read, and reduced to moments.
+
+    ``progress`` receives what was read as exposure before any frame is reduced, and what is divided or left out. With
+    ``every_pixel`` hot pixels count too, as EMVA 1288 demands of a sheet.
 
     Raises: `FolderRefused` with all reasons why the frames are no measurement, `RecipeError` with all mistakes of
     ``changes``.
@@ -83,13 +103,41 @@ def recipe_of_folder(folder: Path, store: Store, changes: Sequence[str] = ()) ->
     name = "".join(c if c.isalnum() else "_" for c in folder.absolute().name) or "frames"
     if descriptors_in(folder):
         return _described(descriptor_of(folder), name, store, changes)
-    found, scale = find_levels(folder), 1.0
-    fit = _fit(_loaded(name, _read(folder, found, scale) + "outputs: [measured]\n"), store)
+    found, scale = find_levels(folder, progress), 1.0
+    needs = _corrections(found, progress, every_pixel)
+    fit = _fit(_loaded(name, _read(folder, found, scale, needs) + "outputs: [measured]\n"), store)
     if found.light != "photons":
         scale = float(fit.efficiency) / _EFFICIENCY
     times = len({level.exposure for level in found.levels if level.dark})
     rest = _rest(fit, float(fit.efficiency) / scale, times, found.light != "photons")
-    return _loaded(name, _read(folder, found, scale) + rest, changes)
+    return _loaded(name, _read(folder, found, scale, needs) + rest, changes)
+
+
+def _corrections(found: FolderLevels, progress: Progress, every_pixel: bool) -> _Corrections:
+    """Return which numbers are divided and which pixels are left out, and tell both."""
+    divisor = _shift(found)
+    if divisor > 1:
+        progress(f"all numbers are multiples of {divisor}: shifted to the left in the files, and divided by {divisor}")
+    if every_pixel:
+        return _Corrections(divisor, ())
+    darkest = max((level for level in found.levels if level.dark), key=lambda level: level.exposure)
+    mask = hot_pixels(files=darkest.files, divisor=divisor)
+    count = int(mask.sum())
+    if not count:
+        return _Corrections(divisor, ())
+    share = f"{count} of {mask.numel()} pixels ({count / mask.numel():.2%})"
+    progress(f"{share} are hot in the dark frames of {darkest.exposure:g} s: they are left out of all levels")
+    return _Corrections(divisor, darkest.files)
+
+
+def _shift(found: FolderLevels) -> int:
+    """Return the divisor of numbers of a converter of 8 to 14 bits that are shifted to the left in 16 bits, else 1."""
+    divisor = 0
+    for level in found.levels:
+        divisor = int(np.gcd(divisor, frame_divisor(level.files[0])))
+        if divisor == 1:
+            return 1
+    return divisor if divisor in [2 ** (16 - bits) for bits in _BITS] else 1
 
 
 def _described(file: Path, name: str, store: Store, changes: Sequence[str]) -> Recipe:
@@ -118,13 +166,25 @@ def _loaded(name: str, text: str, changes: Sequence[str] = ()) -> Recipe:
         return load(path, changes)
 
 
-def _read(folder: Path, found: FolderLevels, scale: float) -> str:
+def _read(folder: Path, found: FolderLevels, scale: float, needs: _Corrections) -> str:
     levels = "\n".join(_level(level, scale) for level in found.levels)
-    return _READ.format(folder=" ".join(folder.name.split()) or ".", source=found.source, levels=levels)
+    divisor = f", divisor: {needs.divisor}" if needs.divisor > 1 else ""
+    return _READ.format(
+        folder=" ".join(folder.name.split()) or ".",
+        source=found.source,
+        levels=levels,
+        divisor=divisor,
+        hot=_HOT.format(files=_listed(needs.hot), divisor=divisor) if needs.hot else "",
+        source_of_level="{frames: frames, mask: hot}" if needs.hot else "frames",
+    )
+
+
+def _listed(files: Sequence[Path]) -> str:
+    return ", ".join(quoted(str(file.absolute())) for file in files)
 
 
 def _level(level: FolderLevel, scale: float) -> str:
-    files = ", ".join(quoted(str(file.absolute())) for file in level.files)
+    files = _listed(level.files)
     return f"  {level.name}: {{photons: {level.light * scale:.8g}, exposure: {level.exposure:.9g} s, files: [{files}]}}"
 
 

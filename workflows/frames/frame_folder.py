@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -9,11 +10,16 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from neusee.nodes.calibrate import FrameHeader, frame_header
-from neusee.workflows.frames.frame_names import read_name
-from neusee.workflows.frames.frame_table import find_table, read_table
+from neusee.workflows.frames.frame_names import NamedFrame, read_name
+from neusee.workflows.frames.frame_table import TableRow, find_table, read_table
 from neusee.workflows.frames.odd_frames import misplaced_frames
+from neusee.workflows.report.study_folder import Progress, silent
 
 SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr", ".fits", ".fit", ".fts")
+#: suffixes of pictures that hold no raw grey numbers, or that nothing here reads
+NOT_READ = (".jpg", ".jpeg", ".jpe", ".jp2", ".heic", ".heif", ".webp", ".gif", ".bmp", ".dng", ".cr2", ".cr3", ".nef",
+            ".arw", ".raf", ".rw2", ".orf", ".avi", ".mp4", ".mov")  # fmt: skip
+_LOSSY = (".jpg", ".jpeg", ".jpe", ".jp2", ".heic", ".heif", ".webp")
 _SHOWN = 3  #: files that a message names
 _LIT = 4  #: lit levels: a gain, a bend, a twist and the lamp are told from fewer only by their priors
 _SAME = 1e-6  #: relative difference of two exposures that are one
@@ -39,6 +45,7 @@ class Frame:
     exposure: float | None  #: s
     photons: float | None  #: per pixel and exposure
     light: float | None = None  #: relative
+    told: str = ""  #: what said the exposure, such as ``1-200s`` of a name
 
 
 class FolderLevel(NamedTuple):
@@ -59,15 +66,20 @@ class FolderLevels(NamedTuple):
     source: str  #: what told exposure and light, in words
 
 
-def find_levels(folder: Path) -> FolderLevels:
+def find_levels(folder: Path, progress: Progress = silent) -> FolderLevels:
     """Return the light levels that the files of a folder hold.
+
+    ``progress`` receives a line for each exposure that was read, before any frame is read.
 
     Raises: `FolderRefused` with every reason why they are no measurement.
     """
     frames, source, problems = _found(folder)
+    unread = sorted(path for path in folder.rglob("*") if path.suffix.lower() in NOT_READ)
     problems += [*_sizes(frames, folder), *_unknown(frames, folder)]
     if problems or not frames:
-        raise FolderRefused("\n".join(problems or [f"{folder}: no frames: {_HOW}"]))
+        raise FolderRefused("\n".join(problems or [_no_frames(folder, unread)]))
+    for line in (*_exposures(frames, folder), *_left(unread, folder)):
+        progress(line)
     light = _kind_of_light(frames)
     groups = _groups(frames, light)
     levels = tuple(_named(groups))
@@ -77,6 +89,39 @@ def find_levels(folder: Path) -> FolderLevels:
     if problems:
         raise FolderRefused("\n".join(problems))
     return FolderLevels(levels, light, source)
+
+
+def _no_frames(folder: Path, unread: Sequence[Path]) -> str:
+    """Return why a folder has no frames: it is empty, or its pictures are of other kinds."""
+    if not unread:
+        return f"{folder}: no frames: {_HOW}"
+    kinds = "/".join(sorted({path.suffix.lower() for path in unread}))
+    lossy = all(path.suffix.lower() in _LOSSY for path in unread)
+    why = "JPEG and its like change the noise of each pixel" if lossy else "no raw grey numbers are read from them"
+    return (f"{_some(unread, folder)}: {kinds} cannot be calibrated: {why}; save the raw frames of one channel as PNG "
+            f"or TIFF of 16 bits, FITS or NumPy, and {_HOW}")  # fmt: skip
+
+
+def _exposures(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
+    """Yield a line for each exposure with what said it, so that a wrong one is seen before the work."""
+    told: dict[tuple[bool, float, str], list[Path]] = defaultdict(list)
+    for frame in frames:
+        told[not frame.dark, frame.exposure or 0.0, frame.told].append(frame.file)
+    for (lit, seconds, text), files in sorted(told.items()):
+        kind, count = "lit" if lit else "dark", f"{len(files)} file{'s' * (len(files) != 1)}"
+        yield f"{kind}: exposure {_readable(seconds)}, from {text}: {count} such as {_short(files[0], folder)}"
+
+
+def _readable(seconds: float) -> str:
+    for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
+        if seconds >= scale:
+            return f"{seconds / scale:.6g} {unit}"
+    return f"{seconds / 1e-9:.6g} ns"
+
+
+def _left(unread: Sequence[Path], folder: Path) -> Iterator[str]:
+    if unread:
+        yield f"not read: {_some(unread, folder)}"
 
 
 def _found(folder: Path) -> tuple[list[Frame], str, list[str]]:
@@ -96,16 +141,55 @@ def _found(folder: Path) -> tuple[list[Frame], str, list[str]]:
         except ValueError as error:
             problems.append(str(error))
             continue
-        photons, exposure = (row.photons, row.exposure) if row else (name.photons, name.exposure)
-        light = row.light if row else None
-        dark = 0.0 in (photons, light, header.photons) or (name.dark and not photons and not light)
-        exposures = [x for x in (exposure, header.exposure) if x is not None]
-        if len(exposures) == 2 and abs(exposures[0] - exposures[1]) > 0.01 * exposures[1]:
-            who = f"{table.name}:{row.line}" if table and row else "its name"
-            problems.append(f"{_short(file, folder)}: {who} says {exposures[0]:g} s, its header {exposures[1]:g} s")
-        told = photons if photons is not None else header.photons
-        frames.append(Frame(file, header, name.level, dark, next(iter(exposures), None), told, light))
+        frames.append(_frame(file, name, row, header, table))
+        problems += _contradiction(frames[-1], name, row, table, folder)
+        if row is None or row.exposure is None:
+            problems += _doubt(frames[-1], name, files, folder)
     return frames, f"the table {table.name}" if table else "names and headers of the files", problems
+
+
+def _frame(file: Path, name: NamedFrame, row: TableRow | None, header: FrameHeader, table: Path | None) -> Frame:
+    """Return a frame with what a table says of it, else its name, else its header."""
+    photons, exposure = (row.photons, row.exposure) if row else (name.photons, name.exposure)
+    light = row.light if row else None
+    dark = 0.0 in (photons, light, header.photons) or (name.dark and not photons and not light)
+    told = "the header"
+    if exposure is not None:
+        told = table.name if row and table else f"{name.written} of the name"
+    return Frame(
+        file=file,
+        header=header,
+        level=name.level,
+        dark=dark,
+        exposure=header.exposure if exposure is None else exposure,
+        photons=header.photons if photons is None else photons,
+        light=light,
+        told=told,
+    )
+
+
+def _contradiction(
+    frame: Frame, name: NamedFrame, row: TableRow | None, table: Path | None, folder: Path
+) -> Iterator[str]:
+    """Yield a problem where a name or a table says another exposure than the header."""
+    said, header = row.exposure if row else name.exposure, frame.header.exposure
+    if said is None or header is None or abs(said - header) <= 0.01 * header:
+        return
+    who = f"{table.name}:{row.line}" if table and row else "its name"
+    yield f"{_short(frame.file, folder)}: {who} says {said:g} s, its header {header:g} s"
+
+
+def _doubt(frame: Frame, name: NamedFrame, files: Sequence[Path], folder: Path) -> Iterator[str]:
+    """Yield a problem for a name such as ``dark_1_200s``, unless a frame 2 shows that the 1 is a number of frames."""
+    if not name.doubtful or frame.header.exposure is not None:
+        return
+    text = str(frame.file.relative_to(folder)).lower()
+    second = text.replace(name.doubtful, "2" + name.doubtful[1:])
+    if second in (str(path.relative_to(folder)).lower() for path in files):
+        return
+    seconds = float(re.findall(r"\d+", name.doubtful)[-1])
+    yield (f"{_short(frame.file, folder)}: {name.doubtful} may be 1/{seconds:g} s, or number 1 of {seconds:g} s: write "
+           f"{_readable(1 / seconds).replace(' ', '')} or {seconds:g}s, or a table frames.csv")  # fmt: skip
 
 
 def _short(file: Path, folder: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from neusee.nodes.input_files import csv_rows
 from neusee.nodes.units import read_any
 
 _TIMES = {"exposure": 0.0, "exposure_s": 1.0, "exposure_ms": 1e-3, "exposure_us": 1e-6, "exposure_ns": 1e-9}
+_FRACTION = re.compile(r"\s*(\d+)\s*[/⁄]\s*([1-9]\d*(?:\.\d+)?)\s*(s|sec)?\s*")  #: 1/200 s
 _COLUMNS = "file, exposure (such as 10 ms) or exposure_ms, and photons or light"
 
 
@@ -73,7 +75,11 @@ def _exposure(text: str, column: str) -> float | None:
     if not text:
         return None
     scale = _TIMES[column]
-    number, unit = (float(text), "s") if scale else read_any(text)
+    if fraction := _FRACTION.fullmatch(text):
+        number, unit = float(fraction[1]) / float(fraction[2]), "s" if scale or fraction[3] else ""
+        scale = 0.0 if fraction[3] else scale
+    else:
+        number, unit = (float(text), "s") if scale else read_any(text)
     if unit != "s" or not 0 < number < math.inf:
         raise ValueError(f"exposure {text}: write a time with a unit, such as 10 ms, or name the column exposure_ms")
     return number * (scale or 1.0)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neusee.nodes.calibrate import emva_sheet, frame_header
+from neusee.nodes.calibrate import SaturationSignal, frame_header, saturation_signal
 from neusee.nodes.values import Levels
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -27,11 +27,13 @@ _VALUES = {
     "read_noise": ("read_noise", "e-"),
     "offset": ("offset", "e-"),
 }
+_STREAM = 11  #: of random numbers, apart from those of the draws
 _BITS = (8, 10, 12, 14, 16)  #: of common converters
 _NOTES = {
     "quantum_efficiency": "electrons per photon",
     "read_noise": "temporal dark noise of the shortest dark frames",
     "offset": "dark signal over gain",
+    "full_well": "signal of full pixels over gain, without the dark signal",
     "dark_current": "mean of one exposure, as long as `exposure` says",
 }
 
@@ -41,7 +43,7 @@ class SensorFrames(NamedTuple):
 
     shape: tuple[int, int]  #: (y, x)
     bits: int  #: of a digital number
-    full_well: float | None  #: e-; None if no level reached saturation
+    full: SaturationSignal | None  #: DN; None if no level reached saturation
     exposure: float  #: s, of the shortest dark frames
 
 
@@ -61,16 +63,15 @@ def sensor_target(name: str, folder: Path) -> Path:
 def frames_of_sensor(recipe: Recipe, store: Store) -> SensorFrames:
     """Return what the frames of a calibration of a folder say of the sensor.
 
-    Saturation counts where the variance falls above it, as in EMVA 1288.
+    A level is full where its variance has fallen.
     """
     files = [file for step in recipe.steps.values() for file in _files(step)]
     header = frame_header(files[0])
     levels: Levels = run(recipe, store, ("measured",)).values["measured"]
-    full = emva_sheet(levels, photons_told=False)["mu_e_sat"]
     brightest = max(float(levels.mean.max()), float(levels.cell_value.max()) if len(levels.cell_value) else 0.0)
     bits = next((b for b in _BITS if brightest < 2**b), header.bits)
     dark = levels.exposure[levels.photons == 0]
-    return SensorFrames(header.shape, bits, None if full.bound else full.value, float(dark.min()))
+    return SensorFrames(header.shape, bits, saturation_signal(levels), float(dark.min()))
 
 
 def _files(step: Step) -> Sequence[Path]:
@@ -93,7 +94,7 @@ def sensor_text(results: Path, frames: SensorFrames) -> str:
         raise ValueError("the frames do not tell the gain, so that no sensor group is written")
     with np.load(results / "draws.npz") as file:
         draws = {name: np.asarray(file[name], np.float64) for name in file}
-    values = _values(budget, draws, frames.exposure)
+    values = _values(budget, draws, frames)
     return _written(values, frames, results.name)
 
 
@@ -103,7 +104,9 @@ class _Value(NamedTuple):
     draws: NDArray[np.float64]  #: with the mean and the standard uncertainty of the budget
 
 
-def _values(budget: Mapping[str, Any], draws: Mapping[str, NDArray[np.float64]], exposure: float) -> dict[str, _Value]:
+def _values(
+    budget: Mapping[str, Any], draws: Mapping[str, NDArray[np.float64]], frames: SensorFrames
+) -> dict[str, _Value]:
     """Return each value of a sensor that the budget has, by its name in the group."""
     moved = {name: _moved(draws[name], row) for name, row in budget.items() if name in draws}
     found = {new: _Value(budget[name]["value"], unit, moved[name]) for name, (new, unit) in _VALUES.items()
@@ -113,8 +116,12 @@ def _values(budget: Mapping[str, Any], draws: Mapping[str, NDArray[np.float64]],
         found["offset"] = _Value(budget["dark_signal"]["value"] / budget["gain"]["value"], "e-", electrons)
     if "dark_current" in moved:
         of = float(str(budget["dark_current"]["unit"]).removeprefix("e- in ").removesuffix(" s"))
-        one = exposure / of
+        one = frames.exposure / of
         found["dark_current"] = _Value(one * budget["dark_current"]["value"], "e-", one * moved["dark_current"])
+    if frames.full is not None:
+        normal = np.random.default_rng(_STREAM).standard_normal(len(moved["gain"]))
+        signal = frames.full.signal + frames.full.uncertainty * normal
+        found["full_well"] = _Value(frames.full.signal / budget["gain"]["value"], "e-", signal / moved["gain"])
     return found
 
 
@@ -129,9 +136,7 @@ def _written(values: Mapping[str, _Value], frames: SensorFrames, source: str) ->
     lines = [f"{FIRST}: {source}.", "# What the frames do not tell is that of the packaged sensor: check pixel_pitch.",
              "defaults: [small]", "sensor:", f"  shape: [{frames.shape[0]}, {frames.shape[1]}]",
              f"  exposure: {frames.exposure:.9g} s", f"  bits: {frames.bits}"]  # fmt: skip
-    if frames.full_well is not None:
-        lines.append(f"  full_well: {frames.full_well:.5g} e-   # of the level of the largest variance")
-    else:
+    if frames.full is None:
         lines.append("  # full_well: no frame reached saturation")
     for name, value in values.items():
         note = f"   # {_NOTES[name]}" if name in _NOTES else ""

@@ -37,8 +37,14 @@ class RecipeError(ValueError):
     """Error for a recipe that cannot be run; the text of the error has one line for each mistake, in file order."""
 
     def __init__(self, diagnostics: Iterable[Diagnostic]) -> None:
-        self.diagnostics = tuple(sorted(set(diagnostics)))
+        self.diagnostics = tuple(sorted(_of_values_once(set(diagnostics))))
         super().__init__(_table(self.diagnostics))
+
+
+def _of_values_once(diagnostics: set[Diagnostic]) -> Iterator[Diagnostic]:
+    """Yield mistakes, without that of a setting where a step says the same of its value: `a` beside `a = -1 m`."""
+    of_steps = {(each.mark, each.path.partition(" = ")[0]) for each in diagnostics if " = " in each.path}
+    yield from (each for each in diagnostics if (each.mark, each.path) not in of_steps)
 
 
 def _table(diagnostics: tuple[Diagnostic, ...]) -> str:

@@ -7,6 +7,7 @@ for each node. The schema requires no key, because groups may complete a file.
 from __future__ import annotations
 
 import inspect
+import math
 import re
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -17,7 +18,7 @@ from pydantic_core import core_schema
 
 from neusee.nodes import Node, units
 from neusee.workflows.recipe.blocks.train_block import Training
-from neusee.workflows.recipe.distributions.scalar import KINDS
+from neusee.workflows.recipe.distributions.law_text import KINDS
 from neusee.workflows.recipe.exported_files import ALL, HALF, NAMES, NONE
 from neusee.workflows.recipe.loading import groups
 from neusee.workflows.recipe.node_families import Own, all_nodes
@@ -172,7 +173,8 @@ class _Generator(GenerateJsonSchema):
 
     def generate_inner(self, schema: Any) -> JsonSchemaValue:
         inner = super().generate_inner(schema)
-        return {"anyOf": [inner, REFERENCE]} if schema["type"] in _REFERABLE else inner
+        takes_reference = schema["type"] in _REFERABLE and REFERENCE not in inner.get("anyOf", ())
+        return {"anyOf": [inner, REFERENCE]} if takes_reference else inner
 
     def function_before_schema(self, schema: core_schema.BeforeValidatorFunctionSchema) -> JsonSchemaValue:
         """Return the JSON schema of a physical quantity: a number with one of the units that the parameter allows."""
@@ -180,7 +182,8 @@ class _Generator(GenerateJsonSchema):
         known = [unit for scale in units._SCALE.values() for unit in scale if _takes(read, unit)]
         if not known:
             return super().function_before_schema(schema)
-        sign = "[+]?" if {"gt", "ge"} & schema["schema"].keys() else "[-+]?"
+        least = max(schema["schema"].get(bound, -math.inf) for bound in ("gt", "ge"))
+        sign = "[+]?" if least >= 0 else "[-+]?"
         pattern = rf"^\s*{sign}{_NUMBER}\s*({'|'.join(map(re.escape, known))})\s*$"
         return {"type": "string", "pattern": pattern}
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from neusee.workflows.handbook.json_schema import schema
 from neusee.workflows.handbook.plain_markdown import escaped, table
-from neusee.workflows.recipe.distributions.scalar import KINDS
+from neusee.workflows.recipe.distributions.law_text import KINDS
 from neusee.workflows.recipe.loading import groups, recipes
 
 _TYPES = {"integer": "whole number", "array": "list", "object": "mapping", "string": "text", "null": "none"}

@@ -33,7 +33,7 @@ from neusee.workflows.keys.reachable_code import reached, read_names
 from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
 
 #: modules that decide no result
-_LEFT_OUT = frozenset({"neusee", ROOT, f"{ROOT}._node", f"{ROOT}.import_times", f"{ROOT}.own_modules"})
+_LEFT_OUT = frozenset({"neusee", ROOT} | {f"{ROOT}.{n}" for n in ("_hooks", "_node", "import_times", "own_modules")})
 _WORKFLOWS = "neusee.workflows"
 _THIS_PROCESS = os.urandom(8).hex()
 _PYTHON = "Python {}.{}".format(*sys.version_info)

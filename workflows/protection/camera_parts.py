@@ -31,7 +31,8 @@ class ProtectionCamera:
     height: Tensor
     flat: Tensor
     stop: Stop
-    bands: Bands  #: a few bands of the recipe, from end to end
+    bands: Bands  #: a few bands of the recipe, from end to end, for the scene
+    laser_bands: Bands  #: all bands of the recipe, for a laser that may have any wavelength
     illuminant: Tensor
     responses: Tensor
     keys: tuple[str, ...]  #: cache keys of these values
@@ -48,7 +49,7 @@ class ProtectionCamera:
         which = torch.linspace(0, len(bands.centres) - 1, min(count, len(bands.centres))).round().long()
         few = Bands(*(one[which] for one in bands))
         keys = tuple(result.keys[name] for name in names)
-        return cls(recipe, height, flat, stop, few, illuminant[which], responses[:, which], keys)
+        return cls(recipe, height, flat, stop, few, bands, illuminant[which], responses[:, which], keys)
 
     @property
     def lens(self) -> Mapping[str, Any]:

@@ -45,8 +45,16 @@ class EqualShade:
         return stop + (f" + filter {self.transmittance:.2g}" if self.transmittance < _OPEN else "")
 
     @property
+    def brightness(self) -> float:
+        """Return the factor that gives a picture behind stop and filter the exposure of one without them."""
+        return 1.0 / (self.transmittance * self.diameter**2)
+
+    @property
     def words(self) -> list[str]:
-        """Return the arguments that add stop and filter to the arm ``mask`` of a recipe."""
+        """Return the arguments that add stop and filter to the arm ``mask`` of a recipe.
+
+        The developed picture behind them has an exposure of its own: it is as bright as without them.
+        """
         values = f"transmittance: {self.transmittance!r}, diameter: {self.diameter!r}"
         return [
             "+arms.plain.shade=null",
@@ -54,6 +62,9 @@ class EqualShade:
             f"+steps.shade={{node: doe.shade, from: stop, with: {{{values}}}}}",
             "+steps.pupil.from.shade=${item.shade}",
             "+steps.laser_pupil.from.shade=${each.arms.shade}",
+            "+arms.plain.brightness=1",
+            f"+arms.mask.brightness={self.brightness!r}",
+            "+steps.developed.with={brightness: '${item.brightness}'}",
         ]
 
 

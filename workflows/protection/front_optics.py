@@ -58,8 +58,8 @@ class FrontMeasures:
 
     spectrum: PictureSpectrum
     energy: Mapping[str, Tensor]  #: by target (channel,)
-    peak: float  #: laser suppression ratio at the worst wavelength
-    heat: float  #: heat of the hottest pixel relative to the clear lens, at the worst wavelength; NaN if not asked for
+    peak: float  #: laser suppression ratio at the worst of all bands of the recipe
+    heat: float  #: heat of the hottest pixel relative to the clear lens, at the worst of them; NaN if not asked for
     radius: Tensor  #: (ring,) cycles per pixel
     square: Tensor  #: (ring,) mean of |OTF|**2
     glare: Mapping[int, GlareLevels]  #: by the side of the field in pixels
@@ -83,6 +83,7 @@ class FrontBench:
     def __init__(self, camera: ProtectionCamera, store: Store, settings: FrontSettings) -> None:
         self.camera, self.store, self.settings = camera, store, settings
         self._psfs: dict[Front, Psf] = {}
+        self._harms: dict[Front, dict[str, Tensor]] = {}
         code = Code(store.code_memo)
         files = [file_digest(Path(inspect.getfile(one))) for one in _SOURCES]
         files += [file_digest(Path(__file__)), file_digest(Path(inspect.getfile(ProtectionCamera)))]
@@ -90,7 +91,8 @@ class FrontBench:
                  if name in camera.recipe.steps]  # fmt: skip
         params = [{name: plain(value) for name, value in step.params.items()} for step in steps]
         self._key = [camera.keys, [code.of(node) for node in camera.nodes], files, params,
-                     camera.bands.centres.tolist(), repr(settings)]  # fmt: skip
+                     camera.bands.centres.tolist(), camera.laser_bands.centres.tolist(),
+                     repr(settings)]  # fmt: skip
 
     def measure(self, front: Front, condition: Condition) -> FrontMeasures:
         """Return what is measured of a front under a condition, from the store if it is there."""
@@ -106,8 +108,31 @@ class FrontBench:
         radius, square = radial_contrast(true, *light)
         found: dict[str, Tensor] = {f"spectrum.{name}": x for name, x in spectrum._asdict().items()}
         found |= {f"energy.{name}": x for name, x in detail_energy(true, *light, s.size).items()}
-        found |= {"radius": radius, "square": square, "peak": metrics.lsr(known).max(), "heat": self._heat(known)}
+        found |= {"radius": radius, "square": square, **self._harm(front)}
         return found | self._glare(front, condition)
+
+    def _harm(self, front: Front) -> dict[str, Tensor]:
+        """Return peak and heat at the worst of all bands of the recipe; they are computed once.
+
+        A mask may pass a laser in a narrow band that lies between the few bands of the scene.
+        """
+        if front not in self._harms:
+            bands = self.camera.laser_bands
+            columns = (torch.split(values, 1) for values in bands)
+            single = (Bands(*values) for values in zip(*columns, strict=True))
+            peaks, heats = zip(*(self._harm_in(front, band) for band in single), strict=True)
+            self._harms[front] = {"peak": torch.stack(peaks).max(), "heat": torch.stack(heats).max()}
+        return self._harms[front]
+
+    def _harm_in(self, front: Front, band: Bands) -> tuple[Tensor, Tensor]:
+        """Return peak and heat in one band, both relative to the clear lens."""
+        psf = self._psf(front, band, None)
+        peak = metrics.lsr(psf).max()
+        if self.settings.dwell is None:
+            return peak, torch.tensor(torch.nan, dtype=torch.float64)
+        clear = self._psf(Front(False), band, None)
+        pitch = self.camera.lens["pixel_pitch"]
+        return peak, metrics.heat_ratio(psf, clear, pixel_pitch=pitch, dwell=self.settings.dwell).max()
 
     def _known(self, front: Front) -> Psf:
         """Return the PSF that the filter knows, without the unknown conditions; it is computed once."""
@@ -120,14 +145,6 @@ class FrontBench:
 
     def _laser_psf(self, front: Front, line: Bands, condition: Condition, **more: Any) -> Psf:
         return self.camera.laser_psf(front.masked, front.diameter, line, condition, **front.notches, **more)
-
-    def _heat(self, known: Psf) -> Tensor:
-        if self.settings.dwell is None:
-            return torch.tensor(torch.nan, dtype=torch.float64)
-        clear = self._known(Front(False))
-        pitch = self.camera.lens["pixel_pitch"]
-        worst: Tensor = metrics.heat_ratio(known, clear, pixel_pitch=pitch, dwell=self.settings.dwell).max()
-        return worst
 
     def _glare(self, front: Front, condition: Condition) -> dict[str, Tensor]:
         """Return the levels of a laser's light over each field, with the light that the lens scatters.

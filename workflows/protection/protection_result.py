@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -32,6 +33,7 @@ SHOWN_AT = 30.0  #: e- a pixel, of the NEQ by frequency
 DRAWN = ("error", "NEQ", "text")  #: measures that are repeated for each draw
 _RATIO = 0.85  #: between two diameters of stops
 _MASK_STOPS = (1.0, 0.8, 0.6)
+_SMALL = (8, 8)  #: pixels of a PSF of which only the lens counts
 _HALF = 0.5  #: share of the information of the quiet frame below which a picture counts as lost
 
 
@@ -69,7 +71,7 @@ def measure_protection(
     own = mask.protection
     refuse_no_mask(own)
     progress(f"the mask lowers the harm of a laser to {own:.3g} of that behind the clear lens")
-    clear = [candidate(Front(False, d)) for d in _diameters(own, bench.settings.dwell is not None)]
+    clear = [candidate(Front(False, d)) for d in _diameters(bench, own)]
     masked = [candidate(Front(True, d)) for d in _MASK_STOPS]
     progress(f"{len(clear)} stops and {len(masked)} stops with the mask are measured")
     gain = {level: {n: gains(masked, clear, level, n, pixel) for n in LIGHTS} for level in (own, *LEVELS)}
@@ -93,15 +95,22 @@ def measure_protection(
                             lost, tint)  # fmt: skip
 
 
-def _diameters(own: float, continuous: bool) -> list[float]:
+def _diameters(bench: FrontBench, own: float) -> list[float]:
     """Return the relative diameters of stops: a series from the open lens, and the stop that alone protects as wanted.
 
     The best rival is often a stop without a filter, so that each wanted protection has such a stop.
     """
-    power = 1 / 3 if continuous else 1 / 4
-    alone = {level**power for level in (own, *LEVELS)}
+    alone = {_stop_alone(bench, level) for level in (own, *LEVELS)}
     series = {_RATIO**k for k in range(40) if _RATIO**k > min(alone)}
     return sorted(alone | series, reverse=True)
+
+
+def _stop_alone(bench: FrontBench, level: float) -> float:
+    """Return the diameter of the stop whose peak, or heat, is ``level`` without a filter."""
+    if bench.settings.dwell is not None:
+        return math.pow(level, 1 / 3)
+    lens = bench.camera.psf(False, 1.0, bench.camera.laser_bands, shape=_SMALL)
+    return float(metrics.stop_diameter(lens, level).min())
 
 
 def _rivals(

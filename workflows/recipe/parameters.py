@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any
 
 from pydantic import ValidationError
-from pydantic_core import ErrorDetails
 
 from neusee.nodes import Node, ParameterError
-from neusee.nodes.units import IsFile
+from neusee.nodes.file_parameters import is_file, texts_of
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.graph.recipe_graph import Step, Wire
 from neusee.workflows.recipe.node_families import Own, class_context
 from neusee.workflows.recipe.own_families import VARIABLE as NO_CODE
+from neusee.workflows.recipe.text.field_errors import message_of
 from neusee.workflows.recipe.text.references import broken
 from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, kind
@@ -91,25 +90,12 @@ class Checker:
         """Return a parameter value as plain data, with a file path relative to the folder of its YAML file."""
         parts = value.data if isinstance(value.data, list) else [value]
         hint = node.hints.get(name)
-        if not _is_file(hint) or not all(isinstance(part.data, str) for part in parts) or value.plain in _texts(hint):
+        if not is_file(hint) or not all(isinstance(part.data, str) for part in parts) or value.plain in texts_of(hint):
             return value.plain
         paths = [os.path.normpath(Path(part.mark.folder) / Path(part.data).expanduser()) for part in parts]
         full = [os.path.abspath(path) for path in paths]
         self.files[value.path] = full if isinstance(value.data, list) else full[0]
         return paths if isinstance(value.data, list) else paths[0]
-
-
-def _is_file(hint: Any) -> bool:
-    """Return True if a parameter's type annotation contains `IsFile` at any depth, so that the parameter is a path."""
-    extras = getattr(hint, "__metadata__", ())
-    return any(isinstance(extra, IsFile) for extra in extras) or any(map(_is_file, get_args(hint)))
-
-
-def _texts(hint: Any) -> list[Any]:
-    """Return the texts that a parameter takes beside a path, such as the names of known cameras."""
-    if get_origin(hint) is Literal:
-        return list(get_args(hint))
-    return [text for part in get_args(hint) for text in _texts(part)]
 
 
 def _problems(
@@ -133,7 +119,7 @@ def _problems(
                 yield Diagnostic(step, f"{given.name}.{name}", f"missing parameter: {node.path} needs {name}")
         else:
             value = _deepest(values[name], e["loc"][1:])
-            wrong.setdefault((value.mark, _said(value)), []).append(_message(e) + _in_si(e, value))
+            wrong.setdefault((value.mark, _said(value)), []).append(message_of(e, value))
     yield from gone.values()  # parameters that moved to the same node share one message
     for (mark, path), messages in wrong.items():
         absent = [message for message in dict.fromkeys(messages) if message.startswith("no such file")]
@@ -152,33 +138,3 @@ def _said(value: Value) -> str:
     """Return the name and the text of a recipe value, such as ``sensor.gain = -1``."""
     text = str(value.plain)
     return f"{value.name} = {text if len(text) <= _LONGEST else text[: _LONGEST - 1] + '…'}"
-
-
-def _message(error: ErrorDetails) -> str:
-    """Return the message of a pydantic error, rewritten so that the user knows which value to write."""
-    if error["type"] == "missing" and isinstance(error["loc"][-1], str):
-        return f"lacks {error['loc'][-1]}"
-    if error["type"] == "extra_forbidden":
-        return "has no meaning here"
-    if error["type"] == "missing":
-        return f"must have at least {int(error['loc'][-1]) + 1} values"
-    text = error["msg"].removeprefix("Value error, ")
-    text = re.sub(
-        r"^Input should be (a valid |valid )?", lambda m: "must be a " if m[1] == "a valid " else "must be ", text
-    )
-    text = re.sub(r"^must be a (?=[aeiou])", "must be an ", text)
-    text = text.replace("must be a tuple", "must be a list, such as [1, 2]").replace("a dictionary", "a mapping")
-    text = text.replace("must be an integer, got a number with a fractional part", "must be a whole number")
-    text = re.sub(r"must be an integer, unable to parse .*", "must be a whole number", text)
-    text = re.sub(r"must be a number, unable to parse .*", "must be a number", text)
-    if error["type"] == "literal_error":
-        options = re.findall(r"'([^']*)'", error.get("ctx", {}).get("expected", ""))
-        hint = nearest(os.path.basename(str(error["input"])), options)
-        text += f"; {hint}" if hint.startswith("did you mean") else ""
-    return text[:1].lower() + text[1:]
-
-
-def _in_si(error: ErrorDetails, value: Value) -> str:
-    """Return a quantity in SI units as text for a message that contains a limit in SI units."""
-    limit = next((v for key, v in error.get("ctx", {}).items() if key in ("gt", "ge", "lt", "le")), 0)
-    return f" in SI, not {error['input']:.4g}" if limit and isinstance(value.data, str) else ""

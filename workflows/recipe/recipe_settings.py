@@ -38,7 +38,7 @@ def final_values(
                 settings |= _defaults(wiring.steps[str(name)], bound)
     for name, law in uncertain.laws.items() if uncertain else ():
         if name in settings:
-            settings[name] = replace(settings[name], value=law.text)
+            settings[name] = replace(settings[name], value=law.full_text)
     return settings
 
 

@@ -20,7 +20,7 @@ from neusee.workflows.report.mask_story import SENTENCES
 from neusee.workflows.report.paper_readings import consequences
 from neusee.workflows.report.run_page import shape_of, unchecked_lines, unit_of
 from neusee.workflows.report.text_table import by_family, indented, lasts, wrapped
-from neusee.workflows.report.tolerance_spent import said_of_economies
+from neusee.workflows.report.tolerance_spent import said_of_economies, said_of_errors
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -251,6 +251,7 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str], took: str =
     took = took or f"{doc['seconds']:.2f}"
     lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
     lines += [left_out_line(doc)] if doc["left_out"] else []
+    lines += [said_of_errors(doc["spent"])] if lines else []
     lines += [doc["spectral"]["said"]] if doc.get("spectral") else []
     rows = [[row["name"], *row["cells"]] for row in doc["table"]["rows"]]
     lines += ["", *indented([["", *doc["table"]["columns"]], *rows])] if rows else []
@@ -276,10 +277,11 @@ def story_lines(doc: Mapping[str, Any]) -> list[str]:
 
 
 def left_out_line(doc: Mapping[str, Any]) -> str:
-    """Return one line with the steps that a run left out, and the upper bounds of the errors that this causes."""
+    """Return one line with the steps that a run left out, and the bounds or estimates of what each changes."""
     named: dict[str, float] = {}
+    estimated = {row["step"].partition("[")[0] for row in doc["spent"]["left_out"] if row["estimated"]}
     for row in doc["left_out"]:
         short = row["step"].partition("[")[0]
         named[short] = max(named.get(short, 0.0), row["bound"] or 0.0)
-    each = ", ".join(f"{name} (at most {bound:.1e})" for name, bound in named.items())
-    return f"left out {each}; tolerance {doc['tolerance']:g}"
+    steps = [f"{name} ({'estimated' if name in estimated else 'at most'} {bound:.1e})" for name, bound in named.items()]
+    return f"left out {', '.join(steps)}; tolerance {doc['tolerance']:g}"

@@ -139,7 +139,7 @@ def srgb(path: Path, /, *, image: Tensor, source: Path, draws: int) -> None:
     from neusee.workflows.report.figures.style import encoded
 
     codes = torch.from_numpy(encoded(image)).permute(2, 0, 1) * 65535.0
-    path.write_bytes(_named(_png16(codes), source, draws))
+    path.write_bytes(_named(_png16(codes), source, draws, _chunk(b"sRGB", b"\0")))
 
 
 def marked(path: Path, /, *, marked: Tensor, source: Path, draws: int) -> None:
@@ -147,12 +147,15 @@ def marked(path: Path, /, *, marked: Tensor, source: Path, draws: int) -> None:
     path.write_bytes(_named(_png16(marked.any(0, keepdim=True) * 65535.0), source, draws))
 
 
-def _named(png: bytes, source: Path, draws: int) -> bytes:
-    """Return a PNG with text chunks that name the frame, and the number of draws of the interval beside it."""
+def _named(png: bytes, source: Path, draws: int, coding: bytes = b"") -> bytes:
+    """Return a PNG with text chunks that name the frame, and the number of draws of the interval beside it.
+
+    ``coding`` is a chunk that says how the numbers are encoded.
+    """
     header = 8 + 12 + 13
     texts = {b"Source": source.name, b"Comment": f"restored by neusee; interval of each pixel from {draws} draws"}
     chunks = (_chunk(b"tEXt", name + b"\0" + text.encode("latin-1", "replace")) for name, text in texts.items())
-    return png[:header] + b"".join(chunks) + png[header:]
+    return png[:header] + coding + b"".join(chunks) + png[header:]
 
 
 def _chunk(name: bytes, body: bytes) -> bytes:

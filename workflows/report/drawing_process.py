@@ -23,6 +23,7 @@ from typing import Any
 
 import torch
 
+from neusee.workflows.engine.worker_processes import deaf_fork, ignore_interrupts
 from neusee.workflows.report.figures import style
 from neusee.workflows.store.serialization import pack, tensors_in, unpack
 
@@ -48,7 +49,7 @@ class DrawingProcess:
         self._next = threading.Lock()  # and is the next then, before the first thread asks again
         context = multiprocessing.get_context("fork")
         self._pipe, there = context.Pipe()
-        with warnings.catch_warnings():  # Python 3.12 warns of every fork beside a thread
+        with warnings.catch_warnings(), deaf_fork():  # Python 3.12 warns of every fork beside a thread
             warnings.simplefilter("ignore", DeprecationWarning)
             self._process = context.Process(target=_serve, args=(there, self._pipe), name="neusee draws", daemon=True)
             self._process.start()
@@ -117,7 +118,7 @@ def _serve(pipe: Connection, other_end: Connection) -> None:
     other_end.close()  # else the pipe stays open when the run is killed
     _close_all_but(pipe.fileno())
     gc.freeze()  # a search for garbage among the objects of the run would copy their memory
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run decides what an interrupt ends
+    ignore_interrupts()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     torch.set_num_threads(1)  # the threads of the run are not in a fork of it
     with suppress(Exception):  # the first picture meets the error again

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.report.contents import RIVAL, shade_of
+from neusee.workflows.report.contents import RIVAL, TABLE, shade_of
 from neusee.workflows.report.result_numbers import Value, arms, lines_of, suppressed
 
-SENTENCES = ("buys", "costs", "rival", "frame")
+SENTENCES = ("buys", "irradiance", "costs", "rival", "frame")
 PLAIN, MASK, RESTORED = "plain lens", "with mask", "restored"
 _PEAK, _QUALITY, _LOST = "peak/I_sat", "PSNR (dB)", "saturated px"
 _EQUAL = 0.01  #: relative difference of two peaks below which the mask changes nothing
@@ -18,6 +18,8 @@ _LEAST = 0.9  #: LSR above which there is nothing to replace
 _TIMES = 2.0  #: ratio of two peaks below which their difference is told in percent
 
 Arm = Mapping[str, float]
+_WHERE = {PLAIN: "behind the plain lens", MASK: "behind the mask"}  #: words of the two arms
+_PREFIXES = {-9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 
 
 def story(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, Any]:
@@ -25,6 +27,8 @@ def story(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, An
     numbers = {name: _known(cells) for name, cells in arms(recipe, keys, value).items()}
     lsr = suppressed(recipe, keys, value)
     said = sentences(numbers, lsr, bool(lines_of(recipe, keys)), element(recipe))
+    judged = any(name.partition("[")[0] == "damage" for name in recipe.steps)
+    said |= irradiance(_laser_peaks(keys, value), judged) if said else {}
     said |= {} if shade_of(recipe) or not said else rival(lsr, numbers)
     return {**said, "numbers": {name: numbers[name] for name in numbers if said}, "lsr": lsr if said else {}}
 
@@ -54,7 +58,33 @@ def sentences(
         return {}
     restored = numbers.get(RESTORED, {})
     texts = _buys(plain, mask, lsr, laser, element), _costs(plain, mask, restored, laser, element)
-    return {name: text for name, text in zip(SENTENCES[:2], texts, strict=True) if text}
+    return {name: text for name, text in zip(("buys", "costs"), texts, strict=True) if text}
+
+
+def irradiance(peaks: Mapping[str, float], judged: bool) -> dict[str, str]:
+    """Return the sentence ``irradiance``: the W/cm2 of the lasers in the brightest pixel, which no multiple replaces.
+
+    ``peaks`` are in W/m2, by plain lens and mask. ``judged`` is True for a recipe that compares them with thresholds.
+    """
+    shining = [f"{_density(peaks[name])} {words}" for name, words in _WHERE.items() if peaks.get(name, 0.0) > 0]
+    if not shining:
+        return {}
+    damage = "the step `damage` compares them" if judged else "`damage: published` and `neusee safety` compare them"
+    text = f"The lasers have {' and '.join(shining)} there: {damage} with the thresholds that are known"
+    return {"irradiance": f"{text}, and a multiple of saturation is not a measure of damage."}
+
+
+def _laser_peaks(keys: Mapping[str, str], value: Value) -> dict[str, float]:
+    """Return the W/m2 of all lasers in the brightest pixel behind the plain lens and behind the mask."""
+    steps = {name: TABLE[name][_PEAK] for name in (PLAIN, MASK)}
+    found = {name: value(step) for name, step in steps.items() if step in keys}
+    return {name: float(peak.laser) for name, peak in found.items() if hasattr(peak, "laser")}
+
+
+def _density(value: float) -> str:
+    """Return an irradiance in W/m2 as text in W/cm2 with a prefix."""
+    power = min(max(3 * math.floor(math.log10(value * 1e-4) / 3), -9), 9)
+    return f"{value * 1e-4 / 10.0**power:.3g} {_PREFIXES[power]}W/cm2"
 
 
 def rival(lsr: Mapping[str, float], numbers: Mapping[str, Arm]) -> dict[str, str]:
@@ -93,12 +123,19 @@ def _buys(plain: Arm, mask: Arm, lsr: Mapping[str, float], laser: bool, element:
         much = f"{_number(ratio)} times" if ratio >= _TIMES else f"{100 * abs(1 / less - 1):.0f} %"
         change = f"the brightest pixel receives {much} {word} light than behind the plain lens ({ends}"
     if not laser:
-        return f"No laser shines here, from which the {element} could protect the sensor: {change})."
-    bought = (
-        "protection for" if less >= _TIMES else "little protection for" if less >= 1 + _EQUAL else "no protection of"
-    )
-    verb = "buy" if _several(element) else "buys"
-    return f"The {element} {verb} {bought} the sensor: {change}{'; ' * bool(lsr)}{_ratios(lsr)})."
+        return f"No laser shines here, whose peak the {element} could lower: {change})."
+    return f"{_lowered(less, element)}: {change}{'; ' * bool(lsr)}{_ratios(lsr)})."
+
+
+def _lowered(less: float, element: str) -> str:
+    """Return whether a mask lowers the peak on the sensor, for the peak of the plain lens over that of the mask."""
+    several = _several(element)
+    if abs(less - 1) < _EQUAL:
+        return f"The {element} {'do' if several else 'does'} not change the peak on the sensor"
+    if less < 1:
+        return f"The {element} {'raise' if several else 'raises'} the peak on the sensor"
+    little = "" if less >= _TIMES else " a little"
+    return f"The {element} {'lower' if several else 'lowers'} the peak on the sensor{little}"
 
 
 def _suppression(lsr: Mapping[str, float], element: str) -> str:

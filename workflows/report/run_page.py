@@ -220,7 +220,9 @@ def unit_of(docstring: str) -> str:
 def _sampling(recipe: Recipe) -> list[str]:
     """Return a note on the sampling of the PSF, because every LSR depends on the sampling."""
     kinds = {step.params.get("sensor") for step in recipe.steps.values() if step.node.path == "optics.psf"}
-    return [_SAMPLING] if "point" in kinds else ["The PSF is integrated over each pixel."] if kinds else []
+    if kinds & {"point", "point_as_printed"}:
+        return [_SAMPLING]
+    return ["The PSF is averaged over each pixel."] if kinds else []
 
 
 def _unchecked(recipe: Recipe) -> list[dict[str, str]]:

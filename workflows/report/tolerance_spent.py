@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,6 +15,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, Substitution, dependents
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import StepRecord
 from neusee.workflows.tolerance.error_norm import error_of
+from neusee.workflows.tolerance.error_propagation import COVERAGE
 
 NORM = "root mean square over the largest element"
 
@@ -22,12 +23,14 @@ NORM = "root mean square over the largest element"
 def spent(result: Result) -> dict[str, Any]:
     """Return the tolerance of a run, with the omitted and the cheaper steps and their errors, as JSON values.
 
-    ``bounds`` has the error bound of each output, and of each input of a step without an error bound.
-    ``estimated`` names those of them that count errors which are estimated and not proved. ``rounded`` has those bounds
-    that are larger with an estimate of what rounding to digital numbers adds.
-    ``measured`` has the error of each output relative to a run with ``--exact``, if the store has its results.
+    ``outputs`` has the error that the run states for each output, its kind (proved, estimated, exact or unknown), and
+    the error measured against a run with ``--exact``, if the store has the results of this run: the numbers of the
+    terminal, of the page and of ``study leave-out``. ``bounds`` has the errors that the tolerance limits: of each
+    output, and of each input of a step without an error bound, before one draw of the noise and rounding add to them.
+    ``estimated`` names those of them that count errors which are estimated and not proved.
     """
-    estimated = _estimated(result)
+    recipe, measured = result.recipe, _measured(result)
+    estimated = dependents(recipe, _estimated_roots(result), needed(recipe, recipe.outputs))
     costs = (
         past_costs(result.store, sizes_of(result.recipe, needed(result.recipe, result.recipe.steps)))
         if result.recipe.substitutions or _left_out(result)
@@ -41,14 +44,14 @@ def spent(result: Result) -> dict[str, Any]:
         "exact": result.recipe.exact,
         "bounds": {name: share for name, share in result.proof.held.items() if share > 0},
         "estimated": [name for name, share in result.proof.held.items() if share > 0 and name in estimated],
-        "rounded": {name: share for name, share in result.proof.stated.items() if share > result.proof.held[name]},
-        "unbounded": [name for name in result.recipe.outputs if result.proof.of(name) is None],
-        "measured": _measured(result),
+        "outputs": [_output(result, name, measured.get(name)) for name in recipe.outputs],
+        "coverage": COVERAGE,
         "economies": [_economy(result, costs, each, each.instead in estimated) for each in result.recipe.substitutions],
         "left_out": [
             {
                 "step": done.step,
                 "bound": done.bound,
+                "estimated": bool(done.bound) and result.recipe.steps[done.step].node.hooks.skip_estimated,
                 "why": done.why,
                 "full_seconds": _seconds(result, costs, done.step),
             }
@@ -65,26 +68,61 @@ def said_of_economies(account: Mapping[str, Any]) -> str:
         if e["instead"] and e["bound"] != 0
     ]
     nothing = [f"{e['step']} (no error)" for e in account["economies"] if not e["instead"]]
-    worst = max(account["bounds"].values(), default=0.0)
-    found = max(account["measured"].values(), default=None)
-    measured = f", measured {found:.1e}" if found is not None else ""
     names = ", ".join([*summed, *nothing])
-    most = f"{worst:.1e} in all, in part estimated" if account["estimated"] else f"at most {worst:.1e} in all"
-    rounded = max(account["rounded"].values(), default=0.0)
-    most += f", about {rounded:.1e} with rounding to digital numbers" if rounded > worst else ""
-    return f"cheaper  {names}: error {most}{measured}; tolerance {account['tolerance']:g}"
+    return f"cheaper  {names}; tolerance {account['tolerance']:g}"
+
+
+def said_of_errors(account: Mapping[str, Any]) -> str:
+    """Return one line of text with the errors that a run states for its outputs, by kind, and the measured errors."""
+    rows = account["outputs"]
+    parts = []
+    if proved := [row for row in rows if row["kind"] == "proved"]:
+        parts.append(f"{_worst(proved, 'error')} at most, proved")
+    if estimated := [row for row in rows if row["kind"] == "estimated"]:
+        parts.append(
+            f"{_worst(estimated, 'error')}, an estimate that {account['coverage']:.0%} of errors do not exceed"
+        )
+    if unknown := [row["output"] for row in rows if row["kind"] == "unknown"]:
+        parts.append(f"unknown in {', '.join(unknown)}")
+    if not parts:
+        return "error    none in the outputs"
+    return f"error    {'; '.join(parts)}{_said_of_measured(rows)}"
+
+
+def _said_of_measured(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the largest error that was measured beside ``--exact``, and in which outputs, if not in all."""
+    measured = [row for row in rows if row["measured"] is not None]
+    if not measured:
+        return ""
+    text = f"; measured beside --exact: {_worst(measured, 'measured')}"
+    others = [row["output"] for row in rows if row["measured"] is None]
+    return f"{text}; not measured: {', '.join(others)}" if others else text
+
+
+def _worst(rows: Sequence[Mapping[str, Any]], column: str) -> str:
+    row = max(rows, key=lambda row: float(row[column]))
+    return f"{row[column]:.1e} in {row['output']}"
+
+
+def _output(result: Result, name: str, measured: float | None) -> dict[str, Any]:
+    error, kind = result.proof.stated_of(name), result.proof.kind_of(name)
+    return {"output": name, "error": error, "kind": kind, "measured": measured}
 
 
 def _within(bound: float | None, estimated: bool) -> str:
     return "error unknown" if bound is None else f"{'estimated' if estimated else 'at most'} {bound:.1e}"
 
 
-def _estimated(result: Result) -> set[str]:
-    """Return the steps whose errors are estimated, and not proved, somewhere on the way."""
+def _estimated_roots(result: Result) -> list[str]:
+    """Return the steps that add an error which is estimated, and not proved."""
     recipe = result.recipe
-    order = needed(recipe, recipe.outputs)
-    roots = [name for name in order if recipe.steps[name].node.hooks.estimated and result.proof.of(name)]
-    return dependents(recipe, roots, order)
+    found = []
+    for name in needed(recipe, recipe.outputs):
+        hooks, record = recipe.steps[name].node.hooks, result.done.get(name)
+        omitted = record is not None and record.state == "left out" and bool(record.bound)
+        if (hooks.skip_estimated and omitted) or (hooks.estimated and result.proof.shares.get(name)):
+            found.append(name)
+    return found
 
 
 def _left_out(result: Result) -> list[StepRecord]:

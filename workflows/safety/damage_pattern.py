@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
+from neusee.nodes.laser import heated_spot
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, unknown_step
 from neusee.workflows.recipe.blocks.safety_block import Safety
-from neusee.workflows.recipe.distributions.scalar import FloatArray
+from neusee.workflows.recipe.distributions.shapes import FloatArray
+from neusee.workflows.safety.exposures import Option
 from neusee.workflows.store.result_store import Store
 
 if TYPE_CHECKING:
@@ -30,6 +33,7 @@ class Spot:
     option: str
     light: FloatArray  #: (y, x)
     pitch: float  #: m
+    heated: float  #: m, 1/e2 diameter of the Gaussian spot of equal peak that heats as much or more
 
 
 @dataclass(frozen=True)
@@ -65,8 +69,18 @@ def step_of(recipe: Recipe, safety: Safety, setting: str, step: str, arm: str) -
 
 
 def _spot(option: str, intensity: FloatArray, params: Mapping[str, float]) -> Spot:
-    light = np.asarray(intensity, np.float64).sum(0)
-    return Spot(option, light / light.max(), params["pixel_pitch"])
+    light, pitch = np.asarray(intensity, np.float64).sum(0), params["pixel_pitch"]
+    heated = heated_spot(torch.from_numpy(light), pitch, lost=max(0.0, 1 - float(light.sum())))
+    return Spot(option, light / light.max(), pitch, heated or 0.0)
+
+
+def with_heated_spots(options: Sequence[Option], spots: Sequence[Spot]) -> tuple[Option, ...]:
+    """Return the options, of which masked ones know how much wider their heated spot is than that of the clear lens."""
+    heated = {spot.option: spot.heated for spot in spots}
+    plain, mask = heated.get(OPTIONS["plain"]), heated.get(OPTIONS["mask"])
+    if not plain or not mask:
+        return tuple(options)
+    return tuple(replace(option, heated=mask / plain) if option.masked else option for option in options)
 
 
 def damage_patterns(spots: Sequence[Spot], findings: Sequence[Finding]) -> Iterator[DamagePattern]:

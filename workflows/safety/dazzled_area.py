@@ -1,144 +1,220 @@
-"""The dazzled area behind each protection: from pixels ranked by their light where a step gives them, else closed."""
+"""The dazzled area behind each protection over the distance: a clear round lens by its integral, a mask by its PSFs."""
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import torch
 
-from neusee.nodes.laser import dazzle_strength, dazzled_pixels, peak_light, pixel_share, spot_in_pixels
-from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
-from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.nodes.laser import Beam, BrightPixels, defocus_at, round_pixels
 from neusee.workflows.recipe.blocks.safety_block import Safety
-from neusee.workflows.recipe.distributions.scalar import FloatArray
-from neusee.workflows.safety.damage_pattern import step_of
-from neusee.workflows.safety.exposures import Option
-from neusee.workflows.store.result_store import Store
+from neusee.workflows.recipe.distributions.shapes import FloatArray
+from neusee.workflows.safety.distance_ladder import as_wide, fill_at, focus_of, ladder
+from neusee.workflows.safety.exposures import Exposures, Option
+from neusee.workflows.safety.light_levels import Grid, Levels, Veil, levels_of, veil_of
+from neusee.workflows.safety.spots_along import Ranked
+from neusee.workflows.safety.uncertain_values import SettingDraws
 
-_RIM = 0.01  #: largest share of the rim of a window whose pixels count, for a window that holds the area
-_STRAY = "flare.stray_light"
-
-
-@dataclass(frozen=True)
-class Ranked:
-    """The pixels of the sensor behind lens or mask by how bright they are, in shares of the clear pupil's light."""
-
-    arm: str  #: ``plain`` or ``mask``
-    count: FloatArray  #: (rank,) number of pixels
-    level: FloatArray  #: (rank,) light in the faintest of these pixels
-    smooth: FloatArray  #: (rank,) the same of the mean over the feature of `Dazzle`
-    held: int  #: number of the first ranks for which the window holds all pixels that are as bright
-    stray: bool  #: whether the light that the lens scatters is in it
-
-    def light_at(self, pixels: float, smooth: bool = False) -> float | None:
-        """Return the light of the faintest of a number of pixels; None where the window does not hold them all."""
-        if not 1 <= pixels <= self.count[self.held - 1]:
-            return None
-        level = self.smooth if smooth else self.level
-        return float(np.exp(np.interp(math.log(pixels), np.log(self.count), np.log(np.maximum(level, 1e-300)))))
-
-    def pixels_above(self, light: FloatArray) -> FloatArray:
-        """Return the number of pixels with at least each of several lights; NaN where the window does not hold them."""
-        rising = np.log(np.maximum(self.level[::-1], 1e-300))
-        found = np.exp(np.interp(np.log(light), rising, np.log(self.count[::-1])))
-        beyond = np.where(light < self.level[self.held - 1], np.nan, found)
-        return np.where(light > self.level[0], 0.0, beyond)
+_RANKS = 80  #: numbers of pixels at which levels are computed
+_STEP, _WAVES = 0.3, 0.5  #: of the ladder of a clear round lens
+_SOFT = 0.1  #: waves below which a change of the defocus does not change the spot
+_DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
 
 
 @dataclass(frozen=True)
 class Area:
-    """The dazzled area of a laser behind one protection, against the exposure at the peak on the sensor."""
+    """The dazzled area of a laser behind one protection."""
 
     option: Option
-    spread: float  #: wavelength times f-number over pixel pitch, of the aperture
-    ranked: Ranked | None  #: None: the closed form of a clear round pupil
+    safety: Safety
+    ranked: Ranked | None  #: None: a clear round lens
 
     @property
-    def _clear(self) -> float:
-        """Return the share of the light in a pixel at the peak of the clear, focused lens."""
-        return peak_light(self.spread) * self.option.peak
+    def ranks(self) -> FloatArray:
+        """Return the numbers of pixels at which levels are known, the one that the settings ask for among them."""
+        rows, columns = self.safety.settings.sensor.shape
+        return np.unique(np.append(np.geomspace(1, rows * columns, _RANKS), self.asked))
 
-    def limit(self, pixels: float, veiled: bool) -> float | None:
-        """Return the peak exposure, in multiples of saturation, that dazzles a number of pixels; None: not known."""
-        if self.ranked is None:
-            return dazzle_strength(pixels, self.spread) / pixel_share(self.spread)
-        light = self.ranked.light_at(pixels, smooth=veiled)
-        return None if light is None else self._clear / light
+    @property
+    def asked(self) -> float:
+        """Return the number of pixels that may be lost."""
+        dazzle, (rows, columns) = self.safety.settings.dazzle, self.safety.settings.sensor.shape
+        return max(1.0, (dazzle.share if dazzle else 1.0) * rows * columns)
 
-    def saturated(self, peak: FloatArray) -> FloatArray:
-        """Return the number of pixels that peak exposures, in multiples of saturation, fill; NaN: not known."""
-        if self.ranked is not None:
-            return self.ranked.pixels_above(self._clear / np.maximum(peak, 1e-300))
-        share = pixel_share(self.spread)
-        return np.array([dazzled_pixels(float(x) * share, self.spread) for x in peak.ravel()]).reshape(peak.shape)
+    def level(self, exposures: Exposures, draws: SettingDraws, veiled: bool) -> FloatArray:
+        """Return the light (1 + draw or 1, distance) of the faintest of the pixels that may be lost.
+
+        It is a share of the light that passes the lens.
+        """
+        table, place, others = self._table(exposures, draws, veiled)
+        rank = int(np.searchsorted(self.ranks, self.asked))
+        level: FloatArray = np.exp(table.at(place, others, slice(rank, rank + 1))[..., 0])
+        return level
+
+    def beyond(self, exposures: Exposures, draws: SettingDraws) -> float:
+        """Return the largest share of the lost pixels that lie beyond the window of a PSF, over all distances."""
+        table, _, _ = self._table(exposures, draws, veiled=False)
+        return float(table.beyond[..., int(np.searchsorted(self.ranks, self.asked))].max())
+
+    def saturated(self, exposures: Exposures, draws: SettingDraws, at: int, light: FloatArray) -> FloatArray:
+        """Return the number of pixels with at least each light at one distance.
+
+        ``light`` (1 + draw or 1, any) is the share of the light that passes the lens.
+        """
+        table, place, others = self._table(exposures, draws, veiled=False)
+        columns = [place, *others]
+        columns = [each[:, at : at + 1] if each.shape[1] > 1 else each for each in columns]
+        known = table.at(columns[0], columns[1:], slice(None))[:, 0]
+        known = np.broadcast_to(known, (max(len(known), len(light)), known.shape[1]))
+        light = np.broadcast_to(light, (len(known), light.shape[1]))
+        ranks = self.ranks
+        rows = [_number(row, ranks, needed) for row, needed in zip(known, light, strict=True)]
+        return np.stack(rows)
+
+    def _table(
+        self, exposures: Exposures, draws: SettingDraws, veiled: bool
+    ) -> tuple[Levels, FloatArray, list[FloatArray]]:
+        """Return the levels, and where draws and distances lie among them; both are kept with the exposures."""
+        name = self._diameter, self.ranked.arm if self.ranked else "", veiled
+        if name not in exposures.tables:
+            if "veil" not in exposures.tables:
+                exposures.tables["veil"] = veil_of(self.safety, draws)
+            veil = exposures.tables["veil"]
+            share = np.log(veil.share)[:, None] if veil else np.zeros((1, 1))
+            if self.ranked is None:
+                spots = self._round_spots(exposures, draws)
+                levels, place = _of_clear(self, spots, veil, share, veiled), spots.place
+                others = [*spots.others, share]
+            else:
+                widths = self.safety.settings.lens.diameter / (2 * np.sqrt(exposures.fill[self.option.name]))
+                place = np.log(as_wide(exposures.beams[0], widths))
+                levels, others = _of_spots(self, veil, share, veiled), [share]
+            exposures.tables[name] = levels, place, others
+        kept: tuple[Levels, FloatArray, list[FloatArray]] = exposures.tables[name]
+        return kept
+
+    @property
+    def _diameter(self) -> float:
+        """Return the diameter in m of the lens with its stop."""
+        return min(self.option.diameter or math.inf, self.safety.settings.lens.diameter)
+
+    def _round_spots(self, exposures: Exposures, draws: SettingDraws) -> _RoundSpots:
+        """Return the spots of a clear round lens; they are kept with the exposures, for each diameter."""
+        name = "round spots", self._diameter
+        if name not in exposures.tables:
+            exposures.tables[name] = _round_spots(self, exposures, draws)
+        spots: _RoundSpots = exposures.tables[name]
+        return spots
 
 
-def ranked_of(recipe: Recipe, safety: Safety, store: Store | None) -> tuple[Ranked, ...]:
-    """Return the ranked pixels of the steps that the settings name; raise `RecipeError` for a step of another kind."""
-    protection = safety.settings.protection
-    named = {
-        arm: step for arm, step in protection.pixels if step is not None and (arm, protection.mask) != ("mask", None)
-    }
-    if safety.settings.dazzle is None or not named:
-        return ()
-    steps = {arm: _step(recipe, safety, arm, step) for arm, step in named.items()}
-    found: Any = run(recipe, store, list(steps.values()))
-    return tuple(_ranked(arm, found[step], _scatters(recipe, step)) for arm, step in steps.items())
+@dataclass(frozen=True)
+class _RoundSpots:
+    """The spots of a clear round lens over distance, defocus and size, and where draws and distances lie among them."""
+
+    rungs: FloatArray  #: (rung,) m
+    grids: tuple[Grid, Grid]  #: of the defocus beside the nominal one, and of the logarithm of the size in pixels
+    groups: tuple[BrightPixels, ...]  #: at each rung and each point of the grids, the last of which runs fastest
+    place: FloatArray  #: (1 + draw or 1, distance) logarithm of the distance at which the nominal beam is as wide
+    others: tuple[FloatArray, FloatArray]  #: the defocus and the size there, in the scales of the grids
 
 
-def _step(recipe: Recipe, safety: Safety, arm: str, named: str) -> str:
-    """Return the name of a step of ranked pixels; raise `RecipeError` for another node, and for another sensor."""
-    setting, sensor = f"protection.pixels.{arm}", safety.settings.sensor
-    step = step_of(recipe, safety, setting, named, arm)
-    given, params = recipe.steps[step], recipe.steps[step].params
-    value, text = safety.values[setting], ""
-    if given.node.path != "laser.bright_pixels":
-        text = f"the step {step} is of the node {given.node.path}: name a step of laser.bright_pixels"
-    elif not math.isclose(params["pixel_pitch"], sensor.pixel_pitch) or tuple(params["shape"]) != sensor.shape:
-        text = f"the step {step} has another sensor: give it safety.sensor.pixel_pitch and safety.sensor.shape"
-    if text:
-        raise RecipeError([Diagnostic(value.mark, value.name, text)])
-    return step
+def _round_spots(area: Area, exposures: Exposures, draws: SettingDraws) -> _RoundSpots:
+    """Return the spots of a clear round lens, by the integral over its pupil at each rung and each point."""
+    lens, sensor, dazzle = area.safety.settings.lens, area.safety.settings.sensor, area.safety.settings.dazzle
+    name, diameter = area.option.name, area._diameter
+    widths = diameter / (2 * np.sqrt(exposures.fill[name]))
+    waist = min(*(beam.waist for beam in exposures.beams), float(widths.min()))
+    beam = exposures.beams[0]._replace(waist=waist)
+    place = np.log(as_wide(beam, widths))
+    defocus = _defocus(area.safety, beam, diameter)
+    bend = np.arcsinh(exposures.waves[name] / _SOFT) - np.arcsinh(defocus(np.exp(place)) / _SOFT)
+    spread = np.log(_spreads(area.safety, draws, diameter))
+    bends, spreads = Grid.around(bend, 1.5), Grid.around(spread, 4)
+    ends = float(np.exp(place.min())), float(np.exp(place.max()))
+    rungs = ladder(beam, lens, diameter, ends, _STEP, _WAVES)
+    groups = []
+    for distance in rungs.tolist():
+        fill = fill_at(beam, diameter, distance)
+        nominal = math.asinh(float(defocus(np.array([distance]))[0]) / _SOFT)
+        for offset, size in itertools.product(bends.points.tolist(), spreads.points.tolist()):
+            waves = _SOFT * math.sinh(nominal + offset)
+            feature = dazzle.feature if dazzle else 1.0
+            groups.append(round_pixels(fill, waves, math.exp(size), sensor.shape, feature))
+    return _RoundSpots(rungs, (bends, spreads), tuple(groups), place, (bend, spread))
 
 
-def _scatters(recipe: Recipe, step: str) -> bool:
-    """Return True if stray light of the lens is in the result of a step."""
-    waiting, seen = [step], set[str]()
-    while waiting:
-        name = waiting.pop()
-        if recipe.steps[name].node.path == _STRAY:
-            return True
-        seen.add(name)
-        waiting += [source for source in recipe.steps[name].sources if source not in seen]
-    return False
+def _number(levels: FloatArray, ranks: FloatArray, light: FloatArray) -> FloatArray:
+    """Return the number of pixels with at least each light, from the logarithms of the levels of rising ranks."""
+    needed = np.log(np.maximum(light, 1e-300))
+    number = np.exp(np.interp(needed, levels[::-1], np.log(ranks)[::-1]))
+    return np.where(needed > levels[0], 0.0, number)
 
 
-def _ranked(arm: str, found: Any, stray: bool) -> Ranked:
-    count, level, smooth, rim = (np.asarray(x, np.float64) for x in found)
-    wide = np.flatnonzero(rim > _RIM)
-    return Ranked(arm, count, level, smooth, int(wide[0]) if wide.size else len(count), stray)
+def _defocus(safety: Safety, beam: Beam, diameter: float) -> Callable[[FloatArray], FloatArray]:
+    """Return the waves of defocus over the distance of a nominal beam behind an aperture."""
+    lens = safety.settings.lens
+    if lens.focus == "laser":
+        return np.zeros_like
+    path = lens.defocus * _DEFOCUS * (diameter / lens.diameter) ** 2
+
+    def waves(distance: FloatArray) -> FloatArray:
+        at: torch.Tensor = torch.from_numpy(distance)
+        return np.asarray(defocus_at(beam, at, torch.tensor(diameter), focus_of(lens), path), np.float64)
+
+    return waves
+
+
+def _spreads(safety: Safety, draws: SettingDraws, diameter: float) -> FloatArray:
+    """Return wavelength times f-number over pixel pitch (1 + draw or 1, 1), nominal and of each draw."""
+    lens, laser, pitch = safety.settings.lens, safety.laser, safety.settings.sensor.pixel_pitch
+    aperture = np.minimum(draws.column("lens.diameter", lens.diameter), diameter)
+    focal = draws.column("lens.focal_length", lens.focal_length)
+    colour = draws.column("laser.wavelength", laser.wavelength)
+    spread = colour * focal / aperture / draws.column("sensor.pixel_pitch", pitch)
+    return (spread if np.ptp(spread) else spread[:1])[:, None]
+
+
+def _of_clear(area: Area, spots: _RoundSpots, veil: Veil | None, share: FloatArray, veiled: bool) -> Levels:
+    """Return the levels of a clear round lens, from its spots."""
+    shares, shape = Grid.around(share, 2), area.safety.settings.sensor.shape
+    levels = [levels_of(groups, shape, area.ranks, veil, np.exp(shares.points), veiled) for groups in spots.groups]
+    points = [len(grid.points) for grid in (*spots.grids, shares)]
+    values, beyond = (
+        np.stack(part).reshape(len(spots.rungs), *points, len(area.ranks)) for part in zip(*levels, strict=True)
+    )
+    return Levels(np.log(spots.rungs), (*spots.grids, shares), values, beyond)
+
+
+def _of_spots(area: Area, veil: Veil | None, share: FloatArray, veiled: bool) -> Levels:
+    """Return the levels behind lens or mask, from the pixels of their PSFs at several distances."""
+    assert area.ranked is not None
+    shares, shape = Grid.around(share, 3), area.safety.settings.sensor.shape
+    found = [levels_of(each, shape, area.ranks, veil, np.exp(shares.points), veiled) for each in area.ranked.groups]
+    values, beyond = (np.stack(part) for part in zip(*found, strict=True))
+    rungs = np.log(np.array(area.ranked.distances))
+    misses = area.ranked.misses
+    return Levels(
+        rungs, (shares,), values, beyond, most=-np.log(area.ranks), misses=misses
+    )  # N pixels share all light at most
 
 
 def area_of(safety: Safety, option: Option, ranked: Sequence[Ranked]) -> Area | str:
     """Return the dazzled area behind an option, or the reason why it is not known."""
-    lens, pitch = safety.settings.lens, safety.settings.sensor.pixel_pitch
-    diameter = min(option.diameter or np.inf, lens.diameter)
-    spread = spot_in_pixels(safety.laser.wavelength, lens.focal_length, diameter, pitch)
     arms = {each.arm: each for each in ranked}
     if option.masked:
-        if "mask" in arms:
-            return Area(option, spread, arms["mask"])
-        return (
-            "the recipe does not compute it. Add `- safety: masked_dazzle` to its defaults, or name a step of "
-            "laser.bright_pixels in safety.protection.pixels.mask"
-        )
-    plain = arms.get("plain")
-    if plain is None or option.diameter is None:
-        return Area(option, spread, plain)
-    if plain.stray:
-        return "the closed form for a stop has no stray light, which the other rows count"
-    return Area(option, spread, None)
+        if "mask" not in arms:
+            return (
+                "the recipe does not compute it. Add `- safety: masked_dazzle` to its defaults, or name a step of "
+                "laser.bright_pixels in safety.protection.pixels.mask"
+            )
+        if not math.isfinite(arms["mask"].error):
+            return "the pupil of safety.protection.pixels.mask has no wavefront, so that its spot is of one distance"
+        return Area(option, safety, arms["mask"])
+    plain = arms.get("plain") if option.diameter is None else None
+    if plain is not None and not math.isfinite(plain.error):
+        return "the pupil of safety.protection.pixels.plain has no wavefront, so that its spot is of one distance"
+    return Area(option, safety, plain)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neusee.workflows.recipe.distributions.scalar import FloatArray
+from neusee.workflows.recipe.distributions.shapes import FloatArray
 
 QUANTILES = (0.05, 0.95)  #: ends of the interval that contains 90 % of the draws
 _ROUNDED = 1e-9  #: relative rounding of the logarithm of a distance
@@ -81,8 +81,17 @@ def _placed(at: FloatArray, height: FloatArray, marks: NDArray[np.bool_], step: 
     return placed
 
 
-def zones_of(distances: FloatArray, nominal: FloatArray, drawn: FloatArray, at: float) -> Zones:
-    """Return the zones of a limit from the ratio of exposure to limit: nominal (distance,), drawn (draw, distance)."""
+def zones_of(
+    distances: FloatArray, nominal: FloatArray, drawn: FloatArray, at: float, asked: tuple[float, float] | None = None
+) -> Zones:
+    """Return the zones of a limit from the ratio of exposure to limit: nominal (distance,), drawn (draw, distance).
+
+    Zones lie between the two distances ``asked``, whether or not the distance ``at`` of the recipe does.
+    """
+    within = _at(distances, drawn, at) >= 1
+    if asked is not None:
+        shown = (distances >= asked[0] * (1 - _ROUNDED)) & (distances <= asked[1] * (1 + _ROUNDED))
+        distances, nominal, drawn = distances[shown], nominal[shown], drawn[:, shown]
     near, far = (ends[0] for ends in crossings(distances, nominal[None]))
     starts, stops = crossings(distances, drawn)
     count = (~np.isnan(starts)).sum(1)
@@ -98,7 +107,6 @@ def zones_of(distances: FloatArray, nominal: FloatArray, drawn: FloatArray, at: 
     )
     furthest = np.nanmax(stops[count > 0], 1) if (count > 0).any() else np.zeros(0)
     reach = Spread.of(float(far.max()) if len(far) else float(np.median(furthest)), furthest) if furthest.size else None
-    within = _at(distances, drawn, at) >= 1
     return Zones(zones, float((count == 0).mean()), float(alike.mean()), reach, float(within.mean()))
 
 

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from neusee.nodes import ParameterError
-from neusee.nodes.laser import eye_limit, frame_power, nominal_ocular_hazard_distance
-from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.blocks.safety_block import Safety
-from neusee.workflows.recipe.distributions.scalar import FloatArray
-from neusee.workflows.safety.damage_pattern import DamagePattern, Spot, damage_patterns, spots_of, step_of
+from neusee.workflows.recipe.distributions.shapes import FloatArray
+from neusee.workflows.safety.counted_parts import near_text
+from neusee.workflows.safety.damage_pattern import (
+    DamagePattern,
+    Spot,
+    damage_patterns,
+    spots_of,
+    with_heated_spots,
+)
+from neusee.workflows.safety.damage_verdict import DamageVerdict, damage_verdicts
 from neusee.workflows.safety.dazzle_curves import Dazzled, dazzled
-from neusee.workflows.safety.dazzled_area import Area, Ranked, area_of, ranked_of
+from neusee.workflows.safety.dazzled_area import Area, area_of
 from neusee.workflows.safety.dead_pixels import DeadPixels, damaged_frames
 from neusee.workflows.safety.distance_zones import QUANTILES, Spread, Zones, zones_of
 from neusee.workflows.safety.exposures import (
@@ -27,13 +32,19 @@ from neusee.workflows.safety.exposures import (
     emission_of,
     options_of,
 )
-from neusee.workflows.safety.sensor_limits import Limit, damage_limits, dazzle_limits
+from neusee.workflows.safety.eye_findings import EyeDazzleFinding, EyeFinding, eye_dazzle_finding, eye_finding
+from neusee.workflows.safety.first_channel import sees, with_channels
+from neusee.workflows.safety.lens_of_recipe import refuse_other_lens
+from neusee.workflows.safety.light_levels import Veil, veil_of
+from neusee.workflows.safety.limit_ratios import emitted, limit_ratio, limits_behind, mean_in_frame
+from neusee.workflows.safety.sensor_limits import Limit
+from neusee.workflows.safety.spots_along import Peaks, Ranked, peaks_of, ranked_of
 from neusee.workflows.safety.uncertain_values import SettingDraws, draw_settings
-from neusee.workflows.safety.unsaid_parts import unsaid_of_damage, unsaid_of_dazzle
+from neusee.workflows.safety.unsaid_parts import beyond_window, unsaid_of_damage, unsaid_of_dazzle
+from neusee.workflows.safety.what_helps import Remedy, remedies
 from neusee.workflows.store.result_store import Store
 
 CERTIFICATE = "An estimate, no certificate: neusee decides nothing about eyes or sensors."
-EYE_SOURCE = "IEC 60825-1:2014, small source, as written out in neusee (nodes.laser.eye_mpe)"
 
 
 @dataclass(frozen=True)
@@ -49,18 +60,7 @@ class Finding:
     probability: Spread | None  #: of damage to a device drawn from all; None where the spread of devices is unknown
     zones: Zones
     curve: FloatArray  #: (3, distance) of the limit at the lens: nominal, 5 % and 95 %
-
-
-@dataclass(frozen=True)
-class EyeFinding:
-    """The exposure limit of the eye, and the distance beyond which the laser does not exceed it."""
-
-    duration: float  #: s
-    limit: float  #: W/m2, or J/m2 of each pulse
-    quantity: str
-    exposure: Spread  #: at the distance of the recipe, on the axis
-    distance: Spread  #: nominal ocular hazard distance, m
-    source: str = EYE_SOURCE
+    ratios: Spread | None = None  #: ``ratio`` with its interval
 
 
 @dataclass(frozen=True)
@@ -75,11 +75,16 @@ class Estimate:
     exposures: Exposures
     findings: tuple[Finding, ...]
     eye: EyeFinding | None
+    eye_dazzle: EyeDazzleFinding
     unsaid: tuple[str, ...]  #: what the estimate does not say, with the reason
     patterns: tuple[DamagePattern, ...] = ()
     dazzled: tuple[Dazzled, ...] = ()  #: behind each protection for which the dazzled area is known
     dead: tuple[DeadPixels, ...] = ()  #: examples of damage in a raw frame
     ranked: tuple[Ranked, ...] = ()
+    damage: tuple[DamageVerdict, ...] = ()  #: behind each protection; empty if damage is not asked for
+    helps: tuple[Remedy, ...] = ()  #: filter, notch, stop or exposure for each limit behind the plain lens
+    peaks: Peaks | None = None
+    veil: Veil | None = None
 
     @property
     def at(self) -> int:
@@ -111,15 +116,20 @@ class Prepared:
     options: tuple[Option, ...]
     spots: tuple[Spot, ...]
     ranked: tuple[Ranked, ...]
+    peaks: Peaks | None
 
 
 def prepare(recipe: Recipe, store: Store | None) -> Prepared:
     """Return what decides an estimate, with the errors that `estimate` lists."""
-    safety = _with_stop(recipe, settings_of(recipe), store)
+    safety = settings_of(recipe)
+    refuse_other_lens(recipe, safety, store)
+    safety = with_channels(recipe, safety, store)
     draws = draw_settings(recipe, safety)
     spots = spots_of(recipe, safety, store)
     ranked = ranked_of(recipe, safety, store)
-    return Prepared(safety, draws, options_of(safety, _mask_peak(recipe, safety, store)), spots, ranked)
+    peaks = peaks_of(recipe, safety, store)
+    options = options_of(safety, peaks.here, peaks.along, peaks.misses) if peaks else options_of(safety, None)
+    return Prepared(safety, draws, with_heated_spots(options, spots), spots, ranked, peaks)
 
 
 def complete(recipe: Recipe, prepared: Prepared) -> Estimate:
@@ -127,19 +137,45 @@ def complete(recipe: Recipe, prepared: Prepared) -> Estimate:
     safety, draws, options = prepared.safety, prepared.draws, prepared.options
     exposures = compute_exposures(safety, draws, options)
     known = {option.name: area_of(safety, option, prepared.ranked) for option in options}
-    areas = tuple(area for area in known.values() if isinstance(area, Area)) if safety.settings.dazzle else ()
+    areas = tuple(area for area in known.values() if isinstance(area, Area)) if _dazzles(safety) else ()
     findings = tuple(_findings(safety, draws, options, exposures, areas))
-    eye, faults = _eye(safety, exposures)
-    unsaid = (*unsaid_of_damage(safety, findings), *unsaid_of_dazzle(safety, known, findings), *faults)
-    patterns = tuple(damage_patterns(prepared.spots, findings))
+    verdicts = tuple(damage_verdicts(safety, options, exposures, draws, findings))
+    eye = eye_finding(safety, exposures)
+    faults = (eye,) if isinstance(eye, str) else ()
+    beyond = {area.option.name: area.beyond(exposures, draws) for area in areas}
+    unsaid = (
+        *unsaid_of_damage(safety, verdicts),
+        *unsaid_of_dazzle(safety, known),
+        *beyond_window(beyond),
+        *near_text(safety.settings.distances[0], prepared.ranked, prepared.peaks),
+        *faults,
+    )
     mean = mean_in_frame(exposures, safety.settings.sensor.exposure or 1.0)
-    filled = dazzled(safety, draws, exposures, areas, mean)
-    dead = tuple(damaged_frames(safety, prepared.spots, findings, exposures))
-    emission = emission_of(safety.laser.beam())
     return Estimate(
-        recipe, safety, emission, options, draws, exposures, findings, eye, unsaid, patterns, filled, dead,
-        prepared.ranked,
-    )  # fmt: skip
+        recipe=recipe,
+        safety=safety,
+        emission=emission_of(safety.laser.beam()),
+        options=options,
+        draws=draws,
+        exposures=exposures,
+        findings=findings,
+        eye=None if isinstance(eye, str) else eye,
+        unsaid=unsaid,
+        patterns=tuple(damage_patterns(prepared.spots, findings)),
+        dazzled=dazzled(safety, draws, exposures, areas, mean),
+        dead=tuple(damaged_frames(safety, prepared.spots, findings, exposures)),
+        ranked=prepared.ranked,
+        peaks=prepared.peaks,
+        veil=veil_of(safety, draws),
+        damage=verdicts,
+        eye_dazzle=eye_dazzle_finding(safety, exposures),
+        helps=remedies(safety, draws, prepared.ranked),
+    )
+
+
+def _dazzles(safety: Safety) -> bool:
+    """Return True if dazzle is asked for and some channel of the sensor sees the laser."""
+    return safety.settings.dazzle is not None and sees(safety.channels)
 
 
 def settings_of(recipe: Recipe) -> Safety:
@@ -150,34 +186,6 @@ def settings_of(recipe: Recipe) -> Safety:
     return recipe.safety
 
 
-def _with_stop(recipe: Recipe, safety: Safety, store: Store | None) -> Safety:
-    """Return the settings with the diameter of the step of the stop, whose grid may be narrower than the lens."""
-    lens = safety.settings.lens
-    if lens.stop is None:
-        return safety
-    step = step_of(recipe, safety, "lens.stop", lens.stop, "")
-    diameter = min(lens.diameter, float(run(recipe, store, [step])[step].diameter))
-    narrowed = lens.model_copy(update={"diameter": diameter})
-    return replace(safety, settings=safety.settings.model_copy(update={"lens": narrowed}))
-
-
-def _mask_peak(recipe: Recipe, safety: Safety, store: Store | None) -> float | None:
-    """Return the peak behind the mask over that behind the plain lens, or None without a mask.
-
-    The largest laser suppression ratio of the mask counts. Where the same step has a copy for the plain lens, its ratio
-    divides: a beam that does not fill the lens lowers both.
-    """
-    named = safety.settings.protection.mask
-    if named is None:
-        return None
-    step = step_of(recipe, safety, "protection.mask", named, "mask")
-    plain = step.replace("[mask,", "[plain,")
-    if plain == step or plain not in recipe.steps:
-        return float(run(recipe, store, [step])[step].max())
-    found = run(recipe, store, [step, plain])
-    return float(found[step].max() / found[plain].max())
-
-
 def _findings(
     safety: Safety,
     draws: SettingDraws,
@@ -186,21 +194,18 @@ def _findings(
     areas: tuple[Area, ...],
 ) -> Iterator[Finding]:
     """Yield what each limit says behind each option."""
+    known = {area.option: area for area in areas}
     for option in options:
-        for limit in damage_limits(safety, option, exposures, draws):
+        for limit in limits_behind(safety, draws, option, known.get(option), exposures):
             yield _finding(safety, option, limit, exposures)
-        for area in areas:
-            if area.option == option:
-                for limit in dazzle_limits(safety, area, draws):
-                    yield _finding(safety, option, limit, exposures)
 
 
 def _finding(safety: Safety, option: Option, limit: Limit, exposures: Exposures) -> Finding:
     per_power, at = exposures.sensor[option.name], exposures.at(safety.laser.distance)
-    emitted = _emitted(safety, limit, exposures)
-    limits = limit.values * limit.devices * np.ones_like(per_power)
-    ratio, at_lens = emitted * per_power / limits, limits * exposures.lens / per_power
-    here = emitted[:, 0] * per_power[:, at]
+    light = emitted(safety, limit, exposures)
+    limits = limit.values * limit.devices * np.ones((len(light), per_power.shape[1]))
+    ratio, at_lens = limit_ratio(safety, option.name, limit, exposures), limits * exposures.lens / per_power
+    here = light[:, 0] * per_power[:, at]
     return Finding(
         option.name,
         limit,
@@ -209,27 +214,15 @@ def _finding(safety: Safety, option: Option, limit: Limit, exposures: Exposures)
         _spread(here),
         float(ratio[0, at]),
         _probability(limit, ratio[1:, at] * limit.devices[1:, 0]),
-        zones_of(exposures.distances, ratio[0], ratio[1:], safety.laser.distance),
+        zones_of(exposures.distances, ratio[0], ratio[1:], safety.laser.distance, safety.settings.distances),
         np.stack([at_lens[0], *np.quantile(at_lens[1:], QUANTILES, axis=0)]),
+        _spread(ratio[:, at]),
     )
 
 
 def _spread(values: FloatArray) -> Spread:
     """Return the nominal value, which comes first, with the interval of the draws after it."""
     return Spread.of(float(values[0]), values[1:])
-
-
-def _emitted(safety: Safety, limit: Limit, exposures: Exposures) -> FloatArray:
-    """Return power or pulse energy (1 + draw, 1); for dazzle the mean power of the light that reaches one frame."""
-    if limit.effect == "damage":
-        return exposures.emitted(limit.quantity)
-    return mean_in_frame(exposures, safety.settings.sensor.exposure or 1.0)
-
-
-def mean_in_frame(exposures: Exposures, exposure: float) -> FloatArray:
-    """Return the mean power in W during an exposure in which at least one pulse of a pulsed laser falls."""
-    rows = [frame_power(beam, exposure) for beam in exposures.beams]
-    return np.array(rows, np.float64)[:, None]
 
 
 def _probability(limit: Limit, ratio: FloatArray) -> Spread | None:
@@ -243,19 +236,3 @@ def _probability(limit: Limit, ratio: FloatArray) -> Spread | None:
 
     shares = ndtr(np.log(ratio) / np.log(limit.factor))
     return Spread.of(float(shares.mean()), shares)
-
-
-def _eye(safety: Safety, exposures: Exposures) -> tuple[EyeFinding | None, tuple[str, ...]]:
-    """Return the finding of the eye, or the reason why there is none."""
-    beam, at = exposures.beams[0], exposures.at(safety.laser.distance)
-    duration = safety.settings.eye.exposure or (0.25 if beam.wavelength <= 700e-9 else 10.0)
-    try:
-        limit = eye_limit(beam, duration)
-        reach = np.array([nominal_ocular_hazard_distance(each, duration) for each in exposures.beams])
-    except ParameterError as error:
-        return None, (f"Nothing is said of the eye: {error}.",)
-    quantity = "fluence" if beam.is_pulsed else "irradiance"
-    here = exposures.emitted("fluence" if beam.is_pulsed else "irradiance")[:, 0] * exposures.lens[:, at]
-    return EyeFinding(
-        duration, limit, quantity, Spread.of(float(here[0]), here[1:]), Spread.of(float(reach[0]), reach[1:])
-    ), ()

@@ -6,7 +6,8 @@ import math
 
 from neusee.workflows.safety.dazzle_curves import Dazzled
 from neusee.workflows.safety.distance_zones import Spread, Zone, Zones
-from neusee.workflows.safety.safety_estimate import Estimate, EyeFinding, Finding
+from neusee.workflows.safety.eye_findings import EyeFinding
+from neusee.workflows.safety.safety_estimate import Estimate, Finding
 
 _PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
 _PER_CM2 = 1e-4  #: of a quantity per m2
@@ -43,7 +44,7 @@ def with_ends(spread: Spread, unit: str, factor: float = 1.0) -> str:
 
 def plain(number: str) -> str:
     """Return a number of three digits without an exponent where this is short, such as 1020 for 1.02e+03."""
-    return f"{float(number):.0f}" if 1e3 <= abs(float(number)) < 1e5 else number
+    return f"{float(number):.0f}" if "e+" in number and abs(float(number)) < 1e5 else number
 
 
 def metres(distance: float) -> str:
@@ -51,7 +52,8 @@ def metres(distance: float) -> str:
     return f"{distance / 1e3:.3g} km" if distance >= 999.5 else f"{distance:.3g} m"
 
 
-def _end(spread: Spread) -> str:
+def end(spread: Spread) -> str:
+    """Return a distance with the interval of its draws."""
     if math.isclose(spread.low, spread.high, rel_tol=_SAME):
         return metres(spread.value)
     return f"{metres(spread.value)} ({metres(spread.low)} to {metres(spread.high)})"
@@ -59,8 +61,8 @@ def _end(spread: Spread) -> str:
 
 def zone_text(zone: Zone) -> str:
     """Return the ends of a zone, with their intervals."""
-    near = f"below {metres(zone.near.value)}" if zone.begins_before else _end(zone.near)
-    far = f"beyond {metres(zone.far.value)}" if zone.ends_beyond else _end(zone.far)
+    near = f"below {metres(zone.near.value)}" if zone.begins_before else end(zone.near)
+    far = f"beyond {metres(zone.far.value)}" if zone.ends_beyond else end(zone.far)
     return f"{near} to {far}"
 
 
@@ -70,7 +72,7 @@ def zones_text(zones: Zones) -> str:
         return "; ".join(map(zone_text, zones.zones))
     if zones.reach is None:
         return "nowhere"
-    return f"nowhere; in some draws up to {metres(zones.reach.low)} to {metres(zones.reach.high)}"
+    return f"nowhere at the nominal values; in some draws out to {end(zones.reach)}"
 
 
 def share(value: float) -> str:
@@ -96,7 +98,7 @@ def probability(finding: Finding) -> str:
 def limit_cells(finding: Finding) -> list[str]:
     """Return the row of a limit: protection, limit, limit on the sensor, its share that is reached, at the lens."""
     unit = UNITS[finding.limit.quantity]
-    now = f"{finding.ratio:.2g} times" if finding.ratio >= 1 else f"{finding.ratio:.2g}"
+    now = f"{plain(f'{finding.ratio:.2g}')} times" if finding.ratio >= 1 else f"{finding.ratio:.2g}"
     sensor = with_ends(finding.at_sensor, f"{unit}/cm²", _PER_CM2)
     return [
         finding.option, finding.limit.name, sensor, now, with_ends(finding.at_lens, f"{unit}/m²"), probability(finding),
@@ -117,7 +119,7 @@ def eye_text(eye: EyeFinding) -> str:
     return (
         f"The eye may receive {scaled(eye.limit, unit)}{each} for {eye.duration:g} s (MPE); here it receives "
         f"{with_ends(eye.exposure, unit)}, which {now} the limit. The nominal ocular hazard distance (NOHD) is "
-        f"{_end(eye.distance)} in clear air. A distance that is safe for a camera may blind people."
+        f"{end(eye.distance)} in clear air. A distance that is safe for a camera may blind people."
     )
 
 
@@ -139,28 +141,22 @@ def laser_text(found: Estimate) -> str:
     )
 
 
-def verdict(found: Estimate) -> list[str]:
-    """Return one sentence for each limit behind the plain lens: where it is exceeded."""
-    plain = [each for each in found.findings if each.option == found.options[0].name]
-    return [
-        f"{each.limit.name}: exceeded {'from ' if each.zones.zones else ''}{zones_text(each.zones)}." for each in plain
-    ]
-
-
 def intervals_text(found: Estimate) -> str:
     """Return what the numbers in brackets mean."""
     laws = found.draws.laws
     named = f" {', '.join(f'{name} {text}' for name, text in laws.items())};" if laws else ""
+    text = f"In brackets: the middle 90 % of {found.draws.count} draws of all that is uncertain"
+    if not found.damage:
+        return f"{text}:{named.removesuffix(';')}." if named else f"{text}; nothing is."
     return (
-        f"In brackets: the middle 90 % of {found.draws.count} draws of all that is uncertain:{named} the published "
-        "thresholds and their spread from device to device."
+        f"{text}:{named} the thresholds of damage. A published threshold has a bracket and no probability: a third of "
+        "the draws each takes its lower end, its middle and its upper end. A law with data of devices is drawn from "
+        "its spread."
     )
 
 
 def dazzled_cells(each: Dazzled) -> list[str]:
     """Return the row of a protection in the table of the dazzled area."""
-    if each.pixels is None or each.share is None:
-        return [each.option, "more than the window of the point-spread function holds", "–", "–"]
     low, high = (_pixels(x) for x in (each.pixels.low, each.pixels.high))
     number = _pixels(each.pixels.value)
     text = number if low == high else f"{number} ({low} to {high})"
@@ -190,7 +186,7 @@ def _both(found: Estimate) -> tuple[Dazzled | None, Dazzled | None]:
 def _counted_text(found: Estimate) -> str:
     """Return the filled pixels behind mask and plain lens at the distance of the recipe."""
     plain, mask = _both(found)
-    if plain is None or mask is None or plain.pixels is None or mask.pixels is None:
+    if plain is None or mask is None:
         return ""
     counts = (
         f"{_pixels(mask.pixels.value)} pixels behind the mask and {_pixels(plain.pixels.value)} behind the plain lens"

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.blocks.safety_block import Safety
-from neusee.workflows.recipe.distributions.scalar import FloatArray
+from neusee.workflows.recipe.distributions.allowed_range import NEGLIGIBLE, within_allowed
+from neusee.workflows.recipe.distributions.nominal_values import Uncertain
+from neusee.workflows.recipe.distributions.shapes import FloatArray
+from neusee.workflows.recipe.distributions.uncertain_inputs import only_values
+
+_ROWS = 3  #: stream of random numbers that selects rows of a table of samples
 
 
 @dataclass(frozen=True)
@@ -35,33 +39,31 @@ class SettingDraws:
 def draw_settings(recipe: Recipe, safety: Safety) -> SettingDraws:
     """Return draws of each setting whose value in the recipe is a distribution or belongs to a posterior.
 
-    Raises `RecipeError` for a distribution that has values which the recipe does not allow.
+    A negligible part of a distribution outside the values that the recipe allows is cut off, and its text says so.
+    Raises `RecipeError` for a distribution with more outside.
     """
     uncertain, count = recipe.uncertain, safety.settings.draws
-    readers: dict[str, list[str]] = {}
-    for setting, value in safety.values.items():
-        readers.setdefault(value.name, []).append(setting)
     if uncertain is None:
         return SettingDraws(count, {}, {}, recipe.seed)
-    names = [name for name in uncertain.names if name in readers]
-    z = np.random.default_rng([recipe.seed, 1]).standard_normal((count, len(names)))
-    laws = [name for name in names if name in uncertain.laws]
-    drawn = {name: uncertain.laws[name].at(z[:, i]) for i, name in enumerate(laws)}
-    if kept := names[len(laws) :]:
-        assert uncertain.joint is not None
-        drawn |= dict(zip(kept, uncertain.joint.only(kept).at(z[:, len(laws) :]).T, strict=True))
-    _refuse_invalid(recipe, drawn)
-    said = {setting: uncertain.said(name) for name in names for setting in readers[name]}
-    return SettingDraws(count, {s: drawn[name] for name in names for s in readers[name]}, said, recipe.seed)
+    paths = {setting: value.name for setting, value in safety.values.items() if value.name in uncertain.names}
+    allowed, notes = within_allowed(only_values(uncertain, paths.values()), NEGLIGIBLE)
+    drawn = _draws(allowed, count, recipe.seed)
+    texts = {path: uncertain.said(path) for path in drawn}
+    texts |= {path: f"{texts[path]} ({note})" for path, note in notes.items()}
+    order = sorted(paths, key=lambda setting: list(drawn).index(paths[setting]))
+    values = {setting: drawn[paths[setting]] for setting in order}
+    return SettingDraws(count, values, {setting: texts[paths[setting]] for setting in order}, recipe.seed)
 
 
-def _refuse_invalid(recipe: Recipe, drawn: Mapping[str, FloatArray]) -> None:
-    """Raise `RecipeError` if the recipe does not allow the smallest or the largest draw of a value."""
-    assert recipe.uncertain is not None
-    for name, values in drawn.items():
-        for value in (float(values.min()), float(values.max())):
-            try:
-                recipe.uncertain.at({name: value})
-            except RecipeError as error:
-                found = [replace(d, message=f"the value is drawn, but {d.message}") for d in error.diagnostics]
-                raise RecipeError(found) from None
+def _draws(uncertain: Uncertain, count: int, seed: int) -> dict[str, FloatArray]:
+    """Return ``count`` draws of each uncertain value; those of a table of samples are whole rows of the table."""
+    z = np.random.default_rng([seed, 1]).standard_normal((count, len(uncertain.names)))
+    drawn = {name: law.at(z[:, i]) for i, (name, law) in enumerate(uncertain.laws.items())}
+    joint = uncertain.joint
+    if joint is None:
+        return drawn
+    if joint.draws is None:
+        rows = joint.at(z[:, len(drawn) :])
+    else:
+        rows = joint.draws[np.random.default_rng([seed, _ROWS]).integers(0, len(joint.draws), count)]
+    return drawn | dict(zip(joint.names, rows.T, strict=True))

@@ -10,9 +10,10 @@ from __future__ import annotations
 import errno
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 
 from neusee.workflows.keys.seal import NotRead
 from neusee.workflows.store import metadata
@@ -21,7 +22,6 @@ from neusee.workflows.store.shared_folder import Disk, below
 
 LOW = 0.9  #: fraction of the budget that remains after an eviction
 _HALF = 7 * 86400.0  #: s in which the weight of an unused value halves
-_NONE = (0, 0.0)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -101,27 +101,46 @@ def candidates(disk: Disk, pinned: Collection[str], read_seconds: Callable[[floa
     The bytes of a band are divided among the values that use the band. A result that this program does not read saves
     no time.
     """
-    stats = {os.path.basename(path): (size, changed) for path, size, changed in files(disk)}
-    shared = Counter[str]()
-    kept = list[tuple[str, int, float, tuple[str, ...]]]()  # key, bytes, s that the value saves, bands
-    for key in metadata.names(disk):
-        stored = stats.get(f"{key}.safetensors", _NONE)[0]
-        with suppress(*UNREADABLE):
-            try:
-                about = metadata.read(disk, key)
-            except NotRead:
-                kept.append((key, stored + stats.get(f"{key}.json", _NONE)[0], 0.0, ()))
-                continue
-            if metadata.is_kept(about):
-                size = stored + sum(len(tensor[-1]) for tensor in about.get("tensors") or ())
-                size += stats.get(about.get("file") or "", _NONE)[0]
-                saved = float(about.get("seconds") or 0.0) - read_seconds(float(about.get("bytes") or 0))
-                kept.append((key, size, saved, tuple(set(metadata.bands(about)))))
-                shared.update(kept[-1][-1])
-    for key, size, saved, bands in kept:
-        if key not in pinned and f"{key}.json" in stats:
-            size += int(sum(stats.get(name, _NONE)[0] / shared[name] for name in bands))
-            yield Candidate(key, size, saved, stats[f"{key}.json"][1])
+    sizes, changes = dict[str, int](), dict[str, float]()
+    for path, size, changed in files(disk):
+        sizes[os.path.basename(path)], changes[os.path.basename(path)] = size, changed
+    values = [_stored_value(disk, key, sizes, read_seconds) for key in metadata.names(disk)]
+    stored = [value for value in values if value is not None]
+    users = Counter(chain.from_iterable(value.bands for value in stored))
+    for value in stored:
+        record = f"{value.key}.json"
+        if value.key not in pinned and record in changes:
+            bands = int(sum(sizes.get(name, 0) / users[name] for name in value.bands))
+            yield Candidate(value.key, value.size + bands, value.seconds, changes[record])
+
+
+@dataclass(frozen=True, slots=True)
+class _StoredValue:
+    """A value of a store, before the bytes of its bands are divided among their users."""
+
+    key: str
+    size: int  #: bytes of its own files
+    seconds: float  #: time in s for computing the value, minus the time for loading the value
+    bands: frozenset[str]  #: names of the files of its bands
+
+
+def _stored_value(
+    disk: Disk, key: str, sizes: Mapping[str, int], read_seconds: Callable[[float], float]
+) -> _StoredValue | None:
+    """Return what is known of a stored value, or None if its metadata are unreadable or a receipt."""
+    payload = sizes.get(f"{key}.safetensors", 0)
+    try:
+        about = metadata.read(disk, key)
+        if not metadata.is_kept(about):
+            return None
+        inline = sum(len(tensor[-1]) for tensor in about.get("tensors") or ())
+        derived = sizes.get(about.get("file") or "", 0)
+        saved = float(about.get("seconds") or 0.0) - read_seconds(float(about.get("bytes") or 0))
+        return _StoredValue(key, payload + inline + derived, saved, frozenset(metadata.bands(about)))
+    except NotRead:
+        return _StoredValue(key, payload + sizes.get(f"{key}.json", 0), 0.0, frozenset())
+    except UNREADABLE:
+        return None
 
 
 def drop(disk: Disk, key: str) -> bool:

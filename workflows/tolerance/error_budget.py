@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import copy
+from dataclasses import replace
 from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -38,10 +39,17 @@ class ErrorBudget:
         spent = self.pass_on(step)
         if self._recipe.exact:
             return SkipDecision(float("inf"), False, "the recipe is exact", "")
+        if step.node.hooks.skip_estimated and not self._recipe.estimates:
+            return self._without_estimate(step, params, facts_of)
         decision = judge(step, params, facts_of, self._recipe.allowed(step.name) * self._share - sum(spent.values()))
         if decision.left_out:
             self.leave_out(step, decision.bound)
         return decision
+
+    def _without_estimate(self, step: Step, params: Mapping[str, Any], facts_of: FactsOf) -> SkipDecision:
+        """Decide whether a step changes nothing; any other effect of the step is only estimated."""
+        decision = judge(step, params, facts_of, 0.0)
+        return decision if decision.left_out else replace(decision, why="its effect is estimated, and not proved")
 
     def leave_out(self, step: Step, bound: float) -> None:
         """Add the error bound of an omitted step to the error budget."""

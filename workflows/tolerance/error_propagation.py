@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 from neusee.nodes import ErrorBound, TensorStats
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
@@ -18,6 +19,8 @@ from neusee.workflows.tolerance.skip_decision import FactsOf
 
 _Input = ErrorBound | list[ErrorBound] | None
 _EXACT = ErrorBound(0.0)
+Kind = Literal["exact", "proved", "estimated", "unknown"]
+COVERAGE = 0.95  #: share of the estimated errors that are at least as large as the error, over random recipes
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,13 +29,35 @@ class ErrorBounds:
 
     shares: Mapping[str, float] = field(default_factory=dict)  #: by step; infinite where a node gives no bound
     held: Mapping[str, float] = field(default_factory=dict)  #: of outputs, and of the inputs of nodes without bounds
-    #: the same values with an estimate of what rounding to digital numbers adds, which the tolerance does not limit
+    #: the errors that a run states for these results: with what one draw of the noise adds, and an estimate of what
+    #: rounding to digital numbers adds; the tolerance does not limit these additions
     stated: Mapping[str, float] = field(default_factory=dict)
+    estimated: frozenset[str] = frozenset()  #: steps whose stated error counts an estimate
 
     def of(self, step: str) -> float | None:
         """Return the error bound of a step's result, or None if no bound is known."""
         share = self.shares.get(step, 0.0)
         return share if math.isfinite(share) else None
+
+    def stated_of(self, step: str) -> float | None:
+        """Return the error that a run states for the result of a step, or None if it is unknown."""
+        error = self.stated.get(step, self.shares.get(step, 0.0))
+        return error if math.isfinite(error) else None
+
+    def worst_stated(self, steps: Iterable[str]) -> float | None:
+        """Return the largest error that a run states for the results of ``steps``, or None if one is unknown."""
+        errors = [self.stated_of(step) for step in steps]
+        known = [error for error in errors if error is not None]
+        return max(known, default=0.0) if len(known) == len(errors) else None
+
+    def kind_of(self, step: str) -> Kind:
+        """Return whether the error that a run states for a step is a proved bound or an estimate."""
+        error = self.stated_of(step)
+        if error is None:
+            return "unknown"
+        if error == 0.0:
+            return "exact"
+        return "estimated" if step in self.estimated else "proved"
 
     @property
     def worst(self) -> float:
@@ -112,68 +137,141 @@ def proof(
         bounds[name] = bound
     shares = {name: bound.share for name, bound in bounds.items()}
     held |= {name: shares[name] for name in wanted if math.isfinite(shares.get(name, math.inf))}
-    rounded = _rounded(recipe, bounds, done, facts_of)
-    return ErrorBounds(shares, held, {name: (rounded.get(name) or bounds[name]).share for name in held})
+    final = bounds | _of_one_picture(recipe, bounds, done, facts_of)
+    stated = {name: final[name].share for name in held}
+    return ErrorBounds(shares, held, stated, frozenset(name for name, bound in final.items() if bound.estimated))
 
 
 def _bound(
-    step: Step, known: Mapping[str, ErrorBound], done: StepRecord, facts_of: FactsOf, recipe: Recipe
+    step: Step,
+    known: Mapping[str, ErrorBound],
+    done: StepRecord,
+    facts_of: FactsOf,
+    recipe: Recipe,
+    one_draw: bool = False,
 ) -> ErrorBound | None:
-    """Return the error bound of a step's result from the ``known`` bounds of its inputs, or None if it is exact."""
-    own = _own(step, done, facts_of)
-    if own is None and not any(known[source].rms for source in step.sources if source in known):
+    """Return the error bound of a step's result from the ``known`` bounds of its inputs, or None if it is exact.
+
+    The bound is the root mean square over all draws of the noise, or with ``one_draw`` that of a single draw.
+    """
+    own = _own(step, done, facts_of, one_draw)
+    sources = [known[source] for source in step.sources if source in known]
+    if own is None and not any(bound.rms for bound in sources):
         return None
     inputs = [_gathered(step.wires.get(i), known) for i in step.node.inputs]
-    facts, error = facts_of(step.name), done.error
-    carried = _carried(step, inputs, facts, _propagates(step, recipe))
-    return ErrorBound(carried + (own or 0.0), facts, error[1] if error else None)
+    facts = facts_of(step.name)
+    hook = step.node.hooks.propagate_error if _propagates(step, recipe) else None
+    if one_draw and hook is not None:
+        hook = step.node.hooks.propagate_draw or hook
+    carried = _carried(step, inputs, facts, hook)
+    return _together(carried, own, facts)
 
 
-def _rounded(
+def _together(carried: ErrorBound, own: ErrorBound | None, facts: TensorStats | None) -> ErrorBound:
+    """Return the sum of the error that a step takes from its inputs and of the error that it adds."""
+    if own is None:
+        return replace(carried, stats=facts)
+    peak = None if own.peak is None else own.peak + carried.peak if carried.peak is not None else None
+    return ErrorBound(
+        carried.rms + own.rms,
+        stats=facts,
+        peak=own.peak if carried.rms == 0.0 else peak,
+        estimated=carried.estimated or own.estimated,
+        scattered=carried.scattered + own.scattered,
+    )
+
+
+def _of_one_picture(
     recipe: Recipe, bounds: Mapping[str, ErrorBound], done: Callable[[str], StepRecord], facts_of: FactsOf
 ) -> dict[str, ErrorBound]:
-    """Return the error bounds of the results of ``bounds`` to which rounding to digital numbers adds something."""
-    found: dict[str, ErrorBound] = {}
+    """Return the bounds of ``bounds`` that are larger for one draw of the noise, and by rounding to digital numbers."""
+    larger: dict[str, ErrorBound] = {}
     for name, before in bounds.items():
-        step, bound = recipe.steps[name], before
-        rounding = step.node.hooks.rounding_error
-        if not found.keys().isdisjoint(step.sources):
-            bound = _bound(step, {**bounds, **found}, done(name), facts_of, recipe) or before
-        elif rounding is None:
+        step, record = recipe.steps[name], done(name)
+        hooks, omitted = step.node.hooks, record.state == "left out"
+        chance = hooks.skip_draw if omitted else hooks.propagate_draw or hooks.rounding_error
+        if chance is None and larger.keys().isdisjoint(step.sources):
             continue
-        if (
-            rounding is not None
-            and bound.stats is not None
-            and math.isfinite(bound.rms)
-            and done(name).state != "left out"
-        ):
-            bound = replace(bound, rms=float(rounding(bound.rms, result=bound.stats, **step.params)))
-        found[name] = bound
-    return found
+        bound = _bound(step, {**bounds, **larger}, record, facts_of, recipe, one_draw=True) or before
+        if hooks.rounding_error is not None and not omitted:
+            bound = _with_rounding(step, bound)
+        larger[name] = bound
+    return larger
 
 
-def _own(step: Step, done: StepRecord, facts_of: FactsOf) -> float | None:
+def _with_rounding(step: Step, bound: ErrorBound) -> ErrorBound:
+    """Return the error bound of digital numbers with an estimate of what their rounding adds."""
+    rounding = step.node.hooks.rounding_error
+    if rounding is None or bound.stats is None or not 0.0 < bound.rms < math.inf:
+        return bound
+    total = float(rounding(bound.rms, result=bound.stats, **step.params))
+    added = math.sqrt(max(total**2 - bound.rms**2, 0.0))
+    return replace(bound, rms=bound.rms + added, scattered=bound.scattered + added, estimated=True)
+
+
+def _own(step: Step, done: StepRecord, facts_of: FactsOf, one_draw: bool = False) -> ErrorBound | None:
     """Return the error that a step adds by its own approximation or omission, in the unit of its result."""
-    share = done.bound if done.state == "left out" else done.error and done.error[0]
+    omitted, hooks = done.state == "left out", step.node.hooks
+    share = done.bound if omitted else done.error and done.error[0]
     if not share or (facts := facts_of(done.step)) is None:
         return None
     largest = max(abs(facts.min), abs(facts.max))
-    if done.state == "left out" and step.node.hooks.skip_scale is not None:
-        largest = step.node.hooks.skip_scale(facts, **step.params)
-    return share * largest / max(1.0 - share, 1e-3)
+    if omitted and hooks.skip_scale is not None:
+        largest = hooks.skip_scale(facts, **step.params)
+    # a share of the full result, of which this result has at least the share 1 - `share`
+    rms = share * largest / (1.0 - share) if share < 1.0 and largest > 0 else math.inf
+    if omitted and one_draw and hooks.skip_draw is not None:
+        rms *= hooks.skip_draw(facts, **step.params)
+    if omitted:
+        return ErrorBound(rms, estimated=hooks.skip_estimated, scattered=rms if step.node.random else 0.0)
+    return ErrorBound(rms, peak=done.error[1] if done.error else None, estimated=hooks.estimated)
 
 
-def _carried(step: Step, inputs: list[_Input], result: TensorStats | None, known: bool) -> float:
-    """Return the error of a step's result that comes from errors of its inputs, or infinity if no bound is known."""
-    errors, hooks = [bound.rms for bound in _flat(inputs)], step.node.hooks
-    if not any(errors) or hooks.approximation_error is not None:  # this hook covers all errors of the result
-        return 0.0
-    if hooks.propagate_error is None or not known or result is None or math.inf in errors:
-        return math.inf
+def _carried(
+    step: Step, inputs: list[_Input], result: TensorStats | None, hook: Callable[..., float | ErrorBound] | None
+) -> ErrorBound:
+    """Return the error of a step's result that errors of its inputs cause; infinite where no ``hook`` bounds it.
+
+    The approximation of a step may count cheaper forms of its inputs, but never what was left out of the inputs: the
+    step cannot know of it.
+    """
+    hooks, errors = step.node.hooks, list(_flat(inputs))
+    if not any(error.rms for error in errors):
+        return _EXACT
+    estimated = hooks.estimated or any(error.estimated for error in errors if error.rms)
+    if hook is None or result is None or any(math.isinf(error.rms) for error in errors):
+        return ErrorBound(math.inf, estimated=estimated)
+    alike = _passed(step, hook, _parts(inputs, scattered=False), result)
+    noise = _passed(step, hooks.propagate_scattered or hook, _parts(inputs, scattered=True), result)
+    return ErrorBound(
+        alike.rms + noise.rms,
+        peak=alike.peak if noise.rms == 0.0 else None,
+        estimated=estimated,
+        scattered=alike.scattered + noise.rms,
+    )
+
+
+def _passed(
+    step: Step, hook: Callable[..., float | ErrorBound], inputs: list[_Input], result: TensorStats
+) -> ErrorBound:
+    """Return the error that a hook of a node finds for the errors of the inputs; exact for exact inputs."""
+    if not any(error.rms for error in _flat(inputs)):
+        return ErrorBound(0.0, peak=0.0)
     try:
-        return float(hooks.propagate_error(*inputs, result=result, **step.params))
-    except Exception as error:
-        raise RunError(step, [], error) from error
+        error = hook(*inputs, result=result, **step.params)
+    except Exception as problem:
+        raise RunError(step, [], problem) from problem
+    return error if isinstance(error, ErrorBound) else ErrorBound(float(error), peak=0.0 if error == 0 else None)
+
+
+def _parts(inputs: list[_Input], *, scattered: bool) -> list[_Input]:
+    """Return the errors of inputs that are like noise, or all other errors of inputs."""
+
+    def part(error: ErrorBound) -> ErrorBound:
+        rms = error.scattered if scattered else max(error.rms - error.scattered, 0.0)
+        return replace(error, rms=rms, scattered=0.0)
+
+    return [[part(error) for error in given] if isinstance(given, list) else given and part(given) for given in inputs]
 
 
 def _gathered(wire: Wire, bounds: Mapping[str, ErrorBound]) -> _Input:

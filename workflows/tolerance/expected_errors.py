@@ -8,6 +8,7 @@ as `proof` carries the errors of a run through its results. A run still proves i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -76,7 +77,7 @@ class _Ranges:
             return
         tensors = tensors_of(self._forms[step.name])
         shape = tuple(tensors[0].shape) if tensors else ()
-        self.known[step.name] = TensorStats(shape, "float32", low, high, 0.0, 0, True)
+        self.known[step.name] = TensorStats(shape, "float32", low, high, math.nan, 0, True)
 
     def _of(self, wire: Wire) -> Any:
         if wire is None:

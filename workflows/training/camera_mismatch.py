@@ -17,7 +17,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step, dependents, needed
 from neusee.workflows.graph.told_copies import FRAME, TOLD, knowers, known, with_copies
 from neusee.workflows.recipe.blocks.train_block import KEY, Training
 from neusee.workflows.recipe.distributions.mismatch_laws import ANGLE, Difference
-from neusee.workflows.recipe.distributions.scalar import Law, draw_laws
+from neusee.workflows.recipe.distributions.scalar import draw_laws
 from neusee.workflows.recipe.distributions.uncertain_inputs import Index, Inputs, put_at
 
 _FAR = 4.5  #: standard deviations up to which the drawn values must be valid
@@ -102,34 +102,26 @@ def _inputs(recipe: Recipe, given: Mapping[str, Difference]) -> Inputs | None:
     if not given:
         return None
     assert recipe.uncertain is not None
-    laws = {path: _truth(one) for path, one in given.items()}
+    laws = {path: one.truth for path, one in given.items()}
     within = replace(recipe, uncertain=replace(recipe.uncertain, laws=laws, joint=None))
     for path in given:
         one = replace(recipe.uncertain, laws={path: laws[path]}, joint=None)
         try:
-            Inputs.of(replace(recipe, uncertain=one), [FRAME])
+            Inputs.of(replace(recipe, uncertain=one), [FRAME], negligible=None)
         except ValueError as error:
             text = "no step before the frame reads it" if str(error).startswith("no output") else str(error)
             raise _mistake(given, path, text) from error
-    inputs = Inputs.of(within, [FRAME])
+    inputs = Inputs.of(within, [FRAME], negligible=None)
     ends = [[one.of(one.own, float(one.law.at(np.array(z)))) for one in given.values()] for z in (-_FAR, _FAR)]
     inputs.checked(np.array(ends))
     return inputs
 
 
-def _truth(one: Difference) -> Law:
-    """Return a law of the true value about that of the recipe, which is nowhere a single value."""
-    law = one.law
-    if law.kind == "normal":
-        return replace(law, first=one.own + law.first, second=law.second or abs(one.own) * 1e-3 or 1e-9)
-    second = law.second if law.kind == "lognormal" else one.of(one.own, law.second)
-    return replace(law, first=one.of(one.own, law.first), second=second)
-
-
 def _probes(inputs: Inputs) -> dict[str, float]:
     """Return a value of each law that differs from that of the recipe."""
-    z = np.full((1, len(inputs.names)), 0.3)
-    return dict(zip(inputs.names, map(float, inputs.at(z)[0]), strict=True))
+    assert inputs.recipe.uncertain is not None
+    own = {path: one.own for path, one in inputs.recipe.uncertain.mismatch.items()}
+    return {name: inputs.uncertain.laws[name].other_than(own[name]) for name in inputs.names}
 
 
 def _towards(recipe: Recipe, given: Mapping[str, Difference], path: str) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 from neusee.nodes import metrics
 from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.keys.input_file_digest import file_digest
 from neusee.workflows.recipe.blocks.train_block import KEY, Training
 from neusee.workflows.training.loop.resumable_loop import Losses
 from neusee.workflows.training.parallel.process_mesh import Mesh
@@ -24,7 +24,6 @@ from neusee.workflows.training.several_cameras import Samples
 from neusee.workflows.training.training_pictures import HELD_OUT, Sample
 
 CONFIDENCE = 0.9  #: of the interval of a mean over photographs
-_ENDS = 1 << 16  #: bytes at each end of a file that identify a photograph
 _METRICS = ("PSNR", "L1", "SSIM")
 _SCORE = "held_out_PSNR"  #: the number by which the best state is chosen
 #: columns of the loss table: network, input of the network, and the PSNR that the network adds to its input
@@ -58,11 +57,12 @@ def split(recipe: Recipe, settings: Training, photographs: Photographs) -> Split
 
     Raises ValueError for a folder with fewer than two different photographs, unless ``train.held_out`` is null.
     """
+    photographs = by_content(photographs)
     if not holds_out(settings):
         return Split(photographs)
     alike: dict[str, list[Path]] = {}
     for path in photographs.paths:
-        alike.setdefault(_digest(path), []).append(path)
+        alike.setdefault(file_digest(path), []).append(path)
     if len(alike) < 2:
         raise ValueError(_too_few(recipe, settings, len(photographs.paths)))
     assert settings.held_out is not None
@@ -73,6 +73,11 @@ def split(recipe: Recipe, settings: Training, photographs: Photographs) -> Split
     one_each = [paths[0] for paths in chosen][: settings.held_out_pictures]
     judged = tuple(path for path in one_each if _readable(path, trained))
     return Split(trained, tuple(path for paths in chosen for path in paths), judged)
+
+
+def by_content(photographs: Photographs) -> Photographs:
+    """Return the photographs in the order of their digests, so that the pictures drawn depend on no name."""
+    return replace(photographs, paths=tuple(sorted(photographs.paths, key=lambda path: (file_digest(path), path))))
 
 
 def holds_out(settings: Training) -> bool:
@@ -88,18 +93,6 @@ def _readable(path: Path, photographs: Photographs) -> bool:
         photographs.broken[path] = str(error)
         return False
     return True
-
-
-def _digest(path: Path) -> str:
-    """Return a digest of the size of a file and of its first and last 64 KiB.
-
-    A folder may hold many gigabytes, which a training need not read before it begins.
-    """
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(_ENDS)
-        file.seek(max(0, size - _ENDS))
-        return hashlib.sha256(b"%d " % size + head + file.read()).hexdigest()
 
 
 def _too_few(recipe: Recipe, settings: Training, count: int) -> str:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,24 +15,29 @@ from neusee.nodes.network_weights import file_metadata
 from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.keys.input_file_digest import file_digest
 from neusee.workflows.recipe.blocks.train_block import KEY, Stage, Training
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training import held_out
 from neusee.workflows.training.camera_mismatch import CameraMismatch
 from neusee.workflows.training.exported_files import require_exports, write_exports
 from neusee.workflows.training.held_out import Best, Split, Validation
+from neusee.workflows.training.loop.changed_inputs import prepare_folder
 from neusee.workflows.training.loop.checkpoint import export
+from neusee.workflows.training.loop.recorded_inputs import RecordedInputs, folder_of
 from neusee.workflows.training.loop.resumable_loop import Losses, Progress, ResumableLoop, Watch
 from neusee.workflows.training.mask_design.design_run import MASK, design_in, designed
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh, MeshError
 from neusee.workflows.training.several_cameras import require_alone, samples_of
 from neusee.workflows.training.tensorboard_log import open_board
 from neusee.workflows.training.training_figures import curves, png, strip
+from neusee.workflows.training.training_inputs import inputs_of
 from neusee.workflows.training.training_iteration import Learner
-from neusee.workflows.training.training_key import key_of_training
 from neusee.workflows.training.training_page import write_page
+from neusee.workflows.training.unchanged_files import UnchangedFiles
 from neusee.workflows.training.warm_start import WarmStart
 
+MASK_FILE = "mask.safetensors"  #: of a folder of results: the mask that was learnt or designed
 _COLUMNS = ("stage", "iteration", "LSR", "BSR", "L1", "reconstruction", "decibels", "adversarial", "critics", "penalty",
             "slope", "rate", *held_out.COLUMNS, "seconds")  # fmt: skip
 
@@ -63,26 +68,49 @@ def train(
     if settings is None:
         raise ValueError(f"{recipe.name} has no block `train`: add `train: recommended` to its defaults")
     with_pictures = [number for number in stages if number != MASK]
+    _require_fitting_mesh(recipe, settings, stages, mesh)
+    CameraMismatch.of(recipe, settings)  # raises its mistakes before any work
+    if not mesh.first:
+        progress, watch = (lambda line: None), None
+    begun = BegunTraining.of(recipe, settings, store, runs, bool(with_pictures))
+    folder = begun.folder
+    if mesh.first:
+        prepare_folder(folder, begun.inputs, recipe, store, progress)
+    if MASK in stages:
+        design_in(folder, recipe, settings, store, command, progress, device)
+    if with_pictures:
+        loop = _TrainingLoop(recipe, settings, begun, store, progress, device, watch, mesh)
+        with loop.board or nullcontext():
+            loop.run_stages(with_pictures, command)
+    return folder
+
+
+@dataclass(frozen=True)
+class BegunTraining:
+    """What a training is before its first iteration: its photographs, first weights, inputs and folder."""
+
+    parts: Split
+    start: WarmStart | None
+    inputs: RecordedInputs
+    folder: Path
+
+    @classmethod
+    def of(cls, recipe: Recipe, settings: Training, store: Store, runs: Path, pictures: bool = True) -> BegunTraining:
+        """Find the inputs of a training, and the folder of results with equal inputs, or a new one."""
+        parts = held_out.split(recipe, settings, _photographs(recipe, settings, pictures))
+        start = WarmStart.of(recipe, settings)
+        code = Code(store.code_memo)
+        inputs = inputs_of(recipe, settings, parts, start, code)
+        code.save()
+        return cls(parts, start, inputs, folder_of(runs, f"{recipe.name}_train", inputs))
+
+
+def _require_fitting_mesh(recipe: Recipe, settings: Training, stages: Sequence[int], mesh: Mesh) -> None:
+    """Raise `MeshError` for a training that several processes cannot share."""
     if MASK in stages and mesh.size > 1:
         raise MeshError("--stage mask runs in a single process: start the training without torchrun")
     _require_equal_shares(recipe, settings, mesh)
     require_alone(recipe, mesh)
-    CameraMismatch.of(recipe, settings)  # raises its mistakes before any work
-    photographs = _photographs(recipe, settings, bool(with_pictures))
-    parts = held_out.split(recipe, settings, photographs)
-    start = WarmStart.of(recipe, settings)
-    key = key_of_training(recipe, settings, photographs, parts, start, Code(store.code_memo))
-    folder = runs / f"{recipe.name}_train_{key}"
-    folder.mkdir(parents=True, exist_ok=True)
-    if not mesh.first:
-        progress, watch = (lambda line: None), None
-    if MASK in stages:
-        design_in(folder, recipe, settings, store, command, progress, device)
-    if with_pictures:
-        loop = _TrainingLoop(recipe, settings, parts, start, store, folder, progress, device, watch, mesh)
-        with loop.board or nullcontext():
-            loop.run_stages(with_pictures, command)
-    return folder
 
 
 def _require_equal_shares(recipe: Recipe, settings: Training, mesh: Mesh) -> None:
@@ -107,17 +135,21 @@ def _photographs(recipe: Recipe, settings: Training, needed: bool) -> Photograph
 
 class _TrainingLoop(ResumableLoop[Learner]):
     def __init__(
-        self, recipe: Recipe, settings: Training, parts: Split, start: WarmStart | None, store: Store,
-        folder: Path, progress: Progress, device: str, watch: Watch | None, mesh: Mesh,
+        self, recipe: Recipe, settings: Training, begun: BegunTraining, store: Store,
+        progress: Progress, device: str, watch: Watch | None, mesh: Mesh,
     ) -> None:  # fmt: skip
+        folder, parts, start = begun.folder, begun.parts, begun.start
         self.designed = designed(folder)
         learner = Learner(recipe, settings, device, self.designed, mesh, start)
         require_exports(learner.net, settings)
-        super().__init__(folder, settings, learner, _COLUMNS, progress, device, watch, mesh.first)
+        super().__init__(folder, settings, learner, _COLUMNS, progress, device, watch, mesh.first,
+                         begun.inputs.digest)  # fmt: skip
         self.recipe, self.settings, self.split, self.store = recipe, settings, parts, store
         self.photographs, self.validation = parts.trained, Validation(parts, mesh, device)
         self.mesh, self.stage, self.best = mesh, 2 if self.designed else min(settings.learnt), Best()
         self.start = start
+        self.read_again = UnchangedFiles.of([*parts.trained.paths, *parts.judged])
+        self.mask_content = ""  #: digest of the mask behind which stage 2 trains
         progress(str(parts))
         if settings.augment.pooled != "none":
             progress("pooled pictures are turned with their true pictures, as behind a mask and a sensor that turn")
@@ -158,6 +190,8 @@ class _TrainingLoop(ResumableLoop[Learner]):
     def _run_stage(self) -> None:
         """Train to the end of the present stage, and write the checkpoint with which the next stage begins."""
         fixed = None if self.stage == 1 else frozen(self.recipe, self.settings, self.folder)
+        if fixed is not None:
+            self._require_same_mask()
         parts = self.recipe, self.settings, self.photographs, self.store, self.device
         self.samples = samples_of(*parts, fixed, self.mesh, self.split.judged)
         self.best = Best.of(self.rows.rows, self.stage)
@@ -169,8 +203,29 @@ class _TrainingLoop(ResumableLoop[Learner]):
             self._export()
         self.stage, self.iteration = self.stage + 1, 0
         self.begin_stage()
+        if self.stage == 2 and self.writes:
+            self._require_same_mask()
         self.keep()
         self.mesh.wait()  # until the first process has written the mask
+
+    def _require_same_mask(self) -> None:
+        """Note the learnt mask behind which stage 2 trains; raise ValueError if it is not that of the checkpoint."""
+        if self.settings.learn is None:
+            return
+        file = self.folder / MASK_FILE
+        content = file_digest(file)
+        if self.mask_content not in ("", content):
+            text = "has another content than the mask behind which stage 2 began"
+            raise ValueError(f"{file} {text}: put that mask back, or remove {self.folder} to start again")
+        self.mask_content = content
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the checkpoint keeps beside the learner: the digest of the mask of stage 2."""
+        return {"mask": self.mask_content}
+
+    def recall(self, facts: Mapping[str, Any]) -> None:
+        """Take from a checkpoint what `facts` gave."""
+        self.mask_content = str(facts.get("mask", ""))
 
     def iterate(self) -> Losses:
         """Train on one batch of pictures; return the losses, and the learning rate relative to its initial value."""
@@ -209,7 +264,11 @@ class _TrainingLoop(ResumableLoop[Learner]):
         super().note(losses)
 
     def keep(self) -> None:
-        """Write TensorBoard events, loss table and checkpoint of a training to disk."""
+        """Write TensorBoard events, loss table and checkpoint of a training to disk.
+
+        Raises ValueError if a photograph has changed, so that no checkpoint is of other photographs than it says.
+        """
+        self.read_again.require()
         if self.board:
             self.board.flush()
         super().keep()
@@ -229,7 +288,9 @@ class _TrainingLoop(ResumableLoop[Learner]):
     def _export(self) -> None:
         if self.stage == 1:
             with torch.no_grad():
-                export(self.folder, "mask", {"height": self.learner.height()})
+                height, stop = self.learner.height(), self.learner.stop
+                size = doe.size_metadata(float(stop.pitch)) if stop is not None else {}
+                export(self.folder, "mask", {"height": height}, size)
         net: Any = self.learner.average.module if self.learner.average else self.learner.net
         export(self.folder, "network", net.stored.state_dict(), file_metadata(self.learner.net))
 
@@ -261,7 +322,7 @@ def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:
     """Return the recipe with the trained mask from the file ``mask.safetensors`` as a fixed mask."""
     if settings.learn is None:
         return recipe
-    file = folder / "mask.safetensors"
+    file = folder / MASK_FILE
     if not file.is_file():
         raise ValueError(f"{file} does not exist: run --stage 1 or --stage mask first to write this file")
     step = recipe.steps[settings.learn]

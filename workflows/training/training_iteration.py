@@ -60,7 +60,7 @@ class Learner:
         start: WarmStart | None = None,
     ) -> None:  # fmt: skip
         self.settings, self.seed, self.device, self.mesh = settings, recipe.seed, device, mesh
-        self._stop: Stop | None = None
+        self.stop: Stop | None = None
         self._moment = 0, 0  # stage and iteration
         self.mask = nn.Module() if designed or not settings.learn else self._start(recipe, settings.learn)
         self.net: Restorer = self._network(settings.network)
@@ -88,14 +88,14 @@ class Learner:
             text = f"{learn} is {path}, which has no trainable parameters; {nearest(path, PARAMETRISATIONS)}"
             raise ValueError(f"train: {text}; or design a mask without images: --stage mask")
         stop = recipe.steps[str(step.wires["stop"])]
-        self._stop = call(stop, [], stop.params, recipe.seed, "cpu")
-        return PARAMETRISATIONS[path](self._stop, step.params, self._rng("element")).to(self.settings.dtype)
+        self.stop = call(stop, [], stop.params, recipe.seed, "cpu")
+        return PARAMETRISATIONS[path](self.stop, step.params, self._rng("element")).to(self.settings.dtype)
 
     def height(self) -> Tensor:
         """Return the height map (v, u) of the mask in m; raise ValueError if no mask is trained."""
-        if self._stop is None:
+        if self.stop is None:
             raise ValueError("train.learn: this training has no trainable mask")
-        height: Tensor = self.mask(self._stop)
+        height: Tensor = self.mask(self.stop)
         return height
 
     def _rng(self, *names: object) -> torch.Generator:

@@ -7,15 +7,16 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator, Field
 
-from neusee.nodes.units import PositiveLength, Wavelength, read_quantity
+from neusee.nodes.parameter_model import ParameterModel
+from neusee.nodes.units import Linewidth, Wavelength, read_quantity
 
 _CELSIUS = re.compile(r"([-+]?\d+(?:\.\d+)?)\s*(°C|C|degC)?")
 _ZERO = 273.15  #: K
 
 Relative = Annotated[float, Field(gt=0, lt=1)]  #: a standard uncertainty over its value
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-100, le=100)]
 Text = Annotated[str, BeforeValidator(lambda value: str(value).strip()), Field(min_length=1)]
 
 
@@ -30,10 +31,8 @@ def _temperature(value: Any) -> float:
     return kelvin
 
 
-class Statement(BaseModel):
+class Statement(ParameterModel):
     """Base class of what a laboratory states; an unknown key is a mistake."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Photometry(Statement):
@@ -42,7 +41,7 @@ class Photometry(Statement):
     known: Literal["absolute", "relative"] = "absolute"  #: relative: up to a factor, so that no efficiency is told
     relative_uncertainty: Relative | None = None  #: standard uncertainty of the photons over their number
     distribution: Literal["normal", "rectangular"] = "normal"
-    degrees_of_freedom: Annotated[float, Field(ge=1)] = math.inf
+    degrees_of_freedom: Annotated[float, Field(ge=1, le=math.inf, allow_inf_nan=True)] = math.inf
     certificate: Text | None = None  #: its number
     date: Text | None = None
     laboratory: Text | None = None
@@ -54,8 +53,8 @@ class Lamp(Statement):
 
     spectrum: Text | None = None  #: in words, or the name of a file
     centroid: Wavelength | None = None
-    centroid_uncertainty: PositiveLength | None = None  #: standard uncertainty
-    fwhm: PositiveLength | None = None
+    centroid_uncertainty: Linewidth | None = None  #: standard uncertainty
+    fwhm: Linewidth | None = None
     efficiency_per_nm: Finite | None = None  #: relative change of the efficiency
     drift: Relative | None = None  #: relative standard uncertainty, from the calibration of the light to the frames
 
@@ -63,8 +62,10 @@ class Lamp(Statement):
 class SensorTemperature(Statement):
     """The temperature of the sensor, and the relative change of its parameters per kelvin."""
 
-    value: Annotated[float, BeforeValidator(_temperature, json_schema_input_type=str)] | None = None  #: K
-    uncertainty: Annotated[float, Field(gt=0), BeforeValidator(lambda x: read_quantity(x, "K"))] | None = None
+    value: Annotated[float, Field(gt=0, le=1e4), BeforeValidator(_temperature, json_schema_input_type=str)] | None = (
+        None  #: K
+    )
+    uncertainty: Annotated[float, Field(gt=0, le=1e6), BeforeValidator(lambda x: read_quantity(x, "K"))] | None = None
     coefficients: Mapping[str, Finite] = Field(default_factory=dict)  #: 1/K, by parameter
 
     @property

@@ -18,7 +18,10 @@ _TIMES = ("exposuretime", "exptime", "exposure", "integrationtime")  #: keys of 
 _LIGHTS = ("photons", "photonsperpixel")
 _SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
 _NUMBER = re.compile(r"\s*([-+]?[\d.]+(?:e[-+]?\d+)?)\s*(s|ms|us|µs|μs|ns)?\s*", re.IGNORECASE)
-_PAIR = re.compile(r"([A-Za-z _]+?)\s*[=:]\s*([-+.\deE]+\s*(?:ms|us|µs|μs|ns|s)?)(?![A-Za-z])")
+_FRACTION = re.compile(r"\s*(\d+)\s*[/⁄]\s*([1-9]\d*(?:\.\d+)?)\s*(s|sec)?\s*", re.IGNORECASE)  #: 1/200 s
+_PAIR = re.compile(
+    r"([A-Za-z _]+?)\s*[=:]\s*(\d+\s*[/⁄]\s*\d[\d.]*\s*s?|[-+.\deE]+\s*(?:ms|us|µs|μs|ns|s)?)(?![A-Za-z/⁄\d])"
+)
 
 
 class FrameHeader(NamedTuple):
@@ -56,9 +59,17 @@ def _number(value: Any, is_time: bool = True) -> float | None:
     try:
         number = float(match[1]) if match else float(value)
     except (TypeError, ValueError):
-        return None
-    scale = _SECONDS[(match[2] or "").lower()] if match and is_time else 1.0
-    return number * scale if number > 0 or (number == 0 and not is_time) else None
+        return _fraction(value) if is_time else None
+    if not is_time:
+        return number if number >= 0 else None
+    unit = (match[2] or "").lower() if match else ""
+    return number * _SECONDS[unit] if number > 0 else None
+
+
+def _fraction(value: Any) -> float | None:
+    """Return the seconds of a text such as ``1/200 s``."""
+    match = _FRACTION.fullmatch(str(value))
+    return float(match[1]) / float(match[2]) or None if match else None
 
 
 _Found = tuple[int, tuple[int, int], int, Mapping[str, Any]]
@@ -119,6 +130,11 @@ def _stack(shape: tuple[int, ...]) -> tuple[int, tuple[int, int]]:
 def frame_means(file: Path) -> list[tuple[float, float]]:
     """Return the mean of each frame of a file and its standard error by the scatter of the pixels, DN."""
     return [(float(x.mean(dtype=np.float64)), float(x.std(dtype=np.float64)) / x.size**0.5) for x in read(file)]
+
+
+def frame_divisor(file: Path) -> int:
+    """Return the greatest common divisor of the numbers of a file of frames; 0 for numbers that are all 0."""
+    return int(np.gcd.reduce(np.unique(read(file))))
 
 
 _HEADERS = {".png": _picture, ".tif": _picture, ".tiff": _picture, ".exr": _exr, ".npy": _plain}

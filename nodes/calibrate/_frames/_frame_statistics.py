@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import accumulate
 from typing import Annotated, Any, Literal
 
@@ -12,10 +13,10 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.units import Time
+from neusee.nodes.units import Exposure
 from neusee.nodes.values import Levels
 
-Photons = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: per pixel and exposure
+Photons = Annotated[float, Field(ge=0, le=1e15)]  #: per pixel and exposure
 Temporal = Literal["temporal", "steady"]
 Scatter = Literal["all", "temporal", "steady"]
 _PIECE = 1 << 20  #: numbers of one block, so that no second copy of a stack is needed
@@ -25,31 +26,34 @@ _FEW, _SURE, _RATIO = 8, 5.0, 5.0  #: least count at an end; least excess in sig
 
 
 @node(rtol=1e-12)
-def reduce(frames: Tensor, *, photons: Photons, exposure: Time, scatter: Scatter = "all") -> Levels:
+def reduce(
+    frames: Tensor, mask: Tensor | None = None, *, photons: Photons, exposure: Exposure, scatter: Scatter = "all"
+) -> Levels:
     """Reduce the frames of one flat illumination to mean and variance, and a histogram if these do not suffice.
 
     ``scatter`` selects the variance. `all`: the variance over all pixels and frames, for pixels that are alike, as in a
     simulation. `temporal`: the variance of a pixel from frame to frame, for two frames half the mean squared
     difference. `steady`: the temporal variance minus the part that all pixels share, as from a drifting lamp, for two
     frames half the squared difference of the means; `camera` needs this variance. The histogram is kept where numbers
-    pile up at an end or have a standard deviation below 0.8 DN.
+    pile up at an end or have a standard deviation below 0.8 DN. Pixels of the ``mask`` are left out.
 
-    Shapes: frames (frame, y, x) -> one level.
+    Shapes: frames (frame, y, x), mask (y, x) True for a pixel that is left out -> one level.
     Units:  frames DN, whole; photons per pixel and exposure; exposure s; mean DN; variance DN2.
     Error:  counted in whole numbers: 1e-15. Numbers pile up at an end where their count exceeds the count of a Gaussian
-            with the mean and variance of all pixels: for `all` by 5 sigma; for `temporal` and `steady`, 5-fold.
+            with the mean and variance of all pixels: for `all` by 5 sigma; for `temporal` and `steady`, 5-fold, and by
+            5 sigma that of the numbers beside them, since pixels of unequal noise have long tails.
     Raises: ValueError for numbers that are fractional, negative or not finite, for a stack that is not (frame, y, x),
-            for a single number, for `temporal` and `steady` of one frame, and for `steady` of one pixel.
+            for a mask of another size, for a single number, for `temporal` and `steady` of one frame, and for `steady`
+            of one pixel.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.5 and 6.6.
     """
     if frames.ndim != 3 or not frames.numel():
         raise ValueError(
             f"frames {tuple(frames.shape)} are not (frame, y, x): give a stack, or (1, y, x) for one frame"
         )
-    if scatter != "all" and len(frames) < 2:
-        raise ValueError("one frame has no temporal variance: give two frames or more, or set scatter: all")
-    if frames.numel() < 2 or (scatter == "steady" and frames[0].numel() < 2):
-        raise ValueError("one pixel value has no variance: give more pixels or frames")
+    if mask is not None:
+        frames = _unmasked(frames, mask)
+    _refuse_single(frames, scatter)
     value, count = histogram(frames)
     total = float(count.sum())
     mean = float((value * count).sum()) / total
@@ -63,6 +67,21 @@ def reduce(frames: Tensor, *, photons: Photons, exposure: Time, scatter: Scatter
     moments = (torch.tensor([x], dtype=torch.float64) for x in (photons, exposure, total, mean, variance, freedom))
     value, count = (value, count) if kept else (value[:0], count[:0])
     return Levels._make([*moments, torch.zeros(len(value), dtype=torch.int64), value.double(), count.double()])
+
+
+def _refuse_single(frames: Tensor, scatter: Scatter) -> None:
+    """Raise ValueError for frames without the variance that ``scatter`` selects."""
+    if scatter != "all" and len(frames) < 2:
+        raise ValueError("one frame has no temporal variance: give two frames or more, or set scatter: all")
+    if frames.numel() < 2 or (scatter == "steady" and frames[0].numel() < 2):
+        raise ValueError("one pixel value has no variance: give more pixels or frames")
+
+
+def _unmasked(frames: Tensor, mask: Tensor) -> Tensor:
+    """Return the pixels (frame, 1, pixel) that a mask does not leave out."""
+    if mask.shape != frames.shape[1:]:
+        raise ValueError(f"the mask {tuple(mask.shape)} is not of the size of the frames {tuple(frames.shape[1:])}")
+    return frames[:, ~mask.bool()][:, None]
 
 
 @reduce.check
@@ -140,11 +159,38 @@ def _kept(value: Tensor, count: Tensor, mean: float, sigma: float, alike: bool) 
     """Return True if the histogram holds information that mean and variance lack."""
     if sigma < _COARSE:
         return True
-    ends = ((value >= value[-1] - 1, value[-1] - 1.5), (value <= value[0] + 1, value[0] - 0.5))
-    return any(_piled(float(count[at].sum()), float(count.sum()), float(low) - mean, sigma, alike) for at, low in ends)
+    ends = (
+        _End(value - value[0], count, float(value[0]) - 0.5),
+        _End(value[-1] - value, count, float(value[-1]) - 1.5),
+    )
+    total = float(count.sum())
+    if alike:
+        return any(_exceeds_gaussian(end.held, total, end.low - mean, sigma, True) for end in ends)
+    return any(_exceeds_gaussian(end.held, total, end.low - mean, sigma, False) and end.rises for end in ends)
 
 
-def _piled(held: float, total: float, low: float, sigma: float, alike: bool) -> bool:
+@dataclass(frozen=True)
+class _End:
+    """One end of the numbers of a level: the two numbers there, and those beside them."""
+
+    away: Tensor  #: distance of each number from the end
+    count: Tensor
+    low: float  #: where the two numbers at the end begin
+
+    @property
+    def held(self) -> float:
+        """Return the count of the two numbers at the end."""
+        return float(self.count[self.away <= 1].sum())
+
+    @property
+    def rises(self) -> bool:
+        """Return True if the numbers at the end are more than those beside them: towards a free end, counts fall."""
+        one, next_one, *two_beside = (float(self.count[self.away == i].sum()) for i in range(4))
+        pairs = ((one, next_one), (one + next_one, sum(two_beside)))
+        return any(at_end - beside > _SURE * math.sqrt(at_end + beside) for at_end, beside in pairs)
+
+
+def _exceeds_gaussian(held: float, total: float, low: float, sigma: float, alike: bool) -> bool:
     """Return True if the count ``held`` of two neighbouring numbers exceeds the count that a Gaussian gives."""
     expected = total * 0.5 * abs(math.erf((low + 2.0) / sigma / math.sqrt(2)) - math.erf(low / sigma / math.sqrt(2)))
     more = _SURE * math.sqrt(expected) if alike else (_RATIO - 1) * expected

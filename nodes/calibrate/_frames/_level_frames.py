@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
@@ -15,23 +16,36 @@ from neusee.nodes.calibrate._frames._damaged_frames import frame_problem
 from neusee.nodes.calibrate._frames._image_files import read, readable
 from neusee.nodes.units import DataFiles
 
+Divisor = Annotated[int, Field(ge=1, le=1 << 16)]
+
 
 @node(rtol=0.0)
-def frames(*, files: DataFiles) -> Tensor:
+def frames(*, files: DataFiles, divisor: Divisor = 1) -> Tensor:
     """Read the frames of one flat illumination: PNG, TIFF, EXR, NumPy or FITS files of raw numbers.
+
+    Numbers of a converter that are shifted to the left in the file, such as 12 bits by 4 in 16, are divided by
+    ``divisor``.
 
     Shapes: -> (frame, y, x) int32, the frames of all files in order.
     Units:  DN.
     Error:  exact.
     Raises: ParameterError before the run for an unknown kind of file, for a damaged file, for colour, and for numbers
-            that are negative or not whole; ValueError for frames that differ in size.
+            that are negative or not whole; ValueError for frames that differ in size, and for a number that is no
+            multiple of the divisor.
     Source: EMVA Standard 1288, release 4.0 Linear, section 6.5 (raw frames, without corrections).
     """
-    return torch.from_numpy(stack(files))
+    numbers = stack(files)
+    if divisor == 1:
+        return torch.from_numpy(numbers)
+    left = numbers % divisor
+    if left.any():
+        raise ValueError(f"{files[0]} and the files of its level hold {numbers[left > 0][0]}, no multiple of {divisor}:"
+                         " leave the divisor out")  # fmt: skip
+    return torch.from_numpy(numbers // divisor)
 
 
 @frames.preflight
-def _(*, files: Sequence[Path]) -> list[str]:
+def _(*, files: Sequence[Path], **params: Any) -> list[str]:
     return refuse_unreadable("files", files)
 
 

@@ -12,8 +12,9 @@ from neusee.nodes.calibrate._frames._frame_statistics import Photons
 from neusee.nodes.sensor._digitization import Bits, Rounding, digitize
 from neusee.nodes.sensor._digitization import full_well as well_of
 from neusee.nodes.sensor._noise import Distribution, Spread, dark_current, photon_noise, read_noise
+from neusee.nodes.sensor._room_for_light import refuse_without_room, refuse_without_steps
 from neusee.nodes.sensor._saturation import Efficiency, Well
-from neusee.nodes.units import Count, Electrons, Fraction, Gain, Shape, Time
+from neusee.nodes.units import Count, Electrons, Exposure, Fraction, Gain, Shape
 
 dark_of, read_of = dark_current, read_noise  # parameters below have the same names
 
@@ -22,12 +23,12 @@ dark_of, read_of = dark_current, read_noise  # parameters below have the same na
 def expose(
     *,
     photons: Photons,
-    exposure: Time,
+    exposure: Exposure,
     shape: Shape,
     frames: Count = 2,
     quantum_efficiency: Efficiency,
     dark_current: Electrons,
-    dark_exposure: Time,
+    dark_exposure: Exposure,
     offset: Electrons,
     read_noise: Electrons,
     full_well: Well,
@@ -60,6 +61,25 @@ def expose(
     e = well_of(read_of(e, offset=offset, read_noise=read_noise, rng=rng), capacity=full_well)
     numbers: Tensor = digitize(e, gain=gain, rounding=rounding, bits=bits, rng=rng)
     return numbers
+
+
+@expose.preflight
+def _(
+    *,
+    exposure: float,
+    dark_current: float,
+    dark_exposure: float,
+    offset: float,
+    read_noise: float,
+    full_well: float,
+    gain: float,
+    bits: int = 16,
+    **params: object,
+) -> list[str]:
+    dark = dark_current * exposure / dark_exposure
+    refuse_without_room(full_well, offset=offset, read_noise=read_noise, dark=dark)
+    refuse_without_steps(full_well, gain=gain, bits=bits)
+    return []
 
 
 @expose.check

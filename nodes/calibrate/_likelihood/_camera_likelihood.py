@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple
 
 import torch
@@ -13,10 +14,11 @@ from neusee.nodes.calibrate._emva_fit import Share, without_histograms
 from neusee.nodes.calibrate._likelihood._linear_sensor import ROUNDED, Likelihood
 from neusee.nodes.sensor._digitization import Rounding
 from neusee.nodes.sensor._saturation import Efficiency
-from neusee.nodes.units import Electrons, Gain, Real, Time
+from neusee.nodes.units import Electrons, Exposure, Gain, Real
 from neusee.nodes.values import Levels
 
-Scattered = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: a standard deviation; 0 for none
+Scattered = Annotated[float, Field(ge=0, le=100)]  #: a standard deviation; 0 for none
+_ITERATIONS = 40  #: of the inverse of a response that bends by less than a half
 _QUIET = 0.24  #: DN2, least variance that EMVA 1288 accepts for a signal
 _COARSE = 0.8  #: DN, standard deviation below which levels keep a histogram although no number is cut off
 
@@ -67,7 +69,7 @@ def camera(
     dark_signal: Real,
     temporal_dark_noise: Electrons,
     dark_current: Electrons = 0.0,
-    dark_exposure: Time = 1.0,
+    dark_exposure: Exposure = 1.0,
     scatter: Scattered = 0.003,
     lamp: Scattered = 0.01,
     drift: Scattered = 0.0,
@@ -127,10 +129,45 @@ def _(result: Likelihood, levels: Levels, **params: Any) -> list[Check]:
     off, used = float(result.deviance.sum()), result.degrees_of_freedom > 0
     count, coarse = int(used.sum()), int((levels.variance[used] < _QUIET).sum())
     checks = [Check(f"deviance {off:.4g} for {2 * count} means and variances, from {count} of {len(used)} levels")]
+    dark = levels.photons == 0
+    first, shortest = levels.exposure[used & dark].min(), levels.exposure[dark].min()
+    if first > shortest:
+        text = f"the dark frames of {float(shortest):.4g} s pile up at an end: dark signal and dark noise are those of"
+        checks.append(Check(f"{text} {float(first):.4g} s", False))
     if coarse:
         text = f"{coarse} levels with a variance below {_QUIET} DN2, where rounding is not independent noise"
         checks.append(Check(text, False))
     return checks
+
+
+def expected_levels(levels: Levels, params: Mapping[str, Any]) -> Levels:
+    """Return measured levels with the means and variances that a camera with given parameters should have.
+
+    ``params`` are the parameters of `camera`, and all numbers. Levels that `camera` leaves out stay as they are.
+
+    Shapes: levels (level,) -> levels (level,), without histograms.
+    Units:  those of `Levels`.
+    Error:  1e-12 of the inverse of the response, which is iterated.
+    Raises: ValueError as `camera`.
+    Source: the model of `camera`.
+    """
+    seen, top, first = _used(levels, params["share"])
+    used = without_histograms(levels, seen)
+    numbers = {name: torch.as_tensor(params[name], dtype=torch.float64) for name in CAMERA_PARAMETERS}
+    sensor = _Camera(*numbers.values())
+    current = sensor.current / params["dark_exposure"]
+    electrons = sensor.efficiency * used.photons + current * (used.exposure - first)
+    signal = sensor.gain * electrons
+    for _ in range(_ITERATIONS):
+        x = signal / top
+        signal = sensor.gain * electrons * (1.0 + sensor.bend * x + sensor.twist * x.square())
+    slope = _signal(signal, top, sensor).slope
+    variance = slope.square() * (sensor.noise.square() + electrons) + ROUNDED[params["rounding"]][1]
+    whole = without_histograms(levels, torch.arange(len(levels.mean)))
+    return whole._replace(
+        mean=whole.mean.index_copy(0, seen, signal + sensor.signal),
+        variance=whole.variance.index_copy(0, seen, variance),
+    )
 
 
 def _residuals(levels: Levels, top: float, camera: _Camera, first: float, quantization: float) -> _Residuals:

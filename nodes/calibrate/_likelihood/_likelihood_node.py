@@ -12,7 +12,7 @@ from neusee.nodes.calibrate._likelihood._sufficient_statistics import Sufficient
 from neusee.nodes.sensor._digitization import Bits, Rounding
 from neusee.nodes.sensor._noise import Distribution, Spread
 from neusee.nodes.sensor._saturation import Efficiency, Well
-from neusee.nodes.units import Electrons, Fraction, Gain, Time
+from neusee.nodes.units import Electrons, Exposure, Fraction, Gain
 
 
 @node()
@@ -24,7 +24,7 @@ def density(
     offset: Electrons,
     read_noise: Electrons,
     dark_current: Electrons,
-    dark_exposure: Time,
+    dark_exposure: Exposure,
     full_well: Well,
     arrivals: Distribution = "gaussian",
     mean_shift: Fraction = 0.0,

@@ -12,8 +12,8 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-Factor = Annotated[float, Field(gt=1, allow_inf_nan=False)]  #: one standard deviation of the logarithm, as a ratio
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Factor = Annotated[float, Field(gt=1, le=1e6)]  #: one standard deviation of the logarithm, as a ratio
+Positive = Annotated[float, Field(ge=1e-12, le=1e12)]
 Pair = tuple[float, float]
 Known = Literal["unknown", "none"]  #: what is known of a fault of the frames before any frame
 FAULTS = ("mixing", "lag", "pattern")  #: faults that may hide in frames: each changes the variance in proportion

@@ -16,10 +16,11 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.calibrate._frames._level_frames import refuse_unreadable, stack
 from neusee.nodes.sensor._digitization import Bits
+from neusee.nodes.sensor._room_for_light import refuse_without_room, refuse_without_steps
 from neusee.nodes.sensor._saturation import Well
 from neusee.nodes.units import DataFiles, Electrons, Gain
 
-Place = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: pixels, from the middle of the first pixel
+Place = Annotated[float, Field(ge=0, le=1e6)]  #: pixels, from the middle of the first pixel
 Numbers = NDArray[np.float64]
 _CUT = 0.95  #: share of saturation from which a number says only that the pixel holds more
 _BELOW = 5.0  #: standard deviations by which a ring must lie below this cut to be averaged
@@ -87,6 +88,8 @@ def point_source(
 @point_source.preflight
 def _(*, files: Sequence[Path], centre: tuple[float, float] | None, **params: Any) -> list[str]:
     refuse_unreadable("files", files)
+    refuse_without_room(params["full_well"], offset=params["offset"], read_noise=params["read_noise"])
+    refuse_without_steps(params["full_well"], gain=params["gain"], bits=params["bits"])
     camera = _Camera(**{name: params[name] for name in _Camera._fields})
     try:
         reduce_rings(stack(files).astype(np.float64), camera, centre)

@@ -15,10 +15,10 @@ from neusee.nodes import Check, node
 from neusee.nodes.calibrate._likelihood._linear_sensor import Likelihood
 from neusee.nodes.calibrate._scatter._point_source import Rings
 from neusee.nodes.flare._harvey_shack import lobe, on_far_pixels, scattered_share
-from neusee.nodes.units import Electrons, Gain, PositiveLength, Real, Wavelength
+from neusee.nodes.units import Diameter, Electrons, FocalLength, Gain, PixelPitch, Real, Wavelength
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Scattered = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: a standard deviation; 0 for none
+Positive = Annotated[float, Field(ge=1e-12, le=1e12)]
+Scattered = Annotated[float, Field(ge=0, le=100)]  #: a standard deviation; 0 for none
 _FRINGES = 0.02  #: relative: how well the mean wing of the core is that of a ring that is one pixel wide
 
 
@@ -35,9 +35,9 @@ def stray_light(
     scatter: Scattered = 0.0,
     read_noise: Electrons,
     gain: Gain,
-    focal_length: PositiveLength,
-    diameter: PositiveLength,
-    pixel_pitch: PositiveLength,
+    focal_length: FocalLength,
+    diameter: Diameter,
+    pixel_pitch: PixelPitch,
     wavelength: Wavelength,
     told: bool = True,
 ) -> Likelihood:

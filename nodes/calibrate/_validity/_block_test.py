@@ -83,6 +83,6 @@ def _cosines(frame: Tensor) -> Tensor:
     k, x = (torch.arange(_BLOCK, dtype=torch.float64) for _ in range(2))
     basis = (math.pi / _BLOCK * k[:, None] * (x + 0.5)).cos() * math.sqrt(2 / _BLOCK)
     basis[0] /= math.sqrt(2)
-    part = frame[: n * _BLOCK, : m * _BLOCK].reshape(n, _BLOCK, m, _BLOCK).transpose(1, 2)
+    part = frame.double()[: n * _BLOCK, : m * _BLOCK].reshape(n, _BLOCK, m, _BLOCK).transpose(1, 2)
     found: Tensor = (basis @ part @ basis.T).reshape(n * m, -1)
     return found

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from neusee.nodes.calibrate._frames._frame_statistics import Scatter, histogram
-from neusee.nodes.calibrate._validity._hidden_faults import Correction, Hidden, corrections
+from neusee.nodes.calibrate._validity._hidden_faults import Hidden, open_errors
 
 Verdict = Literal["passed", "modelled", "widened", "refused"]
 ALARM = 1e-3  #: probability with which chance alone fails one test of a whole measurement
 REFUSED = 0.02  #: relative error of gain or dark noise above which frames are refused, and below which intervals widen
-_WINDOW = 512  #: pixels of the central window on a side, in which patterns and noise are tested
+_WINDOW = 1024  #: pixels of the central window on a side, in which patterns and noise are tested
+_TESTED = 1 << 21  #: pixels of a level in all tested frames together
 _BLOCK = 8  #: pixels by which the window is aligned, as blocks of a compressed picture are
 _PILED = 5.0  #: standard deviations of counting by which numbers pile up at an end
 _LEAST = 20  #: least count of pixels that pile up
+_FLAT = 0.5  #: share of the greatest variance below which a brighter level is saturated
 _AT_ZERO = 5e-3  #: share of the pixels at 0, which hides numbers below 0
 _MOST = 16  #: frames of a level whose noise and patterns are tested
 #: what to do about refused frames, by the name of the test
@@ -43,25 +45,31 @@ class Stack(NamedTuple):
     exposure: float  #: s
     scatter: Scatter  #: which variance `reduce` computes
     frames: Tensor  #: (frame, y, x) DN, whole numbers
+    mask: Tensor | None = None  #: (y, x) True for a pixel that is left out
 
 
 class Level(NamedTuple):
     """One light level: pairs of frames in the central window, and the histogram of the whole frames."""
 
-    stack: Stack
-    first: Tensor  #: (pair, y, x) float64, DN, with the mean of each frame removed
+    name: str
+    photons: float
+    exposure: float  #: s
+    scatter: Scatter
+    first: Tensor  #: (pair, y, x) float32, DN, with the mean of each frame removed; 0 in pixels that are left out
     second: Tensor  #: (pair, y, x), as `first`
-    apart: Tensor  #: (pair, y, x) DN, second less first
+    apart: Tensor  #: (pair, y, x) DN, second less first, without what the lamp changed from the first to the second
     drift: Tensor  #: (pair,) DN, mean of the second frame less mean of the first
     variance: float  #: DN2, temporal, without the drift of the mean
     mean: float  #: DN
     value: Tensor  #: (code,) digital numbers that occur, rising
     pixels: Tensor  #: (code,) count of each number
+    flicker: float = 0.0  #: DN2, variance by the flicker of the lamp over light that is uneven
+    fitted: bool = True  #: True if the likelihood uses the level
 
     @property
     def dark(self) -> bool:
         """Return True for a level without light."""
-        return self.stack.photons == 0
+        return self.photons == 0
 
     @property
     def paired(self) -> bool:
@@ -90,7 +98,8 @@ class FrameTest:
     verdict: Verdict
     sentence: str
     shifts: Mapping[str, float] = field(default_factory=dict)  #: relative errors of "gain" and "noise" that may follow
-    hidden: tuple[Hidden, ...] = ()  #: faults of which the frames tell a size, which corrects gain and noise
+    explains_all: bool = False  #: True if other tests would only find consequences of this fault
+    hidden: tuple[Hidden, ...] = ()  #: faults of which the frames tell a size, whether the test finds them or not
 
 
 class Evidence(NamedTuple):
@@ -107,18 +116,91 @@ class Evidence(NamedTuple):
 
 def prepared(stack: Stack) -> Level:
     """Return the pairs and the histogram of a light level; frame 0 forms a pair with 1, 2 with 3, and so on."""
-    value, count = histogram(stack.frames)
-    frames = _window(stack.frames[:_MOST]).double()
-    means = frames.mean((1, 2))
+    kept = stack.frames if stack.mask is None else stack.frames[:, ~stack.mask]
+    value, count = histogram(kept)
+    frames = _window(stack.frames)
     pairs = len(frames) // 2
-    mean = float((value * count).sum()) / float(count.sum())
-    first, second = ((frames - means[:, None, None])[at : 2 * pairs : 2] for at in (0, 1))
+    means, centred = _centred(frames, stack.mask)
+    first, second = centred[: 2 * pairs : 2], centred[1 : 2 * pairs : 2]
     apart = second - first
-    freedom = max(1, apart.numel() - pairs)
-    variance = float(apart.square().sum()) / 2 / freedom if pairs else math.nan
     return Level(
-        stack, first, second, apart, means[1 : 2 * pairs : 2] - means[: 2 * pairs : 2], variance, mean, value, count
+        name=stack.name,
+        photons=stack.photons,
+        exposure=stack.exposure,
+        scatter=stack.scatter,
+        first=first,
+        second=second,
+        apart=apart,
+        drift=means[1 : 2 * pairs : 2] - means[: 2 * pairs : 2],
+        variance=_variance(apart),
+        mean=float((value * count).sum()) / float(count.sum()),
+        value=value,
+        pixels=count,
     )
+
+
+def fitted_levels(levels: Sequence[Level], share: float | None) -> list[Level]:
+    """Return the levels with what the fit uses: dark levels, and lit levels up to ``share`` of saturation.
+
+    Saturation is at the lit level of the greatest variance, as for the likelihood. Without a ``share`` each level is
+    used. What the lamp changed from frame to frame, which is proportional to the light of each pixel, is taken off the
+    differences of the pairs.
+    """
+    dark = min((level.mean for level in levels if level.dark), default=0.0)
+    lit = [level for level in levels if not level.dark and level.paired]
+    full = max(lit, key=lambda level: level.variance).mean - dark if lit else math.inf
+    limit = math.inf if share is None else share * full
+    return [_steadied(level, dark)._replace(fitted=level.dark or level.mean - dark <= limit) for level in levels]
+
+
+def saturated(levels: Sequence[Level]) -> list[Level]:
+    """Return the levels whose numbers pile up at the highest number, or whose variance has fallen above its maximum.
+
+    A well that differs from pixel to pixel, or that fills before the read noise is added, makes no pile.
+    """
+    lit = [level for level in levels if not level.dark and level.paired]
+    peak = max(lit, key=lambda level: level.variance, default=None)
+    return [level for level in levels if level.high or (peak is not None and _is_flat(level, peak))]
+
+
+def tested(levels: Sequence[Level]) -> list[Level]:
+    """Return the paired levels whose noise is tested: those that the fit uses, without a pile at an end."""
+    return [level for level in levels if level.paired and level.fitted and not level.high and not level.low]
+
+
+def _is_flat(level: Level, peak: Level) -> bool:
+    return level.paired and not level.dark and level.mean > peak.mean and level.variance < _FLAT * peak.variance
+
+
+def _steadied(level: Level, dark: float) -> Level:
+    """Return a lit level without what a change of the lamp between the frames of a pair adds to their difference.
+
+    The light of the second frame is that of the first, times the ratio of their means above the dark.
+    """
+    signal = level.mean - dark
+    if level.dark or not level.paired or signal <= 0:
+        return level
+    change = (level.drift / signal)[:, None, None]
+    apart = level.second * (1 - change / 2) - level.first * (1 + change / 2)
+    light = (level.first * level.second).mean((1, 2)).clamp_min(0.0)
+    flicker = float((change[:, 0, 0].square() * light).mean()) / 2
+    return level._replace(apart=apart, variance=_variance(apart), flicker=flicker)
+
+
+def _variance(apart: Tensor) -> float:
+    """Return the temporal variance of differences (pair, y, x), without the drift of the mean; NaN without a pair."""
+    return float(apart.square().sum()) / 2 / max(1, apart.numel() - len(apart)) if len(apart) else math.nan
+
+
+def _centred(frames: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the means (frame,) of frames, and the frames (frame, y, x) less their means, 0 in masked pixels."""
+    numbers = frames.double()
+    if mask is None:
+        means = numbers.mean((1, 2))
+        return means, (numbers - means[:, None, None]).float()
+    kept = ~_window(mask[None])[0]
+    means = (numbers * kept).sum((1, 2)) / kept.sum().clamp_min(1)
+    return means, ((numbers - means[:, None, None]) * kept).float()
 
 
 def without_lines(x: Tensor) -> Tensor:
@@ -127,8 +209,11 @@ def without_lines(x: Tensor) -> Tensor:
 
 
 def _window(frames: Tensor) -> Tensor:
+    """Return the middle of at most 16 frames, and fewer frames where they are large."""
     starts = [max(0, n - _WINDOW) // 2 // _BLOCK * _BLOCK for n in frames.shape[1:]]
-    return frames[:, starts[0] : starts[0] + _WINDOW, starts[1] : starts[1] + _WINDOW]
+    middle = frames[:, starts[0] : starts[0] + _WINDOW, starts[1] : starts[1] + _WINDOW]
+    most = _TESTED // max(1, middle[0].numel()) // 2 * 2
+    return middle[: min(_MOST, max(2, most))]
 
 
 def _piled(level: Level, value: Tensor, count: Tensor) -> bool:
@@ -188,26 +273,19 @@ def _remedy(name: str, verdict: Verdict) -> str:
     return f"; {_REMEDIES[name]}" if verdict == "refused" and name in _REMEDIES else ""
 
 
-def corrected(name: str, evidence: Evidence, hidden: Sequence[Hidden], sentence: str, passed: str) -> FrameTest:
-    """Return the result of a test whose fault is corrected: refused where the correction is uncertain by over 2 %."""
-    change = corrections(hidden)
-    worst = max(change.values(), key=lambda x: x.sd, default=Correction(0.0, 0.0))
-    verdict: Verdict = "passed"
-    text = f"{passed}; the frames may hide {100 * worst.sd:.2g} %" if hidden else passed
-    if evidence.found:
-        verdict = "modelled" if worst.sd <= REFUSED else "refused"
-        words = [f"{what} by {100 * x.mean:+.2g} % ± {100 * x.sd:.2g} %" for what, x in change.items() if x.sd]
-        text = f"{sentence}: corrected, {' and '.join(words)}" if verdict == "modelled" else ""
-        error = max(abs(x.mean) for x in change.values())
-        text = text or f"{sentence}: an error of {100 * error:.2g} % may follow{_remedy(name, verdict)}"
+def bounded(
+    name: str, evidence: Evidence, hidden: Sequence[Hidden], sentence: str, passed: str, modelled: str = ""
+) -> FrameTest:
+    """Return the result of a test of a fault of which the frames tell a size, found or not.
+
+    Nothing is corrected. A fault that is found is refused where gain or noise may be wrong by more than 2 %, and else
+    widens by its whole size.
+    """
+    worst = max(open_errors(hidden).values())
+    if not evidence.found:
+        text = f"{passed}; the frames may hide {100 * worst:.2g} %" if hidden else passed
+        return FrameTest(name, evidence.strength, evidence.limit, "passed", text, hidden=tuple(hidden))
+    verdict: Verdict = "refused" if worst > REFUSED else "modelled" if modelled else "widened"
+    text = f"{sentence}: an error of {100 * worst:.2g} % may follow, and nothing is corrected{_remedy(name, verdict)}"
+    text = f"{sentence}: {modelled}" if verdict == "modelled" else text
     return FrameTest(name, evidence.strength, evidence.limit, verdict, text, hidden=tuple(hidden))
-
-
-def uncorrected(test: FrameTest) -> FrameTest:
-    """Return the result of a test for a program that corrects no fault: a fault that was found shifts its results."""
-    if not test.hidden or test.verdict != "modelled":
-        return test
-    worst = max(abs(change.mean) + change.sd for change in corrections(test.hidden).values())
-    verdict: Verdict = "refused" if worst > REFUSED else "widened"
-    text = f"{test.sentence.partition(': corrected')[0]}: an error of {100 * worst:.2g} % may follow"
-    return replace(test, verdict=verdict, sentence=text + _remedy(test.name, verdict))

@@ -11,12 +11,12 @@ from torch import Tensor
 from neusee.nodes.calibrate._validity._frame_pairs import (
     FrameTest,
     Level,
-    corrected,
+    bounded,
     strongest,
     studentised,
     without_lines,
 )
-from neusee.nodes.calibrate._validity._hidden_faults import Hidden
+from neusee.nodes.calibrate._validity._hidden_faults import Hidden, probably_sound
 
 _RARE = 4.5  #: standard deviations beyond which a pixel is defective, and left out
 _LEAST = 3  #: least levels in excess of the patterns that are fitted
@@ -49,7 +49,7 @@ def lag(levels: Sequence[Level]) -> list[FrameTest]:
     products, powers = [], 0.0
     for pair in range(pairs):
         u, v = (
-            _left(torch.stack([frames[pair] for frames in each]), weight, basis)[lit]
+            _left(torch.stack([frames[pair].double() for frames in each]), weight, basis)[lit]
             for each in ([level.first for level in group], [level.second for level in group])
         )
         kept = (u.abs() < _RARE * _width(u)) & (v.abs() < _RARE * _width(v))
@@ -60,10 +60,12 @@ def lag(levels: Sequence[Level]) -> list[FrameTest]:
     share, error = float(product.sum()) / powers, math.sqrt(float(product.square().sum())) / powers
     inside = min(max(share, -0.9), 0.9)
     lost = math.log((1 + inside) / (1 - inside) ** 2)
-    hidden = [Hidden("lag", lost, max(3 * error, 1e-9), _KEPT, gain=1.0, noise=0.5, partly=True, positive=True)]
+    sound = probably_sound(pairs * int(lit.sum()) * group[0].first[0].numel())
+    width = max(3 * error, 1e-9)
+    hidden = [Hidden("lag", lost, width, _KEPT, gain=1.0, noise=0.5, positive=True, sound=sound)]
     sentence = f"{share:.1%} of the noise of a frame persists in the next frame, as by lag"
     passed = f"the noise of a frame does not persist in the next frame ({share:.2%} ± {error:.2%})"
-    return [corrected("no lag", evidence, hidden, sentence, passed)]
+    return [bounded("no lag", evidence, hidden, sentence, passed)]
 
 
 def _comparable(levels: Sequence[Level]) -> list[Level]:
@@ -79,7 +81,7 @@ def _patterns(levels: Sequence[Level]) -> Tensor:
     """Return the size (level, part) of each part of a pattern in each level, with as many parts as levels allow."""
     offset = min((level.mean for level in levels), default=0.0)
     signal = torch.tensor([level.mean - offset for level in levels], dtype=torch.float64)
-    exposure = torch.tensor([level.stack.exposure for level in levels], dtype=torch.float64)
+    exposure = torch.tensor([level.exposure for level in levels], dtype=torch.float64)
     dark = torch.tensor([level.dark for level in levels])
     parts = [torch.ones_like(signal)]
     if not bool(dark.all()):

@@ -13,30 +13,36 @@ from neusee.nodes.calibrate._validity._frame_pairs import (
     ALARM,
     FrameTest,
     Level,
-    corrected,
+    bounded,
     normal_limit,
     outcome,
     strongest,
     studentised,
+    tested,
     without_lines,
 )
-from neusee.nodes.calibrate._validity._hidden_faults import Hidden
+from neusee.nodes.calibrate._validity._hidden_faults import Hidden, probably_sound
 
 _NEAR = ((0, 1), (1, 0))  #: lags in pixels (y, x)
-_BOTH = ((1, 1), (1, -1))
+_CORNERS = ((1, 1), (1, -1))
 _FAR = ((0, 2), (2, 0))
 _NOISE = "the noise of neighbouring pixels"
+_JUMPS, _DRIFT = "no telegraph noise", "no drift within a level"
+_ROOT_MEAN_SQUARE = "stated is the root mean square of all pixels, as EMVA 1288 defines it"
 _MIXED = 0.02  #: scale of the prior of the share of the variance that neighbours take from each other
+_STEADY = 1e-3  #: share of the variance that flicker over uneven light may add without a word
 _QUIET = 0.24  #: DN2, least variance of EMVA 1288
+_TINY = 1e-12  #: DN2
 _CORE = 1.5  #: standard deviations of the middle of a distribution that gives its robust width
 
 
 def noise_tests(levels: Sequence[Level]) -> list[FrameTest]:
     """Test the noise of pairs of frames for correlation, block compression, lines, rare jumps and drift.
 
-    The differences of two frames of the same light hold no fixed pattern. Sums of products of neighbouring differences
-    are divided by the root of the sum of their squares, so that they are standard normal for independent pixels of any
-    variance; sums of squares of line means have a chi-square distribution.
+    Only levels that the fit uses are tested. The differences of two frames of the same light hold no fixed pattern.
+    Sums of products of neighbouring differences are divided by the root of the sum of their squares, so that they are
+    standard normal for independent pixels of any variance; sums of squares of line means have a chi-square
+    distribution.
 
     Shapes: a list of levels -> a list of tests.
     Units:  numbers and limits in standard deviations of chance.
@@ -44,7 +50,7 @@ def noise_tests(levels: Sequence[Level]) -> list[FrameTest]:
     Source: EMVA Standard 1288, release 4.0 Linear, sections 2.4 (white noise) and 6.6; Bonferroni; Wilson and
             Hilferty, PNAS 17, 684 (1931); Anscombe and Glynn, Biometrika 70, 227 (1983).
     """
-    paired = [level for level in levels if level.paired and not level.high and not level.low]
+    paired = tested(levels)
     if not paired:
         return []
     white = [without_lines(level.apart) for level in paired]
@@ -58,20 +64,21 @@ def _correlation(levels: Sequence[Tensor], lag: tuple[int, int]) -> float:
 
 
 def _whiteness(levels: Sequence[Level], white: Sequence[Tensor]) -> FrameTest:
-    near, far = (
-        [sum(studentised(products(x, lag)) for lag in lags) / math.sqrt(2) for x in white] for lags in (_NEAR, _FAR)
+    near, corners, far = (
+        [sum(studentised(products(x, lag)) for lag in lags) / math.sqrt(2) for x in white]
+        for lags in (_NEAR, _CORNERS, _FAR)
     )
-    evidence = strongest([near, far], sides=2)
+    evidence = strongest([near, corners, far], sides=2)
     darks, lit = ([x for x, each in zip(white, levels, strict=True) if each.dark == dark] for dark in (True, False))
     of_readout = _from_readout(darks, lit)
     text = f"{_NOISE} {_correlates(white)}"
     sentence = f"{text}, as in frames that are mixed, denoised, interpolated or compressed"
+    modelled = ""
     if of_readout:
-        sentence = (
-            f"in the dark {_NOISE} {_correlates(darks)}, as noise of the readout does, which counts as dark noise"
-        )
-        sentence += f"; in light it {_correlates(lit)}"
-    return corrected("white noise", evidence, [*_of_mixing(darks, lit, of_readout)], sentence, text)
+        sentence = f"in the dark {_NOISE} {_correlates(darks)}, as noise of the readout does"
+        modelled = f"it counts as dark noise; in light it {_correlates(lit)}"
+    hidden = [*_of_mixing(darks, lit, of_readout, evidence.found)]
+    return bounded("white noise", evidence, hidden, sentence, text, modelled)
 
 
 def _correlates(levels: Sequence[Tensor]) -> str:
@@ -92,12 +99,17 @@ def _from_readout(darks: Sequence[Tensor], lit: Sequence[Tensor]) -> bool:
     return dark < -limit * error and dark - light < -limit * math.hypot(error, other)
 
 
-def _of_mixing(darks: Sequence[Tensor], lit: Sequence[Tensor], of_readout: bool) -> Iterator[Hidden]:
-    """Yield what a filter may have taken from the variance in light, and from that in the dark."""
-    for chosen, gain, noise in ((lit, 1.0, 0.5 * of_readout), (() if of_readout else darks, 0.0, 0.5)):
-        for lags, scale in ((_NEAR, _MIXED), ((*_BOTH, *_FAR), _MIXED / 2)):
-            if chosen:  # noise that is made correlated, as by rows of a readout, lacks nothing in the dark
-                yield Hidden("mixing", *_missing(chosen, lags), scale, gain, noise, partly=noise > 0)
+def _of_mixing(darks: Sequence[Tensor], lit: Sequence[Tensor], of_readout: bool, found: bool) -> Iterator[Hidden]:
+    """Yield what a filter may have taken from the variance in light, and from that in the dark.
+
+    A filter reaches the eight neighbours of a pixel; one that is found may reach farther.
+    """
+    lags = (*_NEAR, *_CORNERS, *(_FAR if found else ()))
+    sound = probably_sound(sum(x.numel() for x in lit))
+    if lit:
+        yield Hidden("mixing", *_missing(lit, lags), _MIXED, gain=1.0, sound=sound)
+    if darks and not of_readout:  # the noise of a readout lacks nothing in the dark
+        yield Hidden("mixing", *_missing(darks, lags), _MIXED, noise=0.5, sound=sound)
 
 
 def _missing(levels: Sequence[Tensor], lags: Sequence[tuple[int, int]]) -> tuple[float, float]:
@@ -144,22 +156,56 @@ def _hilferty(chi: float, freedom: float) -> float:
 
 
 def _telegraph(levels: Sequence[Level]) -> list[FrameTest]:
-    """Test if the noise of dark frames has more large differences than a normal distribution."""
+    """Test if the noise of a pixel in the dark jumps, and tell how much the noise differs from pixel to pixel.
+
+    Large differences are of pixels that jump, or of pixels that are noisier than others. A pixel that is noisier is so
+    in each pair: then a third of the fourth power of its differences is the product of the squares of two of them.
+    """
     darks = [level for level in levels if level.dark and level.variance >= _QUIET]
     if not darks:
         return []
-    z, wider = [], []
-    for level in darks:
-        x = level.apart
-        square = float(x.square().mean())
-        fourth = float(x.pow(4).mean()) / square**2 - 3 + 1 / 60 / square**2  # rounding takes 1/60 of the cumulant
-        z.append(_glynn(fourth + 3, x.numel()))
-        wider.append(math.sqrt(square) / _core(x + level.drift[:, None, None]) - 1)
-    evidence = strongest([z])
-    error = abs(sum(wider) / len(wider))
+    fourths = [_fourth(level) for level in darks]
+    evidence = strongest([list(map(_glynn, fourths, [level.apart.numel() for level in darks]))])
+    error = abs(sum(map(_width_over_core, darks)) / len(darks))
+    excess = max(1.0, sum(fourths) / len(fourths) / 3)
+    if evidence.found and _same_in_each_pair(darks):
+        # unequal pixels leave the mean of their variances less certain than equal ones
+        unsure = math.sqrt((excess - 1) / 2 / sum(level.apart.numel() for level in darks))
+        text = f"the dark noise differs from pixel to pixel by about {math.sqrt(excess**0.25 - 1):.0%}"
+        text += f", and is {error:.1%} wider than its middle"
+        return [outcome(_JUMPS, evidence, text, {"noise": unsure}, "", _ROOT_MEAN_SQUARE)]
     sentence = f"the dark noise has rare large jumps, and is {error:.1%} wider than its middle, as of telegraph pixels"
     passed = "the dark noise is normal: no telegraph pixels"
-    return [outcome("no telegraph noise", evidence, sentence, {"noise": error}, passed)]
+    return [outcome(_JUMPS, evidence, sentence, {"noise": error}, passed)]
+
+
+def _fourth(level: Level) -> float:
+    """Return the kurtosis of the differences of a level; rounding takes 1/60 from the cumulant."""
+    square = float(level.apart.square().mean())
+    return float(level.apart.pow(4).mean()) / square**2 + 1 / 60 / square**2
+
+
+def _width_over_core(level: Level) -> float:
+    """Return the relative excess of the standard deviation of differences over that of their middle."""
+    return math.sqrt(float(level.apart.square().mean())) / _core(level.apart + level.drift[:, None, None]) - 1
+
+
+def _same_in_each_pair(levels: Sequence[Level]) -> bool:
+    """Return True if each pixel has normal noise, of a width that may differ from pixel to pixel, beyond chance."""
+    shapes = [level.apart.shape[1:] for level in levels]
+    common = max(shapes, key=shapes.count)
+    scaled = [
+        level.apart.square() / float(level.apart.square().mean())
+        for level, shape in zip(levels, shapes, strict=True)
+        if shape == common
+    ]
+    squares = torch.cat(scaled)
+    count = len(squares)
+    if count < 2:
+        return False
+    sums, fourths = squares.sum(0), squares.square().sum(0)
+    across = (sums.square() - fourths) / (count * (count - 1))
+    return abs(studentised(fourths / (3 * count) - across)) < normal_limit(ALARM / 2)
 
 
 def _glynn(kurtosis: float, n: int) -> float:
@@ -183,18 +229,27 @@ def _core(x: Tensor) -> float:
 
 def _drift(levels: Sequence[Level]) -> FrameTest:
     """Test if the mean moves between the frames of a pair."""
-    z, shares = [], []
-    for level in levels:
-        error = math.sqrt(2 * level.variance / level.apart[0].numel() + 1e-12)
-        z += (level.drift / error).tolist()
-        shares.append(float(level.drift.square().mean()) / 2 / (level.variance + 1e-12))
-    evidence = strongest([[x] for x in z], sides=2)
-    dark = [s for s, level in zip(shares, levels, strict=True) if level.dark] or [0.0]
-    lit = [s for s, level in zip(shares, levels, strict=True) if not level.dark] or [0.0]
-    steady = all(level.stack.scatter == "steady" for level in levels)
-    shifts = {} if steady else {"gain": max(lit), "noise": max(dark) / 2}
+    evidence = strongest([[z] for level in levels for z in _drift_over_chance(level)], sides=2)
+    dark, lit = ([level for level in levels if level.dark == is_dark] for is_dark in (True, False))
+    uneven = sum(level.flicker / (level.variance + _TINY) for level in lit) / max(1, len(lit))
     moved = max((float(level.drift.abs().max()) for level in levels), default=0.0)
-    passed = "the mean keeps from frame to frame"
-    modelled = "`scatter: steady` removes it from the variance" if steady else ""
     sentence = f"the mean moves by up to {moved:.3g} DN between two frames of a level, as under a drifting lamp"
-    return outcome("no drift within a level", evidence, sentence, shifts, passed, modelled)
+    passed = "the mean keeps from frame to frame"
+    if any(level.scatter != "steady" for level in levels):
+        shifts = {"gain": _largest_drift(lit) + uneven, "noise": _largest_drift(dark) / 2}
+        return outcome(_DRIFT, evidence, sentence, shifts, passed)
+    modelled = "`scatter: steady` removes it from the variance" if uneven < _STEADY else ""
+    if not modelled:
+        sentence += f", whose light is uneven: this adds {uneven:.2%} to the variance, which a mean cannot remove"
+    return outcome(_DRIFT, evidence, sentence, {"gain": uneven}, passed, modelled)
+
+
+def _drift_over_chance(level: Level) -> list[float]:
+    """Return the drift of each pair in standard errors."""
+    z: list[float] = (level.drift / math.sqrt(2 * level.variance / level.apart[0].numel() + _TINY)).tolist()
+    return z
+
+
+def _largest_drift(levels: Sequence[Level]) -> float:
+    """Return the largest share of the variance of a level that is the drift of its mean."""
+    return max((float(level.drift.square().mean()) / 2 / (level.variance + _TINY) for level in levels), default=0.0)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 
-from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Level
+from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Level, saturated
 
 _REACH = 8  #: numbers on either side of a number, which say how often it should occur
 _EXPECTED = 25.0  #: least expected count of a number that is missing; chance leaves it out once in 1e11
@@ -29,10 +29,11 @@ def number_tests(levels: Sequence[Level], exact: bool) -> list[FrameTest]:
     Error:  a code of 25 expected pixels is missing by chance once in 1e11; an end piles up by chance at 5 sigma.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.5 (bit depth, saturation) and 6.6 (variance >= 0.24).
     """
-    return [_codes(levels), _black(levels, exact), _white(levels, exact), *_coarse(levels, exact)]
+    used = [level for level in levels if level.fitted]
+    return [codes(used), _black(used, exact), _white(levels, exact), *_coarse(used, exact)]
 
 
-def _codes(levels: Sequence[Level]) -> FrameTest:
+def codes(levels: Sequence[Level]) -> FrameTest:
     top = max(int(level.value[-1]) for level in levels) + 1
     low = min(int(level.value[0]) for level in levels)
     counts = [torch.zeros(top, dtype=torch.float64).index_add(0, x.value, x.pixels.double()) for x in levels]
@@ -48,10 +49,12 @@ def _codes(levels: Sequence[Level]) -> FrameTest:
     text = f"{number} of {looked} expected codes never occur, such as {int(missing.nonzero()[0])}"
     if step > 1:
         text += f": all numbers are {int(present[0])} plus a multiple of {step}: a bit is stuck, or shifted"
+        if int(present[0]) % step == 0:
+            text += f"; where the numbers are shifted, give the step of `calibrate.frames` the divisor {step}"
     else:
         text += ": a bit is stuck, or the numbers were stretched or compressed"
     text += "; take the numbers as the converter gives them"
-    return FrameTest("no missing codes", float(number), 0.0, "refused", text)
+    return FrameTest("no missing codes", float(number), 0.0, "refused", text, explains_all=step > 1)
 
 
 def _expected(count: Tensor) -> Tensor:
@@ -83,7 +86,7 @@ def _black(levels: Sequence[Level], exact: bool) -> FrameTest:
     name, count = "no pile at the lowest number", float(len(cut))
     if not cut:
         return FrameTest(name, 0.0, 0.0, "passed", "no level is clipped at the lowest number")
-    names = ", ".join(level.stack.name for level in cut)
+    names = ", ".join(level.name for level in cut)
     text = f"numbers pile up at {int(min(level.value[0] for level in cut))} DN in {names}"
     if exact and all(int(level.value[0]) == 0 for level in cut):
         return FrameTest(name, count, 0.0, "modelled", f"{text}: the likelihood counts the pixels at 0")
@@ -91,16 +94,25 @@ def _black(levels: Sequence[Level], exact: bool) -> FrameTest:
 
 
 def _white(levels: Sequence[Level], exact: bool) -> FrameTest:
-    full = [level.stack.name for level in levels if level.high]
-    name = "saturated levels are told"
+    full = saturated(levels)
+    name, count = "saturated levels are told", float(len(full))
     if not full:
         return FrameTest(name, 0.0, 0.0, "passed", "no level is saturated")
-    how = "the likelihood counts its numbers" if exact else "such levels only bound the saturation"
-    text = f"numbers pile up at the highest number in {', '.join(full)}: {how}"
-    dark = [level.stack.name for level in levels if level.high and level.dark]
+    use = "the likelihood counts its numbers" if exact else "such levels only bound the saturation"
+    text = f"{'; '.join(_kinds_of_saturation(full))}: {use}"
+    dark = [level.name for level in full if level.dark]
     if dark and not exact:
-        return FrameTest(name, float(len(full)), 0.0, "refused", f"{text}; {', '.join(dark)} is dark")
-    return FrameTest(name, float(len(full)), 0.0, "modelled", text)
+        return FrameTest(name, count, 0.0, "refused", f"{text}; {', '.join(dark)} is dark")
+    return FrameTest(name, count, 0.0, "modelled", text)
+
+
+def _kinds_of_saturation(full: Sequence[Level]) -> Iterator[str]:
+    """Yield a clause for levels that pile up at an end, and one for levels of unequal wells."""
+    if piled := [level.name for level in full if level.high]:
+        yield f"numbers pile up at the highest number in {', '.join(piled)}"
+    if flat := [level for level in full if not level.high]:
+        names = ", ".join(level.name for level in flat)
+        yield f"the variance has fallen in {names}, full at about {max(level.mean for level in flat):.0f} DN"
 
 
 def _coarse(levels: Sequence[Level], exact: bool) -> list[FrameTest]:

@@ -7,14 +7,14 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from neusee.nodes import Check, node
+from neusee.nodes import Check, ErrorBound, TensorStats, node
 from neusee.nodes.optics._imaging._band_image import Border, image, reach
 from neusee.nodes.optics._imaging._collapsed_plan import Given, choose, with_windows
 from neusee.nodes.optics._imaging._convolve_plan import cells, convolved, guessed, majorant, majorant_by_cell, rounding
 from neusee.nodes.optics._imaging._psf_energy import Passed, passed, spread
 from neusee.nodes.values import Channels, FewBands, LowRankCube, Psf
 
-Share = Annotated[float, Field(ge=0, allow_inf_nan=False)]  #: as a share of the brightest pixel
+Share = Annotated[float, Field(ge=0, le=1)]  #: as a share of the brightest pixel
 _QUICKLY = 0.25  #: share of the error up to which the bound of the brightest pixel may come from cells of pixels
 _DARKEST = 1e-3  #: expected brightness of the darkest pixel; photographs have 1e-2, scenes at night 2e-5
 _LARGE = 512  #: pixels along the sides of an image from which cells of pixels save time
@@ -85,6 +85,29 @@ def _(
 def _(result: Channels) -> tuple[float, float]:
     error, top = result.estimated.tolist()
     return float(result.bound) + error, float(result.largest) + top
+
+
+@image.propagate_error
+@image_channels.propagate_error
+def _(
+    radiance: ErrorBound,
+    psf: ErrorBound,
+    rows: ErrorBound | None = None,
+    few: ErrorBound | None = None,
+    *,
+    result: TensorStats,
+    **params: Any,
+) -> float | ErrorBound:
+    """Return the error by what was left out of the PSF, which `Channels.bound` does not count.
+
+    The share of the PSF is that of each pixel of a picture relative to its brightest pixel, as `flare.stray_light`
+    states it. The error by few bands is in `Channels.estimated`, and is not counted a second time.
+    """
+    if radiance.rms or (rows is not None and rows.rms):
+        return math.inf
+    share = psf.share
+    peak = share / (1.0 - share) if share < 1.0 else math.inf
+    return ErrorBound(share * max(abs(result.min), abs(result.max)), peak=peak)
 
 
 @image_channels.expected_range

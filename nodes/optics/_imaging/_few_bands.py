@@ -11,6 +11,7 @@ from neusee.nodes import Check, node
 from neusee.nodes.optics._imaging._band_thumbnail import (
     SIDE,
     Parts,
+    Thumbnail,
     binned,
     bins_of,
     estimated,
@@ -22,7 +23,8 @@ from neusee.nodes.optics._imaging._band_thumbnail import (
 )
 from neusee.nodes.optics._imaging._channel_image import Share
 from neusee.nodes.optics._imaging._psf_energy import centred
-from neusee.nodes.units import PositiveLength, Shape
+from neusee.nodes.optics._psf_definition import SensorSampling
+from neusee.nodes.units import FocalLength, PixelPitch, Shape
 from neusee.nodes.values import FewBands, LowRankCube, Psf, Pupil
 
 _RUNGS = (2, 3, 4, 5, 6, 8, 11, 16, 21)  #: numbers of bands that are tried, the fewest first
@@ -37,11 +39,11 @@ def few_bands(
     radiance: LowRankCube,
     rows: Tensor,
     *,
-    focal_length: PositiveLength,
-    pixel_pitch: PositiveLength,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
     shape: Shape,
     pixel: Literal["point", "zoh"] = "point",
-    sensor: Literal["point", "integrated"] = "point",
+    sensor: SensorSampling = "point",
     within: Share = 0.0,
     largest: bool = False,
 ) -> FewBands:
@@ -61,11 +63,7 @@ def few_bands(
     Raises: ValueError where pupil, scene and rows have different bands.
     Source: composite trapezoidal rule over wavelengths: Dahlquist and Bjorck, Numerical Methods, section 7.2 (1974).
     """
-    bands = {len(pupil.wavelengths), len(radiance.basis), rows.shape[-1]}
-    if len(bands) > 1:
-        counts = f"{len(pupil.wavelengths)}, {len(radiance.basis)} and {rows.shape[-1]}"
-        raise ValueError(f"pupil, radiance and rows have {counts} bands: compute all from the same `bands` step")
-    count = bands.pop()
+    count = _same_count(pupil, radiance, rows)
     rungs = [few for few in _RUNGS if few <= _MOST * count]
     if not rungs or within <= 0:
         return _all_bands(count)
@@ -74,17 +72,37 @@ def few_bands(
     small = thumbnail(pupil, shape, lens)
     if small is None:
         return _all_bands(count)
-    some = _evenly(count // 2 + 1, count)
-    light = small.light(some)
-    between = share_of_bands(some, count).to(light) @ light.flatten(1)
-    few = [each for each in rungs if _FINER * each <= len(some)]
-    given = parts_of(radiance, rows, between.view(count, *light.shape[1:]), small.pixels)
-    found = _fewest(few, given, between.view(count, *light.shape[1:]), within, largest)
-    if found is None:
-        others = torch.tensor(sorted({*range(count)} - {*some.tolist()}))
-        light = torch.cat([light, small.light(others)])[torch.cat([some, others]).argsort()]
-        found = _fewest(rungs, parts_of(radiance, rows, light, small.pixels), light, within, largest)
-    return found or _all_bands(count)
+    half = _evenly(count // 2 + 1, count)
+    light_of_half = small.light(half)
+    light = _interpolated(light_of_half, half, count)
+    rungs_of_half = [few for few in rungs if _FINER * few <= len(half)]
+    choice = _fewest(rungs_of_half, parts_of(radiance, rows, light, small.pixels), light, within, largest)
+    if choice is None:
+        light = _completed(light_of_half, half, count, small)
+        choice = _fewest(rungs, parts_of(radiance, rows, light, small.pixels), light, within, largest)
+    return choice or _all_bands(count)
+
+
+def _same_count(pupil: Pupil, radiance: LowRankCube, rows: Tensor) -> int:
+    """Return the number of bands; raise ValueError where pupil, radiance and rows differ in it."""
+    counts = len(pupil.wavelengths), len(radiance.basis), rows.shape[-1]
+    if len(set(counts)) > 1:
+        text = f"{counts[0]}, {counts[1]} and {counts[2]}"
+        raise ValueError(f"pupil, radiance and rows have {text} bands: compute all from the same `bands` step")
+    return counts[0]
+
+
+def _interpolated(light: Tensor, some: Tensor, count: int) -> Tensor:
+    """Return the PSFs (band, y, x) of all bands from those of some bands, linearly between the bands."""
+    planes = share_of_bands(some, count).to(light) @ light.flatten(1)
+    return planes.view(count, *light.shape[1:])
+
+
+def _completed(light: Tensor, some: Tensor, count: int, small: Thumbnail) -> Tensor:
+    """Return the PSFs (band, y, x) of all bands, of which those of some bands are there already."""
+    others = torch.tensor(sorted({*range(count)} - {*some.tolist()}))
+    together = torch.cat([light, small.light(others)])
+    return together[torch.cat([some, others]).argsort()]
 
 
 def _fewest(rungs: list[int], parts: Parts, light: Tensor, within: float, largest: bool) -> FewBands | None:
@@ -133,10 +151,10 @@ def few_bands_checked(
     radiance: LowRankCube,
     rows: Tensor,
     *,
-    focal_length: PositiveLength,
-    pixel_pitch: PositiveLength,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
     pixel: Literal["point", "zoh"] = "point",
-    sensor: Literal["point", "integrated"] = "point",
+    sensor: SensorSampling = "point",
 ) -> FewBands:
     """Compare PSFs of few bands with about twice as many bands, on parts of the scene, and raise the error estimate
     where it was too low.

@@ -6,32 +6,11 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstring>
-#ifdef __SSE2__
-#include <immintrin.h>
-#endif
+#include <utility>
+
+#include "../../_vector.h"
 
 namespace neusee {
-
-template <class T>
-struct Kind;
-template <>
-struct Kind<float> {
-    typedef float Vector __attribute__((vector_size(64)));
-    typedef int32_t Whole __attribute__((vector_size(64)));
-    typedef uint32_t Bits __attribute__((vector_size(64)));
-    static constexpr int lanes = 16, terms = 5;
-    static constexpr float round = 12582912.0f;
-};
-template <>
-struct Kind<double> {
-    typedef double Vector __attribute__((vector_size(64)));
-    typedef int64_t Whole __attribute__((vector_size(64)));
-    typedef uint64_t Bits __attribute__((vector_size(64)));
-    static constexpr int lanes = 8, terms = 9;
-    static constexpr double round = 6755399441055744.0;
-};
-template <class T>
-using Vector = typename Kind<T>::Vector;
 
 template <class T>
 struct Complex {
@@ -214,43 +193,49 @@ void fft(const Axis& axis, const Complex<T>* in, Complex<T>* ping, Complex<T>* p
     }
 }
 
-#if !defined(__clang__)
+// A vector of chosen lanes of x and y, of which y's are counted after x's.
+template <class V, int... lane>
+inline V chosen(const V& x, const V& y, std::integer_sequence<int, lane...>) {
+#if defined(__clang__) || __GNUC__ >= 12
+    return __builtin_shufflevector(x, y, lane...);
+#else
+    typedef decltype(x == y) Index;
+    return __builtin_shuffle(x, y, Index{lane...});
+#endif
+}
+
+// The lanes that one row and its partner exchange: those whose number contains ``half``.
+template <int half, int... lane>
+constexpr auto lower(std::integer_sequence<int, lane...>) {
+    constexpr int n = sizeof...(lane);
+    return std::integer_sequence<int, (lane & half ? n + lane - half : lane)...>();
+}
+template <int half, int... lane>
+constexpr auto upper(std::integer_sequence<int, lane...>) {
+    constexpr int n = sizeof...(lane);
+    return std::integer_sequence<int, (lane & half ? n + lane : lane + half)...>();
+}
+
 // Exchange the off-diagonal blocks of ``half`` rows and columns within each square of twice that side.
 template <class T, int half>
 inline void exchange(Vector<T>* a) {
-    constexpr int n = Kind<T>::lanes;
-    typename Kind<T>::Whole low, high;
+    constexpr auto lanes = std::make_integer_sequence<int, LANES<T>>();
 #pragma GCC unroll 16
-    for (int c = 0; c < n; ++c) {
-        low[c] = c & half ? n + c - half : c;
-        high[c] = c & half ? n + c : c + half;
-    }
-#pragma GCC unroll 16
-    for (int r = 0; r < n; ++r)
+    for (int r = 0; r < LANES<T>; ++r)
         if (!(r & half)) {
             const Vector<T> x = a[r], y = a[r | half];
-            a[r] = __builtin_shuffle(x, y, low);
-            a[r | half] = __builtin_shuffle(x, y, high);
+            a[r] = chosen(x, y, lower<half>(lanes));
+            a[r | half] = chosen(x, y, upper<half>(lanes));
         }
 }
-#endif
 
 // Transpose a square of vectors, row r with column r, in place.
 template <class T>
 inline void transpose(Vector<T>* a) {
-#if defined(__clang__)
-    for (int r = 0; r < Kind<T>::lanes; ++r)
-        for (int c = 0; c < r; ++c) {
-            const T kept = a[r][c];
-            a[r][c] = a[c][r];
-            a[c][r] = kept;
-        }
-#else
     exchange<T, 1>(a);
-    exchange<T, 2>(a);
-    exchange<T, 4>(a);
-    if (Kind<T>::lanes > 8) exchange<T, Kind<T>::lanes / 2>(a);
-#endif
+    if constexpr (LANES<T> > 2) exchange<T, 2>(a);
+    if constexpr (LANES<T> > 4) exchange<T, 4>(a);
+    if constexpr (LANES<T> > 8) exchange<T, 8>(a);
 }
 
 }  // namespace neusee

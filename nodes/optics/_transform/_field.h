@@ -3,6 +3,10 @@
 
 #pragma once
 
+#ifdef __SSE2__
+#include <immintrin.h>
+#endif
+
 #include "_fft.h"
 
 namespace neusee {
@@ -11,7 +15,7 @@ namespace neusee {
 template <class T>
 inline Vector<T> load(const T* from, int64_t count) {
     Vector<T> v{};
-    if (count >= Kind<T>::lanes)
+    if (count >= LANES<T>)
         std::memcpy(&v, from, sizeof v);
     else if (count > 0)
         std::memcpy(&v, from, sizeof(T) * count);
@@ -20,20 +24,39 @@ inline Vector<T> load(const T* from, int64_t count) {
 
 template <class T>
 inline void store(T* to, const Vector<T>& v, int64_t count) {
-    if (count >= Kind<T>::lanes)
+    if (count >= LANES<T>)
         std::memcpy(to, &v, sizeof v);
     else if (count > 0)
         std::memcpy(to, &v, sizeof(T) * count);
 }
 
-typedef Vector<double> Turns;
-typedef float Eight __attribute__((vector_size(32)));
+// A plane of numbers (row, column) of ``item`` bytes each, or a null pointer.
+struct Plane {
+    const void* first;
+    int64_t item, height, width;
+};
 
-// Read up to 8 numbers in double, of an array of floats or doubles.
+constexpr int64_t AHEAD = 16;  // rows, from the row in use to the row that is fetched
+
+// Fetch a row that will be needed soon. The rows of a large plane lie on different pages, across which no processor
+// reads ahead by itself, so that each row would wait for the memory. Always inline, because GCC removes a call of a
+// function that only fetches.
+template <bool written = false>
+[[gnu::always_inline]] inline void fetch_ahead(const Plane& plane, int64_t row, int64_t column) {
+    if (!plane.first || row + AHEAD >= plane.height) return;
+    const char* at = static_cast<const char*>(plane.first) + ((row + AHEAD) * plane.width + column) * plane.item;
+    __builtin_prefetch(at, written);
+}
+
+typedef Vector<double> Turns;
+constexpr int TURNS = LANES<double>;
+typedef float Half __attribute__((vector_size(VECTOR_BYTES / 2)));  // as many floats as a vector has doubles
+
+// Read up to a vector of numbers in double, of an array of floats or doubles.
 inline Turns load_turns(const void* from, bool wide, int64_t at, int64_t count) {
     if (wide) return load<double>(static_cast<const double*>(from) + at, count);
-    Eight v{};
-    if (count >= 8)
+    Half v{};
+    if (count >= TURNS)
         std::memcpy(&v, static_cast<const float*>(from) + at, sizeof v);
     else if (count > 0)
         std::memcpy(&v, static_cast<const float*>(from) + at, sizeof(float) * count);
@@ -47,22 +70,36 @@ struct Pupil {
     const void *amplitude, *height, *path;
     double turns_height, turns_path;
     const double *tilt_v, *tilt_u;
+    [[gnu::always_inline]] void fetch_ahead(int64_t rows, int64_t columns, int64_t v, int64_t u) const {
+        for (const void* factor : {amplitude, height, path})
+            neusee::fetch_ahead(Plane{factor, wide ? 8 : 4, rows, columns}, v, u);
+    }
 };
 
+// A vector of T as vectors of doubles, and back.
 template <class T>
-struct Lanes {  // a vector of T as vectors of 8 doubles, and back
-    Turns part[Kind<T>::lanes / 8];
+struct Doubles {
+    Turns part[LANES<T> / TURNS];
 };
-inline Vector<double> narrow(const Lanes<double>& v) { return v.part[0]; }
-inline Vector<float> narrow(const Lanes<float>& v) {
-    const Eight low = __builtin_convertvector(v.part[0], Eight), high = __builtin_convertvector(v.part[1], Eight);
-    return __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+template <int... lane>
+inline Vector<float> joined(const Half& low, const Half& high, std::integer_sequence<int, lane...>) {
+#if defined(__clang__) || __GNUC__ >= 12
+    return __builtin_shufflevector(low, high, lane...);
+#else
+    return Vector<float>{(lane < TURNS ? low[lane % TURNS] : high[lane % TURNS])...};
+#endif
+}
+inline Vector<double> narrow(const Doubles<double>& v) { return v.part[0]; }
+inline Vector<float> narrow(const Doubles<float>& v) {
+    const Half low = __builtin_convertvector(v.part[0], Half), high = __builtin_convertvector(v.part[1], Half);
+    return joined(low, high, std::make_integer_sequence<int, 2 * TURNS>());
 }
 
 template <class T>
-inline Lanes<T> read(const void* from, bool wide, int64_t at, int64_t count) {
-    Lanes<T> v;
-    for (int i = 0; i < Kind<T>::lanes / 8; ++i) v.part[i] = load_turns(from, wide, at + 8 * i, count - 8 * i);
+inline Doubles<T> read(const void* from, bool wide, int64_t at, int64_t count) {
+    Doubles<T> v;
+    for (int i = 0; i < LANES<T> / TURNS; ++i)
+        v.part[i] = load_turns(from, wide, at + TURNS * i, count - TURNS * i);
     return v;
 }
 
@@ -80,12 +117,28 @@ inline bool any(const Vector<T>& v) {
     std::memcpy(&bits, &set, sizeof bits);
     return _mm512_test_epi32_mask(bits, bits);
 #else
-    uint64_t word[8], all = 0;
+    uint64_t word[VECTOR_BYTES / 8], all = 0;
     std::memcpy(word, &set, sizeof word);
     for (uint64_t w : word) all |= w;
     return all;
 #endif
 }
+
+// How the phasor of type T is computed: the terms of its series, and the number whose addition rounds to whole numbers.
+template <class T>
+struct Kind;
+template <>
+struct Kind<float> {
+    typedef uint32_t Bits __attribute__((vector_size(VECTOR_BYTES)));
+    static constexpr int terms = 5;
+    static constexpr float round = 12582912.0f;
+};
+template <>
+struct Kind<double> {
+    typedef uint64_t Bits __attribute__((vector_size(VECTOR_BYTES)));
+    static constexpr int terms = 9;
+    static constexpr double round = 6755399441055744.0;
+};
 
 // 1 / n! for the terms of the sine and the cosine.
 template <class T>
@@ -121,11 +174,11 @@ inline Complex<T> phasor(Vector<T> t) {
 template <class T>
 inline Complex<T> phasor_at(const Pupil& pupil, int64_t width, int64_t v, int64_t u, int64_t count) {
     const int64_t at = v * width + u;
-    Lanes<T> turns = read<T>(pupil.height, pupil.wide, at, count);
-    const Lanes<T> tilt = read<T>(pupil.tilt_u, true, u, count);
-    Lanes<T> path{};
+    Doubles<T> turns = read<T>(pupil.height, pupil.wide, at, count);
+    const Doubles<T> tilt = read<T>(pupil.tilt_u, true, u, count);
+    Doubles<T> path{};
     if (pupil.path) path = read<T>(pupil.path, pupil.wide, at, count);
-    for (int i = 0; i < Kind<T>::lanes / 8; ++i) {
+    for (int i = 0; i < LANES<T> / TURNS; ++i) {
         Turns t = turns.part[i] * pupil.turns_height + tilt.part[i];
         if (pupil.path) t += path.part[i] * pupil.turns_path;
         t += pupil.tilt_v[v];
@@ -146,6 +199,7 @@ struct PupilSource {
     Rows operator()(int64_t u, int64_t count, Complex<T>* panel) const {
         Rows lit{height, 0};
         for (int64_t v = 0; v < height; ++v) {
+            pupil.fetch_ahead(height, width, v, u);
             const Vector<T> amplitude = read_narrow<T>(pupil.amplitude, pupil.wide, v * width + u, count);
             if (!any<T>(amplitude)) {
                 panel[v] = Complex<T>{};
@@ -176,10 +230,13 @@ struct FocalSink {
     void operator()(int64_t y, int64_t x, int64_t count, const Complex<T>& u) const {
         const int64_t at = y * width + x;
         if (focal.field) {
+            fetch_ahead<true>({focal.field, sizeof(T), height, width}, y, x);
+            fetch_ahead<true>({focal.field + height * width, sizeof(T), height, width}, y, x);
             store<T>(focal.field + at, u.re, count);
             store<T>(focal.field + height * width + at, u.im, count);
         }
         if (!focal.intensity) return;
+        fetch_ahead<true>({focal.intensity, sizeof(T), height, width}, y, x);
         Vector<T> power = (u.re * u.re + u.im * u.im) * T(focal.weight);
         if (focal.envelope_y) power *= load<T>(focal.envelope_x + x, count) * focal.envelope_y[y];
         if (focal.add) power += load<T>(focal.intensity + at, count);
@@ -197,6 +254,9 @@ struct FocalSource {
         const Vector<T> along = focal.envelope_y ? load<T>(focal.envelope_x + x, count) : Vector<T>{} + T(1);
         for (int64_t y = 0; y < height; ++y) {
             const int64_t at = y * width + x;
+            fetch_ahead({gain, sizeof(T), height, width}, y, x);
+            fetch_ahead({focal.field, sizeof(T), height, width}, y, x);
+            fetch_ahead({focal.field + height * width, sizeof(T), height, width}, y, x);
             const T each = T(2 * focal.weight) * (focal.envelope_y ? focal.envelope_y[y] : T(1));
             const Vector<T> weight = load<T>(gain + at, count) * along * each;
             panel[y] = {load<T>(focal.field + height * width + at, count) * weight,
@@ -217,9 +277,9 @@ inline void add_to(void* grad, bool wide, int64_t at, int64_t count, const Vecto
         T* to = static_cast<T*>(grad) + at;
         return store<T>(to, load<T>(to, count) + more, count);
     }
-    T part[Kind<T>::lanes];
+    T part[LANES<T>];
     std::memcpy(part, &more, sizeof more);
-    for (int64_t i = 0; i < std::min<int64_t>(count, Kind<T>::lanes); ++i) static_cast<double*>(grad)[at + i] += part[i];
+    for (int64_t i = 0; i < std::min<int64_t>(count, LANES<T>); ++i) static_cast<double*>(grad)[at + i] += part[i];
 }
 
 template <class T>
@@ -236,7 +296,10 @@ struct PupilSink {
         return lit;
     }
     void operator()(int64_t v, int64_t u, int64_t count, const Complex<T>& swapped) const {
-        const int64_t at = v * width + u;
+        const int64_t at = v * width + u, item = pupil.wide ? 8 : 4;
+        pupil.fetch_ahead(height, width, v, u);
+        for (const void* gradient : {grads.amplitude, grads.height, grads.path})
+            fetch_ahead<true>({gradient, item, height, width}, v, u);
         const Vector<T>&re = swapped.im, &im = swapped.re;
         const Complex<T> unit = phasor_at<T>(pupil, width, v, u, count);
         if (grads.amplitude) add_to<T>(grads.amplitude, pupil.wide, at, count, unit.re * re + unit.im * im);

@@ -32,12 +32,12 @@ inline int64_t blocks(int64_t n, int64_t size) { return (n + size - 1) / size; }
 // Vectors of A for each vector of T, and the parts of one.
 template <class T, class A>
 constexpr int parts() {
-    return Kind<T>::lanes / Kind<A>::lanes;
+    return LANES<T> / LANES<A>;
 }
 
 template <class T, class A>
 inline Complex<A> part_of(const Complex<T>& x, int part) {
-    typedef T Part __attribute__((vector_size(Kind<A>::lanes * sizeof(T))));
+    typedef T Part __attribute__((vector_size(LANES<A> * sizeof(T))));
     Part re, im;
     std::memcpy(&re, reinterpret_cast<const char*>(&x.re) + part * sizeof re, sizeof re);
     std::memcpy(&im, reinterpret_cast<const char*>(&x.im) + part * sizeof im, sizeof im);
@@ -46,7 +46,7 @@ inline Complex<A> part_of(const Complex<T>& x, int part) {
 
 template <class T, class A>
 inline void set_part(Complex<T>& x, int part, const Complex<A>& from) {
-    typedef T Part __attribute__((vector_size(Kind<A>::lanes * sizeof(T))));
+    typedef T Part __attribute__((vector_size(LANES<A> * sizeof(T))));
     const Part re = __builtin_convertvector(from.re, Part), im = __builtin_convertvector(from.im, Part);
     std::memcpy(reinterpret_cast<char*>(&x.re) + part * sizeof re, &re, sizeof re);
     std::memcpy(reinterpret_cast<char*>(&x.im) + part * sizeof im, &im, sizeof im);
@@ -59,7 +59,7 @@ struct Desk {
     Buffer<Complex<A>> samples, points, ping, pong;
     Desk(const Axis& y, const Axis& x)
         : field(y.n_in),
-          samples(std::max(x.n_in + Kind<A>::lanes, x.kept)),
+          samples(std::max(x.n_in + LANES<A>, x.kept)),
           points(std::max(parts<T, A>() * y.points, x.points)),
           ping(std::max(y.length, x.length)),
           pong(std::max(y.length, x.length)) {}
@@ -69,7 +69,7 @@ struct Desk {
 template <class T, class A, class Source>
 void columns_in(const Axis& y, int64_t width, int64_t u, const Source& source, Complex<A>* tiles,
                 Desk<T, A>& desk) {
-    const int64_t tile = blocks(y.kept, Kind<A>::lanes) * Kind<A>::lanes;
+    const int64_t tile = blocks(y.kept, LANES<A>) * LANES<A>;
     const T* weights = static_cast<const T*>(y.gather);
     Complex<T>* field = desk.field.get();
     const Rows lit = source(u, width - u, field);
@@ -80,7 +80,7 @@ void columns_in(const Axis& y, int64_t width, int64_t u, const Source& source, C
         for (int i = 0; i < parts<T, A>(); ++i) desk.points.get()[i * y.points + l] = part_of<T, A>(point, i);
     }
     for (int i = 0; i < parts<T, A>(); ++i) {
-        Complex<A>* out = tiles + (u / Kind<A>::lanes + i) * tile;
+        Complex<A>* out = tiles + (u / LANES<A> + i) * tile;
         fft<A>(y, desk.points.get() + i * y.points, desk.ping.get(), desk.pong.get(), out);
         std::fill(out + y.kept, out + tile, Complex<A>{});
     }
@@ -88,7 +88,7 @@ void columns_in(const Axis& y, int64_t width, int64_t u, const Source& source, C
 
 template <class A>
 inline void transpose_both(Complex<A>* a) {
-    constexpr int n = Kind<A>::lanes;
+    constexpr int n = LANES<A>;
     Vector<A> re[n], im[n];
 #pragma GCC unroll 16
     for (int i = 0; i < n; ++i) re[i] = a[i].re, im[i] = a[i].im;
@@ -98,13 +98,21 @@ inline void transpose_both(Complex<A>* a) {
     for (int i = 0; i < n; ++i) a[i] = {re[i], im[i]};
 }
 
+// Fetch a square of a tile that will be needed soon: the squares of neighbouring tiles lie on different pages.
+template <class A>
+[[gnu::always_inline]] inline void fetch_square(const Complex<A>* square) {
+    const char* first = reinterpret_cast<const char*>(square);
+    for (size_t byte = 0; byte < LANES<A> * sizeof *square; byte += 64) __builtin_prefetch(first + byte);
+}
+
 // Sweep 2, for the block of frequencies along y from k: samples along x -> points -> frequencies -> samples.
 template <class T, class A>
 void rows_through(const Axis& y, const Axis& x, int64_t k, const Complex<A>* in, Complex<A>* out, Desk<T, A>& desk) {
-    constexpr int n = Kind<A>::lanes;
+    constexpr int n = LANES<A>;
     const int64_t tile = blocks(y.kept, n) * n;
     Complex<A> *samples = desk.samples.get(), *points = desk.points.get(), square[n];
     for (int64_t u = 0; u < x.n_in; u += n) {
+        if (u + 2 * n < x.n_in) fetch_square(in + (u / n + 2) * tile + k);
         std::memcpy(samples + u, in + u / n * tile + k, n * sizeof *samples);
         transpose_both<A>(samples + u);
     }
@@ -125,12 +133,12 @@ void rows_through(const Axis& y, const Axis& x, int64_t k, const Complex<A>* in,
 // Sweep 3, for the block of columns from x: frequencies -> samples along y.
 template <class T, class A, class Sink>
 void columns_out(const Axis& y, int64_t width, int64_t x, const Complex<A>* tiles, const Sink& sink) {
-    const int64_t tile = blocks(y.kept, Kind<A>::lanes) * Kind<A>::lanes;
-    const int64_t there = std::min<int64_t>(parts<T, A>(), blocks(width - x, Kind<A>::lanes));
+    const int64_t tile = blocks(y.kept, LANES<A>) * LANES<A>;
+    const int64_t there = std::min<int64_t>(parts<T, A>(), blocks(width - x, LANES<A>));
     const A* spread = static_cast<const A*>(y.spread);
     const Rows wanted = sink.rows(x, width - x);
     for (int64_t i = wanted.from; i < wanted.to; ++i) {
-        const Complex<A>* in = tiles + x / Kind<A>::lanes * tile + y.spread_first[i];
+        const Complex<A>* in = tiles + x / LANES<A> * tile + y.spread_first[i];
         Complex<T> sample{};
         for (int64_t part = 0; part < there; ++part)
             set_part<T, A>(sample, part, weighted<A>(in + part * tile, spread + i * y.spread_width, 0, y.spread_width));
@@ -146,11 +154,11 @@ void transform(const Axis& y, const Axis& x, int64_t threads, void* before, void
     {
         Desk<T, A> desk(y, x);
 #pragma omp for schedule(dynamic)
-        for (int64_t u = 0; u < x.n_in; u += Kind<T>::lanes) columns_in<T, A>(y, x.n_in, u, source, in, desk);
+        for (int64_t u = 0; u < x.n_in; u += LANES<T>) columns_in<T, A>(y, x.n_in, u, source, in, desk);
 #pragma omp for schedule(dynamic)
-        for (int64_t k = 0; k < y.kept; k += Kind<A>::lanes) rows_through<T, A>(y, x, k, in, out, desk);
+        for (int64_t k = 0; k < y.kept; k += LANES<A>) rows_through<T, A>(y, x, k, in, out, desk);
 #pragma omp for schedule(dynamic)
-        for (int64_t u = 0; u < x.n_out; u += Kind<T>::lanes) columns_out<T, A>(y, x.n_out, u, out, sink);
+        for (int64_t u = 0; u < x.n_out; u += LANES<T>) columns_out<T, A>(y, x.n_out, u, out, sink);
     }
 }
 
@@ -172,3 +180,5 @@ void transform(const Axis& y, const Axis& x, int64_t threads, void* before, void
 NEUSEE_PSF(float, float, single)
 NEUSEE_PSF(float, double, mixed)
 NEUSEE_PSF(double, double, double)
+
+extern "C" int64_t neusee_psf_vector_bytes() { return VECTOR_BYTES; }

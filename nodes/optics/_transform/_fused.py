@@ -22,7 +22,7 @@ from neusee.nodes.optics._transform._workspace import Workspace
 __depends__ = ("_fused.cpp", "_field.h", "_fft.h", "unaffected:ctypes", "unaffected:torch.get_num_threads")
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("_fused.cpp", "_field.h", "_fft.h"))
 #: digest of the sources: keys of cached results depend on this file, and so on the sources; a test compares both
-DIGEST = "0bf39401afdb50ba"
+DIGEST = "885df4bca23da036"
 _NAMES = {
     (torch.float32, torch.float32): "single",
     (torch.float32, torch.float64): "mixed",
@@ -30,7 +30,6 @@ _NAMES = {
 }
 _LITTLE = 0.3  #: share of the work of the first axis, up to which all from the first FFT on is float64
 _ALONE = 1 << 18  #: samples for each further thread: to wake a thread takes as long as to transform a few thousand
-_VECTOR = 64  #: bytes of a vector in the C++
 
 
 class _Pupil(ctypes.Structure):
@@ -62,12 +61,12 @@ class _Gradients(ctypes.Structure):
 
 def operators() -> ctypes.CDLL:
     """Return the library of the C++, compiled if needed; raise `NoCompilerError` if it cannot be compiled."""
-    return _cpp_library.load(*SOURCES)
+    return _cpp_library.load(*SOURCES, rounding=_cpp_library.UNFUSED)
 
 
 def available(device: torch.device) -> bool:
     """Return True if the C++ can compute on this device; on a CPU without a compiler warn once and return False."""
-    return device.type == "cpu" and _cpp_library.compiled("PSF", *SOURCES)
+    return device.type == "cpu" and _cpp_library.compiled("PSF", *SOURCES, rounding=_cpp_library.UNFUSED)
 
 
 class FusedPupil:
@@ -131,10 +130,11 @@ class FusedPupil:
 
     def _tiles(self, label: str, y: CAxis, n: int, kind: torch.dtype) -> Any:
         """Return the address of memory for all frequencies along y of ``n`` columns, aligned to vectors."""
-        lanes, wide = _VECTOR // kind.itemsize, _VECTOR // self.dtype.itemsize
+        vector = operators().neusee_psf_vector_bytes()
+        lanes, wide = vector // kind.itemsize, vector // self.dtype.itemsize
         size = 2 * _up(y.kept, lanes) * _up(n, wide)
         flat = self.work.take(label, size + lanes, dtype=kind)
-        return ctypes.c_void_p(_up(flat.data_ptr(), _VECTOR))
+        return ctypes.c_void_p(_up(flat.data_ptr(), vector))
 
 
 class _Held:

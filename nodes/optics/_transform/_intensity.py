@@ -26,6 +26,7 @@ class Sampling:
     views: tuple[View, ...]
     dtype: torch.dtype
     method: Method | Literal["fused"] = "auto"
+    keep: bool = True  #: focal fields are stored for back-propagation, if they fit in `KEPT_FIELD_BYTES`
 
     @property
     def by_torch(self) -> Method:
@@ -52,8 +53,9 @@ class PupilIntensity(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
         screens = Screens.of(amplitude, height, path)
-        intensity, ctx.fields = _computed(screens, sampling, any(ctx.needs_input_grad))
-        ctx.save_for_backward(amplitude, height, path)
+        intensity, fields = _computed(screens, sampling, any(ctx.needs_input_grad))
+        # as saved tensors the fields are freed with the graph, even where a result still holds this node
+        ctx.save_for_backward(amplitude, height, path, *(field for field in fields if field is not None))
         ctx.sampling, ctx.screens = sampling, screens[3:]
         return intensity
 
@@ -61,8 +63,10 @@ class PupilIntensity(torch.autograd.Function):
     def backward(ctx: Any, weight: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
             raise RuntimeError(_ONCE)
-        screens = Screens(*ctx.saved_tensors, *ctx.screens)
-        return (*_adjoint(weight, screens, ctx.sampling, ctx.fields, ctx.needs_input_grad[:3]), None)
+        amplitude, height, path, *fields = ctx.saved_tensors
+        screens = Screens(amplitude, height, path, *ctx.screens)
+        fields = fields or [None] * len(ctx.sampling.views)
+        return (*_adjoint(weight, screens, ctx.sampling, fields, ctx.needs_input_grad[:3]), None)
 
 
 class _Transformed(torch.autograd.Function):
@@ -140,7 +144,7 @@ def _computed(screens: Screens, sampling: Sampling, keep: bool) -> tuple[Tensor,
     views, shape = sampling.views, (sampling.views[0].rows.n_out, sampling.views[0].columns.n_out)
     device, fields, done = screens.height.device, list[Tensor | None](), -1
     intensity = torch.empty(views[-1].band + 1, *shape, dtype=sampling.dtype, device=device)
-    keep = keep and 2 * len(views) * intensity[0].nbytes <= KEPT_FIELD_BYTES
+    keep = keep and sampling.keep and 2 * len(views) * intensity[0].nbytes <= KEPT_FIELD_BYTES
     fused = sampling.fused(device)
     with borrowed(sampling.dtype, device) as work:
         pupil = FusedPupil(screens, sampling.dtype, work) if fused else None

@@ -33,7 +33,7 @@ def filter_facts(
     nearby: list[Tensor] | None = None,
     ghosts: list[Tensor] | None = None,
     *,
-    balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
+    balance: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0,
     doubt: Doubt = 0.0,
     least_doubt: LeastDoubt = 0.0,
     read_noise: Electrons,

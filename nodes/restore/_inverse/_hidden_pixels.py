@@ -26,6 +26,7 @@ STEPS = 20  #: the most steps on the finest grid; each coarser grid may take fou
 MOST = 100
 ENOUGH = 1e-6  #: squared distance for each seen pixel, in units of the posterior, at which the iteration ends. The
 #: residual underestimates this distance by a factor of 10 to 30, because it underestimates the slowest modes
+_NOISELESS = 1e10  #: norm of the covariance of the scene over that of the noise, whose rounding is 1e-6 of the noise
 _ONCE = "the deconvolution has no second derivative: differentiate without create_graph=True"
 CAREFUL = 8.0  #: factor by which the tolerance falls with each coarser grid, whose steps are cheap
 
@@ -203,20 +204,69 @@ def _pooling(size: int, like: Tensor) -> Tensor:
 
 
 def _factor(seen: Blurred) -> Tensor:
-    """Return the Cholesky factor, in float64, of the whitened covariance of the seen pixels of a small picture."""
-    channels, fine, root = len(seen.picture), _fine(seen), _root(seen)
-    colours = torch.full((channels, channels), seen.grey, dtype=torch.float64, device=root.device).fill_diagonal_(1.0)
+    """Return the Cholesky factor, in float64, of the whitened covariance of the seen pixels of a small picture.
+
+    The noise has the covariance 1. Rounding of the covariance of the scene acts as further noise of 1e-16 of its norm,
+    so that a picture with less noise than that has the factor of a square root of the covariance: ten times slower.
+    """
+    fine, root, colours = _fine(seen), _root(seen), _colours(seen)
     rows = [torch.cat([colours[i, j] * _covariance(fine, a * b.conj()) for j, b in enumerate(fine.transfer)], 1)
             for i, a in enumerate(fine.transfer)]  # fmt: skip
     matrix = root[:, None] * torch.cat(rows) * root
-    for number, pattern in enumerate(seen.glare):
-        shape = root * pattern.double().flatten()
-        free = number < len(seen.glare) - seen.bounded
-        spread = 1e8 / shape.square().sum().clamp_min(1e-30) if free else 1.0
-        matrix = matrix + spread * torch.outer(shape, shape)
+    patterns = _spread_patterns(seen)
+    if float(matrix.detach().abs().sum(-1).max()) > _NOISELESS:
+        return _factor_of_root(fine, patterns)
+    for pattern in patterns:
+        matrix = matrix + torch.outer(pattern, pattern)
     matrix.diagonal().add_(1.0)
     lower: Tensor = torch.linalg.cholesky(matrix)
     return lower
+
+
+def _factor_of_root(fine: Blurred, patterns: list[Tensor]) -> Tensor:
+    """Return the Cholesky factor of A A^T + 1 by QR decompositions of [A 1]^T, without the product A A^T.
+
+    A (seen pixel, unknown) is the response of the whitened pixels to independent unknowns: those of the scene, channel
+    by channel, and the strengths of the glare ``patterns``. The factor has the rounding of A, not that of its square.
+    """
+    root, mixing = _root(fine), torch.linalg.cholesky(_colours(fine))
+    responses = [_response(fine, transfer) for transfer in fine.transfer]
+    upper = torch.eye(len(root), dtype=root.dtype, device=root.device)
+    for shares in mixing.T:
+        columns = torch.cat([share * response for share, response in zip(shares, responses, strict=True)])
+        upper = torch.linalg.qr(torch.cat([upper, (root[:, None] * columns).T]), mode="r").R
+    if patterns:
+        upper = torch.linalg.qr(torch.cat([upper, torch.stack(patterns)]), mode="r").R
+    lower: Tensor = (upper * upper.diagonal().sign()[:, None]).T
+    return lower
+
+
+def _response(seen: Blurred, transfer: Tensor) -> Tensor:
+    """Return the blurred pixels of a channel for a unit of each independent unknown of the prior, (pixel, unknown)."""
+    impulse = torch.fft.irfft2(transfer * seen.power.sqrt(), s=seen.torus)
+    y, x = (torch.arange(count, device=impulse.device) for count in _size(seen))
+    v, u = (torch.arange(count, device=impulse.device) for count in seen.torus)
+    down = (y[:, None] - v) % seen.torus[0]
+    right = (x[:, None] - u) % seen.torus[1]
+    square: Tensor = impulse[down[:, None, :, None], right[None, :, None, :]]
+    return square.reshape(len(y) * len(x), -1)
+
+
+def _colours(seen: Blurred) -> Tensor:
+    """Return the correlations of the channels of the scene."""
+    channels = len(seen.picture)
+    colours = torch.full((channels, channels), seen.grey, dtype=torch.float64, device=seen.weight.device)
+    return colours.fill_diagonal_(1.0)
+
+
+def _spread_patterns(seen: Blurred) -> list[Tensor]:
+    """Return the whitened glare patterns (pixel,), times the standard deviation of their strengths."""
+    root, patterns = _root(seen), []
+    for number, pattern in enumerate(seen.glare):
+        shape = root * pattern.double().flatten()
+        free = number < len(seen.glare) - seen.bounded
+        patterns.append(shape * (1e4 / shape.norm().clamp_min(1e-15)) if free else shape)
+    return patterns
 
 
 def _by_factor(seen: Blurred, lower: Tensor) -> Tensor:

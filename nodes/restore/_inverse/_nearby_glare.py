@@ -1,7 +1,7 @@
 """Other patterns that the glare of a laser may have if its direction, wavelength and focus are known roughly."""
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import torch
 from pydantic import Field
@@ -10,10 +10,12 @@ from torch import Generator, Tensor
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import single
 from neusee.nodes.optics import psf as focus
+from neusee.nodes.optics._psf_definition import SensorSampling
 from neusee.nodes.optics._pupil import DEFOCUS_WAVELENGTH
-from neusee.nodes.units import Length, PositiveLength, Waves
+from neusee.nodes.units import FocalLength, Length, PixelPitch, Waves
 from neusee.nodes.values import Bands, Pupil
 
+Shift = Annotated[Length, Field(ge=0, le=100e-9)]  #: of the wavelength
 Patterns = Annotated[int, Field(ge=1, le=256)]
 Pixels = Annotated[float, Field(ge=0, le=100)]
 
@@ -26,12 +28,12 @@ def nearby_glare(
     line: Bands,
     responses: Tensor,
     *,
-    focal_length: PositiveLength,
-    pixel_pitch: PositiveLength,
-    sensor: Literal["point", "integrated"] = "point",
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
+    sensor: SensorSampling = "point",
     patterns: Patterns = 12,
     pixels: Pixels = 0.5,
-    wavelength: Length = 2e-9,
+    wavelength: Shift = 2e-9,
     defocus: Waves = 0.1,
     rng: Generator,
 ) -> Tensor:

@@ -19,7 +19,7 @@ from neusee.nodes.restore._lasers._intervals import NORMAL, spreads
 from neusee.nodes.restore._lasers._lamp_light import lamp_light
 from neusee.nodes.restore._lasers._line_pattern import Lens, Sensor
 from neusee.nodes.restore._lasers._lost_light import at_the_aperture
-from neusee.nodes.units import Electrons, PositiveLength
+from neusee.nodes.units import Electrons, FocalLength, PixelPitch, PositiveLength, Ratio
 from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
 
 _WIDEST = (0.5, 10.0)  #: pixels and nm; half of a wider interval does not identify
@@ -45,14 +45,14 @@ def find_lasers(
     responses: Tensor,
     bands: Bands,
     *,
-    focal_length: PositiveLength,
-    pixel_pitch: PositiveLength,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
     sensor: Sensor = "point",
     read_noise: Electrons,
     most: Annotated[int, Field(ge=1, le=8)] = 3,
     lamps: Annotated[int, Field(ge=0, le=16)] = 4,
     widths: Widths = (1e-9, 5e-9, 10e-9),
-    least: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 40.0,
+    least: Ratio = 40.0,
     margin: Annotated[float, Field(ge=0, lt=1)] = 0.02,
 ) -> FoundLasers:
     """Find the lasers in one frame: their number, and direction, wavelength and strength of each, with intervals.

@@ -13,7 +13,7 @@ from neusee.nodes._half_precision import single
 from neusee.nodes.restore._inverse._nearby_glare import Patterns
 from neusee.nodes.restore._lasers._intervals import NORMAL
 from neusee.nodes.restore._lasers._line_pattern import Lens, Sensor, line_pattern
-from neusee.nodes.units import PositiveLength
+from neusee.nodes.units import FocalLength, PixelPitch
 from neusee.nodes.values import FoundLasers, Pupil
 
 Rank = Annotated[int, Field(ge=1, le=8)]
@@ -26,8 +26,8 @@ def found_glare(
     electrons: Tensor,
     *,
     rank: Rank = 1,
-    focal_length: PositiveLength,
-    pixel_pitch: PositiveLength,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
     sensor: Sensor = "point",
 ) -> Tensor:
     """Compute the glare of a laser that was found in a frame; 0 where fewer than ``rank`` lasers were found.
@@ -61,8 +61,8 @@ def found_nearby(
     electrons: Tensor,
     *,
     rank: Rank = 1,
-    focal_length: PositiveLength,
-    pixel_pitch: PositiveLength,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
     sensor: Sensor = "point",
     patterns: Patterns = 12,
     rng: Generator,

@@ -102,7 +102,7 @@ def _fading(pixels: int, finer: int) -> Tensor:
 
 def _pixel(fine: tuple[int, int], finer: int, lens: Lens) -> Tensor:
     """Return the factor of a half spectrum of the light in samples that makes it the light in the pixel around each."""
-    if lens.sensor == "point":  # a pixel has the light of its middle, times its area
+    if lens.sensor != "integrated":  # a pixel has the light of its middle, times its area
         return torch.tensor(float(finer**2))
     steps = torch.arange(finer, dtype=torch.float64) - (finer - 1) / 2
     fy, fx = torch.fft.fftfreq(fine[0]).double(), torch.fft.rfftfreq(fine[1]).double()

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from numpy.polynomial.hermite_e import hermegauss
 from torch import Tensor
 
 from neusee.nodes.optics._notch import passed_by_notches
+from neusee.nodes.optics._pixel_filter import FineAxis, averaged, fine_axis
+from neusee.nodes.optics._psf_definition import SensorSampling
+from neusee.nodes.optics._transform._sample_axis import centred
 from neusee.nodes.values import Bands, Pupil
 
-Sensor = Literal["point", "integrated"]
+Sensor = SensorSampling
 
 _COUNTS, _MOST = ((2.5e-9, 3), (6e-9, 5)), 7  #: widths of a line in m, each with the number of its parts; then the most
 _NARROW = 0.1e-9  #: m, width of a line, below which slopes are those of a line so wide
-_GAUSS = (
-    (-0.7745966692414834, 5 / 18),
-    (0.0, 8 / 18),
-    (0.7745966692414834, 5 / 18),
-)  #: nodes over half a pixel, weights
+_FILTER_ERROR = 1e-8  #: of the average over a pixel, relative to the brightest pixel
 
 
 class Lens(NamedTuple):
@@ -61,15 +60,40 @@ def _pattern(pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens) ->
     field = _field(pupil, wavelength)
     spot = direction.to(wavelength) * (lens.focal_length / lens.pixel_pitch)
     reach = _reach(pupil, wavelength, lens)
-    light = torch.zeros(lens.shape, dtype=field.real.dtype, device=field.device)
-    for y, wy in _points(lens.sensor):
-        for x, wx in _points(lens.sensor):
-            rows, columns = (
-                _axis(n, reach, spot[i] - s, field, i) for i, (n, s) in enumerate(zip(lens.shape, (y, x), strict=True))
-            )
-            far = rows @ field @ columns.T
-            light = light + wy * wx * (far.real.square() + far.imag.square())
+    window = _Window.of(lens, field, reach)
+    rows, columns = (_axis(window.places[i], reach, spot[i], field, i) for i in (0, 1))
+    far = rows @ field @ columns.T
+    light = window.seen(far.real.square() + far.imag.square(), (spot[0], spot[1]), reach)
     return light * _share(pupil, wavelength, reach).to(light)
+
+
+class _Window(NamedTuple):
+    """The places along both axes at which the light of a window is computed, and what its pixels see of it."""
+
+    places: tuple[Tensor, Tensor]  #: pixels from the middle pixel
+    pixels: tuple[Tensor, Tensor]  #: the middles of the pixels
+    grids: tuple[FineAxis, FineAxis] | None  #: of pixels that average
+
+    @classmethod
+    def of(cls, lens: Lens, field: Tensor, reach: Tensor) -> _Window:
+        y, x = (torch.arange(n, dtype=torch.float64, device=field.device) - n // 2 for n in lens.shape)
+        if lens.sensor != "integrated":
+            return cls((y, x), (y, x), None)
+        rows, columns = (
+            fine_axis(n, k * float(reach.detach()), _FILTER_ERROR) for n, k in zip(lens.shape, field.shape, strict=True)
+        )
+        down, across = (
+            centred(grid.samples, field.device) / grid.per_pixel + pixels.mean()
+            for grid, pixels in ((rows, y), (columns, x))
+        )
+        return cls((down, across), (y, x), (rows, columns))
+
+    def seen(self, light: Tensor, spot: tuple[Tensor, Tensor], reach: Tensor) -> Tensor:
+        """Return the light (y, x) of each pixel; 0 where the pattern of a spot would repeat."""
+        if self.grids is not None:
+            light = averaged(light, *self.grids)
+        y, x = (_within(pixels, at, reach).to(light) for pixels, at in zip(self.pixels, spot, strict=True))
+        return light * y[:, None] * x
 
 
 def _reach(pupil: Pupil, wavelength: Tensor, lens: Lens) -> Tensor:
@@ -119,39 +143,33 @@ def _moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens) -> tuple[
     """Return the pattern of one wavelength, and its slopes along y and x by pixel."""
     field, reach = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
     turn_y, turn_x = (_turns(n, reach, field) for n in field.shape)
-    light = [torch.zeros(lens.shape, dtype=field.real.dtype, device=field.device) for _ in range(3)]
-    for y, wy in _points(lens.sensor):
-        rows = _axis(lens.shape[0], reach, spot[0] - y, field, 0)
-        for x, wx in _points(lens.sensor):
-            columns = _axis(lens.shape[1], reach, spot[1] - x, field, 1)
-            both = field @ torch.cat([columns, turn_x * columns]).T
-            far, right = (rows @ both).chunk(2, dim=1)
-            down = (turn_y * rows) @ both[:, : len(columns)]
-            light[0] += wy * wx * (far.real.square() + far.imag.square())
-            light[1] += (2 * wy * wx) * (far.real * down.real + far.imag * down.imag)
-            light[2] += (2 * wy * wx) * (far.real * right.real + far.imag * right.imag)
-    share = _share(pupil, wavelength, reach).to(light[0])
-    return share * light[0], share * light[1], share * light[2]
+    window, at = _Window.of(lens, field, reach), (spot[0], spot[1])
+    rows, columns = (_axis(window.places[i], reach, spot[i], field, i) for i in (0, 1))
+    both = field @ torch.cat([columns, turn_x * columns]).T
+    far, right = (rows @ both).chunk(2, dim=1)
+    down = (turn_y * rows) @ both[:, : len(columns)]
+    light = window.seen(far.real.square() + far.imag.square(), at, reach)
+    by_pixel = [window.seen(far.real * way.real + far.imag * way.imag, at, reach) for way in (down, right)]
+    share = _share(pupil, wavelength, reach).to(light)
+    return share * light, 2 * share * by_pixel[0], 2 * share * by_pixel[1]
 
 
 def grid_patterns(pupil: Pupil, down: Tensor, right: Tensor, wavelength: Tensor, lens: Lens) -> Tensor:
     """Return the patterns (row, column, y, x) of one wavelength with spots at each of ``down`` x ``right`` pixels."""
     field, reach = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
-    y, x = lens.shape
-    light = torch.zeros(len(down) * y, len(right) * x, dtype=field.real.dtype, device=field.device)
-    for at_y, wy in _points(lens.sensor):
-        rows = torch.cat([_axis(y, reach, at - at_y, field, 0) for at in down])
-        for at_x, wx in _points(lens.sensor):
-            columns = torch.cat([_axis(x, reach, at - at_x, field, 1) for at in right])
-            far = rows @ (field @ columns.T)
-            light += wy * wx * (far.real.square() + far.imag.square())
-    share = _share(pupil, wavelength, reach).to(light)
-    return share * light.view(len(down), y, len(right), x).transpose(1, 2)
-
-
-def _points(sensor: Sensor) -> tuple[tuple[float, float], ...]:
-    """Return places within a pixel, in pixels, and their weights."""
-    return ((0.0, 1.0),) if sensor == "point" else tuple((0.5 * at, weight) for at, weight in _GAUSS)
+    window = _Window.of(lens, field, reach)
+    rows = torch.cat([_axis(window.places[0], reach, at, field, 0) for at in down])
+    columns = torch.cat([_axis(window.places[1], reach, at, field, 1) for at in right])
+    far = rows @ (field @ columns.T)
+    light = far.real.square() + far.imag.square()
+    tall, wide = (len(places) for places in window.places)
+    patterns = [
+        torch.stack(
+            [window.seen(part, (y, x), reach) for x, part in zip(right, torch.split(row, wide, 1), strict=True)]
+        )
+        for y, row in zip(down, torch.split(light, tall), strict=True)
+    ]
+    return _share(pupil, wavelength, reach).to(light) * torch.stack(patterns)
 
 
 def _field(pupil: Pupil, wavelength: Tensor) -> Tensor:
@@ -162,13 +180,17 @@ def _field(pupil: Pupil, wavelength: Tensor) -> Tensor:
     return torch.polar(pupil.amplitude.to(kind), _radians(turns).to(kind))
 
 
-def _axis(pixels: int, reach: Tensor, spot: Tensor, field: Tensor, dim: int) -> Tensor:
-    """Return the phasors (pixel, sample) along one axis; 0 where the pattern would repeat."""
-    samples = field.shape[dim]
-    away = torch.arange(pixels, dtype=torch.float64, device=field.device) - pixels // 2 - spot
-    at = torch.arange(samples, dtype=torch.float64, device=field.device) - (samples - 1) / 2
-    inside = ((away * reach).abs() <= 0.5 * (1 + 1e-9)).to(field.real)
-    return torch.polar(inside[:, None].expand(-1, samples), -_radians(reach * away[:, None] * at).to(field.real))
+def _axis(places: Tensor, reach: Tensor, spot: Tensor, field: Tensor, dim: int) -> Tensor:
+    """Return the phasors (place, sample) along one axis."""
+    turns = reach * (places - spot)[:, None] * centred(field.shape[dim], field.device)
+    angle = -_radians(turns).to(field.real)
+    return torch.polar(torch.ones_like(angle), angle)
+
+
+def _within(pixels: Tensor, spot: Tensor, reach: Tensor) -> Tensor:
+    """Return True for pixels within half the alias-free field from the spot."""
+    away: Tensor = ((pixels - spot) * reach).abs()
+    return away <= 0.5 * (1 + 1e-9)
 
 
 def _radians(turns: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.restore._networks._mamba_blocks import Block, Directions, Form
 from neusee.nodes.restore._networks._restorer import PictureRestorer, Tile, fitting, restored, restorer_checks
 from neusee.nodes.restore._networks._scan_layer import Kind
-from neusee.nodes.units import Count, DataFile
+from neusee.nodes.units import Count, DataFile, Layers
 
 
 class FFTMamba(PictureRestorer):
@@ -66,9 +66,9 @@ def fft_mamba(
     picture: Tensor,
     *,
     weights: DataFile | None = None,
-    width: Count = 64,
-    blocks: Count = 8,
-    states: Count = 16,
+    width: Layers = 64,
+    blocks: Layers = 8,
+    states: Layers = 16,
     shuffle: Count = 2,
     ssm: Kind = "s6",
     directions: Directions = 2,

@@ -18,7 +18,7 @@ from neusee.nodes.restore._inverse._filter_facts import MAPS, facts
 from neusee.nodes.restore._inverse._wiener import Doubt, LeastDoubt, Settings, pose
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import Restorer
-from neusee.nodes.units import Count, DataFile, Electrons
+from neusee.nodes.units import DataFile, Electrons, Layers
 from neusee.nodes.values import Bands, Psf
 
 
@@ -73,8 +73,8 @@ def informed(
     ghosts: list[Tensor] | None = None,
     *,
     weights: DataFile | None = None,
-    width: Count = 16,
-    balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
+    width: Layers = 16,
+    balance: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0,
     doubt: Doubt = 0.0,
     least_doubt: LeastDoubt = 0.0,
     scatter: bool = False,

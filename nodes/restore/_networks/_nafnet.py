@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from neusee.nodes import node
 from neusee.nodes.restore._networks._restorer import ChannelNorm, Flat, Scale, Tile, fitting, restored, restorer_checks
-from neusee.nodes.units import Count, DataFile
+from neusee.nodes.units import Count, DataFile, Layers
 
 
 class NAFBlock(nn.Module):
@@ -75,7 +75,7 @@ def nafnet(
     picture: Tensor,
     *,
     weights: DataFile | None = None,
-    width: Count = 16,
+    width: Layers = 16,
     tile: Tile | None = None,
     reduce: Count = 1,
     detail: bool = False,

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from neusee.nodes import node
 from neusee.nodes.restore._networks._restorer import LEAK, LEAKY, Flat, Tile, fitting, restored, restorer_checks
-from neusee.nodes.units import Count, DataFile
+from neusee.nodes.units import Count, DataFile, Layers
 
 
 class UNet(Flat):
@@ -46,7 +46,7 @@ def unet(
     picture: Tensor,
     *,
     weights: DataFile | None = None,
-    width: Count = 32,
+    width: Layers = 32,
     tile: Tile | None = None,
     reduce: Count = 1,
     detail: bool = False,

@@ -21,7 +21,7 @@ from neusee.nodes.restore._inverse._wiener import Doubt, LeastDoubt, Settings, p
 from neusee.nodes.restore._inverse._wiener_problem import unpacked
 from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import Restorer
-from neusee.nodes.units import Count, DataFile, Electrons
+from neusee.nodes.units import Count, DataFile, Electrons, Layers
 from neusee.nodes.values import Bands, Psf
 
 Steps = Annotated[Count, Field(le=16)]
@@ -101,9 +101,9 @@ def unrolled(
     ghosts: list[Tensor] | None = None,
     *,
     weights: DataFile | None = None,
-    width: Count = 16,
+    width: Layers = 16,
     steps: Steps = 2,
-    balance: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0,
+    balance: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0,
     doubt: Doubt = 0.0,
     least_doubt: LeastDoubt = 0.0,
     read_noise: Electrons,

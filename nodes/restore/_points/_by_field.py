@@ -31,7 +31,7 @@ from neusee.nodes.restore._points._point_model import hats
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, MeasuredPsf, Psf, Shading
 
-Balance = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Balance = Annotated[float, Field(ge=1e-6, le=1e6)]
 
 
 @node(rtol=1e-5, additive_inputs=[("glare", "nearby")])

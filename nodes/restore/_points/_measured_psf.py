@@ -15,6 +15,8 @@ from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.restore._points._point_fit import fitted
 from neusee.nodes.restore._points._point_frames import Camera, read_points, refuse_bad_frames
 from neusee.nodes.sensor._digitization import Bits
+from neusee.nodes.sensor._frame_file import Curve
+from neusee.nodes.sensor._room_for_light import refuse_without_room, refuse_without_steps
 from neusee.nodes.sensor._saturation import Well
 from neusee.nodes.units import DataFiles, Electrons, Gain, Shape
 from neusee.nodes.values import MeasuredPsf
@@ -47,6 +49,7 @@ def measured_psf(
     full_well: Well,
     read_noise: Electrons,
     bits: Bits = 16,
+    curve: Curve | None = None,
     rng: Generator,
 ) -> MeasuredPsf:
     """Measure the PSF of each channel by field from frames of point sources.
@@ -77,7 +80,7 @@ def measured_psf(
             Papandreou and Yuille, NIPS 23 (2010), for the draws.
     """
     camera = gain, offset, full_well, bits, read_noise
-    refuse_bad_frames(files or (), len(responses), _two(shape), _two(window), _two(zones), camera)
+    refuse_bad_frames(files or (), len(responses), _two(shape), _two(window), _two(zones), camera, curve)
     seen = read_points(files or (), _two(window), camera)
     fit = fitted(seen, _two(shape), _two(zones), _two(window), draws, rng)
     kernels = fit.kernels.reshape(*zones, *fit.kernels.shape[1:])
@@ -98,9 +101,11 @@ def _(
         raise ParameterError("files", "give the folder with frames of point sources")
     names = ("gain", "offset", "full_well", "bits", "read_noise")
     gain, offset, full_well, bits, read_noise = (params[name] for name in names)
+    refuse_without_room(full_well, offset=offset, read_noise=read_noise)
+    refuse_without_steps(full_well, gain=gain, bits=bits)
     camera: Camera = gain, offset, full_well, bits, read_noise
     channels = None if responses is None else len(responses)
-    refuse_bad_frames(files, channels, _two(shape), _two(window), _two(zones), camera)
+    refuse_bad_frames(files, channels, _two(shape), _two(window), _two(zones), camera, params.get("curve"))
     return []
 
 

@@ -15,7 +15,7 @@ from torch.nn.functional import max_pool2d, pad
 from neusee.nodes import ParameterError
 from neusee.nodes.input_files import once_per_version
 from neusee.nodes.metrics._saturated_pixels import clipped
-from neusee.nodes.sensor._frame_file import frame_problem, read_frame
+from neusee.nodes.sensor._frame_file import Curve, frame_problem, read_frame
 
 _SIGNIFICANT = 8.0  #: standard deviations by which a point stands out of the noise
 _FAINTEST = 0.03  #: of the brightest point of the frame: what is fainter is a lobe or a reflection
@@ -50,13 +50,13 @@ def lit_and_dark(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
 
 def refuse_bad_frames(
     files: Sequence[Path], channels: int | None, shape: tuple[int, int], window: tuple[int, int],
-    zones: tuple[int, int], camera: Camera,
+    zones: tuple[int, int], camera: Camera, curve: Curve | None = None,
 ) -> None:  # fmt: skip
     """Raise ParameterError with the names of all frames that cannot be used, and of all zones without a point."""
     lit, dark = lit_and_dark(files)
     if not lit:
         raise ParameterError("files", "there is no frame with points: only names that begin with dark")
-    problems = [p for file in [*lit, *dark] if (p := frame_problem(file, channels, shape, camera[3]))]
+    problems = [p for file in [*lit, *dark] if (p := frame_problem(file, channels, shape, camera[3], curve))]
     found = {}
     if not problems:
         found = {file: _found(file, window, camera) for file in lit}

@@ -1,42 +1,47 @@
 // The selective scan on a CPU, in plain C++ with GCC's vectors. A vector holds neighbouring channels d, so that any n
-// runs at full width and only the gradients of B and C are summed across lanes. Layouts as in _cpp_scan.py, rows
+// runs at full width and only the gradients of B and C are summed across channels. Layouts as in _cpp_scan.py, rows
 // contiguous. Decays enter as exp(x) - 1, because the round-off of a decay near 1 would act at each step.
 
 #include <algorithm>
 #include <cstdint>
 #include <cstring>
 #include <vector>
+
+#include "../../_vector.h"
 #ifdef __SSE2__
 #include <immintrin.h>
 #endif
 
+using namespace neusee;
+
 namespace {
 
 constexpr int64_t STEPS = 32;  // between stored states, so that the states of one chunk fit in the second-level cache
+
+// Channels are summed as if a vector had 64 bytes, of one vector or of several: then a sum has the same order, and so the
+// same bits, for every width of a vector.
+constexpr int64_t PARTS = 64 / VECTOR_BYTES;
+template <class T>
+constexpr int64_t CHANNELS = PARTS * LANES<T>;
 
 template <class T>
 struct Kind;
 
 template <>
 struct Kind<float> {
-    typedef float Vector __attribute__((vector_size(64)));
-    typedef int32_t Whole __attribute__((vector_size(64)));
-    static constexpr int lanes = 16, shift = 23, bias = 127, terms = 7;
+    typedef int32_t Whole __attribute__((vector_size(VECTOR_BYTES)));
+    static constexpr int shift = 23, bias = 127, terms = 7;
     static constexpr float round = 12582912.0f, low = -87.0f, high = 88.0f;
     static constexpr float ln2_high = 0.693359375f, ln2_low = -2.12194440e-4f;
 };
 
 template <>
 struct Kind<double> {
-    typedef double Vector __attribute__((vector_size(64)));
-    typedef int64_t Whole __attribute__((vector_size(64)));
-    static constexpr int lanes = 8, shift = 52, bias = 1023, terms = 13;
+    typedef int64_t Whole __attribute__((vector_size(VECTOR_BYTES)));
+    static constexpr int shift = 52, bias = 1023, terms = 13;
     static constexpr double round = 6755399441055744.0, low = -708.0, high = 709.0;
     static constexpr double ln2_high = 6.93145751953125e-1, ln2_low = 1.42860682030941723212e-6;
 };
-
-template <class T>
-using Vector = typename Kind<T>::Vector;
 
 // While this object lives, subnormal numbers count as zero: a decayed state would stay subnormal, and each product
 // with a subnormal number takes a hundred times as long. (The state stays at some 1e-38 / dt |A| instead.)
@@ -80,7 +85,7 @@ inline Decay<T> decay(Vector<T> x) {
 template <class T>
 inline Vector<T> load(const T* from, int64_t count) {
     Vector<T> v{};
-    if (count >= Kind<T>::lanes)
+    if (count >= LANES<T>)
         std::memcpy(&v, from, sizeof v);
     else
         std::memcpy(&v, from, sizeof(T) * count);
@@ -89,16 +94,17 @@ inline Vector<T> load(const T* from, int64_t count) {
 
 template <class T>
 inline void store(T* to, const Vector<T>& v, int64_t count) {
-    std::memcpy(to, &v, count >= Kind<T>::lanes ? sizeof v : sizeof(T) * count);
+    std::memcpy(to, &v, count >= LANES<T> ? sizeof v : sizeof(T) * count);
 }
 
+// The sum over the channels of PARTS vectors, which lie ``apart`` from each other.
 template <class T>
-inline T across(const Vector<T>& v) {
-    T part[Kind<T>::lanes];
-    std::memcpy(part, &v, sizeof v);
-    for (int half = Kind<T>::lanes / 2; half; half /= 2)
-        for (int i = 0; i < half; ++i) part[i] += part[i + half];
-    return part[0];
+inline T across(const Vector<T>* v, int64_t apart) {
+    T channel[CHANNELS<T>];
+    for (int part = 0; part < PARTS; ++part) std::memcpy(channel + part * LANES<T>, v + part * apart, sizeof *v);
+    for (int half = CHANNELS<T> / 2; half; half /= 2)
+        for (int i = 0; i < half; ++i) channel[i] += channel[i + half];
+    return channel[0];
 }
 
 // sum += more, with the round-off in ``lost``, which is added at the next step. Otherwise the round-off of thousands of
@@ -121,7 +127,7 @@ template <class T>
 void rates(const Sizes& s, const T* A, int64_t first, Vector<T>* out) {
     for (int64_t n = 0; n < s.n; ++n) {
         out[n] = Vector<T>{};
-        for (int64_t i = 0; i < std::min<int64_t>(Kind<T>::lanes, s.d - first); ++i)
+        for (int64_t i = 0; i < std::min<int64_t>(LANES<T>, s.d - first); ++i)
             out[n][i] = A[(first + i) * s.n + n];
     }
 }
@@ -202,29 +208,31 @@ void backward_chunk(const Sizes& s, int64_t b, int64_t chunk, int64_t first, con
     }
 }
 
-// The blocks of one group, chunk by chunk from the end, with gradients of B and C summed over the lanes of the group.
+// The blocks of one group, chunk by chunk from the end, with gradients of B and C summed over the channels of the group.
 template <class T>
 void backward_group(const Sizes& s, int64_t b, int64_t group, const T* u, const T* dt, const T* A, const T* B,
                     const T* C, const T* dy, const T* states, const Gradients<T>& out) {
     using V = Vector<T>;
-    const int64_t lanes = Kind<T>::lanes, blocks = (s.d + lanes - 1) / lanes;
-    const int64_t begin = blocks * group / s.groups, end = blocks * (group + 1) / s.groups, own = end - begin;
-    std::vector<V> memory((5 * own + 5 * STEPS + 2) * s.n, V{});
+    const int64_t lanes = LANES<T>, blocks = (s.d + lanes - 1) / lanes, sums = 2 * STEPS * s.n;
+    const int64_t units = (s.d + CHANNELS<T> - 1) / CHANNELS<T>;
+    const int64_t begin = units * group / s.groups * PARTS, end = units * (group + 1) / s.groups * PARTS;
+    const int64_t own = std::min(end, blocks) - begin;
+    std::vector<V> memory((5 * own + 3 * STEPS + 2) * s.n + PARTS * sums, V{});
     V *rate = memory.data(), *carry = rate + own * s.n, *carried = carry + own * s.n;
     V *total = carried + own * s.n, *slope = total + own * s.n;
-    V *acc = slope + own * s.n, *kept = acc + 2 * STEPS * s.n;
+    V *acc = slope + own * s.n, *kept = acc + PARTS * sums;
     for (int64_t k = 0; k < own; ++k) rates<T>(s, A, (begin + k) * lanes, rate + k * s.n);
     for (int64_t chunk = s.chunks() - 1; chunk >= 0; --chunk) {
         std::fill(slope, kept, V{});
         for (int64_t k = 0; k < own; ++k)
-            backward_chunk<T>(s, b, chunk, (begin + k) * lanes, u, dt, B, C, dy, states, rate + k * s.n, kept, acc,
-                              carry + k * s.n, carried + k * s.n, slope + k * s.n, out);
+            backward_chunk<T>(s, b, chunk, (begin + k) * lanes, u, dt, B, C, dy, states, rate + k * s.n, kept,
+                              acc + k % PARTS * sums, carry + k * s.n, carried + k * s.n, slope + k * s.n, out);
         for (int64_t i = 0; i < own * s.n; ++i) total[i] += slope[i];
         const int64_t steps = std::min(STEPS, s.length - chunk * STEPS);
         const int64_t at = ((group * s.batch + b) * s.length + chunk * STEPS) * s.n;
         for (int64_t i = 0; i < steps * s.n; ++i) {
-            out.B[at + i] = across<T>(acc[i]);
-            out.C[at + i] = across<T>(acc[STEPS * s.n + i]);
+            out.B[at + i] = across<T>(acc + i, sums);
+            out.C[at + i] = across<T>(acc + STEPS * s.n + i, sums);
         }
     }
     for (int64_t k = 0; k < own; ++k)
@@ -234,7 +242,7 @@ void backward_group(const Sizes& s, int64_t b, int64_t group, const T* u, const 
 
 template <class T>
 void forward(const Sizes& s, const T* u, const T* dt, const T* A, const T* B, const T* C, T* y, T* states) {
-    const int64_t lanes = Kind<T>::lanes, blocks = (s.d + lanes - 1) / lanes;
+    const int64_t lanes = LANES<T>, blocks = (s.d + lanes - 1) / lanes;
 #pragma omp parallel for schedule(static) num_threads(s.threads) if (s.threads > 1)
     for (int64_t unit = 0; unit < s.batch * blocks; ++unit) {
         NoSubnormals quick;
@@ -273,3 +281,5 @@ NEUSEE_SCAN(float, f32)
 NEUSEE_SCAN(double, f64)
 
 extern "C" int64_t neusee_scan_steps() { return STEPS; }
+extern "C" int64_t neusee_scan_channels(int64_t size) { return PARTS * VECTOR_BYTES / size; }
+extern "C" int64_t neusee_scan_vector_bytes() { return VECTOR_BYTES; }

@@ -14,7 +14,8 @@ from neusee.nodes.restore._electrons_and_colour import clipped
 from neusee.nodes.restore._shading._frame_cells import Cells, at_pixels, cells_of, grid
 from neusee.nodes.restore._shading._shared_field import shared_field
 from neusee.nodes.sensor._digitization import Bits
-from neusee.nodes.sensor._frame_file import frame, frame_problem
+from neusee.nodes.sensor._frame_file import Curve, frame, frame_problem
+from neusee.nodes.sensor._room_for_light import refuse_without_room, refuse_without_steps
 from neusee.nodes.sensor._saturation import Well
 from neusee.nodes.units import DataFiles, Electrons, Gain, Shape
 from neusee.nodes.values import Shading
@@ -37,6 +38,7 @@ def shading(
     offset_subtracted: bool = True,
     full_well: Well,
     read_noise: Electrons,
+    curve: Curve | None = None,
 ) -> Shading:
     """Estimate the smooth transmission, such as dirt on a window, that frames of different scenes share.
 
@@ -61,7 +63,7 @@ def shading(
     """
     frames = []
     for file in files:
-        raw = frame(responses, file=file, shape=shape, bits=bits)
+        raw = frame(responses, file=file, shape=shape, bits=bits, curve=curve)
         light = raw.double() / gain - (offset if offset_subtracted else 0.0)
         frames.append(cells_of(light, clipped(raw, full_well=full_well, gain=gain, bits=bits).any(0), read_noise))
     return _estimated(frames, (shape[0], shape[1]))
@@ -91,13 +93,16 @@ def _estimated(frames: Sequence[Cells], shape: tuple[int, int]) -> Shading:
 
 @shading.preflight
 def _(
-    *, responses: Tensor | None = None, files: Sequence[Path], shape: Shape, bits: int = 16, **params: Any
-) -> list[str]:
+    *, responses: Tensor | None = None, files: Sequence[Path], shape: Shape, bits: int = 16,
+    curve: Curve | None = None, **params: Any,
+) -> list[str]:  # fmt: skip
     if len(files) > MOST:
         raise ParameterError("files", f"{len(files)} frames are more than {MOST}: give fewer, of different scenes")
+    refuse_without_room(params["full_well"], offset=params["offset"], read_noise=params["read_noise"])
+    refuse_without_steps(params["full_well"], gain=params["gain"], bits=bits)
     channels = None if responses is None else len(responses)
     for file in files:
-        if problem := frame_problem(file, channels, (shape[0], shape[1]), bits):
+        if problem := frame_problem(file, channels, (shape[0], shape[1]), bits, curve):
             raise ParameterError("files", problem)
     return []
 

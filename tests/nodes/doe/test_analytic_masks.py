@@ -93,8 +93,12 @@ def test_every_reading_of_the_aperture_comes_from_one_place():
     def axicon(samples=64, pitch=5e-6, diameter=480e-6, **aperture):
         return doe.axicon(optics.stop(samples=samples, pitch=pitch, diameter=diameter, **aperture), waves=8.0)
 
-    assert_close(axicon(), axicon(diameter=320e-6))
+    with pytest.raises(ParameterError, match="give samples: 96, leave the pitch out, or choose aperture: stretched"):
+        axicon()
+    assert_close(axicon(aperture="inscribed"), axicon(diameter=320e-6))
     assert_close(axicon(aperture="stretched"), axicon(pitch=7.5e-6))
+    assert_close(axicon(pitch=None), axicon(pitch=7.5e-6))
+    assert_close(axicon(aperture="stretched", diameter=160e-6), axicon(pitch=2.5e-6, diameter=160e-6))
     whole = axicon(samples=96)[16:-16, 16:-16]
     assert_close(axicon(aperture="clipped"), whole, rtol=1e-4, atol=float(whole.max()) * 1e-2)
     small = axicon(diameter=160e-6)
@@ -104,9 +108,16 @@ def test_every_reading_of_the_aperture_comes_from_one_place():
 def test_preflight_says_what_the_grid_does_to_the_aperture():
     paper = {"samples": 2160, "pitch": 3.74e-6, "diameter": 11e-3}
     (note,) = optics.stop.hooks.preflight(**paper, aperture="inscribed")
-    assert note == "aperture 11.0 mm > pupil grid 8.08 mm: inscribed, a disc of 8.08 mm; see reading.aperture"
+    grid = "pupil grid 2160 x 3.74 um = 8.078 mm"
+    assert note == f"aperture 11 mm > {grid}: inscribed, a disc of 8.078 mm; see reading.aperture"
     (note,) = optics.stop.hooks.preflight(**paper, aperture="stretched")
-    assert "3.74 -> 5.09 um" in note
+    assert note == f"aperture 11 mm, {grid}: the pitch becomes 5.093 um, so that 2160 samples span the aperture"
+    with pytest.raises(ParameterError, match=r"11 mm is wider than the pupil grid of 2160 x 3\.74 um") as caught:
+        optics.stop.hooks.preflight(**paper)
+    assert caught.value.parameter == "diameter"
+    assert "samples: 2942" in str(caught.value)
+    assert optics.stop.hooks.preflight(**{**paper, "diameter": 8.0784e-3}, aperture="stretched") == []
+    assert optics.stop.hooks.preflight(**{**paper, "pitch": None}) == []
     assert optics.stop.hooks.preflight(samples=2160, pitch=3.74e-6, diameter=8e-3, aperture="inscribed") == []
     with pytest.raises(ParameterError, match="no pupil sample") as caught:
         optics.stop.hooks.preflight(samples=4, pitch=1e-3, diameter=1e-3, aperture="inscribed")

@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from neusee.nodes import ParameterError, doe, optics
 
 STOP = optics.stop(samples=64, pitch=1e-4, diameter=6.4e-3)
+STATED = {"pupil_pitch": 1e-4}  #: the pitch of the pupil as a recipe writes it
 HEIGHT = np.random.default_rng(5).uniform(0, 3e-6, (64, 64)).astype(np.float32)
 
 
@@ -20,7 +21,7 @@ def seeded():
 
 
 def read(file, **params):
-    assert doe.pixelwise.hooks.preflight(stop=STOP, file=file, **params) == []
+    assert doe.pixelwise.hooks.preflight(stop=STOP, file=file, **STATED, **params) == []
     return doe.pixelwise(STOP, file=file, **params, rng=seeded())
 
 
@@ -67,7 +68,7 @@ def test_a_picture_states_the_height_of_white(tmp_path):
     found = read(saved(tmp_path, "png", levels, depth="2.5 um"))
     np.testing.assert_allclose(found.numpy(), levels / 65535 * 2.5e-6, rtol=1e-6)
     assert_close(read(saved(tmp_path, "png", levels), depth=2.5e-6), found, rtol=0, atol=0)
-    (note,) = doe.pixelwise.hooks.preflight(stop=STOP, file=saved(tmp_path, "png", levels))
+    (note,) = doe.pixelwise.hooks.preflight(stop=STOP, file=saved(tmp_path, "png", levels), **STATED)
     assert note == "map.png: white counts as 1.2 um high, because nothing states its height: give depth"
 
 
@@ -89,7 +90,7 @@ def test_the_recipe_and_the_header_must_agree(tmp_path, kind):
     word = "depth" if kind == "png" else "unit"
     height = HEIGHT if kind != "png" else np.ones((64, 64), np.uint16)
     file = saved(tmp_path, kind, height, **{word: "1 um"})
-    assert doe.pixelwise.hooks.preflight(stop=STOP, file=file, **{word: 1e-6}) == []
+    assert doe.pixelwise.hooks.preflight(stop=STOP, file=file, **STATED, **{word: 1e-6}) == []
     assert refused(file, **{word: 1e-9}) == (
         word,
         f"0.001 um, but the header of map.{kind} says 1 um: leave one of them out",
@@ -228,3 +229,39 @@ def test_several_variables_need_a_name(tmp_path):
 def test_grey_levels_have_no_unit(tmp_path):
     file = saved(tmp_path, "png", np.ones((64, 64), np.uint16))
     assert refused(file, unit=1e-6) == ("unit", "map.png holds grey levels: give depth, the height of white")
+
+
+# --- the size of a map is never changed without a word ----------------------------------------------------------------
+
+
+def test_a_map_without_a_pitch_is_refused_on_a_stretched_pupil(tmp_path):
+    """540 samples of 14.96 um became a mask of 25 mm when the lens did."""
+    np.save(tmp_path / "map.npy", np.zeros((64, 64)))
+    parameter, text = refused(tmp_path / "map.npy", pupil_pitch=3e-5)
+    assert parameter == "pitch"
+    assert "states no pitch, and the samples of the pupil are 100 um apart and written as 30 um: give pitch" in text
+    for fitting in (1e-4, 1.0004e-4):
+        assert doe.pixelwise.hooks.preflight(stop=STOP, file=tmp_path / "map.npy", pupil_pitch=fitting) == []
+    (note,) = doe.pixelwise.hooks.preflight(stop=STOP, file=tmp_path / "map.npy")
+    assert note == "map.npy states no pitch: its samples count as those of the pupil, 100 um apart, 6.4 mm wide"
+    found = doe.pixelwise(STOP, file=tmp_path / "map.npy", rng=seeded())
+    checks = doe.pixelwise.hooks.check(found, STOP, file=tmp_path / "map.npy")
+    assert checks[-1].text == "map.npy: 64 x 64 samples, 100 um apart, 6.4 mm wide"
+
+
+def test_a_map_with_a_pitch_keeps_its_size_on_another_pupil(tmp_path):
+    """A ring of 1 mm stays a ring of 1 mm in a lens of half the diameter."""
+    at = (np.arange(640) - 319.5) * 1e-5
+    ring = (np.abs(np.hypot(at[:, None], at) - 1e-3) < 1e-4).astype(np.float64) * 1e-6
+    np.save(tmp_path / "map.npy", ring)
+    half = optics.stop(samples=320, diameter=3.2e-3)
+    options = {"file": tmp_path / "map.npy", "pitch": 1e-5, "pupil_pitch": 2e-5, "between": "nearest"}
+    found = doe.pixelwise(half, **options, rng=seeded())
+    np.testing.assert_array_equal(found.numpy(), ring[160:-160, 160:-160].astype(np.float32))
+
+
+def test_a_designed_mask_states_its_pitch(tmp_path):
+    save_file({"height": torch.zeros(8, 8)}, tmp_path / "mask.safetensors", doe.size_metadata(14.96e-6))
+    height, pitch = doe.height_map(tmp_path / "mask.safetensors")
+    assert height.shape == (8, 8)
+    assert pitch == pytest.approx(14.96e-6, rel=1e-11)

@@ -65,8 +65,8 @@ def test_start_from_a_random_relief_has_a_slope_and_a_flat_one_has_none():
 
 
 def test_pixelwise_start_is_the_same_at_every_sampling():
-    coarse = doe.pixelwise(optics.stop(samples=27, pitch=9e-6, diameter=1.0), rng=seeded())
-    fine = doe.pixelwise(optics.stop(samples=81, pitch=3e-6, diameter=1.0), rng=seeded())
+    coarse = doe.pixelwise(optics.stop(samples=27, pitch=9e-6, diameter=243e-6), rng=seeded())
+    fine = doe.pixelwise(optics.stop(samples=81, pitch=3e-6, diameter=243e-6), rng=seeded())
     assert_close(fine[1::3, 1::3], coarse, rtol=1e-4, atol=1e-12)
 
 
@@ -88,7 +88,9 @@ def test_pixelwise_reads_a_file(tmp_path, suffix):
     else:
         save_file({"height": torch.from_numpy(relief), "other": torch.zeros(2)}, file)
     params = {"file": file, "depth": 1.2e-6, "scale": 0.1}
-    assert doe.pixelwise.hooks.preflight(stop=STOP, **params) == []
+    (note,) = doe.pixelwise.hooks.preflight(stop=STOP, **params)
+    assert "states no pitch" in note
+    assert "5 um apart" in note
     assert_close(doe.pixelwise(STOP, **params, rng=seeded()), torch.from_numpy(relief), rtol=0, atol=0)
 
 

@@ -14,7 +14,7 @@ from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 
-STOP = stop(samples=270, pitch=29.92e-6, diameter=8.08e-3)
+STOP = stop(samples=270, pitch=29.92e-6, diameter=8.0784e-3)
 BANDS = bands(start=500e-9, stop=600e-9, count=3)
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6, "shape": (48, 48)}
 SMALL = ["scene.shape=[64, 64]", "sensor.shape=[48, 48]", "optics.samples=64", "optics.pitch=126 um",

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy import integrate, special
+from scipy import integrate, special, stats
 
 from neusee.nodes import ParameterError
 from neusee.nodes.laser import (
@@ -14,8 +14,11 @@ from neusee.nodes.laser import (
     beam,
     beam_radius,
     curvature_radius,
+    defocus_at,
+    density_in_spot,
     peak_on_sensor,
     power_through,
+    scintillation,
     sensor_density,
     share_through,
     underfilled,
@@ -178,3 +181,121 @@ def test_rounded_data_sheets_are_not_refused():
     assert beam(532e-9, power=1.0, waist=1e-3, divergence=2 * exact, m_squared=2.02).m_squared == pytest.approx(2.0)
     train = {"pulse_energy": 1e-3, "pulse_duration": 1e-9, "repetition_rate": 1e3, "waist": 1e-3}
     assert beam(532e-9, power=1.01, **train).power == pytest.approx(1.0)
+
+
+# --- borders ----------------------------------------------------------------------------------------------------------
+
+PULSED = {"pulse_energy": 1e-6, "waist": 1e-3}
+
+
+def test_a_pulse_as_long_as_the_period_is_refused_and_a_shorter_one_is_not():
+    with pytest.raises(ParameterError, match="does not fit into the period"):
+        beam(905e-9, pulse_duration=0.125, repetition_rate=8.0, **PULSED)
+    assert beam(905e-9, pulse_duration=0.1249, repetition_rate=8.0, **PULSED).power == pytest.approx(8e-6)
+
+
+@pytest.mark.parametrize(("off", "agrees"), [(1.019, True), (0.9815, True), (1.021, False), (0.979, False)])
+def test_statements_agree_within_two_per_cent(off, agrees):
+    train = {"pulse_duration": 1e-9, "repetition_rate": 1e3, "power": 1e-3 * off, **PULSED}
+    shaped = {"power": 1.0, "waist": 1e-3, "divergence": 3 * 2e-6 / (math.pi * 1e-3), "m_squared": 3 * off}
+    for statements, wavelength in ((train, 905e-9), (shaped, 1e-6)):
+        if agrees:
+            beam(wavelength, **statements)
+        else:
+            with pytest.raises(ParameterError, match="leave one of the three out"):
+                beam(wavelength, **statements)
+
+
+@pytest.mark.parametrize(("quality", "found"), [(0.981, 1.0), (0.979, None), (1.0, 1.0), (1.5, 1.5)])
+def test_two_per_cent_below_diffraction_are_rounding_and_count_as_a_perfect_beam(quality, found):
+    shape = {"waist": 1e-3, "divergence": quality * 2e-6 / (math.pi * 1e-3)}
+    if found is None:
+        with pytest.raises(ParameterError, match="no beam has less than 1"):
+            beam(1e-6, power=1.0, **shape)
+    else:
+        assert beam(1e-6, power=1.0, **shape).m_squared == pytest.approx(found)
+
+
+def test_a_perfect_beam_may_be_stated_and_zero_is_no_power():
+    assert beam(1e-6, power=1.0, waist=1e-3, m_squared=1.0).m_squared == 1.0
+    with pytest.raises(ParameterError, match="below 1"):
+        beam(1e-6, power=1.0, waist=1e-3, m_squared=0.9999)
+    with pytest.raises(ParameterError, match="finite number above 0"):
+        beam(1e-6, power=0.0, waist=1e-3)
+    with pytest.raises(ParameterError, match="finite number above 0"):
+        beam(1e-6, power=math.inf, waist=1e-3)
+
+
+@pytest.mark.parametrize("x", [5e-5, 1e-4, 2e-4, 0.05, 0.3])
+def test_the_series_of_an_underfilled_lens_agrees_with_the_closed_form_to_its_last_digit(x):
+    """1 - x^2 / 12 + x^4 / 120, from the series of the hyperbolic tangent."""
+    exact = 2 / x * math.tanh(x / 2) if x > 0.01 else 1 - x**2 / 12 + x**4 / 120
+    assert 1 - underfilled(x) == pytest.approx(1 - exact, rel=1e-6, abs=1e-15)
+    assert float(1 - underfilled(torch.tensor(x, dtype=torch.float64))) == pytest.approx(1 - exact, rel=1e-6, abs=1e-15)
+
+
+def test_a_pinhole_far_away_passes_what_its_area_says():
+    """1 - exp(-x) of a tiny x has no digits left if it is computed as it stands."""
+    share = share_through(POINTER, 1e6, 1e-6)
+    assert share == pytest.approx(axis_density(POINTER, 1e6) * math.pi * (0.5e-6) ** 2, rel=1e-9)
+
+
+# --- along the axis ---------------------------------------------------------------------------------------------------
+
+
+def sag(radius, rim):
+    """Path in m at the rim of a sphere, without a difference of two large numbers."""
+    return 0.0 if math.isinf(radius) else rim**2 / (radius + math.sqrt(radius**2 - rim**2))
+
+
+@pytest.mark.parametrize("focus", [2.0, 40.0, math.inf])
+@pytest.mark.parametrize("distance", [3.0, 25.0, 4e3])
+def test_defocus_is_the_path_at_the_rim_between_the_wavefront_and_the_sphere_of_the_focus(distance, focus):
+    """Of the LIDAR, whose waist of 2 mm bends the wavefront less near to it."""
+    rayleigh = math.pi * LIDAR.waist**2 / (905e-9 * LIDAR.m_squared)
+    path = sag(distance + rayleigh**2 / distance, 6e-3) - sag(focus, 6e-3)
+    assert defocus_at(LIDAR, distance, 12e-3, focus) == pytest.approx(path / 905e-9, rel=1e-5)
+    off = defocus_at(LIDAR, distance, 12e-3, focus, 0.7 * 905e-9) - defocus_at(LIDAR, distance, 12e-3, focus)
+    assert off == pytest.approx(0.7, rel=1e-9)
+
+
+@lasers
+@pytest.mark.parametrize("waves", [0.0, 0.3, -0.45])
+def test_the_density_out_of_focus_is_the_square_of_the_diffraction_integral_with_its_phase(laser, waves):
+    """On the axis, which is the brightest point up to half a wave: 2 pi int sqrt(I) exp(2 pi i W r^2) r dr."""
+    radius, focal = 5.5e-3, 0.11
+    for distance in (0.3, 7.0, 5e3):
+        irradiance = profile(laser, distance)
+        field = [
+            lambda r, f=f, i=irradiance: math.sqrt(i(r)) * f(2 * math.pi * waves * (r / radius) ** 2)
+            for f in (math.cos, math.sin)
+        ]
+        parts = [integrate.quad(lambda r, f=f: 2 * math.pi * r * f(r), 0, radius, epsrel=1e-11)[0] for f in field]
+        expected = (parts[0] ** 2 + parts[1] ** 2) / (laser.wavelength * focal) ** 2 / laser.power
+        columns = (torch.tensor(x, dtype=torch.float64) for x in (distance, 2 * radius, focal, waves))
+        at, diameter, length, defocus = columns
+        assert float(density_in_spot(laser, at, diameter, length, defocus)) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(("distance", "cn2"), [(300.0, 1e-15), (1e3, 1e-14), (2e3, 3e-14)])
+@pytest.mark.parametrize("worst", [0.9, 0.99])
+def test_turbulence_multiplies_by_the_quantile_of_scipys_lognormal_law(distance, cn2, worst):
+    """The mean of the factor is 1, and the variance of its logarithm Rytov's of a plane wave."""
+    spread = math.sqrt(1.23 * cn2 * (2 * math.pi / 532e-9) ** (7 / 6) * distance ** (11 / 6))
+    law = stats.lognorm(spread, scale=math.exp(-(spread**2) / 2))
+    assert law.mean() == pytest.approx(1)
+    expected = float(law.ppf(worst)) if spread < stats.norm.ppf(worst) else None
+    found = float(scintillation(532e-9, distance, cn2, worst))
+    assert found == pytest.approx(expected if expected else math.exp(stats.norm.ppf(worst) ** 2 / 2), rel=1e-9)
+
+
+@pytest.mark.parametrize("worst", [0.05, 0.3, 0.5, 0.7, 0.99])
+def test_turbulence_never_falls_with_the_distance_nor_is_its_factor_above_all_quantiles(worst):
+    """Below one half the quantile of any spread is below 1, and still air has 1."""
+    at = torch.logspace(-1, 6, 200, dtype=torch.float64)
+    found = scintillation(532e-9, at, 1e-13, worst).numpy()
+    assert (np.diff(found) >= -1e-12).all()
+    spreads = np.linspace(1e-6, 4, 4000)
+    largest = np.exp(stats.norm.ppf(worst) * spreads - spreads**2 / 2).max()
+    assert found[-1] == pytest.approx(max(largest, 1.0), rel=1e-4)
+    assert found[0] == pytest.approx(1, abs=2e-3)

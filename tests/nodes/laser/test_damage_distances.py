@@ -1,10 +1,8 @@
-"""Intervals of distance for margins with known roots, and the peak behind a defocused pupil by its own integral."""
+"""Intervals of distance for margins with known roots, and limits at the lens."""
 
 import math
 
 import pytest
-from scipy.integrate import quad
-from scipy.special import j0
 
 from neusee.nodes.laser import (
     axis_irradiance,
@@ -76,26 +74,6 @@ def test_a_margin_that_is_not_a_number_is_refused_with_its_distance():
     assert distance_intervals(lambda distance: -math.inf if distance < 1.5 else math.inf, 1.0, 2.0) == [
         (pytest.approx(1.5), 2.0)
     ]
-
-
-@pytest.mark.parametrize("waves", [0.0, 0.3, 1.0, 2.5, 7.7])
-def test_the_peak_of_a_defocused_pupil_is_the_largest_value_of_its_integral(waves):
-    def irradiance(v):
-        parts = (
-            quad(lambda r, f=f: 2 * r * j0(v * r) * f(2 * math.pi * waves * r * r), 0, 1, limit=400)[0]
-            for f in (math.cos, math.sin)
-        )
-        return sum(x * x for x in parts)
-
-    largest = max(irradiance(0.1 * k) for k in range(int(10 * (2 * math.pi * waves + 1))))
-    assert defocused_peak(waves) == pytest.approx(largest, rel=0.01)
-    assert defocused_peak(-waves) == defocused_peak(waves) >= irradiance(0.0) * (1 - 1e-9)
-
-
-def test_far_out_of_focus_the_peak_is_an_upper_bound_that_the_axis_reaches():
-    assert defocused_peak(49.5) == pytest.approx(1 / (math.pi * 49.5) ** 2, rel=1e-6)
-    assert defocused_peak(50.5) == pytest.approx(1 / (math.pi * 50.5) ** 2, rel=1e-12)
-    assert 0.4 < defocused_peak(49.0) * (math.pi * 49) ** 2 < 1
 
 
 def test_a_source_at_2_m_is_eight_waves_out_of_focus():

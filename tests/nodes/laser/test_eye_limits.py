@@ -123,14 +123,14 @@ def test_a_pulsed_laser_is_judged_by_the_energy_of_a_pulse():
 
 
 def test_a_train_is_limited_by_the_strictest_of_three_rules():
-    one, rate, seconds = eye_mpe(905e-9, 1e-8), 100.0, 10.0
+    one, rate, seconds, old = eye_mpe(905e-9, 1e-8), 100.0, 10.0, "N^(-1/4)"
     count = rate * seconds
-    assert eye_mpe_train(905e-9, 1e-8, rate, seconds) == pytest.approx(one * count**-0.25, rel=1e-12)
+    assert eye_mpe_train(905e-9, 1e-8, rate, seconds, old) == pytest.approx(one * count**-0.25, rel=1e-12)
     fast = 50e3  # 5e5 pulses: the mean irradiance decides
-    assert eye_mpe_train(905e-9, 1e-8, fast, seconds) == pytest.approx(one * (fast * seconds) ** -0.25, rel=1e-12)
+    assert eye_mpe_train(905e-9, 1e-8, fast, seconds, old) == pytest.approx(one * (fast * seconds) ** -0.25, rel=1e-12)
     very = 1e6  # five pulses within 5 us count as one
     groups = very * seconds / 5
-    assert eye_mpe_train(905e-9, 1e-8, very, seconds) == pytest.approx(
+    assert eye_mpe_train(905e-9, 1e-8, very, seconds, old) == pytest.approx(
         min(eye_mpe(905e-9, seconds) / (very * seconds), one / 5 * groups**-0.25), rel=1e-9
     )
     assert eye_mpe_train(1550e-9, 5e-9, 1e5, 10) == pytest.approx(1e4 / 1e6, rel=1e-12)

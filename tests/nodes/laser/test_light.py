@@ -1,5 +1,6 @@
 """The light of a laser at the lens, its wavefront in the pupil, and the pulses that an exposure catches."""
 
+import itertools
 import math
 
 import numpy as np
@@ -167,3 +168,30 @@ def test_the_clear_area_of_a_clipped_disc_is_that_of_its_samples():
         samples = float(optics.pupil(torch.zeros(1000, 1000), doe.material(LINE), LINE, stop).aperture.sum())
         found = laser.light(LINE, stop, **CAMERA, **BEAM, power=1.0)
         assert float(found.flux / found.irradiance) == pytest.approx(samples * 8e-6**2, rel=2e-4)
+
+
+@pytest.mark.parametrize("width", [2e-3, 8e-3, 0.2])
+@pytest.mark.parametrize("diameter", [7e-3, 9e-3, 10e-3, 20e-3])
+def test_the_light_through_a_clipped_disc_is_that_of_its_opening(diameter, width):
+    """Power and peak by quadrature over the disc that the square grid of 8 mm cuts; a disc of 8 mm has too little."""
+    stop = optics.stop(samples=1000, pitch=8e-6, diameter=diameter, aperture="clipped")
+    beam = {"waist": width, "divergence": 1e-3, "distance": 1e-9}
+    found = laser.light(LINE, stop, **CAMERA, **beam, power=1.0, lens_transmittance=0.7)
+    radius, half = diameter / 2, 4e-3
+
+    def opened(law):
+        """Return four times the integral of a law of r squared over a quadrant of the opening, row by row."""
+
+        def row(y):
+            end = min(half, math.sqrt(max(radius**2 - y**2, 0.0)))
+            return integrate.quad(lambda x: law(x * x + y * y), 0, end, epsabs=0, epsrel=1e-10)[0]
+
+        corner, top = math.sqrt(max(radius**2 - half**2, 0.0)), min(radius, half)
+        parts = [0.0, min(corner, top), top]
+        return 4 * sum(integrate.quad(row, *ends, epsabs=0, epsrel=1e-9)[0] for ends in itertools.pairwise(parts))
+
+    axis = 2 / (math.pi * width**2)
+    power, field = (axis * opened(lambda square, k=k: math.exp(-k * square / width**2)) for k in (2, 1))
+    assert float(found.power) == pytest.approx(power, rel=1e-6)
+    peak = 0.7 * field**2 / axis / (532e-9 * 0.11) ** 2
+    assert float(found.peak) == pytest.approx(peak, rel=1e-6)

@@ -19,7 +19,7 @@ def light(pulses):
 
 
 def empty_pattern():
-    return SpotDamage(*torch.zeros(6, 0, dtype=torch.float64), torch.zeros(8, 10, dtype=torch.uint8))
+    return SpotDamage(*torch.zeros(8, 0, dtype=torch.float64), pattern=torch.zeros(8, 10, dtype=torch.uint8))
 
 
 @pytest.mark.parametrize(("node", "inputs", "params"), [

@@ -10,7 +10,7 @@ from neusee.nodes.losses import contrast
 from neusee.nodes.metrics import limits, mtf
 from neusee.nodes.values import Bands, Psf
 
-STOP = optics.stop(samples=135, pitch=59.84e-6, diameter=11e-3)
+STOP = optics.stop(samples=135, pitch=59.84e-6, diameter=8.0784e-3)
 
 
 def rand(*shape, seed=1):

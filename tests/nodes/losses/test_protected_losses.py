@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from neusee.nodes.losses import best_stop, filtered_error, information
+from neusee.nodes.metrics import stop_diameter
 from neusee.nodes.values import Bands, Psf
 
 HOW = {"light": 40.0, "read_noise": 6.0, "limit": 0.2}
@@ -134,3 +135,14 @@ def test_the_rival_is_no_worse_than_any_stop_and_filter_of_the_fourier_transform
         assert (width, passed) == (1.0, 1.0)
     else:
         assert width**4 * passed == pytest.approx(limit)
+
+
+def test_in_the_dark_the_rival_is_a_stop_without_a_filter_behind_pixels_that_average():
+    """Light decides there, and a stop passes more of it than a filter of the same peak."""
+    one = torch.ones(1, dtype=torch.float64)
+    lens = Psf(torch.zeros(1, 64, 64, dtype=torch.float64), 0.11 * one, 0.39 * one, one)
+    grey = (one, one[None], Bands(550e-9 * one, one, one))
+    _, width, passed = best_stop(lens, *grey, light=3.0, read_noise=10.5, limit=0.01)
+    assert passed > 0.999
+    assert width == pytest.approx(float(stop_diameter(lens, 0.01)), rel=1e-6)
+    assert width < 0.99 * 0.01**0.25

@@ -20,7 +20,7 @@ from tests.nodes.metrics import independent_neq as numpy_code
 
 GREEN = bands(start=500e-9, stop=600e-9, count=1)
 ONE = torch.ones(1, dtype=torch.float64)
-STOP = optics.stop(samples=540, pitch=14.96e-6, diameter=11e-3)
+STOP = optics.stop(samples=540, pitch=14.96e-6, diameter=8.0784e-3)
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6, "shape": (512, 512)}
 SIGMA = 10.5
 LIGHTS = (10, 30, 100, 300, 1e3, 1e4)

@@ -2,13 +2,15 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.special import j1
 
 from neusee.nodes import doe, metrics, optics
 from neusee.nodes.metrics._protection_bounds import CLEAR
 from neusee.nodes.spectra import bands
-from neusee.nodes.values import Psf
+from neusee.nodes.values import Bands, Psf
 
 GREEN = bands(start=500e-9, stop=600e-9, count=1)
 STOP = optics.stop(samples=96, pitch=8.08e-3 / 96, diameter=8.08e-3)
@@ -154,5 +156,28 @@ def test_a_part_of_the_band_breaks_the_bound_of_contrast():
 
 def test_pixels_that_do_not_resolve_the_lens_band_break_a_bound():
     """At 16 um the pixels sample a seventh of the band: aliases count as contrast, points hold more than all light."""
-    coarse = focused(doe.zernike(STOP, coefficients={4: 900e-9}).double(), pixel_pitch=16e-6, shape=(40, 40))
+    pupil = optics.pupil(doe.zernike(STOP, coefficients={4: 900e-9}).double(), 0.46 + 0 * GREEN.centres, GREEN, STOP)
+    lens = {"focal_length": 0.11, "pixel_pitch": 16e-6, "shape": (40, 40)}
+    with pytest.raises(ValueError, match="average over each pixel"):
+        optics.psf(pupil, **lens)
+    coarse = optics.psf.hooks.reference(pupil, **lens)
     assert metrics.protection_bounds(coarse, electrons=30.0, read_noise=10.5).broken()
+
+
+@pytest.mark.parametrize(("wavelength", "share"), [(400e-9, 0.0122), (700e-9, 0.001), (550e-9, 0.3)])
+def test_a_stop_has_its_peak_behind_pixels_that_average(wavelength, share):
+    """By Airy's law, averaged over the square of the pixel by Gauss and Legendre; points have the fourth root."""
+    line = Bands(*(torch.tensor([x], dtype=torch.float64) for x in (wavelength, 1e-9, 1.0)))
+    pupil = optics.pupil(torch.zeros(96, 96).double(), 0.46 + 0 * line.centres, line, STOP)
+    averaged = optics.psf(pupil, sensor="integrated", **{**LENS, "shape": (8, 8)})
+    (width,) = metrics.stop_diameter(averaged, share).tolist()
+
+    def peak(diameter):
+        nodes, weights = np.polynomial.legendre.leggauss(40)
+        radius = np.hypot(*np.meshgrid(*[nodes * LENS["pixel_pitch"] / 2] * 2))
+        at = np.pi * diameter * radius / (wavelength * LENS["focal_length"])
+        return diameter**4 * float(weights @ (2 * j1(at) / at) ** 2 @ weights)
+
+    assert peak(8.08e-3 * width) / peak(8.08e-3) == pytest.approx(share, rel=2e-3)
+    points = optics.psf(pupil, **{**LENS, "shape": (8, 8)})
+    assert float(metrics.stop_diameter(points, share)) == pytest.approx(share**0.25, rel=1e-9)

@@ -93,3 +93,82 @@ def test_the_curve_of_encircled_light_has_what_lies_within_each_radius(pixels):
 def test_the_clear_lens_over_its_own_peak_is_one_on_the_axis():
     clear = lens(window=32, samples=64)
     assert float(over_clear_peak(clear, 0)[16, 16]) == pytest.approx(1.0, rel=1e-9)
+
+
+def test_each_band_is_over_the_peak_of_its_own_clear_lens():
+    flat = Psf(torch.full((2, 3, 3), 0.2, dtype=torch.float64), torch.tensor([0.5, 0.8], dtype=torch.float64))
+    assert float(over_clear_peak(flat, 0)[0, 0]) == pytest.approx(0.4)
+    assert float(over_clear_peak(flat, 1)[2, 1]) == pytest.approx(0.25)
+
+
+def test_what_a_run_says_of_contrast_and_light_is_the_mean_and_the_range_of_the_bands():
+    found = mtf(two_pixels(0.6))
+    line = found._replace(rms=torch.tensor([0.2, 0.4, 0.9]), median=torch.tensor([0.1, 0.3, 0.5]))
+    assert mtf.hooks.check(line)[0].text.endswith("rms 0.5, median 0.3")
+    assert "20.0% to 90.0%" in encircled.hooks.check(torch.tensor([0.4, 0.2, 0.9]))[0].text
+
+
+def test_only_the_root_mean_square_has_a_gradient():
+    psf = two_pixels(0.6)
+    found = mtf(psf._replace(intensity=psf.intensity.requires_grad_()))
+    assert [x.requires_grad for x in found] == [True, False, False]
+
+
+# --- borders ----------------------------------------------------------------------------------------------------------
+
+
+def two_pixels(ratio, size=8, clear=0.5):
+    """Return a PSF of two neighbours, whose contrast along x is that of two slits: |cos(pi f) + ...|."""
+    kernel = torch.zeros(1, size, size, dtype=torch.float64)
+    kernel[0, size // 2, size // 2], kernel[0, size // 2, size // 2 + 1] = 1.0, ratio
+    return Psf(kernel, torch.tensor([clear], dtype=torch.float64))
+
+
+def contrasts(ratio, size, cut):
+    """Return the sorted contrasts of two pixels at all frequencies of the half plane up to ``cut``, in closed form."""
+    found = []
+    for i in range(size):
+        for j in range(size // 2 + 1):
+            fy, fx = (i if i < size / 2 else i - size) / size, j / size
+            if math.hypot(fy, fx) <= cut + 1e-12:
+                found.append(math.sqrt(1 + ratio**2 + 2 * ratio * math.cos(2 * math.pi * fx)) / (1 + ratio))
+    return sorted(found)
+
+
+@pytest.mark.parametrize("cut", [0.25, 0.3, 0.5])
+@pytest.mark.parametrize("size", [8, 24])
+def test_statistics_of_two_pixels_are_those_of_their_closed_form(size, cut):
+    """The cut-off itself counts; the median of an even number is the lower one; 1 of 100 is below `low`."""
+    found = mtf(two_pixels(0.6, size, clear=math.pi * (cut + 1e-9) ** 2 / 4))
+    exact = contrasts(0.6, size, cut)
+    assert float(found.rms) == pytest.approx(math.sqrt(sum(x**2 for x in exact) / len(exact)), rel=1e-9)
+    assert float(found.median) == pytest.approx(exact[(len(exact) - 1) // 2], rel=1e-9)
+    assert float(found.low) == pytest.approx(exact[math.floor(0.01 * (len(exact) - 1))], rel=1e-9)
+
+
+def test_a_contrast_is_at_most_one_and_light_below_the_darkest_has_none():
+    kernel = torch.zeros(3, 8, 8, dtype=torch.float64)
+    kernel[0, 4, 4], kernel[0, 4, 5] = 1.0, -0.5  # an error that is negative: 1.5 times the light at high frequencies
+    kernel[1, 4, 4], kernel[2, 4, 4] = 0.9e-30, 1.1e-30
+    found = mtf(Psf(kernel, torch.full((3,), 0.5, dtype=torch.float64)))
+    assert float(found.median[0]) == 1.0
+    assert [float(x) for x in found.rms[1:]] == pytest.approx([0.0, 1.0])
+    assert mtf.hooks.check(found)[0].ok
+    assert not mtf.hooks.check(found._replace(rms=found.rms + 0.1))[0].ok
+
+
+@pytest.mark.parametrize(("radius", "count"), [(0.999, 1), (1.0, 5), (1.414, 5), (1.4143, 9), (2.0, 13)])
+def test_a_pixel_counts_whose_centre_is_within_the_radius_or_on_it(radius, count):
+    flat = Psf(torch.ones(1, 7, 6, dtype=torch.float64), torch.ones(1, dtype=torch.float64))
+    assert float(encircled(flat, pixel_pitch=2.0, radius=2.0 * radius)) == count
+
+
+def test_the_curve_counts_a_pixel_from_the_next_whole_radius_on():
+    curve = encircled_curve(torch.ones(7, 7, dtype=torch.float64))
+    assert curve[:4].tolist() == [1.0, 5.0, 13.0, 29.0]
+    assert len(curve) == 6  # the corner is 4.24 pixels away
+
+
+@pytest.mark.parametrize(("share", "ok"), [(1.0099, True), (1.0101, False)])
+def test_more_than_all_of_the_light_is_noticed(share, ok):
+    assert encircled.hooks.check(torch.tensor([share], dtype=torch.float64))[0].ok == ok

@@ -67,19 +67,21 @@ def test_the_peak_of_a_laser_alone_is_its_strength(strength):
     laser = laser_irradiance(psf, line, strength=strength, **SENSOR)
     found = peak_irradiance(dark, bands(550e-9), torch.ones(1), [laser], [line], **SENSOR)
     assert float(found.irradiance) == pytest.approx(strength, rel=1e-5)
-    assert bool(found.damaged) == (float(found.irradiance) > 1e6)
+    assert bool(found.above) == (float(found.irradiance) > 1e6)
+    assert float(found.laser) == pytest.approx(float(laser.sum(0).max()), rel=1e-6)
 
 
-def test_the_papers_threshold_of_damage_is_a_reading_and_can_be_left_out():
+def test_the_multiple_of_the_paper_is_a_reading_and_no_verdict_and_can_be_left_out():
     """A multiple of saturation is no damage: the same light exceeds it after a longer exposure."""
     light, one = torch.full((1, 2, 2), 1e5), torch.ones(1)
     short, long = (peak_irradiance(light, bands(550e-9), one, **{**SENSOR, "exposure": t}) for t in (1e-3, 1.0))
-    assert (float(short.damaged), float(long.damaged)) == (0.0, 1.0)
-    text = peak_irradiance.hooks.check(long)[0].text
-    assert text.endswith("above the 1e+06 at which the paper expects damage (no threshold in W/cm2)")
-    none = peak_irradiance(light, bands(550e-9), one, **{**SENSOR, "exposure": 1.0}, damage=None)
-    assert math.isnan(float(none.damaged))
-    (check,) = peak_irradiance.hooks.check(none, damage=None)
+    assert (float(short.above), float(long.above)) == (0.0, 1.0)
+    (check,) = peak_irradiance.hooks.check(long, exposure=1.0)
+    assert check.ok
+    assert check.text.endswith("above the 1e+06 that the paper names (C10), which is no threshold of damage")
+    none = peak_irradiance(light, bands(550e-9), one, **{**SENSOR, "exposure": 1.0}, multiple=None)
+    assert math.isnan(float(none.above))
+    (check,) = peak_irradiance.hooks.check(none, exposure=1.0, multiple=None)
     assert check.ok
     assert "damage" not in check.text
 
@@ -94,7 +96,21 @@ def test_scene_and_lasers_add():
     even = saturation(visible, **SENSOR)[:, None, None].expand(2, 4, 4).float()
     both = peak_irradiance(scene, visible, factor, [even, even], [visible, visible], **SENSOR)
     assert float(both.irradiance) == pytest.approx(4.7, rel=1e-5)
-    assert peak_irradiance.hooks.check(both)[0].text == "brightest pixel 4.7 times the saturation irradiance"
+    (check,) = peak_irradiance.hooks.check(both, exposure=0.1)
+    lasers = f"{2e-4 * float(even.sum(0).max()):.3g} W/cm2 of lasers"
+    assert check.text == f"brightest pixel 4.7 times the saturation irradiance of 0.1 s, {lasers}"
+
+
+@pytest.mark.parametrize("exposure", [1e-3, 1e-2, 0.1, 3.0])
+def test_the_peak_is_counted_in_saturation_of_its_own_exposure(exposure):
+    """The same light is as many multiples of I_sat as the exposure is long: h c / (lambda QE) well / (t p^2)."""
+    light, line = torch.full((1, 2, 2), 3.0), bands(532e-9)
+    one_well = 25500 / 0.56 * 6.62607015e-34 * 299792458 / 532e-9 / (exposure * 2.9e-6**2)
+    found = peak_irradiance(
+        torch.zeros(1, 2, 2), line, torch.ones(1), [light], [line], **{**SENSOR, "exposure": exposure}
+    )
+    assert float(found.irradiance) == pytest.approx(3.0 / one_well, rel=1e-6)
+    assert float(found.laser) == pytest.approx(3.0, rel=1e-6)
 
 
 def test_every_spot_needs_its_line():

@@ -43,7 +43,7 @@ def test_an_element_that_suppresses_by_a_thousand_does_so_here():
     assert float((found / saturation(LINE, **SENSOR)[:, None, None]).sum(0).max()) == pytest.approx(1e3, rel=1e-6)
     assert (
         laser_irradiance.hooks.check(found, weak, LINE, strength=1e6, **SENSOR)[0].text
-        == "peak of the spot 1e+03 I_sat, strength 1e+06 I_sat"
+        == "peak of the spot 20.22 W/m2, strength 1e+06 at the nominal exposure of 0.1 s"
     )
 
 
@@ -82,7 +82,7 @@ def test_light_in_watts_lands_whole_on_the_sensor_and_states_its_strength():
     assert float(found.sum()) * 2.9e-6**2 == pytest.approx(2e-6 * float(share), rel=1e-6)
     hook = laser_irradiance.hooks.check
     (told,) = hook(found, clear_psf(), LINE, seen, WATTS, meaning="first_channel", **SENSOR)
-    strength = float(told.text.rpartition(" ")[2])
+    strength = float(told.text.partition("a strength of ")[2].split()[0])
     again = laser_irradiance(clear_psf(), LINE, seen, strength=strength, meaning="first_channel", **SENSOR).double()
     torch.testing.assert_close(again, found * (2.4 / 3.0), rtol=1e-3, atol=0.0)  # of the peak of the tapered pupil
 

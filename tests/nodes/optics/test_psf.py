@@ -157,16 +157,6 @@ def test_integrated_pixels_are_the_mean_over_their_square(wavelength):
     assert float(result.clear_peak[0]) < 0.97 * float(psf(pupil, shape=(1, 1), **SENSOR).clear_peak[0])
 
 
-def test_quadrature_holds_its_promise_of_1e_minus_5():
-    from neusee.nodes.optics._psf import _nodes
-
-    for bandwidth in (0.05, 0.387, 0.532, 1.4):
-        points, weights = (torch.tensor(x, dtype=torch.float64) for x in _nodes(bandwidth))
-        fringe = torch.linspace(0, bandwidth, 1000, dtype=torch.float64)
-        mean = torch.cos(2 * math.pi * fringe[:, None] * points) @ weights
-        assert float((mean - torch.sinc(fringe)).abs().max()) < 5.1e-6
-
-
 CASES = [
     {},
     {"pixel": "zoh"},
@@ -188,9 +178,8 @@ def test_the_node_agrees_with_its_reference(shape, params):
     assert double.intensity.dtype == truth.intensity.dtype == result.clear_peak.dtype == torch.float64
     peak = float(psf.hooks.reference(pupil, shape=(65, 65), **SENSOR).intensity.max())
     assert float((result.intensity - truth.intensity).abs().max()) < psf.rtol * peak
-    averaged = 1e-5 * float(truth.clear_peak.max()) if params.get("sensor") == "integrated" else 0.0
-    assert float((double.intensity - truth.intensity).abs().max()) < 1e-12 * peak + averaged
-    torch.testing.assert_close(result.clear_peak, truth.clear_peak, rtol=1e-5 if averaged else 1e-10, atol=0)
+    assert float((double.intensity - truth.intensity).abs().max()) < 1e-12 * peak
+    torch.testing.assert_close(result.clear_peak, truth.clear_peak, rtol=1e-10, atol=0)
     direct = _focus(pupil, _Camera(**SENSOR, shape=shape, **params), torch.float64, "direct")
     assert float((double.intensity - direct.intensity).abs().max()) < 1e-12 * peak
     torch.testing.assert_close(result.clear_peak, direct.clear_peak, rtol=1e-10, atol=0)
@@ -280,8 +269,6 @@ def test_check_reads_the_energy_in_the_window():
     pupil = make(96, height=rough, diameter=96 * GREEN * FOCAL / (256 * PIXEL))
     whole = psf.hooks.check(psf(pupil, shape=(256, 256), **SENSOR), pupil)
     assert [(c.text, c.ok) for c in whole] == [("energy in window 100.0 %", True)]
-    result = psf(pupil, shape=(256, 256), **SENSOR)
-    assert not psf.hooks.check(result._replace(intensity=2 * result.intensity), pupil)[0].ok
 
 
 def test_a_direction_adds_to_the_angle():

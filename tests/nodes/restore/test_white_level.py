@@ -65,3 +65,21 @@ def test_clipped_pixels_and_the_brightest_of_a_thousand_do_not_count():
 def test_a_frame_that_is_clipped_everywhere_still_has_a_level():
     signal = torch.full((3, 4, 4), 1000.0)
     assert float(level(signal, torch.ones(3, 4, 4, dtype=torch.bool))[0]) > 0
+
+
+def test_the_restored_picture_gives_the_white_and_not_the_blurred_frame():
+    """By hand: the 99.5 % quantile of the largest colour is 1, in a picture whose frame is blurred to a third of it."""
+    rng = np.random.default_rng(4)
+    reflectance = torch.from_numpy(rng.uniform(0.02, 1.0, (50, 60)))
+    sharp = torch.from_numpy(electrons_of_white(3e-3))[:, None, None] * reflectance
+    frame = sharp.mean((1, 2), keepdim=True).expand_as(sharp) * 0.66
+    found = level(frame.clone(), restored=sharp)
+    shown = colour(sharp, colour_matrix(BANDS, LIGHT, RESPONSES, found, **PIXEL)).amax(0).numpy()
+    assert np.quantile(shown, 0.995) == pytest.approx(1.0, rel=1e-5)
+    assert float(found[0]) > 1.3 * float(level(frame.clone())[0])
+    clipped = torch.zeros(3, 50, 60, dtype=torch.bool)
+    clipped[0] = reflectance > 0.9
+    without = level(frame.clone(), clipped, restored=sharp)
+    shown = colour(sharp, colour_matrix(BANDS, LIGHT, RESPONSES, without, **PIXEL)).amax(0)
+    assert np.quantile(shown[~clipped[0]].numpy(), 0.995) == pytest.approx(1.0, rel=1e-5)
+    assert torch.equal(level(frame.clone(), restored=sharp, white=0.7), level(frame.clone(), white=0.7))

@@ -8,8 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes import TensorStats
-from neusee.nodes.sensor import crop, digitize, full_well
+from neusee.nodes import ErrorBound, TensorStats
+from neusee.nodes.sensor import crop, digitize, electrons_to_clip, full_well
+from neusee.nodes.sensor._digitization import clipping_number
 from neusee.nodes.units import read_quantity
 
 
@@ -174,3 +175,79 @@ def test_more_numbers_change_in_one_of_ten_thousand_cases(mean):
     more = 1.0 - sum(math.exp(n * math.log(mean) - mean - math.lgamma(n + 1)) for n in range(few + 1))
     assert more <= 1e-4
     assert few <= mean + 8.0 * math.sqrt(mean) + 9.0
+
+
+# --- borders ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bits", [1, 8, 12, 16])
+def test_the_ends_of_the_converter_are_zero_and_two_to_the_bits_less_one(bits):
+    top = 2**bits - 1
+    found = digitize(torch.tensor([-0.6, -0.4, 0.4, top - 0.6, top + 0.4, top + 1.0, 1e9]), gain=1.0, bits=bits)
+    assert found.tolist() == [0, 0, 0, top - 1, top, top, top]
+
+
+def test_halves_are_rounded_to_even_and_truncation_cuts():
+    halves = torch.tensor([0.5, 1.5, 2.5, 3.5])
+    assert digitize(halves, gain=1.0).tolist() == [0, 2, 2, 4]
+    assert digitize(halves, gain=1.0, rounding="truncation").tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(("high", "ok"), [(1, True), (2, False)])
+def test_half_of_the_pixels_at_the_largest_number_are_too_many(high, ok):
+    numbers = torch.tensor([255.0] * high + [254.0] * (4 - high))
+    assert digitize.hooks.check(numbers, bits=8)[0].ok == ok
+
+
+def test_a_full_well_is_reached_by_the_well_itself():
+    assert full_well(torch.tensor([8.9, 9.0, 9.1]), capacity=9.0).tolist() == pytest.approx([8.9, 9.0, 9.0])
+    at_well = TensorStats.of(torch.tensor([9.0]))
+    above = TensorStats.of(torch.tensor([10.0, -2.0], dtype=torch.float64))
+    assert full_well.hooks.skip_bound(at_well, capacity=9.0) == 0.0
+    assert full_well.hooks.skip_bound(TensorStats.of(torch.tensor([6.0])), capacity=9.0) == 0.0
+    assert full_well.hooks.skip_bound(above, capacity=9.0) == pytest.approx(1 / 9)
+    below = TensorStats.of(torch.tensor([10.0, -30.0], dtype=torch.float64))
+    assert full_well.hooks.skip_bound(below, capacity=9.0) == pytest.approx(1 / 30)
+
+
+def test_a_well_limits_from_above_alone():
+    assert full_well(torch.tensor([-3.0, 5.0, 20.0]), capacity=10.0).tolist() == [-3.0, 5.0, 10.0]
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12])
+@pytest.mark.parametrize("gain", [0.013, 0.0777, 0.1003, 0.25, 0.9, 3.1])
+def test_a_full_pixel_has_at_least_the_clipping_number_and_may_have_no_more(bits, gain):
+    """Full pixels by all three roundings; the dither draws the lowest of their numbers."""
+    full = full_well(torch.full((5000,), 2000.0, dtype=torch.float64), capacity=1237.0)
+    numbers = [
+        digitize(full, gain=gain, rounding=rounding, bits=bits, rng=seeded())
+        for rounding in ("nearest", "truncation", "dithered_floor")
+    ]
+    assert clipping_number(1237.0, gain, bits) == min(float(x.min()) for x in numbers)
+
+
+def test_black_is_not_clipped():
+    assert clipping_number(10.0, 0.01, 8) == 1
+
+
+@pytest.mark.parametrize(("well", "gain", "bits"), [(1237.0, 0.1003, 12), (1e5, 0.1, 12), (5000.0, 0.25, 10)])
+@pytest.mark.parametrize("offset", [0.0, 37.0])
+def test_the_light_that_fills_a_pixel_is_the_least_that_gives_the_clipping_number(well, gain, bits, offset):
+    light = electrons_to_clip(well, gain, bits, offset)
+    around = torch.tensor([light * (1 - 1e-6), light * (1 + 1e-6)], dtype=torch.float64) + offset
+    below, above = digitize(full_well(around, capacity=well), gain=gain, bits=bits).tolist()
+    assert below < clipping_number(well, gain, bits) <= above
+
+
+@pytest.mark.parametrize("error", [0.1, 0.3, 0.45, 0.7])
+def test_of_very_many_pixels_the_share_that_changes_its_number_is_the_expected_one(error):
+    """A number changes with the probability e, so that the mean square grows by e - e^2, and by 1/4 from e = 1/2 on."""
+    many = TensorStats((10**7, 10**7), "float32", min=0.0, max=9.0, sum=4e14, support=10**14, finite=True)
+    found = digitize.hooks.rounding_error(error, result=many)
+    share = error - error**2 if error < 0.5 else 0.25
+    assert found == pytest.approx(math.sqrt(error**2 + share), rel=1e-4)
+
+
+def test_a_run_says_the_end_of_the_converter_and_its_error_in_numbers():
+    assert digitize.hooks.preflight(gain=0.5, bits=8) == ["the largest digital number is 255 DN = 510 e-"]
+    assert digitize.hooks.propagate_error(ErrorBound(3.0), result=None, gain=0.5) == 1.5

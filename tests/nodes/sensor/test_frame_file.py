@@ -1,5 +1,8 @@
 """A frame is read as the numbers that a file holds, in every format, and refused if it does not fit."""
 
+import struct
+import zlib
+
 import numpy as np
 import pytest
 import torch
@@ -44,7 +47,7 @@ def test_the_numbers_of_every_format_are_unchanged(name, tmp_path):
     bits, write = WRITERS[name]
     values = numbers(2**bits - 1)
     write(tmp_path / name, values)
-    found = frame(THREE, file=tmp_path / name, shape=SHAPE, bits=bits)
+    found = frame(THREE, file=tmp_path / name, shape=SHAPE, bits=bits, curve="linear" if bits == 8 else None)
     assert found.dtype == torch.float32
     np.testing.assert_array_equal(found.numpy(), values.transpose(2, 0, 1))
 
@@ -110,6 +113,80 @@ def test_a_file_of_another_form_is_refused_before_the_run(name, tmp_path):
     with pytest.raises(ParameterError, match=message) as error:
         frame.hooks.preflight(responses=THREE, file=tmp_path / name, shape=SHAPE, bits=12)
     assert "\n" not in str(error.value)
+
+
+def chunk(kind, data):
+    return struct.pack(">I4s", len(data), kind) + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def with_chunk(kind, data):
+    """A frame of 16 bits in a PNG with one more chunk."""
+
+    def write(path):
+        io.write_image_png_u16(str(path), numbers().astype(np.uint16), "rgb")
+        whole = path.read_bytes()
+        path.write_bytes(whole[:33] + chunk(kind, data) + whole[33:])
+
+    return write
+
+
+def tiff_with_profile(name):
+    """A TIFF of 16 bits by hand: a directory of ten entries, the pixels, and a colour profile."""
+
+    def write(path):
+        pixels, profile = numbers().astype("<u2").tobytes(), b"acsp" + name + bytes(40)
+        first = 8 + 2 + 12 * 10 + 4
+        depths, strip, icc = first, first + 6, first + 6 + len(pixels)
+        entries = [(256, 3, 1, SHAPE[1]), (257, 3, 1, SHAPE[0]), (258, 3, 3, depths), (259, 3, 1, 1), (262, 3, 1, 2),
+                   (273, 4, 1, strip), (277, 3, 1, 3), (278, 3, 1, SHAPE[0]), (279, 4, 1, len(pixels)),
+                   (34675, 7, len(profile), icc)]  # fmt: skip
+        listed = b"".join(struct.pack("<HHII", *entry) for entry in entries)
+        head = b"II*\0" + struct.pack("<IH", 8, len(entries)) + listed + bytes(4)
+        path.write_bytes(head + struct.pack("<3H", 16, 16, 16) + pixels + profile)
+
+    return write
+
+
+SIGNS = {
+    "eight.png": (8, lambda path: png8(path, numbers(255)), "has 8 bits, as pictures with a tone curve"),
+    "eight.tif": (8, WRITERS["d.tiff"][1], "has 8 bits"),
+    "eight.npy": (8, np.save, "has 8 bits"),
+    "bytes.npy": (12, lambda path, x: np.save(path, x.astype(np.uint8)), "has 8 bits"),
+    "stretched.npy": (16, lambda path, x: np.save(path, x.astype(np.uint16) * 257), "only multiples of 257"),
+    "moved.npy": (16, lambda path, x: np.save(path, x.astype(np.uint16) * 256), "only multiples of 256"),
+    "srgb.png": (16, with_chunk(b"sRGB", b"\0"), "says of itself that it is sRGB encoded"),
+    "gamma.png": (16, with_chunk(b"gAMA", struct.pack(">I", 45455)), r"a tone curve with the gamma 2\.2"),
+    "code.png": (16, with_chunk(b"cICP", bytes([1, 13, 0, 1])), "transfer characteristic 13 of ITU-T H.273"),
+    "profile.png": (16, with_chunk(b"iCCP", b"Display P3\0\0" + zlib.compress(b"x")), "colour profile Display P3"),
+    "profile.tif": (16, tiff_with_profile(b"sRGB IEC61966-2.1"), "has a colour profile"),
+}
+
+
+@pytest.mark.parametrize("name", SIGNS)
+def test_a_file_with_a_sign_of_a_tone_curve_needs_a_statement(name, tmp_path):
+    bits, write, sign = SIGNS[name]
+    write(tmp_path / name, numbers(255)) if name.endswith("npy") or name == "eight.tif" else write(tmp_path / name)
+    given = {"responses": THREE, "file": tmp_path / name, "shape": SHAPE, "bits": bits}
+    with pytest.raises(ParameterError, match=sign) as error:
+        frame.hooks.preflight(**given)
+    assert error.value.parameter == "file"
+    assert "linear in the light" in str(error.value)
+    assert "state frame.curve=linear" in str(error.value)
+    assert frame.hooks.preflight(**given, curve="linear") == []
+
+
+LINEAR = {
+    "plain.png": WRITERS["a.png"][1],
+    "linear.png": lambda path, x: with_chunk(b"gAMA", struct.pack(">I", 100000))(path),
+    "moved.npy": lambda path, x: np.save(path, (x.astype(np.uint16) // 16) * 16),  # 12 bits at the upper end
+    "linear.tif": lambda path, x: tiff_with_profile(b"Linear sRGB")(path),
+}
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_a_frame_of_the_converter_needs_no_statement(name, tmp_path):
+    LINEAR[name](tmp_path / name, numbers())
+    assert frame.hooks.preflight(responses=THREE, file=tmp_path / name, shape=SHAPE, bits=16) == []
 
 
 def test_a_png_that_is_cut_is_refused(tmp_path):

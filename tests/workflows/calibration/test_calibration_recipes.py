@@ -155,7 +155,7 @@ def test_missing_files_are_told_with_their_place(measured):
         ("calibrate.descriptor", "  file     a file; required"),
         (
             "calibrate.frames",
-            "  files  files: a path, a folder, a pattern such as dark/*.png, or a list of these; required",
+            "  files    files: a path, a folder, a pattern such as dark/*.png, or a list of these; required",
         ),
     ],
 )

@@ -26,7 +26,15 @@ def result():
     known = Identifiability(KINDS, [], [], "")
     chains = SimpleNamespace(flat=flat, log=rng.normal(size=(2, 40, 8)))
     return SimpleNamespace(
-        problem=problem, chains=chains, identifiability=known, draws=draws, checks=[], models=[], frames=[], rows=list
+        problem=problem,
+        chains=chains,
+        identifiability=known,
+        draws=draws,
+        checks=[],
+        models=[],
+        frames=[],
+        rows=list,
+        beside=[],
     )
 
 

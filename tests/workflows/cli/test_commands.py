@@ -64,7 +64,8 @@ def test_help_comes_at_once_and_without_torch():
         "try: main(['--help'])\nexcept SystemExit: pass\n"
         f"assert not {slow | {'importlib.metadata', 'importlib.resources', 'logging'}!r} & (set(sys.modules) - before)"
     )
-    assert min(_seconds(code)[0] for _ in range(3)) < 0.1 + _seconds("pass")[0]
+    bare, ours = (min(_seconds(text)[0] for _ in range(3)) for text in ("pass", code))
+    assert ours < 5 * bare
     assert "run" in _seconds(code)[1]
 
 
@@ -265,7 +266,7 @@ def test_recipes_nodes_schema_and_cache_say_what_there_is(neusee, here):
     _, out, _ = neusee("nodes")
     assert "doe.axicon" in out
     _, out, _ = neusee("nodes", "doe.fabricate")
-    assert "max_height  length > 0" in out
+    assert "max_height  length from 1e-10 m to 10 mm" in out
     assert "Source:" in out
     _, out, _ = neusee("nodes", "optics.stop")
     assert "reading.aperture" in out

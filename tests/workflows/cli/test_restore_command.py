@@ -63,6 +63,9 @@ def test_a_frame_becomes_a_folder_with_picture_uncertainty_and_page(neusee, tmp_
     assert {"restored.png", "restored.exr", "restored_spread.exr", "invented.png"} <= {
         path.name for path in (folder / "data").iterdir()
     }
+    full = (io.read_image_png_u16(str(folder / "data" / "restored.png"), "rgb") == 65535).any(-1)
+    full[2:5, 2:5] = False
+    assert 1 <= full.sum() <= 3, "half a percent of the 391 pixels that are not saturated is white"
     marked = np.asarray(Image.open(folder / "data" / "invented.png"))
     expected = np.zeros((SIDE, SIDE))
     expected[2:5, 2:5] = 65535
@@ -224,6 +227,7 @@ BAD = {
     "format": (["shot.jpg", "--camera", "half_ring"], "no frame that can be read"),
     "tone curve": (["eight.png", "--camera", "half_ring"], "has 8 bits, but sensor.bits is 16"),
     "sensor elsewhere": ([GOOD, "--camera", "loose.yaml"], "put it into a folder called sensor"),
+    "tone curve of 8 bits": (["eight.png", "--camera", "half_ring", "sensor.bits=8"], "or state frame.curve=linear"),
     "laser twice": ([GOOD, "--camera", "half_ring", "laser=grene"], "no option grene in laser; did you mean green?"),
     "device": ([GOOD, "--camera", "half_ring", "--device", "tpu"], "--device"),
 }

@@ -27,7 +27,7 @@ tolerance: 0
 outputs: [full, restored_quality]
 steps:
   scene: {node: scene.targets, with: {kind: siemens, shape: [16, 16]}}
-  full: {node: sensor.full_well, from: {electrons: scene}, with: {capacity: 0.25 e-}}
+  full: {node: restore.electrons, from: {raw: scene}, with: {gain: 4 DN/e-, offset: 0 e-}}
   restored_quality: {node: metrics.quality, from: {estimate: full, truth: scene}}
 """
 
@@ -38,7 +38,7 @@ def runs(tmp_path_factory):
     root = tmp_path_factory.mktemp("runs")
     (root / "mine.yaml").write_text(RECIPE)
     names = []
-    for change in ([], ["steps.full.with.capacity=0.125 e-"]):
+    for change in ([], ["steps.full.with.gain=8 DN/e-"]):
         recipe = load(root / "mine.yaml", change, root)
         names.append(simulate(recipe, Store(root / "cache"), root / "runs", ["neusee", "run", *change]).folder.name)
     return root / "runs", *names
@@ -65,8 +65,8 @@ def edited(path, change):
 def test_a_changed_value_is_named_with_both_sources_and_its_numbers(two):
     found = compared(two)
     (value,) = found.recipe
-    assert (value.name, value.left, value.right) == ("steps.full.with.capacity", "0.25 e-", "0.125 e-")
-    assert (value.left_source, value.right_source) == ("mine.yaml:7:77", "argument 1")
+    assert (value.name, value.left, value.right) == ("steps.full.with.gain", "4 DN/e-", "8 DN/e-")
+    assert (value.left_source, value.right_source) == ("mine.yaml:7:68", "argument 1")
     sides = [json.loads((two / side / "provenance.json").read_text())["metrics"] for side in ("left", "right")]
     wanted = [(a[3], b[3]) for a, b in zip(*sides, strict=True)]
     assert [(n.left, n.right) for n in found.numbers] == wanted
@@ -75,7 +75,7 @@ def test_a_changed_value_is_named_with_both_sources_and_its_numbers(two):
     assert found.steps[0].startswith("2 of 3 common steps have another cache key: full, restored_quality")
     assert [each.name for each in found.environment] == ["command"]
     text = "\n".join(lines(found))
-    assert "steps.full.with.capacity: 0.25 e- (mine.yaml:7:77) -> 0.125 e- (argument 1)" in text
+    assert "steps.full.with.gain: 4 DN/e- (mine.yaml:7:68) -> 8 DN/e- (argument 1)" in text
     assert "1 value of the recipe differs." in text
 
 
@@ -95,7 +95,7 @@ def test_the_folder_of_a_comparison_holds_page_table_pictures_and_document(two):
     folder = write_comparison(found, two / "out", ["neusee", "compare", "left", "right"])
     assert folder.parent == two / "out" / "comparisons"
     page = (folder / "report.html").read_text()
-    assert not [word for word in ("steps.full.with.capacity", "restored_quality", "argument 1") if word not in page]
+    assert not [word for word in ("steps.full.with.gain", "restored_quality", "argument 1") if word not in page]
     assert "data:image/png;base64," in page
     rows = list(csv.DictReader((folder / "numbers.csv").read_text().splitlines()))
     assert [float(row["left"]) for row in rows] == [n.left for n in found.numbers]

@@ -190,7 +190,7 @@ def test_cheap_steps_after_one_another_are_kept_once_together_they_are_dear(stor
 def test_a_stored_value_is_computed_again_where_reading_takes_longer(store):
     class RemoteFiles(Store):
         def read_seconds(self, size):
-            return 5.0
+            return 500.0
 
     run(recipe("b m", **CHEAP), store)
     CALLS.clear()

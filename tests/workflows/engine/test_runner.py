@@ -317,9 +317,14 @@ def test_an_input_runs_for_a_verdict_only_if_the_bound_asks_for_its_facts(store)
     assert [e.step for e in events] == ["s", "s", "n"]
 
 
-@pytest.mark.parametrize("value", [float("inf"), float("nan")])
-def test_nothing_is_left_out_after_a_value_that_is_not_finite(store, value):
-    steps = recipe("n", 1.0, s=(source, {}, {"value": value}), n=(noise, {"x": "s"}))
+@node()
+def endless(*, kind: str = "inf"):
+    return torch.full((4,), float(kind))
+
+
+@pytest.mark.parametrize("kind", ["inf", "nan"])
+def test_nothing_is_left_out_after_a_value_that_is_not_finite(store, kind):
+    steps = recipe("n", 1.0, s=(endless, {}, {"kind": kind}), n=(noise, {"x": "s"}))
     assert states(run(steps, store)) == {"s": "run", "n": "run"}
 
 
@@ -343,10 +348,12 @@ def test_a_check_that_fails_to_run_is_a_failed_check(store):
 
 
 def test_the_account_says_what_it_cost(store):
+    began = time.perf_counter()
     done = run(diamond(count=BIG, outputs="top left head"), store).done["left"]
+    whole_run = time.perf_counter() - began
     assert done.bytes == 4 * BIG
     assert done.facts.max == 2.0 + BIG
-    assert 0 < done.seconds < 5
+    assert 0 < done.seconds < whole_run
     cached = run(diamond(count=BIG), again(store), outputs=("left",)).done["left"]
     assert (cached.bytes, cached.facts, cached.key) == (done.bytes, done.facts, done.key)
     assert cached.why.startswith("computed 20")
@@ -533,9 +540,18 @@ def chain(n):
 def test_a_chain_of_ten_thousand_steps_runs(store):
     steps = chain(10_000)
     assert run(steps, store).values["s10000"][0] == 10_001
-    began = time.process_time()
     assert run(steps, again(store)).values["s10000"][0] == 10_001
-    assert time.process_time() - began < 5
+
+
+@pytest.mark.slow
+def test_the_work_of_a_cached_chain_grows_with_its_length(store):
+    work = {}
+    for length in (1000, 8000):
+        run(chain(length), store)
+        began = time.process_time()
+        run(chain(length), again(store))
+        work[length] = time.process_time() - began
+    assert work[8000] < 24 * work[1000]  # eight times, and 64 times if each step looked at all others
 
 
 def test_the_result_says_how_much_memory_and_time(store):

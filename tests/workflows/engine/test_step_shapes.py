@@ -106,7 +106,7 @@ def test_more_bands_than_memory_can_hold_have_a_size_at_once():
     recipe = load("first_light", ["optics.bands=3"])
     steps = {**recipe.steps, "bands": replace(recipe.steps["bands"], node=countless, params={})}
     sizes = sizes_of(replace(recipe, steps=steps), ["bands", "stop", "flat", "index", "pupil[plain]", "psf[plain]"])
-    assert sizes["psf[plain]"].result == 1e8 * (512 * 512 * 4 + 8)
+    assert sizes["psf[plain]"].result == 1e8 * (512 * 512 * 4 + 3 * 8)
     assert sizes["psf[plain]"].bands == 10**8
 
 

@@ -210,9 +210,7 @@ def test_the_interval_of_a_gain_is_that_of_the_delta_method():
 
 
 def test_a_scene_without_a_laser_counts_at_no_strength_but_none():
-    point = dict.fromkeys(
-        ("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "saturated", "peak", "damaged")
-    )
+    point = dict.fromkeys(("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "saturated", "peak", "above"))
     found = metric_table(
         [{0.0: {**point, "l1": 1.0}, 10.0: {**point, "l1": 3.0}}, {0.0: {**point, "l1": 5.0}}], (0.0, 10.0)
     )

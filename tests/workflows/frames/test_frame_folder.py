@@ -236,7 +236,8 @@ def test_a_folder_becomes_a_sensor_with_its_uncertainty(working, capsys):
     assert 0.98 * 0.02 * 0.495 < joint.sd[place["sensor.quantum_efficiency"]] < 0.02, "2 % of the light and more"
     assert joint.sd[place["sensor.gain"]] < 0.04 * 0.125, "chance, and faults that frames of 64 x 64 pixels may hide"
     correlation = joint.factor @ joint.factor.T
-    assert correlation[place["sensor.gain"], place["sensor.read_noise"]] < -0.5
+    # nine tenths of both widths are what so few pixels may hide, which ties the two values less than chance does
+    assert correlation[place["sensor.gain"], place["sensor.read_noise"]] < -0.3
 
     (results,) = (path for path in (working / "runs").iterdir() if path.name != "latest")
     assert (results / "sensor" / "mine.yaml").read_text() == (working / "sensor" / "mine.yaml").read_text()

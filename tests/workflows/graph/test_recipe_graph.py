@@ -1,5 +1,3 @@
-import time
-
 import pytest
 
 from neusee.workflows.graph.diagnostics import Location
@@ -71,10 +69,8 @@ def _chain(toy, last):
 def test_a_chain_of_10000_steps_is_bound_and_ordered(toy):
     from neusee.workflows.recipe.loading import check
 
-    start = time.process_time()
     recipe = check(_chain(toy, {"node": "toy.height"}))
     assert len(needed(recipe, recipe.outputs)) == CHAIN
-    assert time.process_time() - start < 20
 
 
 def test_a_loop_of_10000_steps_is_found_and_told_in_short(toy):

@@ -36,7 +36,7 @@ def test_a_quantity_is_a_number_with_one_of_its_units(of_toys):
 
 def test_numbers_and_words_have_their_ranges(of_toys):
     fields = of_toys["$defs"]["toy.digitize"]["properties"]
-    assert branches(fields["bits"]) == [{"minimum": 1, "type": "integer"}]
+    assert branches(fields["bits"]) == [{"minimum": 1, "maximum": 10**9, "type": "integer"}]
     assert branches(fields["rounding"])[0]["enum"] == ["nearest", "floor"]
     assert branches(of_toys["$defs"]["toy.gather"]["properties"]["share"])[0]["maximum"] == 1
 

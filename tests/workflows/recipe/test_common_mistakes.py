@@ -106,7 +106,7 @@ def test_8_a_number_out_of_range(refused):
         "argument 1 | sensor.quantum_efficiency = 56 | must be less than or equal to 1"
     ]
     assert refused("lasers.green.wavelength=532 um") == [
-        "argument 1 | lasers.green.wavelength = 532 um | must be less than or equal to 0.00002 in SI, not 0.000532"
+        "argument 1 | lasers.green.wavelength = 532 um | must be at most 20 um"
     ]
 
 
@@ -166,9 +166,12 @@ def test_16_a_key_that_stands_twice(refused):
     assert refused(more="seed: 1\nseed: 2\n") == ["mine.yaml:16:1 | seed | given twice, first in line 15"]
 
 
-def test_17_an_aperture_beyond_the_grid_is_legal_and_noted(accepted):
-    recipe = accepted("optics.diameter=110 mm")
-    assert any("aperture" in note for note in recipe.notes)
+def test_17_an_aperture_beyond_the_grid_stretches_the_grid_until_it_carries_no_window(accepted, refused):
+    recipe = accepted("optics.diameter=11 mm")
+    assert any("aperture 11 mm" in note and "the pitch becomes 20.37 um" in note for note in recipe.notes)
+    lines = refused("optics.diameter=110 mm")
+    assert all("a pupil pitch of 203.7 um" in line for line in lines)
+    assert not any("aperture" in note for note in accepted().notes)  # no note where nothing is changed
 
 
 def test_18_no_light_of_the_laser_is_legal_and_no_exposure_is_not(accepted, refused):
@@ -216,11 +219,16 @@ def test_without_a_group_only_what_is_sure_is_told(refused):
     ]
 
 
-def test_a_mistake_is_told_in_less_than_a_second(refused):
-    refused("sensor.gian=3")
-    start = time.process_time()
-    refused("sensor.gian=3")
-    assert time.process_time() - start < 1
+def test_a_mistake_is_told_as_fast_as_a_right_recipe_is_read(refused):
+    work = {"right": [], "wrong": []}
+    for _ in range(5):
+        start = time.process_time()
+        load("first_light", ["sensor.gain=3 e-/DN"])
+        middle = time.process_time()
+        refused("sensor.gian=3")
+        work["right"].append(middle - start)
+        work["wrong"].append(time.process_time() - middle)
+    assert min(work["wrong"]) < 5 * min(work["right"])
 
 
 def test_a_mistake_in_the_text_is_told_without_torch():

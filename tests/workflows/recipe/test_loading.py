@@ -177,9 +177,10 @@ def _heights(folder, side):
 def test_a_preflight_sees_an_input_that_parameters_alone_decide(read, mistakes, tmp_path, monkeypatch):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
     _heights(tmp_path, 4)
-    (note,) = read(ON_A_GRID).notes
+    size, note = read(ON_A_GRID).notes
+    assert size.startswith("mask.npy states no pitch: its samples count as those of the pupil, 10 um apart")
     assert note == "feature 12 um is less than 1.5 samples of 10 um: not resolved"
-    assert read(ON_A_GRID, "steps.written.with.feature=15 um").notes == ()
+    assert read(ON_A_GRID, "steps.written.with.feature=15 um").notes == (size,)
     assert not (tmp_path / "cache").exists()  # nothing is stored
     _heights(tmp_path, 8)
     message = "mask.npy is (8, 8), not the pupil grid (4, 4): state its pitch to resample it, or set samples to 8"
@@ -203,7 +204,7 @@ def test_an_input_with_wrong_parameters_is_one_mistake(mistakes, tmp_path):
     _heights(tmp_path, 8)
     for old, new, said in (
         ("diameter: 40 um", "diameter: 1 um", "holds no pupil sample"),
-        ("samples: 4", "samples: -4", "must be greater than or equal to 1"),
+        ("samples: 4", "samples: -4", "must be greater than or equal to 4"),
     ):
         (problem,) = mistakes(ON_A_GRID.replace(old, new))
         assert "| steps.stop.with." in problem

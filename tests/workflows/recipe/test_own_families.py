@@ -221,7 +221,7 @@ def test_nodes_and_schema_list_those_of_a_recipe(mine, tmp_path, monkeypatch):
     out = CliRunner().invoke(app, ["nodes", "--recipe", "mine.yaml"]).output
     assert "Blooming: charge above the full well spills along the column" in out
     out = CliRunner().invoke(app, ["nodes", "bloom_f.bloom", "--recipe", "mine.yaml"]).output
-    assert "full_well  charge >= 0" in out
+    assert "full_well  charge from 0 to 1e+12 e-, such as 390 e-" in out
     schema = json_schema.schema(families_of("mine.yaml"))
     good = {"nodes": ["bloom_f.py"], "steps": {"a": {"node": "bloom_f.bloom", "with": {"full_well": "3 e-"}}}}
     jsonschema.validate(good, schema)

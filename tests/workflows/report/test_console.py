@@ -98,6 +98,7 @@ def test_nothing_is_printed_where_silence_was_asked_for(capsys):
 
 
 def test_left_out_steps_are_named_once_with_the_largest_bound():
-    rows = [{"step": f"dark[{i}]", "bound": b} for i, b in (("a", 1e-5), ("b", 3e-5))]
-    line = console_room.left_out_line({"left_out": rows, "tolerance": 1e-3})
-    assert line == "left out dark (at most 3.0e-05); tolerance 0.001"
+    rows = [{"step": f"dark[{i}]", "bound": b, "estimated": False} for i, b in (("a", 1e-5), ("b", 3e-5))]
+    rows.append({"step": "psf[a]", "bound": 2e-4, "estimated": True})
+    line = console_room.left_out_line({"left_out": rows, "spent": {"left_out": rows}, "tolerance": 1e-3})
+    assert line == "left out dark (at most 3.0e-05), psf (estimated 2.0e-04); tolerance 0.001"

@@ -82,7 +82,8 @@ def test_outputs_are_read_by_safetensors(tmp_path):
     psf = Psf(noise(3, 4, 5), torch.ones(3, dtype=torch.float64))
     data_exports.safetensors(path := tmp_path / "x", path=noise(2, 3).bool(), psf=psf, raw=noise(4, 6).t())
     found = load_file(path)
-    assert found.keys() == {"path", "psf.intensity", "psf.clear_peak", "raw"}
+    of_psf = {f"psf.{field}" for field in ("intensity", "clear_peak", "cut_off", "averaged")}
+    assert found.keys() == {"path", "raw", *of_psf}
     assert torch.equal(found["raw"], noise(4, 6).t())
     assert torch.equal(found["psf.intensity"], psf.intensity)
     assert found["path"].dtype == torch.bool

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -31,6 +32,7 @@ from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 
 HERE = os.getpid()
+GATE: list[str] = []  #: path of the file that pictures of the other process wait for
 
 
 @node()
@@ -164,12 +166,19 @@ def test_the_process_that_draws_ends_with_a_run_that_is_killed(tmp_path, forks):
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
         child = int(parent.stdout.readline())
         parent.kill()
-    for _ in range(200):
-        if not Path(f"/proc/{child}").exists() or ") Z " in Path(f"/proc/{child}/stat").read_text():
+    for _ in range(6000):
+        if _has_ended(child):
             return
         time.sleep(0.05)
     os.kill(child, signal.SIGKILL)
     pytest.fail("the process that draws outlived the run")
+
+
+def _has_ended(pid: int) -> bool:
+    try:
+        return ") Z " in Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return True
 
 
 def test_a_drawing_is_sent_by_its_name(tmp_path, forks):
@@ -191,7 +200,8 @@ def test_two_threads_take_turns_with_the_process_that_draws(tmp_path, forks):
 
 
 def test_a_thread_that_waits_is_the_next(tmp_path, forks):
-    drawer, order = DrawingProcess(), []
+    drawer, order, entered = DrawingProcess(), [], []
+    drawer._next = NotedDoor(drawer._next, lambda: entered.append(len(order)))
 
     def pictures():
         for n in range(30):
@@ -202,13 +212,27 @@ def test_a_thread_that_waits_is_the_next(tmp_path, forks):
         drawing = threads.submit(pictures)
         waited = []
         while not drawing.done() and len(waited) < 8:
-            before = len(order)
             drawer.make(tmp_path / "file", sums, {"x": torch.ones(3)})
-            waited.append(len(order) - before)
+            waited.append(len(order) - entered[-1])
             time.sleep(0.03)
         drawing.result(60)
     drawer.close()
     assert max(waited) <= 2  # the picture that is drawn, and one that was asked for before
+
+
+class NotedDoor:
+    """A lock that notes when the main thread has it."""
+
+    def __init__(self, lock, note):
+        self.lock, self.note = lock, note
+
+    def __enter__(self):
+        self.lock.acquire()
+        if threading.current_thread() is threading.main_thread():
+            self.note()
+
+    def __exit__(self, *error):
+        self.lock.release()
 
 
 def short(path: Path, /, **values: torch.Tensor) -> None:
@@ -217,11 +241,29 @@ def short(path: Path, /, **values: torch.Tensor) -> None:
 
 
 def slow(path: Path, /, **values: torch.Tensor) -> None:
-    time.sleep(0.5)
+    """Draw a picture, in the other process not before one was drawn in this process, if a `GATE` is named."""
+    _pass_the_gate()
     sums(path, **values)
 
 
-def test_a_data_file_does_not_wait_for_pictures(tmp_path, forks, monkeypatch):
+def _pass_the_gate() -> None:
+    """Open the gate in this process, and wait for it in the process that draws."""
+    if GATE and os.getpid() == HERE:
+        Path(GATE[0]).touch()
+    ends = time.monotonic() + 300
+    while GATE and not Path(GATE[0]).exists():
+        assert time.monotonic() < ends, "nothing is drawn in the other process"
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def gate(tmp_path, monkeypatch):
+    """Hold back the pictures of the other process until the file is there."""
+    monkeypatch.setattr(sys.modules[__name__], "GATE", [str(tmp_path / "gate")])
+    return tmp_path / "gate"
+
+
+def test_a_data_file_does_not_wait_for_pictures(tmp_path, forks, monkeypatch, gate):
     monkeypatch.setattr(files_beside, "Drawing", type(slow))  # functions count as pictures here
     copies = replace(files(Sums())[1], copied=True)
     shelf = DerivedFiles(Store(tmp_path / "cache"))
@@ -230,6 +272,7 @@ def test_a_data_file_does_not_wait_for_pictures(tmp_path, forks, monkeypatch):
         copied = [begun for begun, job in beside._begun if job.here]
         copied[0].result(60)
         assert [begun.done() for begun, job in beside._begun if not job.here] == [False, False]
+        gate.touch()
 
 
 class Sums:
@@ -243,6 +286,7 @@ def test_the_last_pictures_are_drawn_here_while_the_other_process_is_busy(tmp_pa
     monkeypatch.setattr(files_beside, "Drawing", type(slow))
     makers = {}
     for imported in (True, False):
+        monkeypatch.setattr(sys.modules[__name__], "GATE", [str(tmp_path / "gate")] if imported else [])
         monkeypatch.setattr(files_beside, "_draws_at_once", lambda imported=imported: imported)
         (paths, missing), early = result_of(tmp_path / str(imported), files(slow))
         assert (texts(paths), missing, len(early)) == ({"one": "2016", "both": "6048"}, {}, 2)
@@ -265,14 +309,14 @@ def test_the_report_makes_the_files_of_a_process_that_was_killed_during_the_run(
 
 
 def exceeds(path: Path, /, **values: torch.Tensor) -> None:
-    time.sleep(0.5)
+    _pass_the_gate()
     if os.getpid() == HERE:
         raise MemoryLimit
     sums(path, **values)
 
 
 @pytest.mark.parametrize("error", [MemoryLimit, ValueError])
-def test_too_little_memory_ends_the_report_and_other_errors_are_met_again(tmp_path, forks, monkeypatch, error):
+def test_too_little_memory_ends_the_report_and_other_errors_are_met_again(tmp_path, forks, monkeypatch, gate, error):
     monkeypatch.setattr(files_beside, "Drawing", type(slow))
     monkeypatch.setattr(files_beside, "_draws_at_once", lambda: True)
     shelf = DerivedFiles(Store(tmp_path / "cache"))

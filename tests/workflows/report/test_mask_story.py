@@ -26,7 +26,7 @@ def said(plain=PLAIN, mask=MASK, restored=None, lsr=GREEN, laser=True):
 
 def test_both_sentences_have_the_numbers_of_the_run():
     assert said(restored=17.67) == {
-        "buys": "The mask buys protection for the sensor: the brightest pixel receives 236 times less light than "
+        "buys": "The mask lowers the peak on the sensor: the brightest pixel receives 236 times less light than "
         "behind the plain lens (3.87 in place of 912 times saturation; LSR 0.00149 at 530 nm).",
         "costs": "The mask costs picture quality: PSNR 27.1 dB with the plain lens, 14.6 dB with the mask, and 17.7 dB "
         "after restoration; 418 pixels saturate with the mask, 244 without: the mask enlarges the dazzled area "
@@ -37,11 +37,11 @@ def test_both_sentences_have_the_numbers_of_the_run():
 def test_a_mask_that_gains_nothing_is_not_praised():
     worse = said(plain=MASK, mask=PLAIN, lsr={"530 nm": 1.0})["buys"]
     assert worse.startswith(
-        "The mask buys no protection of the sensor: the brightest pixel receives 236 times more light than"
+        "The mask raises the peak on the sensor: the brightest pixel receives 236 times more light than"
     )
     same = said(mask=PLAIN, lsr={"530 nm": 1.0})["buys"]
     assert same.startswith(
-        "The mask buys no protection of the sensor: the brightest pixel receives as much light as behind"
+        "The mask does not change the peak on the sensor: the brightest pixel receives as much light as behind"
     )
     assert same.endswith("LSR 1 at 530 nm).")
 
@@ -97,7 +97,7 @@ def test_without_a_laser_no_area_is_dazzled():
 
 def test_without_a_laser_the_mask_is_not_said_to_protect():
     found = said(lsr={}, laser=False)["buys"]
-    assert found.startswith("No laser shines here, from which the mask could protect the sensor: the brightest pixel")
+    assert found.startswith("No laser shines here, whose peak the mask could lower: the brightest pixel")
     assert "LSR" not in found
     assert "buys" not in found
 
@@ -118,8 +118,20 @@ def test_a_small_change_is_told_in_percent(peak, words):
 def test_a_mask_that_protects_little_is_not_praised():
     found = said({"peak/I_sat": 912.0}, {"peak/I_sat": 608.0})["buys"]
     assert found.startswith(
-        "The mask buys little protection for the sensor: the brightest pixel receives 33 % less light"
+        "The mask lowers the peak on the sensor a little: the brightest pixel receives 33 % less light"
     )
+
+
+@pytest.mark.parametrize("judged", [False, True])
+def test_the_peak_is_said_in_watts_and_no_multiple_is_a_verdict_of_damage(judged):
+    """First light: 912 I_sat are 1.8 mW/cm2, ten million times below what damages; a mask protects from nothing."""
+    found = mask_story.irradiance({"plain lens": 18.4, "with mask": 0.0782}, judged)["irradiance"]
+    assert found.startswith("The lasers have 1.84 mW/cm2 behind the plain lens and 7.82 uW/cm2 behind the mask there: ")
+    assert ("`damage: published`" in found) is not judged
+    assert found.endswith("and a multiple of saturation is not a measure of damage.")
+    assert mask_story.irradiance({"plain lens": 0.0}, judged) == {}
+    for watts, text in ((1e4, "1 W/cm2"), (7.35e5, "73.5 W/cm2"), (7.8e9, "780 kW/cm2"), (3e13, "3 GW/cm2")):
+        assert text in mask_story.irradiance({"plain lens": watts}, judged)["irradiance"]
 
 
 def test_several_lasers_have_the_least_and_the_largest_ratio():
@@ -245,6 +257,16 @@ def test_the_page_leads_with_the_pictures_and_the_story(document):
     assert "What the camera sees" not in run_html.page(document | {"story": {}}, {})
 
 
+@pytest.mark.parametrize("why", ["`neusee study accuracy first_light` measures it", "the recipe has no step shading"])
+def test_the_page_shows_no_backtick(document, why):
+    """Words between backticks are code, in the story and in the reasons of what is not drawn."""
+    document["story"] |= mask_story.irradiance({"plain lens": 18.4, "with mask": 0.0782}, judged=False)
+    document["missing"] = [{"title": "Error against run time", "why": why}]
+    page = run_html.page(document, {})
+    assert "<code>damage: published</code> and <code>neusee safety</code> compare them" in page
+    assert "`" not in page.partition("</style>")[2]
+
+
 def test_the_rival_of_a_mask_is_the_grey_filter_of_its_least_suppressed_laser():
     (text,) = mask_story.rival({"410 nm": 0.0012, "690 nm": 0.0022}, {}).values()
     assert text == (
@@ -283,7 +305,7 @@ def test_the_story_names_what_stands_in_place_of_a_mask(doe, name, plural):
     assert mask_story.element(load("first_light", [f"doe={doe}"])) == name
     numbers = {"plain lens": PLAIN, "with mask": MASK, "restored": {}}
     found = sentences(numbers, GREEN, True, name)
-    assert found["buys"].startswith(f"The {name} {'buy' if plural else 'buys'} protection for the sensor")
+    assert found["buys"].startswith(f"The {name} {'lower' if plural else 'lowers'} the peak on the sensor")
     assert found["costs"].startswith(f"The {name} {'cost' if plural else 'costs'} picture quality: PSNR 27.1 dB with")
     assert (
         f"14.6 dB with the {name}; 418 pixels saturate with the {name}, 244 without: the {name} enl" in found["costs"]

@@ -10,9 +10,10 @@ from neusee.workflows import load
 from neusee.workflows.cli.app import app
 from neusee.workflows.engine.runner import run
 from neusee.workflows.report import run_html
-from neusee.workflows.report.tolerance_spent import said_of_economies, spent
+from neusee.workflows.report.tolerance_spent import said_of_errors, spent
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.studies.leave_out.omission_rows import OmissionComparison
 from neusee.workflows.tolerance import cheaper_steps
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of
@@ -112,11 +113,12 @@ def test_a_large_tolerance_spoils_no_figure_of_merit(recipe, warm):
 def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
     result = run(recipe, store)
     before = spent(result)
-    assert before["measured"] == {}
+    assert {row["measured"] for row in before["outputs"]} == {None}
     full = run(replace(recipe, exact=True), store)
     after = spent(result)
-    assert set(after["measured"]) == set(recipe.outputs)
-    assert after["measured"]["raw[mask]"] == error_of(result["raw[mask]"], full["raw[mask]"])
+    measured = {row["output"]: row["measured"] for row in after["outputs"]}
+    assert set(measured) == set(recipe.outputs)
+    assert measured["raw[mask]"] == error_of(result["raw[mask]"], full["raw[mask]"])
     economy = after["economies"][0]
     alike = [
         step.seconds for name, step in full.done.items() if name.startswith(economy["step"].partition("[")[0] + "[")
@@ -124,8 +126,9 @@ def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
     assert min(alike) - 1e-9 <= economy["full_seconds"] <= max(alike) + 1e-9  # arms of one size are one measurement
     assert spent(full)["economies"] == []
     assert spent(full)["exact"]
-    assert "measured" in said_of_economies(after)
-    assert "measured" not in said_of_economies(before)
+    assert f"measured beside --exact: {max(measured.values()):.1e}" in said_of_errors(after)
+    assert "not measured" not in said_of_errors(after)
+    assert "measured" not in said_of_errors(before)
 
 
 @pytest.mark.slow
@@ -153,8 +156,38 @@ def test_the_page_says_it(recipe, warm, tmp_path):
     done = simulate(recipe, warm, tmp_path / "runs", ["neusee"])
     page, doc = done.page.read_text(), json.loads((done.folder / "provenance.json").read_text())
     assert "image[mask].channels" in page
+    for row in doc["spent"]["outputs"]:
+        error = "" if row["error"] is None else f"{row['error']:.2g}"
+        assert f'<td class="n">{error}</td><td>{row["kind"]}</td>' in page
     assert doc["spent"]["economies"][0]["bound"] <= recipe.tolerance
     assert max(doc["spent"]["bounds"].values()) <= recipe.tolerance
     whole = simulate(replace(recipe, exact=True), warm, tmp_path / "runs", ["neusee"])
     assert "every step was computed in full" in whole.page.read_text()
     assert "measured beside --exact" in run_html.page({**doc, "spent": spent(run(recipe, warm))}, {})
+
+
+def account_of(*rows):
+    names = ("output", "error", "kind", "measured")
+    return {"outputs": [dict(zip(names, row, strict=True)) for row in rows], "coverage": 0.95}
+
+
+def test_a_measurement_of_some_outputs_is_not_that_of_all():
+    """The photons of a recipe were off by 5.3e-6, its pictures by 2e-3, and the terminal said "measured 5.3e-06"."""
+    account = account_of(("photons", 7.4e-6, "proved", 5.3e-6), ("raw", 4.6e-3, "estimated", None))
+    assert said_of_errors(account) == (
+        "error    7.4e-06 in photons at most, proved; 4.6e-03 in raw, an estimate that 95% of errors do not exceed; "
+        "measured beside --exact: 5.3e-06 in photons; not measured: raw"
+    )
+
+
+def test_an_error_that_is_not_known_is_named_and_none_is_none():
+    account = account_of(("raw", None, "unknown", None), ("lsr", 0.0, "exact", None))
+    assert said_of_errors(account) == "error    unknown in raw"
+    assert said_of_errors(account_of(("lsr", 0.0, "exact", 0.0))) == "error    none in the outputs"
+
+
+def test_study_and_run_state_the_same_error(recipe, warm):
+    rows = {row["output"]: row for row in spent(run(recipe, warm))["outputs"]}
+    for output in OmissionComparison(recipe, warm).output_errors():
+        row = rows[output.output]
+        assert (output.bound, output.kind, output.rms) == (row["error"], row["kind"], row["measured"])

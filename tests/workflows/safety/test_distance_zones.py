@@ -78,3 +78,25 @@ def test_the_ends_are_those_of_draws_with_as_many_zones():
     assert found.zones[1].far.low == pytest.approx(found.zones[1].far.value)
     assert found.inside == 0.25
     assert found.reach.high > 800
+
+
+def test_an_exposure_that_just_reaches_the_limit_exceeds_it_there():
+    at = np.array([1.0, 2.0, 4.0, 8.0])
+    near, far = crossings(at, np.array([[0.5, 1.0, 0.25, 0.1]]))
+    assert (near.tolist(), far.tolist()) == ([[2.0]], [[2.0]])
+
+
+@pytest.mark.parametrize("recipe", [0.2, 30.0, 5e5])
+def test_zones_lie_between_the_asked_distances_wherever_the_laser_of_the_recipe_is(recipe):
+    """The exposure is above the limit up to 300 m; at the distance of the recipe it is judged apart."""
+    at = sampled(2.0, 5e3, (recipe,))
+    ratio = (300.0 / at) ** 2
+    found = zones_of(at, ratio, np.stack([ratio, ratio * 1.1, ratio / 1.1]), recipe, (2.0, 5e3))
+    (zone,) = found.zones
+    assert zone.near.value == pytest.approx(2.0, rel=1e-9)
+    assert zone.far.value == pytest.approx(300, rel=1e-6)
+    assert (zone.begins_before, zone.ends_beyond) == (True, False)
+    assert found.inside == (1.0 if recipe < 300 else 0.0)
+    assert found.reach.high == pytest.approx(300 * np.sqrt(1.1), rel=0.02)
+    (short,) = zones_of(at, ratio, ratio[None], recipe, (2.0, float(at[at < 200][-1]))).zones
+    assert short.ends_beyond

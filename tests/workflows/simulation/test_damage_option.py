@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from neusee.workflows import Store, load
+from neusee.workflows.graph.diagnostics import RecipeError
 
 RECIPE = """\
 # A small camera in watts with damage.
@@ -21,13 +22,14 @@ defaults:
   - damage: published
 scene: {shape: [48, 48], illuminance: 500 lx}
 optics: {samples: 128, pitch: 63.12 um, window: [48, 48], bands: 4}
-sensor: {camera: mono.csv, shape: [40, 44], exposure: 5 ms, background: null, dark_current: 0.02 e-/s, damage: null}
+sensor: {camera: mono.csv, shape: [40, 44], exposure: 5 ms, background: null, dark_current: 0.02 e-/s}
+reading: {damage_multiple: null}
 outputs: [damage, dead]
 """
 GREEN = """\
 lasers:
   dot: {wavelength: 532 nm, fwhm: 1 nm, power: 3 W, divergence: 1 mrad, distance: 30 m, angle: [0 mrad, 0 mrad]}
-  flash: {wavelength: 532 nm, fwhm: 1 nm, pulse_energy: 5 uJ, pulse_duration: 10 ns, divergence: 1 mrad, distance: 50 m,
+  flash: {wavelength: 532 nm, fwhm: 1 nm, pulse_energy: 7 uJ, pulse_duration: 10 ns, divergence: 1 mrad, distance: 50 m,
           angle: [0.1 mrad, 0.2 mrad]}
 """
 INFRARED = """\
@@ -66,13 +68,13 @@ def test_the_verdict_is_the_same_for_every_exposure_gain_well_and_noise(compute)
     for change in (["sensor.exposure=1 us"], ["sensor.exposure=1 s", *camera]):
         other = compute("green", steps, *change)
         for step in steps:
-            for field in ("ratio", "probability", "low", "high"):
+            for field in ("ratio", "least", "most", "probability"):
                 torch.testing.assert_close(
                     getattr(other[step], field), getattr(nominal[step], field), rtol=1e-5, atol=0
                 )
     assert 1 < float(nominal["damage[plain,dot]"].ratio[0]) < 100
     assert float(nominal["damage[mask,dot]"].ratio[0]) < 1
-    assert len(nominal["damage[plain,flash]"].ratio) == 5
+    assert len(nominal["damage[plain,flash]"].ratio) == 7
 
 
 @pytest.mark.slow
@@ -86,6 +88,20 @@ def test_the_frame_has_the_dead_pixels_of_both_lasers(compute):
     assert bool((dead[:, black] == 0).all())
     white = (pattern & 1 > 0) & ~black
     assert bool((dead[:, ~black & ~white] == raw[:, ~black & ~white]).all())
+
+
+def test_a_laser_without_a_law_is_not_judged_and_the_others_are(compute):
+    """Once one laser of 1550 nm refused the whole recipe."""
+    found = compute("infrared", ["damage[plain,lidar]", "dead[plain]", "raw[plain]"])
+    assert found["damage[plain,lidar]"].ratio.isnan().all()
+    assert torch.equal(found["dead[plain]"], found["raw[plain]"])
+
+
+def test_damage_none_takes_the_steps_out(compute):
+    found = compute("green", ["raw[plain]"], "damage=none", "outputs=[raw]")
+    assert float(found["raw[plain]"].max()) > 0
+    with pytest.raises(RecipeError, match=r"outputs\.0 +step damage is null"):
+        compute("green", ["raw[plain]"], "damage=none")
 
 
 def test_at_1550_nm_own_thresholds_are_judged_although_no_channel_sees_the_laser(compute):

@@ -24,7 +24,7 @@ def test_the_story_has_the_numbers_of_the_readme(tmp_path):
     done = simulate(recipe, Store(tmp_path / "store"), tmp_path, ["neusee", "run"])
     story = json.loads((done.folder / "provenance.json").read_text())["story"]
     told = re.findall(r"\d[\d.,]*\d", story["buys"] + story["costs"])
-    assert told == ["236", "3.87", "912", "0.00149", "530", "27.1", "14.6", "17.7", "418", "244", "1.71"]
+    assert told == ["232", "3.95", "916", "0.00158", "530", "26.9", "14.6", "17.7", "459", "267", "1.72"]
     text = README.read_text(encoding="utf-8")
     row = next(line for line in text.splitlines() if line.startswith("| plain lens, same filter")).split("|")
     rival = story["numbers"]["grey filter, restored"]
@@ -33,7 +33,7 @@ def test_the_story_has_the_numbers_of_the_readme(tmp_path):
     sentence = " ".join(text.partition("The run computes the first rival itself: ")[2].split("\n\n")[0].split())
     assert (
         sentence
-        == f"a grey filter that passes 0.00149 of the light gives a PSNR of {row[2].strip()}, and no pixel saturates."
+        == f"a grey filter that passes 0.00158 of the light gives a PSNR of {row[2].strip()}, and no pixel saturates."
     )
     assert int(row[4]) == rival["saturated px"] == 0
     assert "no pixel saturates" in story["rival"]

@@ -30,7 +30,8 @@ SCALE = {"km": 1e3, "m": 1, "mm": 1e-3, "nm": 1e-9, "W": 1, "mW": 1e-3, "uJ": 1e
          "ns": 1e-9, "us": 1e-6, "ms": 1e-3, "Hz": 1, "kHz": 1e3}  # fmt: skip
 QUIET = [
     "camera=mono", "scene=wall", "flare=clean", "doe=flat", "restore=wiener", "sensor=mine", "sensor.background=null",
-    "expect={}", "scene.shape=[32,32]", "sensor.shape=[32,32]", "optics.window=[32,32]", "optics.bands=4",
+    "expect={}", "sensor.sampling=point",
+    "scene.shape=[32,32]", "sensor.shape=[32,32]", "optics.window=[32,32]", "optics.bands=4",
 ]  # fmt: skip
 SENSOR = """\
 # A mono camera with an absolute QE; the efficiency below does not count beside it.

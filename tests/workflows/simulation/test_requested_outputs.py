@@ -17,7 +17,7 @@ tolerance: 0
 outputs: [full]
 steps:
   scene: {node: scene.targets, with: {kind: siemens, shape: [16, 16]}}
-  full: {node: sensor.full_well, from: {electrons: scene}, with: {capacity: 0.5 e-}}
+  full: {node: restore.electrons, from: {raw: scene}, with: {gain: 1 DN/e-, offset: 0 e-}}
   restored_quality: {node: metrics.quality, from: {estimate: full, truth: scene}}
 expect:
   a corner: {step: full, at: [0, 0, 0], value: 0.5, rtol: 1e-3}

@@ -426,3 +426,105 @@ def test_nothing_is_swept_where_there_is_nothing(tmp_path):
     swept = Store(tmp_path / "none").gc(budget=0)
     assert swept == type(swept)((), (), 0, 0, 0)
     assert not (tmp_path / "none").exists()
+
+
+# --- borders ----------------------------------------------------------------------------------------------------------
+
+
+class Folder:
+    """A store of which only the number of bytes is known."""
+
+    def __init__(self, monkeypatch, stored):
+        self.stored, self.counted = stored, 0
+        monkeypatch.setattr(budget_eviction, "total", self.total)
+
+    def total(self, _):
+        self.counted += 1
+        return self.stored
+
+
+@pytest.mark.parametrize(("stored", "excess"), [(999, 0.0), (1000, 0.0), (1001, 101.0), (5000, 4100.0)])
+def test_beyond_the_budget_a_tenth_of_it_is_freed_too(monkeypatch, stored, excess):
+    """Nine tenths of the budget remain, so that the next write evicts nothing."""
+    folder = Folder(monkeypatch, stored)
+    assert budget_eviction.CacheBudget(folder, 1000).excess(1) == excess
+    assert folder.counted == 1
+
+
+def test_bytes_are_counted_again_after_a_twentieth_of_the_budget(monkeypatch):
+    folder = Folder(monkeypatch, 100)
+    budget = budget_eviction.CacheBudget(folder, 1000)
+    counted = []
+    for _ in range(11):
+        assert budget.excess(10) == 0.0
+        counted.append(folder.counted)
+    assert counted == [1, 1, 1, 1, 1, 2, 2, 2, 2, 2, 3]
+
+
+def test_near_the_budget_bytes_are_counted_as_soon_as_it_may_be_passed(monkeypatch):
+    folder = Folder(monkeypatch, 980)
+    budget = budget_eviction.CacheBudget(folder, 1000)
+    assert budget.excess(1) == 0.0
+    assert budget.excess(19) == 0.0
+    assert folder.counted == 1
+    folder.stored = 1002
+    assert budget.excess(2) == pytest.approx(102.0)
+    assert folder.counted == 2
+
+
+def test_the_weight_halves_in_a_week_since_the_newest_use():
+    week = 7 * 86400.0
+    old = Candidate("old", 10, 20.0, 0.0)  # 1 s a byte, where all is of use now
+    for seconds, first in ((10.1, "old"), (9.9, "new")):
+        assert [c.key for c in chosen([old, Candidate("new", 10, seconds, week)], 1)] == [first]
+
+
+def test_of_equal_weight_the_longest_unused_goes_first_and_then_the_key_decides():
+    nothing = [Candidate("b", 10, 0.0, 5.0), Candidate("a", 10, -3.0, 5.0), Candidate("c", 10, 0.0, 1.0)]
+    assert [c.key for c in chosen(nothing, 25)] == ["c", "a", "b"]
+    assert chosen(nothing, 0) == []
+    assert chosen([Candidate("empty", 0, 0.0, 0.0)], 10) == []
+
+
+def test_of_values_that_together_free_too_much_the_dearest_stays():
+    first, second, third = (Candidate(name, size, 1.0 + i * size, 0.0) for i, (name, size) in
+                            enumerate((("first", 10), ("second", 10), ("third", 20))))  # fmt: skip
+    assert [c.key for c in chosen([first, second, third], 30)] == ["first", "third"]
+
+
+def test_a_value_saves_its_time_without_that_of_reading_it(tmp_path):
+    store = Store(tmp_path)
+    put(store, 1, seconds=2.0)
+    (one,) = budget_eviction.candidates(store.disk, (), lambda size: size / SIZE / 4)
+    assert one.seconds == pytest.approx(2.0 - 0.25)
+    assert SIZE <= one.size < SIZE + 1000
+
+
+def test_all_bytes_but_receipts_are_divided_among_the_values(tmp_path):
+    """A band that two values use is counted once, and one that is not there not at all."""
+    store = Store(tmp_path)
+    store.put(key_of(1), banded([1, 2, 3]), {"seconds": 5.0})
+    store.put(key_of(2), banded([3, 4]), {"seconds": 1.0})
+    records = sum(path.stat().st_size for path in tmp_path.glob("[0-9a-f][0-9a-f]/*.json"))
+    sizes = {c.key: c.size for c in budget_eviction.candidates(store.disk, (), lambda size: 0.0)}
+    assert sum(sizes.values()) == pytest.approx(budget_eviction.total(store.disk) - records, abs=2)
+    assert sizes[key_of(1)] == pytest.approx(2.5 / 4 * sum(sizes.values()), rel=0.05)
+
+
+def test_a_value_that_this_program_does_not_read_saves_no_time_and_frees_its_record_too(tmp_path, monkeypatch):
+    put(Store(tmp_path), 1, seconds=100.0)
+    monkeypatch.setenv("NEUSEE_CACHE_SECRET", "one")  # the record has no signature
+    store = Store(tmp_path)
+    (one,) = budget_eviction.candidates(store.disk, (), lambda size: 7.0)
+    assert one.seconds == 0.0
+    assert one.size == budget_eviction.total(store.disk)
+
+
+def test_eviction_goes_on_until_enough_is_freed(tmp_path):
+    store = Store(tmp_path)
+    for i in range(4):
+        put(store, i, seconds=float(i + 1))
+    among = list(budget_eviction.candidates(store.disk, (), lambda size: 0.0))
+    gone, refused = budget_eviction.evict(store.disk, among, 1.5 * SIZE, dry=True)
+    assert (len(gone), refused) == (2, [])
+    assert payloads(tmp_path) == {0, 1, 2, 3}

@@ -1,5 +1,6 @@
 """Values that are computed once: kept under a key, whatever their type, and computed again where a file is damaged."""
 
+import time
 from dataclasses import dataclass, field
 
 import pytest
@@ -40,10 +41,12 @@ def test_a_value_is_computed_once_and_comes_back_as_it_was(tmp_path, kind, value
 
 def test_the_metadata_say_what_it_is_when_it_was_made_and_how_long_it_took(tmp_path):
     store = Store(tmp_path)
+    began = time.perf_counter()
     compute_once(store, "0" * 32, Measured, lambda: FOUND, ABOUT)
+    whole = time.perf_counter() - began
     about = store.about("0" * 32)
     assert about["step"] == "a study"
-    assert 0 <= about["seconds"] < 10
+    assert 0 <= about["seconds"] <= whole
     assert about["date"].endswith("+00:00")
     compute_once(store, "1" * 32, Measured, lambda: FOUND, {**ABOUT, "seconds": 7.0})
     assert store.about("1" * 32)["seconds"] == 7.0

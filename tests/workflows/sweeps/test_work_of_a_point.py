@@ -3,11 +3,10 @@
 import sys
 from collections import Counter
 from pathlib import Path
-from statistics import median
 
 import pytest
 
-from neusee.workflows.engine import cost_laws
+from neusee.workflows.engine import cost_laws, step_job
 from neusee.workflows.graph import recipe_graph
 from neusee.workflows.keys import known_keys
 from neusee.workflows.recipe.text import composition, option_groups
@@ -53,6 +52,25 @@ def mean(image: Tensor) -> Tensor:
 '''
 
 
+class Ticks:
+    """A clock by which every step takes 0.3 s, so that every result is kept, however busy the machine is."""
+
+    now = 1.9e9
+
+    def time(self):
+        return self.now
+
+    def perf_counter(self):
+        self.now += 0.3
+        return self.now
+
+
+@pytest.fixture(autouse=True)
+def every_result_is_kept(monkeypatch):
+    """What is kept, and so what a later point computes again, is chosen by the time that a step took."""
+    monkeypatch.setattr(step_job, "time", Ticks())
+
+
 @pytest.fixture
 def counted(monkeypatch):
     """Count the calls of functions, by name."""
@@ -93,14 +111,15 @@ def swept(count, tmp_path, counted):
 
 
 def test_a_further_point_repeats_nothing_that_cannot_differ(tmp_path, counted):
+    swept(2, tmp_path, counted)  # what a process does once, whichever test comes first
     few, many = swept(4, tmp_path, counted), swept(8, tmp_path, counted)
     assert few[0]["read"] == many[0]["read"] > 10  # files
     assert few[0]["in_order"] == many[0]["in_order"]
     assert few[1]["in_order"] == many[1]["in_order"]
     further = {name: (many[0][name] - few[0][name]) / 4 for name in many[0]}
-    assert further["key_of"] <= 9  # eight steps depend on the noise, and one reads a file
+    assert further["key_of"] <= 11  # ten steps depend on the noise, and one reads a file
     further = {name: (many[1][name] - few[1][name]) / 4 for name in many[1]}
-    assert further["key_of"] <= 9
+    assert further["key_of"] <= 9  # the two full wells are left out
     assert further["form_of"] <= 3  # the two steps that have the noise, and the one that reads a file
 
 
@@ -118,4 +137,5 @@ def test_the_calls_of_a_point_do_not_grow_with_the_points_before_it(tmp_path):
             calls[0] = 0
     finally:
         sys.setprofile(None)
-    assert median(found[80:]) == pytest.approx(median(found[10:30]), rel=0.1)
+    # the fewest calls of a point: a thread that waits for another calls once more, and never once less
+    assert min(found[80:]) == pytest.approx(min(found[10:30]), rel=0.1)

@@ -11,6 +11,7 @@ from neusee.workflows.engine import runner
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Substitution
+from neusee.workflows.graph.step_record import StepRecord
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.error_budget import ErrorBudget
 from neusee.workflows.tolerance.error_norm import largest_error
@@ -85,6 +86,20 @@ def rough(x, *, digits: int = 2):
 @rough.approximation_error
 def _(result):
     return float(result[1]), float(result[1])
+
+
+@node()
+def reshaped(x, *, digits: int = 2):
+    """A cheaper form that also tells how errors of its input pass through."""
+    return (x, torch.tensor(0.5 * 10.0**-digits / float(x.max())))
+
+
+reshaped.approximation_error(rough.hooks.approximation_error)
+
+
+@reshaped.propagate_error
+def _(x, *, result, digits):
+    return ErrorBound(x.rms, peak=x.share)
 
 
 @node()
@@ -262,6 +277,139 @@ def test_a_cheaper_form_tells_its_own_error(store):
     again = run(recipe(*steps), Store(store.root))
     assert again.done["out"].state == "cached"
     assert again.proof.of("out") == pytest.approx(0.005, rel=0.01)
+
+
+def test_an_approximation_does_not_count_what_was_left_out_before(store):
+    """The cheaper form knows of its own error alone: 0.005 of 0.01 were stated where 0.5 of 100 were left out too."""
+    steps = chain(0.5, last=step("r", rough, {"digits": 1}, x="g0"))
+    steps.append(step("out", first, pair="r"))
+    result = run(recipe(*steps), store)
+    assert states(result) == ["left out"]
+    assert result.proof.of("out") is None
+    assert result.proof.kind_of("out") == "unknown"
+    assert list(result.proof.held) == ["g0"]
+
+
+def test_an_approximation_that_carries_errors_adds_its_own(store):
+    steps = chain(0.5, last=step("r", reshaped, {"digits": 1}, x="g0"))
+    steps.append(step("out", first, pair="r"))
+    result, full = run(recipe(*steps), store), run(recipe(*steps, exact=True), store)
+    assert states(result) == ["left out"]
+    assert largest_error(result["out"], full["out"]) <= result.proof.of("out")
+    assert result.proof.of("out") == pytest.approx(0.5 / 100 + 0.05 / 100, rel=0.01)
+    assert result.proof.kind_of("out") == "proved"
+
+
+def test_a_bound_of_all_of_the_light_is_no_bound():
+    """A share of 1 or more of the full result gives no bound of its size, and a result of 0 has no share."""
+    facts = {"l": TensorStats((4,), "float32", 0.0, 0.0, 0.0, 0, True)}
+    facts |= {name: facts["l"] for name in ("g0", "out")}
+    steps = chain(0.5)
+    for share, top in ((1.0, 100.0), (2.0, 100.0), (0.5, 0.0)):
+        facts["g0"] = replace(facts["g0"], max=top)
+        records = {each.name: StepRecord(each.name, "run", "", 0.0, "") for each in steps}
+        records["g0"] = StepRecord("g0", "left out", "", 0.0, "", bound=share)
+        found = proof(recipe(*steps), [each.name for each in steps], ["out"], records.__getitem__, facts.get)
+        assert found.of("out") is None
+
+
+@node()
+def grain(x, *, size: float = 1.0, rng):
+    return x + size * torch.randn(x.shape, generator=rng)
+
+
+@grain.skip_bound
+def _(x, *, size):
+    return size / (x.max + size)
+
+
+@grain.skip_draw
+def _(x, *, size):
+    return 1.5
+
+
+@node()
+def mixer(x):
+    return x - x.flip(0)
+
+
+@mixer.propagate_error
+def _(x, *, result):
+    return x.rms
+
+
+@mixer.propagate_scattered
+def _(x, *, result):
+    return 4.0 * x.rms
+
+
+mixer.hooks.estimated = True
+
+
+def test_noise_passes_as_noise_and_light_as_light(store):
+    light_only = [*chain(0.5, last=step("out", mixer, x="g0"))]
+    noise_only = [step("l", light), step("n", grain, {"size": 0.2}, x="l"), step("out", mixer, x="n")]
+    found = run(recipe(*light_only), store).proof
+    assert found.shares["out"] * 100 == pytest.approx(0.5, rel=0.01)
+    noisy = run(recipe(*noise_only), store).proof
+    assert noisy.shares["out"] * 100 == pytest.approx(4 * 0.2, rel=0.01)
+    assert noisy.stated["out"] == pytest.approx(1.5 * noisy.held["out"], rel=1e-9)
+    assert (noisy.kind_of("n"), noisy.kind_of("out")) == ("proved", "estimated")
+    assert noisy.worst_stated(["l", "out"]) == noisy.stated["out"]
+
+
+@node()
+def counted(x):
+    return x.round()
+
+
+@counted.propagate_error
+def _(x, *, result):
+    return x.rms
+
+
+@counted.rounding_error
+def _(rms, *, result):
+    return math.hypot(rms, 0.3)
+
+
+def test_rounding_is_noise_that_is_estimated(store):
+    steps = chain(0.4, last=step("c", counted, x="g0"))
+    result = run(recipe(*steps, step("out", mixer, x="c"), outputs="c out"), store)
+    assert result.proof.held["c"] * 100 == pytest.approx(0.4, rel=0.01)
+    assert result.proof.stated["c"] * 100 == pytest.approx(0.4 + 0.3, rel=0.01)
+    assert result.proof.stated["out"] * 100 == pytest.approx(0.4 + 4 * 0.3, rel=0.01)
+    assert (result.proof.kind_of("g0"), result.proof.kind_of("c")) == ("proved", "estimated")
+
+
+@node()
+def guess(x, *, amount: float = 0.5):
+    return x + amount
+
+
+@guess.skip_bound
+def _(x, *, amount):
+    return amount / (x.max + amount)
+
+
+@guess.propagate_error
+def _(x, *, result, amount):
+    return x.rms
+
+
+guess.hooks.skip_estimated = True
+
+
+def test_what_is_omitted_by_an_estimate_is_estimated_and_may_be_forbidden(store):
+    steps = [step("l", light), step("g", guess, x="l"), step("out", power, x="g")]
+    found = run(recipe(*steps), store)
+    assert states(found) == ["left out"]
+    assert found.proof.kind_of("out") == "estimated"
+    assert states(run(recipe(*steps, estimates=False), store)) == ["run"]
+    nothing = [step("l", light), step("g", guess, {"amount": 0.0}, x="l"), step("out", power, x="g")]
+    none = run(recipe(*nothing, estimates=False), store)
+    assert states(none) == ["left out"]
+    assert none.proof.kind_of("out") == "exact"
 
 
 def test_nothing_is_left_out_in_the_end_where_no_share_is_small_enough(store):

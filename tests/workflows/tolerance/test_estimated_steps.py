@@ -8,7 +8,7 @@ from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.recipe.changed_recipe import changed
-from neusee.workflows.report.tolerance_spent import said_of_economies, spent
+from neusee.workflows.report.tolerance_spent import said_of_economies, said_of_errors, spent
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of
@@ -77,7 +77,9 @@ def test_the_error_is_within_the_tolerance_and_the_account_says_what_is_estimate
     assert "compared with the next finer choice" in plain["what"]
     assert {"raw[plain]", "developed[mask]"} <= set(account["estimated"])
     assert f"psf[plain] (estimated {plain['bound']:.1e})" in said_of_economies(account)
-    assert "in part estimated" in said_of_economies(account)
+    worst = max((row for row in account["outputs"]), key=lambda row: row["error"])
+    assert {row["kind"] for row in account["outputs"]} == {"estimated"}
+    assert f"{worst['error']:.1e} in {worst['output']}, an estimate that 95% of errors" in said_of_errors(account)
 
 
 def test_a_looser_tolerance_takes_no_more_bands(recipe, tmp_path):

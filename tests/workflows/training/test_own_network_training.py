@@ -16,7 +16,7 @@ from neusee.workflows.evaluation.pipelines import CASES, EvaluationRefused, comp
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.run_training import train
-from neusee.workflows.training.training_key import _identity
+from neusee.workflows.training.training_inputs import code_of_class, network_settings
 
 TINY = [
     "optics.samples=64", "optics.pitch=126.2 um", "optics.bands=3", "optics.window=[48, 48]", "scene.shape=[48, 48]",
@@ -153,17 +153,16 @@ def other_weights(tmp_path, state):
 def test_a_training_is_another_one_after_an_edit_of_the_class_and_in_the_same_folder_without(mine, tmp_path):
     def identity():
         network = load("mine.yaml", [*TINY, *SHORT], tmp_path).training.network
-        return _identity(network, Code(tmp_path / "code.json"))
+        return network_settings(network), code_of_class(network.architecture, Code(tmp_path / "code.json"))
 
-    first = identity()
-    assert first["class"] == f"{mine}.Small"
-    assert first["parameters"] == {"width": 4}
-    assert identity() == first
+    first, code = identity()
+    assert first == {"class": f"{mine}.Small", "parameters": {"width": 4}, "multiple": None}
+    assert identity() == (first, code)
     file = tmp_path / f"{mine}.py"
     file.write_text(file.read_text().replace("x * self.kernel +", "x * self.kernel -"))
     os.utime(file, ns=(1, 1))
     del sys.modules[mine]
-    assert identity()["code"] != first["code"]
+    assert identity()[1] != code
 
 
 NET = "train.network"
@@ -171,7 +170,7 @@ MISTAKES = [
     ([f"{NET}.architecture={{0}}.Smal"], f"argument 11 | {NET}.architecture", "{0} has no network class Smal"),
     ([f"{NET}.parameters={{{{depth: 3}}}}"], f"argument 11 | {NET}.parameters", "{0}.Small takes no argument depth"),
     ([f"{NET}.width=8"], f"argument 11 | {NET}.width", "width is of the networks of neusee: write parameters: {{width"),
-    ([f"{NET}.parameters=4"], f"argument 11 | {NET}.parameters", "Input should be a valid dictionary"),
+    ([f"{NET}.parameters=4"], f"argument 11 | {NET}.parameters", "must be a mapping"),
     (
         [f"{NET}.architecture={{0}}.Fixed", f"{NET}.parameters=null"],
         f"argument 11 | {NET}.architecture",
@@ -182,7 +181,7 @@ MISTAKES = [
         f"argument 11 | {NET}.architecture",
         "{0}.Single fails for a picture 1 x 3 x 33 x 35: {0}.py:32: Input type (float) and bias type (double) should",
     ),
-    ([f"+{NET}.multiple=0"], f"argument 11 | {NET}.multiple", "Input should be greater than or equal to 1"),
+    ([f"+{NET}.multiple=0"], f"argument 11 | {NET}.multiple", "must be greater than or equal to 1"),
     (
         [f"{NET}.architecture=null"],
         f"mine.yaml:9:79 | {NET}.parameters",

@@ -16,7 +16,7 @@ from neusee.workflows.training.held_out import Split, _by_photograph
 from neusee.workflows.training.parallel.process_mesh import Mesh, MeshError
 from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.several_cameras import SeveralCameras, require_alone
-from neusee.workflows.training.training_key import key_of_training
+from neusee.workflows.training.training_inputs import inputs_of
 from neusee.workflows.training.training_pictures import HELD_OUT, TrainingStream
 from tests.workflows.training.noise_photographs import noise_photograph
 from tests.workflows.training.test_posed_pictures import POSED
@@ -97,10 +97,8 @@ def test_a_file_of_a_camera_is_sought_beside_the_recipe_and_counts_by_its_conten
     assert recipe.cameras[0].cameras == ()
 
     def key():
-        photographs = Photographs((files / "one.png",))
-        return key_of_training(
-            recipe, recipe.training, photographs, Split(photographs), None, Code(Store(tmp_path / "store").code_memo)
-        )
+        split = Split(Photographs((files / "one.png",)))
+        return inputs_of(recipe, recipe.training, split, None, Code(Store(tmp_path / "store").code_memo)).key
 
     before = key()
     np.save(tmp_path / "masks" / "mine.npy", np.zeros((48, 48)))

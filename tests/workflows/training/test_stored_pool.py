@@ -1,5 +1,8 @@
 """Pools in the store: the same bits as simulated ones, another picture for any other camera, and a kill loses one."""
 
+import os
+
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -70,6 +73,24 @@ def test_another_photograph_is_another_picture(tmp_path, photograph):
     other = stream([], brighter, tmp_path)
     other({}, 2, 0)
     assert other.pool_counts == {"from_store": 0, "simulated": 1}
+
+
+def test_another_mask_under_the_same_name_is_another_pool_and_a_renamed_one_is_the_same(tmp_path, photograph):
+    """The keys of the first picture, which cover everything that the picture depends on."""
+
+    def key(name):
+        samples = stream(["doe=pixelwise", f"doe.file={tmp_path / name}"], photograph, tmp_path / "store")
+        theta, noise, _ = samples._drawn(2, 0)
+        return samples._stored._key(theta["scene"], {reader: theta[reader] for reader in samples._readers}, noise)
+
+    np.save(tmp_path / "m.npy", np.random.default_rng(1).uniform(0, 1e-6, (48, 48)))
+    first = key("m.npy")
+    (tmp_path / "m.npy").rename(tmp_path / "n.npy")
+    assert key("n.npy") == first
+    about = (tmp_path / "n.npy").stat()
+    np.save(tmp_path / "n.npy", np.random.default_rng(2).uniform(0, 1e-6, (48, 48)))
+    os.utime(tmp_path / "n.npy", ns=(about.st_atime_ns, about.st_mtime_ns))
+    assert key("n.npy") != first
 
 
 @pytest.mark.slow

@@ -44,7 +44,7 @@ def peak(folder, bands, batch):
 
 @pytest.mark.slow
 def test_a_picture_more_costs_its_estimate_and_a_band_more_a_few_numbers_a_pixel(tmp_path):
-    """402 and 16 bytes were found; 2285 instead of 402 where the graph of each picture of a batch is kept."""
+    """111 and 21 bytes were found; 733 where the fields of each picture live on, 2285 where its whole graph does."""
     usual = peak(tmp_path, 5, 1)
-    assert (peak(tmp_path, 5, 3) - usual) / 2 / NET**2 < 500
+    assert (peak(tmp_path, 5, 3) - usual) / 2 / NET**2 < 200
     assert (peak(tmp_path, 21, 1) - usual) / 16 / SIDE**2 < 24

@@ -78,7 +78,7 @@ class Trial:
 @pytest.mark.parametrize("part", ["mask", "net"])
 def test_the_loss_in_float64_has_no_step_of_single_precision(tmp_path, part):
     trial = Trial(tmp_path, "train.precision=float64", "train.clip=null", "train.stages.1.batch=1")
-    module, h = getattr(trial.learner, part), 1e-6
+    module, h = getattr(trial.learner, part), 1e-7  # within 1e-6 a rectifier of this network has its kink
     values = [trial.moved(module, n * h)[0] for n in range(-2, 3)]
     slope = trial.moved(module, 0.0)[1]
     # five points of a smooth function: the fourth difference is of order h^4, so it shows the round-off of the values

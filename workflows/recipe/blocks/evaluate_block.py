@@ -20,7 +20,7 @@ class Mismatch(SettingsBlock):
     wavelength: Annotated[Length, Field(ge=0, le=100e-9)] = 2e-9  #: of the laser
     defocus: Waves = 0.1  #: of the lens, for scene and laser, peak to valley at 550 nm
     dirt: bool = True  #: whether the dirt of the window is not told
-    strength: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None  #: null: the largest of the evaluation
+    strength: Annotated[float, Field(gt=0, le=1e18)] | None = None  #: null: the largest of the evaluation
     scenes: Number = 5  #: the first scenes with a laser
 
 

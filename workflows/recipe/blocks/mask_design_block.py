@@ -18,9 +18,21 @@ from neusee.nodes.losses import (
     PeakLimit,
     SceneLight,
 )
-from neusee.nodes.units import Angle, Count, DataFile, Electrons, Length, PositiveLength, Wavelength, Waves
+from neusee.nodes.units import (
+    Angle,
+    Count,
+    DataFile,
+    Depth,
+    Electrons,
+    Layers,
+    Length,
+    PupilPitch,
+    Slope,
+    Wavelength,
+    Waves,
+)
 from neusee.workflows.graph.diagnostics import nearest
-from neusee.workflows.recipe.blocks.settings_block import SettingsBlock, Weight
+from neusee.workflows.recipe.blocks.settings_block import LearningRate, SettingsBlock, Weight
 
 Kind = Literal["pixelwise", "recipe_mask", "zernike", "polynomial", "streak", "rings", "unet", "five_half_rings"]
 _RATE = {"pixelwise": 0.05, "recipe_mask": 4e-3, "zernike": 0.1, "polynomial": 0.02, "streak": 0.02, "rings": 0.1,
@@ -65,7 +77,7 @@ class MaskSettings(SettingsBlock):
 
     kind: Kind = "pixelwise"  #: `recipe_mask`: all samples of the recipe's own height map, from its formula or file
     iterations: Count = 300  #: iterations of Adam, or generations for five_half_rings
-    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None  #: None: the default for the kind
+    learning_rate: LearningRate | None = None  #: None: the default for the kind
     schedule: Literal["cosine", "step"] = "cosine"  #: `step`: halved at each fifth of the iterations
     weights: Weights = Weights(bsr=4.0, contrast=1.0)
     power: Annotated[float, Field(ge=8, le=64)] = 16.0  #: exponent of the norm that replaces the peak
@@ -80,34 +92,40 @@ class MaskSettings(SettingsBlock):
     read_noise: Electrons = 10.5
     veil: Electrons = 0.0  #: even light of a laser behind the clear lens
     contrast_variance: ContrastVariance = 0.1  #: of the scene, relative
-    defocus_spread: Waves = 0.0  #: standard deviation of the defocus, drawn at each iteration
-    wavelength_spread: Annotated[Length, Field(ge=0)] = 0.0  #: the same of all wavelengths together
+    defocus_spread: Annotated[Waves, Field(ge=0)] = 0.0  #: standard deviation of the defocus, drawn at each iteration
+    wavelength_spread: Annotated[Length, Field(ge=0, le=1e-6)] = 0.0  #: the same of all wavelengths together
     direction_spread: Annotated[Angle, Field(ge=0)] = 0.0  #: the same of the direction of the laser, on each axis
     learn_stop: bool = False  #: the diameter of `doe.shade` is learnt with the mask
     bands: Count | None = 7  #: number of bands of the recipe in one iteration; None: all bands
-    seed: int = 0
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     starts: Count = 1  #: independent starts; the result is the best mask on all bands
     at: dict[str, Any] = Field(default={})  #: recipe values that differ during training, such as a coarser pupil
     save_every: Count = 50  #: iterations between two saved states
 
     # parameters of the kinds of mask
-    max_height: PositiveLength = 5 * 1e-6  #: pixelwise, unet; equal to `5 um` to the last bit
+    max_height: Depth = 5 * 1e-6  #: pixelwise, unet; equal to `5 um` to the last bit
     grid: Count = 270  #: pixelwise, unet: samples along an axis
     scale: Annotated[float, Field(gt=0, le=1)] = 0.04  #: pixelwise: feature size of the initial mask, in diameters
     start: DataFile | None = None  #: pixelwise: a height map to start from, such as one of another kind
-    width: Count = 16  #: unet: channels of its first layer
+    width: Layers = 16  #: unet: channels of its first layer
     modes: Count = 100  #: zernike: number of polynomials, from Noll's number 4 on
-    waves: Annotated[float, Field(gt=0)] = 5.0  #: zernike, polynomial, streak: root mean square of the initial mask
+    waves: Annotated[float, Field(gt=0, le=1e5)] = (
+        5.0  #: zernike, polynomial, streak: root mean square of the initial mask
+    )
     degree: Annotated[int, Field(ge=2, le=30)] = 8  #: polynomial, streak: greatest degree
     rings: Count = 40  #: rings: annuli of equal area
     sided: bool = True  #: rings: heights are odd about the axis, like half-rings
-    noise: Annotated[float, Field(ge=0)] = 1.0  #: rings: random part of each slope of the initial mask, in waves
-    slopes: tuple[float, float] = (4.0, 48.0)  #: five_half_rings: least and greatest slope, in waves at the rim
-    population: Annotated[int, Field(ge=5)] = 70  #: five_half_rings
-    polish: Annotated[int, Field(ge=0)] = 300  #: five_half_rings: masks tried by descent from the best, on all bands
+    noise: Annotated[float, Field(ge=0, le=1e5)] = (
+        1.0  #: rings: random part of each slope of the initial mask, in waves
+    )
+    slopes: tuple[Slope, Slope] = (4.0, 48.0)  #: five_half_rings: least and greatest slope, in waves at the rim
+    population: Annotated[int, Field(ge=5, le=10**6)] = 70  #: five_half_rings
+    polish: Annotated[int, Field(ge=0, le=10**9)] = (
+        300  #: five_half_rings: masks tried by descent from the best, on all bands
+    )
     wavelength: Wavelength = 550e-9  #: reference wavelength of heights in waves
     material: Material = "fused silica"  #: material of heights in waves
-    feature: PositiveLength | None = None  #: smallest feature (`doe.smooth`); the recipe sets depth and levels
+    feature: PupilPitch | None = None  #: smallest feature (`doe.smooth`); the recipe sets depth and levels
 
     plain: str = "psf[plain]"  #: the step of the lens without a mask
     illuminant: str = "illuminant"  #: of `losses.wiener`, `losses.filtered_error` and `losses.information`

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,20 +11,29 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from neusee.nodes import ParameterError
-from neusee.nodes.laser import PUBLISHED_DAMAGE, Beam, DamageLaw, beam, read_damage_laws
+from neusee.nodes.flare import Surfaces
+from neusee.nodes.laser import Beam, DamageLaw, TrainRule, beam, read_damage_laws
+from neusee.nodes.optics import refuse_impossible_f_number
 from neusee.nodes.units import (
+    BeamRadius,
     Count,
+    Diameter,
+    Distance,
     Electrons,
     Energy,
+    Exposure,
+    FocalLength,
     Frequency,
+    Luminance,
     PositiveAngle,
-    PositiveLength,
     Power,
-    Shape,
     Time,
+    Visibility,
     Wavelength,
+    Waves,
 )
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
+from neusee.workflows.recipe.blocks.sensor_facts import LaserChannels, Passing, SensorFacts
 from neusee.workflows.recipe.blocks.settings_block import SettingsBlock, located
 from neusee.workflows.recipe.text.references import References, Scope, broken
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted, kind
@@ -32,8 +42,8 @@ KEY, LASERS = "safety", "lasers"  #: keys of the two blocks in a recipe
 SATURATION = ("quantum_efficiency", "full_well", "exposure")  #: facts of a sensor without which nothing saturates
 BEAM = ("wavelength", "power", "pulse_energy", "pulse_duration", "repetition_rate", "waist", "divergence", "m_squared")
 
-Above = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Passing = Annotated[float, Field(gt=0, le=1)]
+Above = Annotated[float, Field(gt=0, le=1e9)]
+Exponent = Annotated[float, Field(ge=0, le=1)]
 Model = TypeVar("Model", bound=SettingsBlock)
 
 
@@ -45,13 +55,13 @@ class Laser(SettingsBlock):
     pulse_energy: Energy | None = None
     pulse_duration: Time | None = None
     repetition_rate: Frequency | None = None
-    waist: PositiveLength | None = None  #: radius of the beam at the exit of the laser
+    waist: BeamRadius | None = None  #: radius of the beam at the exit of the laser
     divergence: PositiveAngle | None = None  #: full angle
-    m_squared: Above | None = None
+    m_squared: Annotated[float, Field(ge=1, le=1e6)] | None = None
     convention: Literal["1/e2", "1/e"] = "1/e2"  #: of waist and divergence
-    distance: PositiveLength
+    distance: Distance
     air_transmittance: Passing | None = None  #: over the whole distance
-    visibility: PositiveLength | None = None  #: None: clear air, unless its transmittance is given
+    visibility: Visibility | None = None  #: None: clear air, unless its transmittance is given
     haze: Literal["kruse", "kim"] = "kim"
 
     def beam(self, values: Mapping[str, float] | None = None) -> Beam:
@@ -67,13 +77,30 @@ class Laser(SettingsBlock):
         return self
 
 
-class Lens(SettingsBlock):
-    """Lens of the camera: its focal length, its clear diameter and its transmittance."""
+class Scatter(SettingsBlock):
+    """Light that the lens scatters, by the law of Harvey and Shack: a veil around the spot, behind a mask too."""
 
-    focal_length: PositiveLength
-    diameter: PositiveLength
+    share: Annotated[float, Field(gt=0, lt=1)] = 0.005  #: of the light; without a value in the recipe it is assumed
+    l: Annotated[float, Field(gt=0, le=10)] = 0.01  #: width of the scatter, as a sine  # noqa: E741
+    s: Annotated[float, Field(ge=-10, le=0)] = -1.5  #: slope far outside of the width
+    surfaces: Surfaces | None = None  #: of `flare.stray_light`, in place of these numbers
+
+
+class Lens(SettingsBlock):
+    """Lens of the camera: its focal length, its clear diameter, its transmittance, its focus and its scatter."""
+
+    focal_length: FocalLength
+    diameter: Diameter
     transmittance: Passing = 1.0
+    focus: Literal["infinity", "laser"] | Distance = "infinity"  #: distance, or always on the laser
+    defocus: Waves = 0.0  #: of the lens at its rim, beside that of the distance, at 550 nm
+    scatter: Scatter | None = Scatter()  #: None: a lens that scatters nothing
     stop: str | None = None  #: step that returns the stop; its grid may narrow the diameter
+
+    @model_validator(mode="after")
+    def _can_focus(self) -> Lens:
+        refuse_impossible_f_number(self.focal_length, self.diameter, "diameter")
+        return self
 
 
 class Spots(SettingsBlock):
@@ -91,28 +118,21 @@ class Protection(SettingsBlock):
 
     mask: str | None = None  #: step of the laser suppression ratio (LSR) at the wavelength of the laser, as in `Spots`
     filter: Passing | None = None  #: transmittance
-    stop: PositiveLength | None = None  #: diameter
+    stop: Diameter | None = None  #: diameter
+    notch_index: Annotated[float, Field(ge=1, le=4)] = (
+        1.8  #: effective index of a notch filter, which shifts with angle
+    )
     spots: Spots = Spots()  #: PSFs of the pattern of damage
     pixels: Spots = Spots()  #: steps of `laser.bright_pixels`, which give the dazzled area
-
-
-class SensorFacts(SettingsBlock):
-    """What damage and dazzle need to know of the sensor; no quantum efficiency means that none is known."""
-
-    pixel_pitch: PositiveLength
-    shape: Shape
-    quantum_efficiency: Passing | None = None  #: at the wavelength of the laser
-    full_well: Electrons | None = None
-    exposure: Time | None = None
 
 
 class Damage(SettingsBlock):
     """Which thresholds of damage hold, and for which exposure."""
 
     device: str = "CMOS"  #: class of the sensor, as the table of thresholds names it
-    dwell: Time = 1.0  #: s, for which continuous light stays on one place of the sensor
-    spot: Literal["diffraction", "published"] = "diffraction"  #: for which spot a continuous threshold is taken
-    file: Path | None = None  #: table of thresholds of the user, in place of the published ones
+    dwell: Time = 1.0  #: s, for which the light stays on one place of the sensor
+    small_spot_exponent: Exponent = 0.0  #: of published spot / spot, the bonus of a narrower spot; 0: none
+    file: Path | None = None  #: table of thresholds of the user, which count where they hold
 
 
 class Dazzle(SettingsBlock):
@@ -132,24 +152,75 @@ class Dazzle(SettingsBlock):
         return self.threshold or {"snr": 5.0, "contrast": 0.05}[self.rule]
 
 
-class Eye(SettingsBlock):
-    """How long an eye looks into the laser."""
+class EyeDazzle(SettingsBlock):
+    """What a viewer has to see beside the laser: the light of the surroundings, the target, and who looks."""
 
-    exposure: Time | None = None  #: None: 0.25 s for visible light, until the eye turns away, and 10 s for other light
+    angles: Annotated[tuple[PositiveAngle, ...], Field(min_length=1)] = tuple(map(math.radians, (1.0, 5.0, 10.0, 20.0)))
+    backgrounds: Annotated[tuple[Luminance, ...], Field(min_length=1)] = (0.1, 10.0, 1000.0)  #: night, dusk and day
+    contrast: Above = 0.2  #: Weber contrast of the target
+    size: PositiveAngle = math.radians(10 / 60)  #: across the target, from 1 to 60 arc minutes
+    age: Annotated[float, Field(ge=23, le=75)] = 40.0  #: years
+    pigmentation: Annotated[float, Field(ge=0, le=1.2)] = 0.5  #: of the iris: 0 black, 0.5 brown, 1.0 to 1.2 light
+    margin: Above = 2.6  #: contrast that the viewer needs, over the threshold of the laboratory
+
+    @field_validator("angles")
+    @classmethod
+    def _has_an_equation(cls, angles: tuple[float, ...]) -> tuple[float, ...]:
+        for angle in angles:
+            if not math.radians(0.1) <= angle <= math.radians(100):
+                raise ValueError(f"{math.degrees(angle):.3g} deg: the glare equation holds from 0.1 to 100 deg")
+        return angles
+
+    @field_validator("backgrounds")
+    @classmethod
+    def _is_lit(cls, backgrounds: tuple[float, ...]) -> tuple[float, ...]:
+        if min(backgrounds) <= 0:
+            raise ValueError("a background without light shows no target: give cd/m2 above 0")
+        return backgrounds
+
+    @field_validator("size")
+    @classmethod
+    def _has_a_threshold(cls, size: float) -> float:
+        if not 1 <= math.degrees(size) * 60 <= 60.000001:
+            raise ValueError(f"{math.degrees(size) * 60:.3g} arc minutes: the threshold is known from 1 to 60")
+        return size
+
+
+class Eye(SettingsBlock):
+    """How long an eye looks into the laser, by which rule trains of pulses are judged, and what the eye has to see."""
+
+    #: None: 0.25 s for visible light, until the eye turns away, and 10 s for other light
+    exposure: Exposure | None = None
+    rule: TrainRule = "IEC 60825-1:2014"  #: for trains of pulses; `N^(-1/4)` is the stricter rule of 2007
+    dazzle: EyeDazzle = EyeDazzle()
+
+
+class Unevenness(SettingsBlock):
+    """How much brighter than an even Gaussian beam a laser may be, in places or for moments."""
+
+    hot_spots: Annotated[float, Field(ge=1, le=1000)] = 1.0  #: factor on the irradiance; 1: not counted
+    cn2: Above | None = None  #: m^(-2/3), of the turbulent air; None: not counted
+    worst: Annotated[float, Field(gt=0, lt=1)] = 0.99  #: share of the time in which turbulence is exceeded by none
 
 
 class SafetySettings(SettingsBlock):
     """Settings in the block ``safety`` of a recipe."""
 
     laser: str | None = None
-    distances: tuple[PositiveLength, PositiveLength] = (1.0, 1e5)
+    distances: tuple[Distance, Distance] = (1.0, 1e5)
     lens: Lens
     sensor: SensorFacts
-    damage: Damage = Damage()
+    damage: Damage | None = Damage()  #: None, written none or null: damage is not asked for
     dazzle: Dazzle | None = None  #: None: dazzle is not asked for
     eye: Eye = Eye()
+    beam: Unevenness = Unevenness()
     protection: Protection = Protection()
     draws: Annotated[Count, Field(ge=100, le=10_000)] = 1000
+
+    @field_validator("damage", mode="before")
+    @classmethod
+    def _may_be_none(cls, damage: object) -> object:
+        return None if damage == "none" else damage
 
     @field_validator("distances")
     @classmethod
@@ -175,7 +246,8 @@ class Safety:
     settings: SafetySettings
     name: str  #: of the laser
     values: Mapping[str, Value]  #: value in the recipe by setting, such as ``laser.power`` or ``lens.diameter``
-    laws: tuple[DamageLaw, ...]  #: thresholds of damage: the published ones, or those of the file of the user
+    laws: tuple[DamageLaw, ...]  #: thresholds of damage in the file of the user; empty without a file
+    channels: LaserChannels | None = None  #: known where the settings name a step of responses
 
 
 def read_safety(
@@ -207,10 +279,10 @@ def read_safety(
 
 
 def _laws(block: Value, diagnostics: list[Diagnostic], files: dict[Where, str]) -> tuple[DamageLaw, ...]:
-    """Return the thresholds of damage in the file of the user, or the published ones; report a mistake in the file."""
+    """Return the thresholds of damage in the file of the user; report a mistake in the file."""
     given = block.below(("damage", "file"))
     if given is None or not isinstance(given.data, str):
-        return PUBLISHED_DAMAGE
+        return ()
     path = (Path(given.mark.folder) / Path(given.data).expanduser()).resolve()
     files[given.path] = str(path)
     try:
@@ -219,7 +291,7 @@ def _laws(block: Value, diagnostics: list[Diagnostic], files: dict[Where, str]) 
         return read_damage_laws(path)
     except (ValueError, OSError) as error:
         diagnostics.append(Diagnostic(given.mark, given.name, str(error)))
-        return PUBLISHED_DAMAGE
+        return ()
 
 
 def _validated(model: type[Model], block: Value, diagnostics: list[Diagnostic]) -> Model | None:

@@ -5,24 +5,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
+from neusee.nodes.parameter_model import ParameterModel
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.recipe.text.composition import Composed
+from neusee.workflows.recipe.text.field_errors import message_of
 from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value
 
-Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Weight = Annotated[float, Field(ge=0, le=1e9)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Beta = Annotated[float, Field(ge=0, lt=1)]
-Number = Annotated[int, Field(ge=1)]
-GradientNorm = Annotated[float, Field(gt=0, allow_inf_nan=False)] | None  #: None: no limit
+Number = Annotated[int, Field(ge=1, le=10**9)]
+LearningRate = Annotated[float, Field(gt=0, le=1e3)]
+GradientNorm = Annotated[float, Field(gt=0, le=1e12)] | None  #: None: no limit
 
 
-class SettingsBlock(BaseModel):
+class SettingsBlock(ParameterModel):
     """Base class of a block of settings in a recipe; an unknown key in the block is a mistake."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 Settings = TypeVar("Settings", bound=BaseModel)
@@ -48,7 +49,7 @@ def located(block: Value, model: type[BaseModel], error: Any) -> Diagnostic:
     value = block
     for key in error["loc"]:
         value = value.child(key) or value
-    text = str(error["msg"]).removeprefix("Value error, ")
+    text = message_of(error, value)
     if error["type"] == "extra_forbidden":
         names = _fields(model, error["loc"])
         return Diagnostic(value.key, value.name, instead(value.name) or f"unknown; {nearest(error['loc'][-1], names)}")

@@ -16,6 +16,7 @@ from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings, MaskT
 from neusee.workflows.recipe.blocks.settings_block import (
     Beta,
     GradientNorm,
+    LearningRate,
     Number,
     SettingsBlock,
     Share,
@@ -35,7 +36,7 @@ class Network(SettingsBlock):
     """Settings of the restoration network: its kind, width and options."""
 
     kind: Literal["fft_mamba", "unet", "nafnet", "unrolled", "informed"] = "fft_mamba"
-    width: Annotated[int, Field(ge=2)] = 64
+    width: Annotated[int, Field(ge=2, le=4096)] = 64
     shuffle: Annotated[int, Field(ge=1, le=8)] = 2  #: of fft_mamba: pixels along an axis that are scanned as one
     directions: Literal[2, 4] = 2  #: of fft_mamba, like the next two
     pyramid: bool = False
@@ -63,16 +64,16 @@ class Network(SettingsBlock):
 class Critics(SettingsBlock):
     """Settings of the two critic networks of adversarial training: their width and the momenta of their optimiser."""
 
-    width: Annotated[int, Field(ge=2)] = 64
+    width: Annotated[int, Field(ge=2, le=4096)] = 64
     betas: tuple[Beta, Beta] = (0.0, 0.9)
 
 
 class Rates(SettingsBlock):
     """Learning rates of a training, which are halved once and then reduced at intervals, down to a minimum."""
 
-    weights: Annotated[float, Field(gt=0)] = 2e-4
-    biases: Annotated[float, Field(gt=0)] = 4e-4
-    mask: Annotated[float, Field(gt=0)] = 2e-4
+    weights: LearningRate = 2e-4
+    biases: LearningRate = 4e-4
+    mask: LearningRate = 2e-4
     halve: Number = 2000
     every: Number = 1000
     factor: Annotated[float, Field(gt=0, le=1)] = 0.7
@@ -98,7 +99,7 @@ class Augment(SettingsBlock):
 class Stage(SettingsBlock):
     """Settings of a training stage: duration, batch size and weights of the loss terms; a weight of 0 omits a term."""
 
-    iterations: Annotated[int, Field(ge=0)]
+    iterations: Annotated[int, Field(ge=0, le=10**9)]
     batch: Number = 8
     lsr: Weight = 0.0
     bsr: Weight = 0.0

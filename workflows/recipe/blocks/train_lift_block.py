@@ -8,7 +8,15 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from neusee.workflows.recipe.blocks.mask_design_block import half_cosine
-from neusee.workflows.recipe.blocks.settings_block import Beta, GradientNorm, Number, SettingsBlock, Weight, read_block
+from neusee.workflows.recipe.blocks.settings_block import (
+    Beta,
+    GradientNorm,
+    LearningRate,
+    Number,
+    SettingsBlock,
+    Weight,
+    read_block,
+)
 from neusee.workflows.recipe.text.composition import Composed
 
 KEY = "train_lift"  #: key of the block in a recipe
@@ -23,10 +31,10 @@ class LiftTraining(SettingsBlock):
     start: Literal["linear", "random"] = "linear"
     iterations: Number
     batch: Number = 4
-    rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 4e-4
+    rate: LearningRate = 4e-4
     min_rate: Weight = 1e-6
     betas: tuple[Beta, Beta] = (0.9, 0.999)
-    warmup: Annotated[int, Field(ge=0)] = 200  #: iterations in which the rate rises evenly
+    warmup: Annotated[int, Field(ge=0, le=10**9)] = 200  #: iterations in which the rate rises evenly
     floor: Annotated[float, Field(gt=0, le=1)] = 0.02
     clip: GradientNorm = 10.0  #: largest norm of the gradient of all weights
     ema_decay: Beta = 0.998  #: of the moving average of the weights; 0: no average

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import csv
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from glob import glob
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
 from neusee.nodes.units import read_any, read_written
-from neusee.workflows.recipe.distributions.scalar import FloatArray
+from neusee.workflows.recipe.distributions.sample_table import read_columns, require_samples, with_units
+from neusee.workflows.recipe.distributions.shapes import FloatArray, scores_between
 from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
 
 GAIN_UNIT = "DN/e-"  #: unit of the system gain K of EMVA 1288
@@ -23,8 +21,6 @@ BARE_GAIN = (
     "the folder of `neusee calibrate` contains the unit"
 )
 Z_90 = 1.6448536269514722  #: standard deviations around the mean that contain 90 % of a normal distribution
-_LEAST = 30  #: smallest number of draws from which a distribution is estimated
-_HEAD = re.compile(r"\s*(.*?)\s*\[([^\[\]]*)\]\s*")  #: ``gain [DN/e-]``
 _JITTER = 1e-10  #: added to the diagonal of a correlation so that its Cholesky factor exists
 _FILES = "the folder of `neusee calibrate`, its posterior.json, draws in .npz or .csv, or a mean and sd in .json, .yaml"
 
@@ -42,16 +38,13 @@ class Joint:
     sd: FloatArray  #: (name,)
     factor: FloatArray  #: (name, name), lower
     draws: FloatArray | None = None  #: (draw, name)
+    bounds: FloatArray | None = None  #: (name, 2) normal scores at which each value is cut off; None for no bounds
 
     @classmethod
     def of_draws(cls, names: Sequence[str], draws: FloatArray) -> Joint:
         """Return the joint distribution of random draws; raise ValueError for too few, non-finite or constant draws."""
-        if len(draws) < _LEAST:
-            raise ValueError(f"the posterior has {len(draws)} draws, which are too few: give {_LEAST} or more")
-        if not np.isfinite(draws).all():
-            raise ValueError("a draw of the posterior is NaN or infinite: remove this draw")
-        if still := [name for name, x in zip(names, draws.T, strict=True) if np.ptp(x) == 0]:
-            raise ValueError(f"all draws of {still[0]} are equal: remove {still[0]} from the posterior")
+        for name, column in zip(names, draws.T, strict=True):
+            require_samples(column, name)
         correlation = np.atleast_2d(np.corrcoef(_scores(draws).T))
         return cls(tuple(names), draws.mean(0), draws.std(0, ddof=1), _factor(correlation), draws)
 
@@ -64,12 +57,18 @@ class Joint:
         if not (np.isfinite(sd) & (sd > 0)).all():
             raise ValueError("every standard deviation must be greater than 0")
         if not np.allclose(np.diag(correlation), 1.0) or np.linalg.eigvalsh(correlation)[0] < -1e-9:
-            raise ValueError("the correlation matrix must have ones on its diagonal and no negative eigenvalue")
+            raise ValueError(
+                "the correlation matrix must have ones on its diagonal and no negative eigenvalue; the least "
+                f"eigenvalue is {np.linalg.eigvalsh(correlation)[0]:.3g}, so that no distribution has this matrix"
+            )
         return cls(tuple(names), mean, sd, _factor(correlation))
 
     def at(self, z: FloatArray) -> FloatArray:
         """Transform standard normal numbers ``z`` to draws of the joint distribution; both have the shape (…, name)."""
         score = z @ self.factor.T
+        if self.bounds is not None:
+            columns = [scores_between(score[..., i], low, high) for i, (low, high) in enumerate(self.bounds)]
+            score = np.stack(columns, -1)
         if self.draws is None:
             return np.asarray(self.mean + self.sd * score, np.float64)
         from scipy.special import ndtr
@@ -107,7 +106,8 @@ class Joint:
             return Joint.of_draws(names, self.draws[:, at])
         whole = self.factor @ self.factor.T
         scale = np.sqrt(np.diag(whole))
-        return Joint.of_normal(names, self.mean[at], self.sd[at], (whole / scale / scale[:, None])[np.ix_(at, at)])
+        joint = Joint.of_normal(names, self.mean[at], self.sd[at], (whole / scale / scale[:, None])[np.ix_(at, at)])
+        return joint if self.bounds is None else replace(joint, bounds=self.bounds[at])
 
 
 def _scores(draws: FloatArray) -> FloatArray:
@@ -141,13 +141,11 @@ def read_posterior(path: Path) -> Posterior:
     if not path.is_file():
         raise ValueError(f"there is no posterior file {path}: give {_FILES}")
     try:
-        if path.suffix == ".npz":
-            return _drawn(*_headed(_arrays(path)))
-        if path.suffix == ".csv":
-            return _drawn(*_headed(_columns(path)))
+        if path.suffix in (".npz", ".csv"):
+            return _drawn(*with_units(read_columns(path)))
         if path.suffix in (".json", ".yaml", ".yml"):
             return _document(path)
-    except (OSError, KeyError, TypeError, BadZipFile, UnicodeDecodeError) as error:
+    except (OSError, KeyError, TypeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path.name} cannot be read as a posterior: {error!r}") from None
     raise ValueError(f"{path.name} is not a posterior file: give {_FILES}")
 
@@ -178,13 +176,6 @@ def _document(path: Path) -> Posterior:
     return replace(posterior, kinds={name: str(row["kind"]) for name, row in rows.items()}, untold=untold)
 
 
-def _headed(columns: Mapping[str, FloatArray]) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """Return the draws of each quantity and its unit, both by name, from column headings such as ``gain [DN/e-]``."""
-    heads = {head: _HEAD.fullmatch(head) for head in columns}
-    named = {m[1] if m else head: columns[head] for head, m in heads.items()}
-    return named, {m[1]: m[2].strip() for m in heads.values() if m}
-
-
 def _drawn(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Posterior:
     """Return the posterior that consists of the given draws; convert draws of a gain in e-/DN to DN/e-."""
     with np.errstate(divide="ignore"):
@@ -194,26 +185,6 @@ def _drawn(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Poste
         raise ValueError("the values have different numbers of draws" if lengths else "the file contains no draws")
     joint = Joint.of_draws(tuple(columns), np.stack(draws, 1))
     return Posterior(joint, units={name: GAIN_UNIT if unit == "e-/DN" else unit for name, unit in units.items()})
-
-
-def _arrays(path: Path) -> dict[str, FloatArray]:
-    with path.open("rb") as file:
-        if file.read(2) != b"PK":
-            raise ValueError(f"{path.name} cannot be read: the file does not have the format .npz")
-    with np.load(path) as arrays:
-        return {name: np.asarray(arrays[name], np.float64).reshape(-1) for name in arrays}
-
-
-def _columns(path: Path) -> dict[str, FloatArray]:
-    with path.open(newline="", encoding="utf-8") as file:
-        header, *rows = list(csv.reader(file)) or [[]]
-    if short := [n for n, row in enumerate(rows, 2) if len(row) != len(header)]:
-        raise ValueError(f"line {short[0]} of the posterior file must have {len(header)} values like the first line")
-    try:
-        numbers = np.array(rows, np.float64).reshape(-1, len(header))
-    except ValueError as error:
-        raise ValueError(f"the lines below the column headings must contain numbers: {error}") from None
-    return {name.strip(): numbers[:, i] for i, name in enumerate(header)}
 
 
 def summary(given: Mapping[str, Any]) -> Posterior:

@@ -11,11 +11,12 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.nodes.units import read_any
+from neusee.nodes.units import KNOWN_UNITS, read_any
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.recipe.distributions.joint import BARE_GAIN, GAIN_UNIT, Joint, Posterior, read_posterior, summary
+from neusee.workflows.recipe.distributions.law_text import is_law, read_law
 from neusee.workflows.recipe.distributions.mismatch_laws import Difference
-from neusee.workflows.recipe.distributions.scalar import Law, is_law, read_law, written
+from neusee.workflows.recipe.distributions.scalar import Law, written
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.references import BROKEN
 from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
@@ -25,6 +26,7 @@ KEY = "posterior"  #: key of the block in a recipe
 _BLOCK = "sensor"  #: block of the values that a calibration names without their block
 _KEYS = ("file", "use", "values")
 _SUMMARY = ("mean", "sd", "correlation", "covariance")
+_MANY_SCALES = ("m", "s", "rad", "W", "J", "Hz")  #: units whose numbers a table could mean in another scale
 _FAR = 0.005  #: probability of each tail of a posterior in which a recipe's own value counts as far off
 
 
@@ -92,7 +94,7 @@ def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
     diagnostics = list(composed.diagnostics)
     for path, leaf in _laws(root):
         try:
-            laws[dotted(path)] = law = read_law(leaf.data)
+            laws[dotted(path)] = law = read_law(leaf.data, Path(leaf.mark.folder))
         except ValueError as error:
             diagnostics.append(Diagnostic(leaf.mark, f"{dotted(path)} = {leaf.data}", str(error)))
             root = put(root, path, BROKEN)
@@ -158,6 +160,10 @@ class _Reader:
             return self._fail(strange[0].key, strange[0].name, f"unknown; {nearest(strange[0].name, _KEYS)}")
         try:
             posterior = self._posterior(given, items)
+        except ValueError as error:
+            place = items.get("covariance") or items.get("correlation") or given
+            return self._fail(place.mark, place.name, str(error))
+        try:
             use = self._use(items.get("use"), posterior)
             pairs = self._pairs(items.get("values"), posterior)
         except ValueError as error:
@@ -242,6 +248,9 @@ class _Reader:
             except ValueError as error:
                 self._fail(value.mark, path, f"the posterior contains this value, but {error}")
                 continue
+            if fault := _unit_fault(name, posterior.units.get(name, ""), unit):
+                self._fail(mark, KEY, fault)
+                continue
             kept[path] = name
             self.units[path] = unit
             self._stand(posterior, path, name, own, use, mark)
@@ -271,6 +280,15 @@ class _Reader:
 
     def _fail(self, mark: Location, path: str, message: str) -> None:
         self.diagnostics.append(Diagnostic(mark, path, message))
+
+
+def _unit_fault(name: str, unit: str, own: str) -> str:
+    """Return what is wrong with the unit of a value of the posterior, beside the unit of the recipe's ``own`` value."""
+    if not unit and own in _MANY_SCALES:
+        return f"the {name} of the posterior has no unit: write it after the mean, or in the heading, {name} [{own}]"
+    if unit in KNOWN_UNITS and unit != own:
+        return f"the {name} of the posterior is in {unit}, and the value of the recipe in {own or 'no unit'}"
+    return ""
 
 
 def _flat(value: Value) -> Any:

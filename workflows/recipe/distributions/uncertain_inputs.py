@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.nodes.units import read_any
+from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.recipe.distributions.allowed_range import RARE, within_allowed
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain
-from neusee.workflows.recipe.distributions.scalar import FloatArray
+from neusee.workflows.recipe.distributions.shapes import FloatArray, Normal, Shape
 
 SCRAMBLES = 8  #: number of independently scrambled Sobol sequences, whose scatter gives the error
-_PROBE = 0.3  #: standard deviations by which a value is changed to find the parameters that read the value
+_PROBE = 0.3  #: standard deviations by which a value of a joint distribution is changed to find its readers
+_NORMAL = Normal()
 _CORRELATED = 0.1  #: smallest correlation of two values that count as correlated
 _EDGE = 1e-12  #: smallest distance of the probability of a point from 0 and 1
 
 Index = tuple[int | str, ...]  #: path of a number in a parameter; empty for the parameter itself
+
+
+class NothingDrawn(ValueError):
+    """Error for a recipe of which no output depends on an uncertain value."""
 
 
 @dataclass(frozen=True)
@@ -38,35 +45,47 @@ class Inputs:
     names: tuple[str, ...]  #: paths of the recipe that affect an output
     idle: tuple[str, ...]  #: paths that affect no output
     readers: Mapping[str, tuple[tuple[Index, str], ...]]  #: indices and inputs by ``step.parameter``
+    notes: Mapping[str, str] = field(default_factory=dict)  #: by name, what was cut off because it is not allowed
 
     @classmethod
-    def of(cls, recipe: Recipe, outputs: Sequence[str] | None = None) -> Inputs:
+    def of(cls, recipe: Recipe, outputs: Sequence[str] | None = None, negligible: float | None = RARE) -> Inputs:
         """Return the uncertain inputs of a recipe that affect ``outputs``, by default the recipe's own outputs.
 
-        Raises ValueError for a recipe without uncertain values, and if no output depends on an uncertain value.
+        A part of a distribution outside the allowed values is cut off, with a note, if its probability is at most
+        ``negligible``; None leaves all distributions as they are.
+        Raises: `NothingDrawn` for a recipe without uncertain values, and if no output depends on an uncertain value.
+        `RecipeError` for a distribution of which more is outside. ValueError for a value that cannot be sampled.
         """
         outputs = recipe.outputs if outputs is None else outputs
         uncertain = recipe.uncertain
         if uncertain is None or not uncertain.names:
-            raise ValueError(
+            raise NothingDrawn(
                 "no value is uncertain: write a distribution in place of a value, such as "
                 'sensor.read_noise="normal(10.5 e-, 0.5 e-)", or posterior: PATH'
             )
-        readers: dict[str, tuple[tuple[Index, str], ...]] = {}
-        for name in uncertain.names:
-            for reader, index in _readers(recipe, uncertain, name, outputs):
-                readers[reader] = (*readers.get(reader, ()), (index, name))
+        uncertain, notes = (uncertain, {}) if negligible is None else within_allowed(uncertain, negligible)
+        readers = _all_readers(recipe, uncertain, outputs)
         used = {name for inputs in readers.values() for _, name in inputs}
         if not used:
-            raise ValueError(f"no output depends on {', '.join(uncertain.names)}")
+            raise NothingDrawn(f"no output depends on {', '.join(uncertain.names)}")
         idle = tuple(name for name in uncertain.names if name not in used)
-        drawn = _only(uncertain, used)
-        return cls(recipe, drawn, drawn.names, idle, readers)
+        drawn = only_values(uncertain, used)
+        return cls(recipe, drawn, drawn.names, idle, readers, notes)
 
     @property
     def labels(self) -> list[str]:
         """Return the label of each uncertain input; the label shows whether the input is correlated with others."""
         return [_label(self.uncertain, name) for name in self.names]
+
+    @property
+    def shapes(self) -> list[Shape]:
+        """Return the distribution of each column of normal numbers; values of a joint distribution are normal."""
+        return [self.uncertain.laws[name].shape if name in self.uncertain.laws else _NORMAL for name in self.names]
+
+    @property
+    def has_table(self) -> bool:
+        """Return True if some inputs are drawn as whole rows of a table of samples."""
+        return self.most is not None
 
     @property
     def most(self) -> int | None:
@@ -123,8 +142,16 @@ class Inputs:
                     drawn = [replace(d, message=f"the value is sampled, but {d.message}") for d in error.diagnostics]
                     raise RecipeError(drawn) from None
 
+    def problem(self, row: FloatArray) -> Diagnostic | None:
+        """Return why the recipe does not allow the values of a draw together, or None."""
+        try:
+            self.uncertain.at(dict(zip(self.names, map(float, row), strict=True)))
+        except RecipeError as error:
+            return error.diagnostics[0]
+        return None
 
-def _only(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
+
+def only_values(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
     """Return those uncertain values of a recipe whose paths are in ``names``."""
     laws = {name: law for name, law in uncertain.laws.items() if name in names}
     joint = uncertain.joint
@@ -132,14 +159,20 @@ def _only(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
     return replace(uncertain, laws=laws, joint=joint.only(kept) if joint and kept else None)
 
 
+def _all_readers(
+    recipe: Recipe, uncertain: Uncertain, outputs: Sequence[str]
+) -> dict[str, tuple[tuple[Index, str], ...]]:
+    """Return the indices and the names of the uncertain values in each ``step.parameter`` that uses some."""
+    readers: dict[str, tuple[tuple[Index, str], ...]] = {}
+    for name in uncertain.names:
+        for reader, index in _readers(recipe, uncertain, name, outputs):
+            readers[reader] = (*readers.get(reader, ()), (index, name))
+    return readers
+
+
 def _readers(recipe: Recipe, uncertain: Uncertain, name: str, outputs: Sequence[str]) -> Iterator[tuple[str, Index]]:
     """Yield each ``step.parameter`` that uses the recipe value ``name``, and the value's index in the parameter."""
-    if name in uncertain.laws:
-        probe = float(uncertain.laws[name].at(np.array(_PROBE)))
-    else:
-        assert uncertain.joint is not None
-        i = uncertain.joint.names.index(name)
-        probe = float(uncertain.joint.mean[i] + _PROBE * uncertain.joint.sd[i])
+    probe = _probe(uncertain, name)
     changed: Recipe = uncertain.at({name: probe})
     if changed.steps.keys() != recipe.steps.keys() or changed.outputs != recipe.outputs:
         raise ValueError(f"the value {name} changes the list of steps and therefore cannot be sampled")
@@ -147,9 +180,27 @@ def _readers(recipe: Recipe, uncertain: Uncertain, name: str, outputs: Sequence[
         before, after = recipe.steps[step], changed.steps[step]
         for param, value in after.params.items():
             for index, new in _changed(before.params[param], value):
-                if not isinstance(new, float) or abs(new - probe) > 1e-9 * abs(probe):
-                    raise ValueError(f"{step}.{param} does not use {name} unchanged, so {name} cannot be sampled")
+                _refuse_changed(new, probe, f"{step}.{param}", name)
                 yield f"{step}.{param}", index
+
+
+def _probe(uncertain: Uncertain, name: str) -> float:
+    """Return a value of an uncertain input that differs from the value in the recipe."""
+    if name in uncertain.laws:
+        value = uncertain.composed.root.below(name.split("."))
+        assert value is not None
+        return uncertain.laws[name].other_than(read_any(value.data)[0])
+    assert uncertain.joint is not None
+    i = uncertain.joint.names.index(name)
+    return float(uncertain.joint.mean[i] + _PROBE * uncertain.joint.sd[i])
+
+
+def _refuse_changed(new: Any, probe: float, reader: str, name: str) -> None:
+    """Raise ValueError if a parameter has another number than the value of the recipe that it reads."""
+    if isinstance(new, int):
+        raise ValueError(f"{name} is a whole number and cannot be sampled: compare its values by `neusee sweep`")
+    if not isinstance(new, float) or abs(new - probe) > 1e-9 * abs(probe):
+        raise ValueError(f"{reader} does not use {name} unchanged, so {name} cannot be sampled")
 
 
 def _changed(before: Any, after: Any) -> Iterator[tuple[Index, Any]]:

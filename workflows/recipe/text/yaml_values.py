@@ -11,16 +11,18 @@ from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, YAMLError, YAMLStreamError
+from ruamel.yaml.error import YAMLError, YAMLStreamError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
+from neusee.workflows.recipe.text.yaml_mistakes import YamlMistake, directive_mistake, explained
 
 Where = tuple[str | int, ...]  #: path of a value: keys and indices from the top of a recipe
 
 _TAG = "tag:yaml.org,2002:"
 _INT = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
+_LACKS_SPACE = re.compile(r"[\w.-]+:\S.*")
 _MOST = 1_000_000  #: largest number of values in one file
 _LARGEST = 4_000_000  #: bytes of one file; 20 000 steps take about half of them
 _MOST_ALIASED = 100_000  #: largest number of values from aliases in one file
@@ -134,16 +136,24 @@ def _document(text: str, shown: str, folder: str) -> Document:
 def parse(text: str, start: Location, path: Where = ()) -> Value:
     """Return the values in a YAML text; ``start`` is the location of the text in a file, or an argument."""
     builder = _Builder(start)
+    if mistake := directive_mistake(text):
+        raise RecipeError([_diagnostic(mistake, start, path)])
     try:
         node = YAML(typ="safe", pure=True).compose(text)
         value = Value(None, start, start, path) if node is None else builder.value(node, path, start)
     except RecursionError:
         raise RecipeError([Diagnostic(start, dotted(path), "the YAML text is nested too deeply")]) from None
     except (YAMLError, YAMLStreamError) as error:
-        raise RecipeError([_explain(error, text, start, path)]) from None
+        raise RecipeError([_diagnostic(explained(error, text), start, path)]) from None
     if builder.diagnostics:
         raise RecipeError(builder.diagnostics)
     return value
+
+
+def _diagnostic(mistake: YamlMistake, start: Location, path: Where) -> Diagnostic:
+    """Return the diagnostic for a mistake in a YAML text that begins at ``start``."""
+    mark = Location(start.file, mistake.line + 1, mistake.column + 1, start.folder) if start.line else start
+    return Diagnostic(mark, dotted(path), mistake.message)
 
 
 def kind(value: Value) -> str:
@@ -190,6 +200,9 @@ class _Builder:
                 self._refuse(mark, path, "merge keys (<<) are not part of YAML 1.2: refer to values with ${…}")
             elif key is None:
                 self._refuse(mark, path, "the key of a mapping must be a name or a whole number")
+            elif isinstance(key, str) and _LACKS_SPACE.fullmatch(key) and _is_empty(value_node):
+                name, _, text = key.partition(":")
+                self._refuse(mark, (*path, name), f"needs a space after the colon: write `{name}: {text}`")
             elif key in data:
                 line = data[key].key.line
                 self._refuse(mark, (*path, key), f"given twice, first in line {line}" if line else "given twice")
@@ -254,41 +267,14 @@ def number(text: str) -> int | float | str:
     return text
 
 
+def _is_empty(node: Node) -> bool:
+    """Return True for the value of a key behind which nothing is written."""
+    return isinstance(node, ScalarNode) and node.style is None and str(node.value) == ""
+
+
 def _key(node: Node) -> str | int | None:
     """Return the key of a YAML mapping as a name or a whole number, or None for another kind of key."""
     if not isinstance(node, ScalarNode):
         return None
     key = _scalar(node)
     return key if isinstance(key, str | int) and not isinstance(key, bool) and key != "" else None
-
-
-def _explain(error: Exception, text: str, start: Location, path: Where) -> Diagnostic:
-    """Return the diagnostic for a text that is not valid YAML."""
-    at = getattr(error, "problem_mark", None)
-    line, column = (at.line, at.column) if at else _control(text)
-    problem = error.problem if isinstance(error, MarkedYAMLError) and error.problem else "an invalid character"
-    lines = text.splitlines() or [""]
-    here = lines[min(line, len(lines) - 1)]
-    mark = Location(start.file, line + 1, column + 1, start.folder) if start.line else start
-    return Diagnostic(mark, dotted(path), _fix(problem, here, column))
-
-
-def _fix(problem: str, here: str, column: int) -> str:
-    if "\\t" in problem or "\t" in here[: column + 1]:
-        return "a tab: indent YAML with spaces"
-    if re.search(r"[^\"']\$\{", here) and "expected" in problem:
-        return 'inside { } or [ ], quote a reference: "${…}"'
-    if re.search(r"\[[^\]]*\w\[", here) and "'['" in problem:
-        return 'inside [ ], quote a name with brackets: "psf[mask]"'
-    if "mapping values are not allowed" in problem:
-        return "a second ':' on this line, or a wrong indent: quote the text, or begin a new line"
-    if "but found another document" in problem:
-        return "a second document (---): a recipe must be a single document"
-    return f"is not YAML: {problem}"
-
-
-def _control(text: str) -> tuple[int, int]:
-    """Return the line and column of the first control character in a text."""
-    match = re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff\ufffe\uffff]", text)
-    before = text[: match.start()] if match else ""
-    return before.count("\n"), len(before.rpartition("\n")[2])

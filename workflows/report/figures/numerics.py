@@ -80,7 +80,7 @@ def _errors(step: Callable[..., Any], scene: Tensor, psf: Psf, strength: float, 
     point[..., at, at] = strength
     spot = torch.zeros_like(scene)
     spot[..., at - half : at + half, at - half : at + half] = strength * psf.intensity
-    double = Psf(psf.intensity.double(), psf.clear_peak)
+    double = psf._replace(intensity=psf.intensity.double())
     truth = step(scene.double(), double) + spot.double()
     results = (step(scene, psf) + spot, step(scene + point, psf))
     down, across = (torch.arange(n) - at for n in scene.shape[-2:])

@@ -98,14 +98,14 @@ def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
 
 
 @drawn
-def promises(asked: Sequence[float], measured: Mapping[str, Sequence[float]], proved: Sequence[float | None]) -> Any:
-    """Draw the measured error of each output and the proved error bound against the requested tolerance."""
+def promises(asked: Sequence[float], measured: Mapping[str, Sequence[float]], stated: Sequence[float | None]) -> Any:
+    """Draw the measured error of each output and the stated error against the requested tolerance."""
     figure, axes = canvas(8.4, 5.0)
     ax = axes[0, 0]
     ax.loglog(asked, asked, color=BLACK, linewidth=1.2, label="error equal to the tolerance")
-    bounds = [(t, max(b, EXACT)) for t, b in zip(asked, proved, strict=True) if b is not None]
+    bounds = [(t, max(b, EXACT)) for t, b in zip(asked, stated, strict=True) if b is not None]
     if bounds:
-        ax.loglog(*zip(*bounds, strict=True), color=_GREY, linestyle="--", label="proved error bound")
+        ax.loglog(*zip(*bounds, strict=True), color=_GREY, linestyle="--", label="stated error")
     for name, (colour, mark) in _styles(measured).items():
         style = {"color": colour, "marker": mark, "markersize": 6, "linewidth": 1.0}
         ax.loglog(asked, np.maximum(measured[name], EXACT), label=name, **style)

@@ -18,7 +18,7 @@ from neusee.workflows.studies.accuracy.single_steps import USED, StepTried
 from neusee.workflows.studies.accuracy.work_precision_points import WorkPrecisionPoint
 
 TOLERANCE, KEEP_ALL = "tolerance", "everything kept"
-HEADER = ("part", "line", "setting", "output", "seed", "error", "seconds", "computing", "proved", "refused")
+HEADER = ("part", "line", "setting", "output", "seed", "error", "seconds", "computing", "stated", "refused")
 _BUSY = 1.5  #: processes for each core, above which times are not reliable
 _NO_WORSE = 2.0  #: factor on the error of the full computation, which is one draw of its rounding error
 _ABREAST = 6  #: outputs side by side in a table
@@ -155,7 +155,7 @@ def sections(result: AccuracyResult, drawn: Mapping[str, bytes]) -> list[Section
 
 def _all_points(points: Points, text: str, picture: bytes | None) -> Section:
     columns = ["parameter", "setting", "run time, s", "of it computing, s"]
-    columns += ["error", "least", "most", "proved", "worst output"]
+    columns += ["error", "least", "most", "stated", "worst output"]
     sound = [p for p in points if p.sound]
     best = {id(p) for p in pareto_front(sound)}
     rows, marks = [], {}

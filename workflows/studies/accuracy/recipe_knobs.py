@@ -95,13 +95,22 @@ def _samples(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
         if samples:
             yield f"{' and '.join(p.path for p in (*samples, *pitches))} are not one pair of samples and pitch"
         return
-    own, pitch = int(samples[0].value), float(pitches[0].value)
+    own, pitch = int(samples[0].value), pitches[0].value
+    if pitch is None:  # the grid is as wide as the aperture
+        sizes = _sizes(own, quick)
+        yield _knob(samples[0].path, [(n, str(n), (f"{samples[0].path}={n}",)) for n in sizes], own)
+        return
     if others := _others(recipe, "pitch", pitches[0]):
         yield f"{', '.join(others)} would keep the old pitch, which is written elsewhere"
         return
     at, other = samples[0].path, pitches[0].path
-    sizes = sorted({max(2, round(own * f)) for f in (1.0, *(_FEWER_SCALES if quick else _SCALES))})
-    yield _knob(at, [(n, str(n), (f"{at}={n}", f"{other}={own * pitch / n!r} m")) for n in sizes], own)
+    settings = [(n, str(n), (f"{at}={n}", f"{other}={own * pitch / n!r} m")) for n in _sizes(own, quick)]
+    yield _knob(at, settings, own)
+
+
+def _sizes(own: int, quick: bool) -> list[int]:
+    """Return the numbers of pupil samples that a study tries, the recipe's own among them."""
+    return sorted({max(2, round(own * f)) for f in (1.0, *(_FEWER_SCALES if quick else _SCALES))})
 
 
 _BOTH = (("samples", "pitch"), ("pitch", "samples"))

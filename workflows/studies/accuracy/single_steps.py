@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Node
-from neusee.nodes.values import BAND_FIELDS, Channels, LowRankCube, Psf
+from neusee.nodes.values import Channels, LowRankCube, Psf, band_names
 from neusee.workflows.engine.provenance import machine
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
@@ -248,5 +248,5 @@ def _fewer_bands(value: Any, axis: int, bands: int) -> Any:
             return value
         indices = value.new_tensor([round((i + 0.5) * count / bands - 0.5) for i in range(bands)]).long()
         return value.index_select(axis, indices)
-    fields = {name: getattr(value, name) for name in BAND_FIELDS.get(type(value), ())}
+    fields = {name: getattr(value, name) for name in band_names(value)}
     return value._replace(**{n: _fewer_bands(x, axis, bands) for n, x in fields.items()}) if fields else value

@@ -53,7 +53,7 @@ class PointMeasurement:
     seconds: list[float] = field(default_factory=list)  #: of the engine, one for each cold run
     computing: float = 0.0  #: s in the steps of the first cold run
     load: float = 0.0  #: runnable processes for each core before the run, this process included
-    bound: float | None = None  #: proved error bound of the worst output
+    bound: float | None = None  #: largest error that the run states for its outputs; None if one is unknown
     steps: dict[str, float] = field(default_factory=dict)  #: s by step, in the first cold run
     refused: str = ""
 
@@ -151,7 +151,9 @@ class PointCache:
                 errors = self._errors(recipe, result.values, store)
         except RunError as error:
             return PointMeasurement(refused=f"{error.step}: {error.cause}")
-        return PointMeasurement(errors, [result.seconds], sum(ran.values()), load, result.proof.worst, ran)
+        return PointMeasurement(
+            errors, [result.seconds], sum(ran.values()), load, result.proof.worst_stated(result.values), ran
+        )
 
     def _warm_up(self, recipe: Recipe) -> None:
         """Run the recipe once without timing, because the first run of a process imports libraries and reads code."""

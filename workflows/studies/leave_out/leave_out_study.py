@@ -46,7 +46,8 @@ def study(
     output_errors, rows = comparison.output_errors(), []
     failure = {True: "", False: ": does not hold"}
     for output in output_errors:
-        error = f"error {output.rms:.2g}, tolerance {recipe.tolerance:.2g}"
+        stated = output.kind if output.bound is None else f"{output.bound:.2g} ({output.kind})"
+        error = f"error {output.rms:.2g}, stated {stated}, tolerance {recipe.tolerance:.2g}"
         progress(f"{output.output}: {error}{failure[output.holds]}")
     for row in comparison.rows():
         rows.append(row)
@@ -76,7 +77,7 @@ def _report(recipe: Recipe, result: LeaveOutResult) -> StudyReport:
 
 
 def _output_line(p: OutputError) -> Sequence[Any]:
-    return "output", p.output, "", "", p.bound, p.rms, p.largest, "", "", "", p.holds
+    return "output", p.output, p.kind, "", p.bound, p.rms, p.largest, "", "", "", p.holds
 
 
 def _cells(r: OmissionRow) -> tuple[Any, ...]:
@@ -87,7 +88,7 @@ def _cells(r: OmissionRow) -> tuple[Any, ...]:
 def _lead(recipe: Recipe, result: LeaveOutResult) -> str:
     chosen = [row for row in result.rows if row.taken]
     worst = max((p.rms for p in result.output_errors), default=0.0)
-    held = "All bounds hold" if not result.failed else f"{result.failed} bounds do not hold"
+    held = "All stated errors hold" if not result.failed else f"{result.failed} stated errors are too small"
     return (
         f"{held}. Of {len(result.rows)} possible omissions with a known bound, the recipe chooses {len(chosen)} at its "
         f"tolerance of {recipe.tolerance:.2g}. The largest error of an output is then {worst:.2g}, "
@@ -96,12 +97,13 @@ def _lead(recipe: Recipe, result: LeaveOutResult) -> str:
 
 
 def _outputs(recipe: Recipe, result: LeaveOutResult) -> Section:
-    rows = [(p.output, p.bound, p.rms, p.largest, recipe.tolerance, _HELD[p.holds]) for p in result.output_errors]
+    tolerance = recipe.tolerance
+    rows = [(p.output, p.bound, p.kind, p.rms, p.largest, tolerance, _HELD[p.holds]) for p in result.output_errors]
     text = """Each output of the recipe with the chosen omissions, compared with the full computation (`--exact`). The
-        error is the root mean square of the difference over the largest element; the tolerance limits this error. The
-        proved bound follows from the bounds of the omissions, if all nodes can propagate them."""
-    columns = ("output", "proved bound", "error", "largest difference", "tolerance", "holds")
-    return Section("The outputs", text, columns, rows, marks=_marks(result.output_errors, 5))
+        error is the root mean square of the difference over the largest element; the tolerance limits it before noise
+        and rounding. The stated error is that of the page of a run: proved, estimated, or unknown."""
+    columns = ("output", "stated error", "kind", "error", "largest difference", "tolerance", "holds")
+    return Section("The outputs", text, columns, rows, marks=_marks(result.output_errors, len(columns) - 1))
 
 
 def _omissions(result: LeaveOutResult) -> Section:

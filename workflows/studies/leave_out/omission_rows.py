@@ -26,6 +26,7 @@ from neusee.workflows.store.memo import compute_once
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.leave_out.possible_omissions import Omission, omissions
 from neusee.workflows.tolerance.error_norm import error_of, largest_error
+from neusee.workflows.tolerance.error_propagation import Kind
 
 _SURE = 4.0  #: standard errors by which a mean over pixels may differ from the mean over all noise
 _ABOUT = {"step": "study leave-out"}
@@ -54,7 +55,8 @@ class OutputError:
     """The error of one output after the engine has left out steps, relative to the full computation."""
 
     output: str
-    bound: float | None  #: error bound that the engine proved
+    bound: float | None  #: error that the run states, as its page does; None if it is unknown
+    kind: Kind
     rms: float
     largest: float
     holds: bool
@@ -80,9 +82,10 @@ class OmissionComparison:
         for name in self.recipe.outputs:
             value, reference = self.chosen.values[name], self.truth.values[name]
             rms, proved = error_of(value, reference), self.chosen.proof
-            bound = proved.stated.get(name, proved.of(name))
-            holds = rms <= min(self.recipe.tolerance, math.inf if bound is None or self.chosen.recipe.exact else bound)
-            errors.append(OutputError(name, bound, rms, largest_error(value, reference), holds))
+            bound, kind = proved.stated_of(name), proved.kind_of(name)
+            # beyond the tolerance only by what noise and rounding add, which the stated error counts
+            holds = rms <= (self.recipe.tolerance if bound is None or self.chosen.recipe.exact else bound)
+            errors.append(OutputError(name, bound, kind, rms, largest_error(value, reference), holds))
         return errors
 
     def rows(self) -> Iterator[OmissionRow]:

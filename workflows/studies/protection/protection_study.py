@@ -39,9 +39,9 @@ def study(
 ) -> Path:
     """Compare the mask of a recipe with filters and stops of equal protection, and return the folder with the results.
 
-    Args: draws: of the unknown conditions. bands: wavelengths of the scene. light: `pulse`, whose peak does harm, or
-    `continuous`, whose heat does. size: height of the targets in pixels. prnu: relative spread of the sensitivity of
-    pixels. residual: share of the glare that is subtracted wrongly.
+    Args: draws: of the unknown conditions. bands: wavelengths of the scene; the laser may have each of the recipe.
+    light: `pulse`, whose peak does harm, or `continuous`, whose heat does. size: height of the targets in pixels.
+    prnu: relative spread of the sensitivity of pixels. residual: share of the glare that is subtracted wrongly.
     """
     study_run = StudyRun("protection", recipe, command)
     camera = ProtectionCamera.of(recipe, store, bands)
@@ -110,8 +110,9 @@ def _notes(camera: ProtectionCamera, options: dict[str, Any]) -> list[str]:
     noise = camera.noise
     harm = "peak of the PSF" if options["light"] == "pulse" else f"heat of the hottest pixel after {_CONTINUOUS:g} s"
     laws = ", ".join(f"{name.replace('_', ' ')} {law}" for name, law in asdict(_LAWS).items())
+    wavelengths = len(camera.laser_bands.centres)
     return [
-        f"Equal protection: the {harm} at the worst of {len(camera.bands.centres)} wavelengths. Sensor: read noise "
+        f"Equal protection: the {harm} at the worst of {wavelengths} wavelengths. Sensor: read noise "
         f"{noise['read_noise']:g} e-, well {noise['full_well']:g} e-, PRNU {options['prnu']:.1%}, residual glare "
         f"{options['residual']:.1%} (the share of the glare that is subtracted wrongly).",
         f"Scene: grey, natural spectrum 1 / frequency^2 with a contrast variance of {_VARIANCE:g}. Targets: "

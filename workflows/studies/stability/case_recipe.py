@@ -53,7 +53,7 @@ def _smaller(step: Step, size: Size, part: float) -> dict[str, Any]:
     if params.get("shape"):
         params["shape"] = tuple(max(1, round(side * part)) for side in params["shape"])
     if "samples" in params:
-        params["pitch"] *= params["samples"] / size.samples
+        params["pitch"] = params["pitch"] and params["pitch"] * params["samples"] / size.samples
         params["samples"] = size.samples
     if step.node.path == "spectra.bands":
         params["count"] = size.bands

@@ -25,8 +25,8 @@ class Scatter:
 
     @property
     def is_constant(self) -> bool:
-        """Return True if the quantity has the same value in all draws."""
-        return not float(self.sd.max()) > 0
+        """Return True if the quantity has the same finite value in all draws."""
+        return bool(np.isfinite(self.mean).all()) and not float(self.sd.max()) > 0
 
 
 def scatter(values: FloatArray, sequences: int = 0) -> Scatter:

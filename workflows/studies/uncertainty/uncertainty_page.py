@@ -15,10 +15,11 @@ from neusee.workflows.report.contents import BANDS
 from neusee.workflows.report.study_page import Mark, Section, with_uncertainty
 from neusee.workflows.studies.uncertainty import uncertainty_figures as figures
 from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray, Scatter, worst_known
-from neusee.workflows.studies.uncertainty.sobol_indices import EXPLAINED, SobolIndices
+from neusee.workflows.studies.uncertainty.sobol_indices import IndexInterval, SobolIndices
 
 _MOST = 12  #: numbers in the pictures and in the lead
 _LITTLE = 0.01  #: share of a variance; inputs with a smaller share have no row
+_TOO_LITTLE = 0.5  #: share of a variance that a polynomial must predict for a row of indices
 _TRANSFER = "sensor.photon_transfer"
 _CONSTRAINT = {"upper": "only an upper limit", "lower": "only a lower limit", "none": "nothing"}
 
@@ -39,6 +40,7 @@ class UncertaintyResult:
     wanted: float  #: the requested relative error
     sequences: int  #: number of Sobol sequences; 0 for independent draws
     deciding: tuple[str, ...]  #: quantities whose standard deviations decided when to stop
+    left_out: str  #: draws whose values the recipe does not allow together; empty for none
 
     @property
     def worst(self) -> str:
@@ -128,19 +130,31 @@ def _node_of(result: UncertaintyResult, quantity: str) -> str:
 def lead(result: UncertaintyResult) -> str:
     """Return the summary of the uncertainty study in a few sentences."""
     count, kind = len(result.points.z), "Sobol points" if result.sequences else "independent draws"
-    every = len(result.deciding) == len(result.scatter)
-    which = "every standard deviation" if every else f"the standard deviation of {', '.join(result.deciding)}"
-    known = f"{which} is known to {result.error:.1%}"
-    if result.error > result.wanted:
-        known = f"the standard deviation of {result.worst} is known to {result.error:.1%} only"
-        known += f"; {result.wanted:.1%} was requested"
-    if not every:
-        other = worst_known(result.scatter)
-        known += f"; others did not decide, the least known is {other} to {result.scatter[other].error:.1%}"
     numbers = {name: result.scatter[name] for name in result.numbers[:_MOST]}
     values = [f"{name} {with_uncertainty(float(s.mean[0]), float(s.sd[0]))}" for name, s in numbers.items()]
     strange = f" NaN or infinite in some draw: {', '.join(result.strange)}." if result.strange else ""
+    known = "; ".join([*_known(result), *_exceptions(result)])
     return f"{count} {kind} of {', '.join(result.inputs.names)}: {known}.{strange}\n\n{'; '.join(values)}."
+
+
+def _known(result: UncertaintyResult) -> list[str]:
+    """Return how well the standard deviations are known."""
+    if len(result.deciding) == len(result.scatter):
+        which, others = "every standard deviation", []
+    else:
+        which, other = f"the standard deviation of {', '.join(result.deciding)}", worst_known(result.scatter)
+        others = [f"others did not decide, the least known is {other} to {result.scatter[other].error:.1%}"]
+    if result.error <= result.wanted:
+        return [f"{which} is known to {result.error:.1%}", *others]
+    known = f"the standard deviation of {result.worst} is known to {result.error:.1%} only"
+    return [known, f"{result.wanted:.1%} was requested", *others]
+
+
+def _exceptions(result: UncertaintyResult) -> list[str]:
+    """Return which numbers do not vary, and how many draws were left out."""
+    constant = [name for name, s in result.scatter.items() if s.is_constant]
+    parts = [f"{', '.join(constant)} {'does' if len(constant) == 1 else 'do'} not vary"] if constant else []
+    return [*parts, f"left out: {result.left_out}"] if result.left_out else parts
 
 
 def sections(result: UncertaintyResult, shown: Mapping[str, bytes]) -> list[Section]:
@@ -165,6 +179,11 @@ def _inputs(result: UncertaintyResult) -> Section:
     text = """The drawn values, in SI units. A joint distribution is drawn from independent inputs: the first input
         moves all correlated values, and each further input the part of its value that the inputs before it leave free.
         The same noise is drawn every time, so that only the inputs make a difference."""
+    notes = result.inputs.notes
+    cut = [f"{name} = {result.inputs.uncertain.said(name)}: {note}." for name, note in notes.items()]
+    if result.left_out:
+        cut.append(f"Left out: {result.left_out}; all numbers hold for the other draws.")
+    text = "\n\n".join([text, *cut])
     rows = [(r["name"], r["label"], r["law"], f"{r['mean']:.6g}", r["sd"]) for r in result.input_rows]
     return Section("Inputs", text, ("value", "drawn as", "law", "mean", "sd"), rows)
 
@@ -196,33 +215,38 @@ def _numbers(result: UncertaintyResult, picture: bytes | None) -> Section:
         label = name if len(s.sd) == 1 else f"{name}, element {i}"
         numbers = (f"{result.middle[name][i]:.6g}", f"{s.mean[i]:.6g}", float(s.sd[i]))
         marks[len(rows), 4] = "pass" if s.error <= result.wanted and name not in result.strange else "fail"
-        rows.append((label, *numbers, f"{s.error:.1%}", f"{s.low[i]:.6g}", f"{s.high[i]:.6g}"))
+        error = "does not vary" if s.is_constant else f"{s.error:.1%}"
+        rows.append((label, *numbers, error, f"{s.low[i]:.6g}", f"{s.high[i]:.6g}"))
     return Section("Numbers", text, columns, rows, picture, marks)
 
 
 def _moves(result: UncertaintyResult, picture: bytes | None) -> list[Section]:
     if picture is None:
         return []
-    text = f"""Each input alone at its 5 % and its 95 % quantile, all others at their medians. The table has shares of
-        the variance (SALib). First: the effect of the input alone, from the draws (RBD-FAST). Total: the effect alone
-        and together with other inputs, from a polynomial of second order. Explained: the share of the variance that
-        this polynomial predicts for draws outside the fit; below {EXPLAINED:.0%} the total shares are not shown. Inputs
-        with less than {_LITTLE:.0%}, or with at most half their error, have no row; provenance.json has all."""
-    columns = ("quantity", "input", "first", "±", "total", "±", "explained")
+    text = f"""Each input alone at its 5 % and its 95 % quantile, all others at their medians. The table has Sobol
+        indices, the shares of the inputs in the variance, with 95 % intervals. First: the effect of the input alone.
+        Total: the effect alone and together with other inputs. Both are those of one polynomial, fitted to the draws.
+        Explained: the share of the variance that this polynomial predicts for draws outside its fit. What is
+        left may belong to any input, so that every interval contains it; below {_TOO_LITTLE:.0%} the inputs are not
+        judged. Inputs with a total of less than {_LITTLE:.0%} have no row; provenance.json has all."""
+    columns = ("quantity", "input", "first", "interval", "total", "interval", "explained")
     rows: list[Sequence[Any]] = []
     marks: dict[tuple[int, int], Mark] = {}
     for name, shares in result.shares.items():
-        before = len(rows)
-        first = zip(shares.first, shares.first_error, strict=True)
-        total = zip(shares.total, shares.total_error, strict=True)
-        for label, alone, together in zip(result.inputs.labels, first, total, strict=True):
-            share, error = together if shares.explains_enough else alone
-            if share > max(_LITTLE, error / 2):
-                shown = together if shares.explains_enough else (None, None)
-                rows.append((name, label, *alone, *shown, shares.explained))
-        if len(rows) > before and not shares.explains_enough:
-            marks[before, 6] = "warn"
+        if not shares.explains_enough:
+            marks[len(rows), 6] = "warn"
+        if shares.explained < _TOO_LITTLE:
+            rows.append((name, "not judged", None, None, None, None, f"{shares.explained:.0%}"))
+            continue
+        for label, first, total in zip(result.inputs.labels, shares.first, shares.total, strict=True):
+            if total.value > _LITTLE:
+                explained = f"{shares.explained:.1%}"
+                rows.append((name, label, first.value, _between(first), total.value, _between(total), explained))
     return [Section("Influence of the inputs", text, columns, rows, picture, marks)]
+
+
+def _between(index: IndexInterval) -> str:
+    return f"{index.low:.2g} to {index.high:.2g}"
 
 
 def _rest(result: UncertaintyResult) -> list[Section]:

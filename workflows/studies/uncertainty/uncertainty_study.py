@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.recipe.distributions.allowed_range import NEGLIGIBLE
 from neusee.workflows.recipe.distributions.joint import Z_90
 from neusee.workflows.recipe.distributions.nominal_values import told
 from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, InputDraws, Inputs
 from neusee.workflows.report.study_folder import Content, Progress, StudyReport, StudyRun
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.studies.study_refused import StudyRefused
+from neusee.workflows.studies.uncertainty.allowed_draws import AllowedDraws, refuse_combinations
 from neusee.workflows.studies.uncertainty.output_draws import Numbers, OutputDraws
 from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray, Scatter, scatter, worst_known
-from neusee.workflows.studies.uncertainty.sobol_indices import indices, require_salib
+from neusee.workflows.studies.uncertainty.sobol_indices import indices
 from neusee.workflows.studies.uncertainty.uncertainty_page import UncertaintyResult, draw_pictures, lead, sections
 
 LEAST = 64  #: draws before the first decision to stop
+_RARE = 3.09  #: normal score of the quantile at 99.9 %
 _ROUND = 16  #: independent draws in each further round
 PICTURED = 32  #: draws for the mean and standard deviation of pictures; the deviation is known to 13 %
 _KEPT = ("mean", "sd")  #: of each picture
@@ -48,15 +53,48 @@ def study(
     processes compute draws; 0 means one for each free processor. Returns the folder with the results.
     """
     study_run = StudyRun("uncertainty", recipe, command)
-    require_salib()
-    inputs = Inputs.of(recipe)
+    inputs = _inputs(recipe)
     _chosen([name.partition(".")[0] for name in until], inputs.recipe.outputs)
-    at = _points(inputs, recipe.seed, most, points)
-    inputs.checked(np.concatenate([at.values, _ends(inputs)]))
+    sequences = SCRAMBLES if points == "sobol" else 0
+    allowed = AllowedDraws(inputs, _points(inputs, recipe.seed, most, points), sequences)
+    allowed.extend(LEAST)
+    refuse_combinations(inputs, _ends(inputs), allowed)
     draws = OutputDraws(inputs, store, device, workers)
-    result = _measure(inputs, draws, at, progress, (error, SCRAMBLES if points == "sobol" else 0, until))
+    result = _measure(inputs, draws, allowed, progress, StopRule(error, sequences, tuple(until)))
     document = study_run.document(_document(result, draws))
     return study_run.write(runs, digest(document["quantities"]), document, _report(result))
+
+
+@dataclass(frozen=True)
+class StopRule:
+    """When a study has enough draws."""
+
+    wanted: float  #: relative error of each standard deviation
+    sequences: int  #: number of Sobol sequences; 0 for independent draws
+    until: tuple[str, ...]  #: outputs or quantities whose standard deviations decide; empty for all
+
+    @property
+    def text(self) -> str:
+        """Return the standard deviations that decide, in words."""
+        return f"standard deviations of {', '.join(self.until)}" if self.until else "every standard deviation"
+
+    def needed(self, count: int, error: float, available: int) -> int:
+        """Return about how many draws are needed, from the ``error`` of ``count`` draws."""
+        return count if error <= self.wanted else min(available, int(count * (error / self.wanted) ** 2))
+
+    def following(self, count: int) -> int:
+        """Return the number of draws of the next round after ``count`` draws."""
+        # Sobol points are evenly spread only for a power of two
+        return max(LEAST, 2 * count if self.sequences else count + _ROUND)
+
+
+def _inputs(recipe: Recipe) -> Inputs:
+    try:
+        return Inputs.of(recipe, negligible=NEGLIGIBLE)
+    except RecipeError:
+        raise
+    except ValueError as error:
+        raise StudyRefused(str(error)) from error
 
 
 def _points(inputs: Inputs, seed: int, most: int, points: str) -> InputDraws:
@@ -67,49 +105,119 @@ def _points(inputs: Inputs, seed: int, most: int, points: str) -> InputDraws:
 
 def _ends(inputs: Inputs) -> FloatArray:
     """Return the input values of each run: all at their medians, then one input at its 5 % and at its 95 % quantile."""
-    count = len(inputs.names)
-    return inputs.at(np.concatenate([np.zeros((1, count)), *(np.stack([-Z_90 * e, Z_90 * e]) for e in np.eye(count))]))
+    return np.concatenate([inputs.at(np.zeros((1, len(inputs.names)))), _one_at_a_time(inputs, Z_90)])
+
+
+def _one_at_a_time(inputs: Inputs, score: float) -> FloatArray:
+    """Return input values with one input at each of two opposite normal scores, and all others at their medians."""
+    z = [sign * score * direction for direction in np.eye(len(inputs.names)) for sign in (-1, 1)]
+    return inputs.at(np.stack(z))
 
 
 def _chosen(until: Sequence[str], there: Sequence[str]) -> tuple[str, ...]:
-    """Return the names ``there`` that ``until`` means, or all; raise ValueError for a name that means none of them."""
-    found = {name: [x for x in there if x == name or x.startswith((f"{name}.", f"{name}["))] for name in until}
-    for name in (name for name, those in found.items() if not those):
-        raise ValueError(f"--until {name}: no output with numbers has this name; there are {', '.join(there)}")
-    return tuple(name for name in there if not until or any(name in those for those in found.values()))
+    """Return the names ``there`` that ``until`` means, or all; raise `StudyRefused` for a name of none of them."""
+    if not until:
+        return tuple(there)
+    decide = dict[str, None]()
+    for name in until:
+        meant = _means(name, there)
+        if not meant:
+            raise StudyRefused(f"--until {name}: no output with numbers has this name; there are {', '.join(there)}")
+        decide |= dict.fromkeys(meant)
+    return tuple(name for name in there if name in decide)
+
+
+def _deciding(until: Sequence[str], there: Sequence[str], constant: Sequence[str]) -> tuple[str, ...]:
+    """Return the numbers that decide when to stop; raise `StudyRefused` for an output that depends on no input."""
+    still = [name for name in until if _means(name, constant) and not _means(name, there)]
+    if still:
+        raise StudyRefused(f"--until {still[0]}: this output depends on no uncertain input, and does not vary")
+    return _chosen(until, there)
+
+
+def _means(name: str, there: Sequence[str]) -> list[str]:
+    """Return the names ``there`` of an output or of a single quantity."""
+    return [quantity for quantity in there if quantity == name or quantity.startswith((f"{name}.", f"{name}["))]
 
 
 def _measure(
-    inputs: Inputs, draws: OutputDraws, at: InputDraws, progress: Progress, how: tuple[float, int, Sequence[str]]
+    inputs: Inputs, draws: OutputDraws, allowed: AllowedDraws, progress: Progress, rule: StopRule
 ) -> UncertaintyResult:
-    wanted, sequences, until = how
-    progress(f"{len(inputs.names)} inputs: {', '.join(inputs.names)}; {len(draws.outputs)} outputs depend on them")
-    progress(f"steps that depend on no input: {draws.ready():.1f} s")
-    pictures = draws.pictures(at.values[:PICTURED])
+    _say_inputs(inputs, draws, rule.sequences, progress)
     ends = draws.numbers(_ends(inputs))
     if not ends[0]:
-        raise ValueError("the outputs are pictures only: add an output with numbers, such as restored_quality")
-    deciding = _chosen(until, list(ends[0]))
-    what = f"standard deviations of {', '.join(until)}" if until else "every standard deviation"
-    numbers: list[Numbers] = []
-    used = 0
-    while used < len(at.values):
-        # Sobol points are evenly spread only for a power of two
-        used = min(len(at.values), max(LEAST, 2 * used if sequences else used + _ROUND))
-        numbers += draws.numbers(at.values[len(numbers) : used])
-        values = {name: np.array([n[name] for n in numbers]) for name in ends[0]}
-        scattered = {name: scatter(x, sequences) for name, x in values.items()}
+        raise StudyRefused("the outputs are pictures only: add an output with numbers, such as restored_quality")
+    deciding = _deciding(rule.until, list(ends[0]), draws.is_constant)
+    _say_constant(inputs, draws, ends, deciding, progress)
+    pictures = draws.pictures(allowed.values[:PICTURED])
+    numbers = list[Numbers]()
+    while allowed.tried < allowed.available or not numbers:
+        allowed.extend(rule.following(allowed.tried) if numbers else LEAST)
+        numbers += draws.numbers(allowed.values[len(numbers) :])
+        values = _by_quantity(numbers)
+        scattered = {name: scatter(x, rule.sequences) for name, x in values.items()}
         worst = worst_known({name: scattered[name] for name in deciding})
         error = scattered[worst].error
-        needed = used if error <= wanted else min(len(at.values), int(used * (error / wanted) ** 2))
-        progress(f"{used} draws of about {needed}: {what} to {error:.1%} ({worst})")
-        if error <= wanted:
+        needed = rule.needed(len(numbers), error, allowed.available)
+        progress(f"{len(numbers)} draws of about {needed}: {rule.text} to {error:.1%} ({worst})")
+        if error <= rule.wanted:
             break
-    middle, swings = ends[0], _swings(inputs, ends, values, scattered)
-    z = at.z[:used]
-    shares = {n: indices(inputs.labels, z, values[n][:, 0], inputs.recipe.seed) for n in swings}
-    rest = (pictures, draws.is_constant, wanted, sequences, deciding)
-    return UncertaintyResult(inputs, InputDraws(z, at.values[:used]), values, scattered, middle, swings, shares, *rest)
+    swings = _swings(inputs, ends, values, scattered)
+    return UncertaintyResult(
+        inputs=inputs,
+        points=InputDraws(allowed.z, allowed.values),
+        values=values,
+        scatter=scattered,
+        middle=ends[0],
+        swings=swings,
+        shares={name: indices(inputs.shapes, allowed.z, values[name][:, 0]) for name in swings},
+        pictures=pictures,
+        is_constant=draws.is_constant,
+        wanted=rule.wanted,
+        sequences=rule.sequences,
+        deciding=deciding,
+        left_out=allowed.statement,
+    )
+
+
+def _say_inputs(inputs: Inputs, draws: OutputDraws, sequences: int, progress: Progress) -> None:
+    """Print the inputs, what was cut off their distributions, and the outputs that depend on none of them."""
+    progress(f"{len(inputs.names)} inputs: {', '.join(inputs.names)}; {len(draws.outputs)} outputs depend on them")
+    for name, note in inputs.notes.items():
+        progress(f"{name} = {inputs.uncertain.said(name)}: {note}")
+    if draws.is_constant:
+        progress(f"outputs that depend on no input, and do not vary: {', '.join(draws.is_constant)}")
+    if inputs.has_table and sequences:
+        progress("a Sobol sequence draws from the columns of the table and their rank correlation, not its rows")
+    progress(f"steps that depend on no input: {draws.ready():.1f} s")
+
+
+def _say_constant(
+    inputs: Inputs, draws: OutputDraws, ends: Sequence[Numbers], deciding: Sequence[str], progress: Progress
+) -> None:
+    """Print which numbers do not vary in the first runs; raise `StudyRefused` if none of those that decide varies."""
+    constant = _constant(ends)
+    if set(deciding) <= set(constant):  # the rare ends of the distributions may tell more
+        ends = [*ends, *draws.numbers(_one_at_a_time(inputs, _RARE))]
+        constant = _constant(ends)
+    if constant:
+        progress(f"{', '.join(constant)}: the same in the first {len(ends)} runs, one input after another at its ends")
+    if set(deciding) <= set(constant):
+        raise StudyRefused(
+            f"nothing varies: {', '.join(deciding)} {'is' if len(deciding) == 1 else 'are'} the same in {len(ends)} "
+            "runs, with all inputs at their medians, and with each at its 5 %, 95 %, 0.1 % and 99.9 % quantile. Name "
+            "outputs that the inputs change, or write wider distributions"
+        )
+
+
+def _constant(runs: Sequence[Numbers]) -> list[str]:
+    """Return the names of the quantities that are the same in all runs."""
+    return [name for name, values in _by_quantity(runs).items() if scatter(values).is_constant]
+
+
+def _by_quantity(runs: Sequence[Numbers]) -> dict[str, FloatArray]:
+    """Return the values (run, element) of each quantity."""
+    return {name: np.array([run[name] for run in runs]) for name in runs[0]}
 
 
 def _swings(
@@ -143,6 +251,8 @@ def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
         "decided by": list(result.deciding),
         "inputs": result.input_rows,
         "posterior": told(result.inputs.uncertain.standings),
+        "cut off": dict(result.inputs.notes),
+        "left out": result.left_out,
         "idle": list(result.inputs.idle),
         "still": list(result.is_constant),
         "quantities": {name: _plain(result, name) for name in result.values},

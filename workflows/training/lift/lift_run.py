@@ -7,18 +7,26 @@ from pathlib import Path
 
 import torch
 
-from neusee.workflows.graph.recipe_graph import Recipe, needed
-from neusee.workflows.keys.cache_key import digest, plain
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.keys.engine_digest import outline
 from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.training.lift import lift_iteration
 from neusee.workflows.training.lift.lift_figures import lift_curves, lifted_spectra
 from neusee.workflows.training.lift.lift_iteration import LiftLearner, Pairs
+from neusee.workflows.training.loop import resumable_loop
+from neusee.workflows.training.loop.changed_inputs import prepare_folder
 from neusee.workflows.training.loop.checkpoint import export
+from neusee.workflows.training.loop.recorded_inputs import CameraInputs, RecordedInputs, folder_of
 from neusee.workflows.training.loop.resumable_loop import DOCUMENT, Losses, Progress, ResumableLoop, Watch
 
 _COLUMNS = ("iteration", "MRAE", "RMSE", "slope", "rate", "seconds")
-#: old names of settings in the folder key, so that trainings of version 0.1 continue
-_OLD_NAMES = {"min_rate": "least", "warmup": "warm", "ema_decay": "average", "validation_batches": "judge"}
+#: files of the program that decide the pairs and the steps of the optimiser
+_PROGRAM = {
+    "neusee/workflows/training/lift/lift_iteration.py": lift_iteration.__file__,
+    "neusee/workflows/training/loop/resumable_loop.py": resumable_loop.__file__,
+}
 
 
 def train_lift(
@@ -41,35 +49,38 @@ def train_lift(
     if settings is None:
         raise ValueError(f"{recipe.name} has no block `train_lift`: start from the recipe train_lift")
     pairs = Pairs(recipe, settings, store, device)
-    folder = runs / f"{recipe.name}_{_key(recipe, settings)}"
-    folder.mkdir(parents=True, exist_ok=True)
+    code = Code(store.code_memo)
+    inputs = lift_inputs(recipe, settings, code)
+    code.save()
+    folder = folder_of(runs, recipe.name, inputs)
+    prepare_folder(folder, inputs, recipe, store, progress)
     learner = LiftLearner(settings, pairs, recipe.seed, device)
-    _LiftLoop(settings, learner, folder, progress, device, watch).run_to_end(recipe, command)
+    _LiftLoop(settings, learner, inputs, folder, progress, device, watch).run_to_end(recipe, command)
     return folder
 
 
-def _key(recipe: Recipe, settings: LiftTraining) -> str:
-    """Return a digest of all settings that can change the trained weights, as a part of the folder name."""
-    steps = {
-        name: [
-            recipe.steps[name].node.path,
-            {key: plain(value) for key, value in recipe.steps[name].params.items()},
-            {key: plain(wire) for key, wire in recipe.steps[name].wires.items()},
-        ]
-        for name in needed(recipe, [settings.measured, settings.picture, settings.cube])
-    }
-    usual = {"clip"} if settings.clip == 10.0 else set()  # so that older trainings continue
-    fixed = settings.model_copy(update={"keep": 1, "show": 1, "validation_batches": 1})
-    block = fixed.model_dump(mode="json", exclude=usual)
-    return digest("lift", recipe.seed, steps, {_OLD_NAMES.get(name, name): value for name, value in block.items()})[:8]
+def lift_inputs(recipe: Recipe, settings: LiftTraining, code: Code) -> RecordedInputs:
+    """Return everything that can change the trained weights."""
+    camera = CameraInputs.of(recipe, [settings.measured, settings.picture, settings.cube], code)
+    block = settings.model_dump(mode="json", exclude={"keep", "show", "validation_batches"})
+    nodes = {f"neusee.nodes.{name}": code.digest(f"neusee.nodes.{name}") for name in ("losses", "spectra")}
+    program = {name: Path(file).read_bytes() for name, file in _PROGRAM.items()}
+    return RecordedInputs(
+        kind="lift",
+        recipe=recipe.name,
+        settings={**camera.settings, **{f"train_lift.{name}": value for name, value in block.items()}},
+        steps=camera.steps,
+        laws=camera.laws,
+        code={**nodes, **{name: outline(source).digest for name, source in program.items()}},
+    )
 
 
 class _LiftLoop(ResumableLoop[LiftLearner]):
     def __init__(
-        self, settings: LiftTraining, learner: LiftLearner, folder: Path, progress: Progress, device: str,
-        watch: Watch | None,
+        self, settings: LiftTraining, learner: LiftLearner, inputs: RecordedInputs, folder: Path, progress: Progress,
+        device: str, watch: Watch | None,
     ) -> None:  # fmt: skip
-        super().__init__(folder, settings, learner, _COLUMNS, progress, device, watch)
+        super().__init__(folder, settings, learner, _COLUMNS, progress, device, watch, inputs=inputs.digest)
         self.settings = settings
         self.resume()
 

@@ -46,12 +46,13 @@ class ResumableLoop(ABC, Generic[L]):
 
     def __init__(
         self, folder: Path, settings: Training | LiftTraining, learner: L, columns: Sequence[str],
-        progress: Progress, device: str, watch: Watch | None, writes: bool = True,
+        progress: Progress, device: str, watch: Watch | None, writes: bool = True, inputs: str = "",
     ) -> None:  # fmt: skip
         self.folder, self.learner, self.progress, self.device = folder, learner, progress, device
         self.keep_every, self.show_every, self.watch, self.writes = settings.keep, settings.show, watch, writes
         self.rows, self.state = Rows(folder / "losses.csv", columns), StateFile(folder / "state.pt")
         self.stage, self.iteration, self.batch, self.began = 0, 0, 1, timestamp()
+        self.inputs = inputs  #: digest of all that decides the training
 
     @abstractmethod
     def iterate(self) -> Losses:
@@ -73,15 +74,26 @@ class ResumableLoop(ABC, Generic[L]):
         """Return True if the present stage ends before its last iteration."""
         return False
 
+    def facts(self) -> dict[str, Any]:
+        """Return what a checkpoint keeps beside stage, iteration, inputs and the learner; most trainings have none."""
+        return {}
+
+    def recall(self, facts: Mapping[str, Any]) -> None:
+        """Take from a checkpoint what `facts` gave."""
+
     def begin_stage(self) -> None:
         """Prepare networks and optimisers for the present stage of the training."""
 
     def resume(self) -> None:
         """Continue a training from its checkpoint file, or begin at the first iteration if there is no checkpoint."""
         state = self.state.read(self.device)
+        if state and state.get("inputs", self.inputs) != self.inputs:
+            text = "was written for other inputs than those of this training, although its folder has their name"
+            raise ValueError(f"{self.state.path} {text}: remove the folder to start again")
         self.stage, self.iteration = state.get("stage", self.stage), state.get("iteration", 0)
         self.begin_stage()
         if state:
+            self.recall(state)
             for name, part in self.learner.parts().items():
                 part.load_state_dict(state["parts"][name])
             self.rows.cut(self.stage, self.iteration, self.writes)
@@ -142,7 +154,8 @@ class ResumableLoop(ABC, Generic[L]):
 
     def _packed(self, **about: Any) -> dict[str, Any]:
         parts = {name: part.state_dict() for name, part in self.learner.parts().items()}
-        return {"stage": self.stage, "iteration": self.iteration, **about, "parts": parts}
+        return {"stage": self.stage, "iteration": self.iteration, "inputs": self.inputs, **self.facts(), **about,
+                "parts": parts}  # fmt: skip
 
     def _dumped(self, error: NotFinite) -> ArithmeticError:
         """Write the weights and the picture numbers that led to a NaN or infinite loss, and return the error."""

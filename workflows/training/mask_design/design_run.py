@@ -17,15 +17,13 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import losses, metrics
-from neusee.nodes.doe import PARAMETRISATIONS, Polynomials, half_rings
+from neusee.nodes.doe import PARAMETRISATIONS, Polynomials, half_rings, size_metadata
 from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.final_values import flow
-from neusee.workflows.graph.recipe_graph import Recipe, needed
-from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.keys.input_file_digest import file_digest
+from neusee.workflows.keys.engine_digest import outline
 from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining, Weights, need_steps, state_file
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.changed_recipe import changed
@@ -34,6 +32,7 @@ from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_folder import StudyReport
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.loop.checkpoint import StateFile
+from neusee.workflows.training.loop.recorded_inputs import CameraInputs, RecordedFile, RecordedInputs
 from neusee.workflows.training.loop.resumable_loop import Progress
 from neusee.workflows.training.mask_design.design_terms import Fabrication, Terms
 from neusee.workflows.training.mask_design.differential_evolution import evolve
@@ -44,6 +43,8 @@ from neusee.workflows.training.mask_design.peak_limit import against_stops, line
 
 __all__ = ["DesignError", "MaskTraining", "Weights", "design", "mask_figures"]
 
+#: files of the program that decide the loss and the steps of the optimisers
+_OPTIMISES = ("camera_laws", "design_terms", "differential_evolution", "gradient_descent", "learnt_shade", "peak_limit")
 MASK = 0  #: the number of the stage that designs the mask, before stage 1
 _LEARNT_WITH = {
     used.__module__
@@ -70,7 +71,8 @@ def design(
     Raises: `DesignError` if the recipe lacks a step, or the loss is NaN or infinite.
     """
     need_steps(recipe.steps, settings)
-    key = _key(recipe, settings, store)
+    code = Code((store or Store()).code_memo)
+    key = design_inputs(recipe, settings, code).digest
     kept = StateFile(state_file(out, recipe.name, key))
     mask = DesignedMask.of(recipe, settings, store, kept, progress, device)
     with new_run(out, f"{recipe.name}_mask", key) as folder:
@@ -176,7 +178,8 @@ class DesignedMask:
         tables = {"history.csv": (header, [[row.get(name, "") for name in header] for row in history])}
         title, lead = f"{terms.recipe.name}: a mask designed without images", summary_line(self.figures)
         parts = sections(self.figures, terms.fabrication, drawings)
-        files = {"mask.safetensors": save({"height": self.height})}
+        size = size_metadata(float(terms.stop.pitch))
+        files = {"mask.safetensors": save({"height": self.height}, size)}
         return StudyReport(title, f"{terms.settings.kind}: {lead}.", parts, drawings, tables, files, shown)
 
 
@@ -199,20 +202,26 @@ def _at(recipe: Recipe, settings: MaskTraining) -> Recipe:
         raise DesignError(f"at: {error.diagnostics[0].path}: {error.diagnostics[0].message}") from error
 
 
-def _key(recipe: Recipe, settings: MaskTraining, store: Store | None) -> str:
-    """Return a digest of everything that can change a designed mask: recipe, settings and code."""
-    code = Code((store or Store()).code_memo)
-    steps = [recipe.steps[name] for name in needed(recipe, [settings.psf, settings.plain])]
-    nodes = sorted({step.node.fn.__module__ for step in steps} | _LEARNT_WITH)
-    block = settings.model_dump(mode="json", exclude={"save_every", "start"})
-    block["start"] = settings.start and file_digest(settings.start)
-    return digest(
-        "mask",
-        recipe.config.to_yaml(),
-        recipe.seed,
-        block,
-        [code.digest(node) for node in nodes],
-        engine("training.mask_design.design_run"),
+def design_inputs(recipe: Recipe, settings: MaskTraining, code: Code) -> RecordedInputs:
+    """Return everything that can change a designed mask: steps with their files and code, settings and own code."""
+    seen = (settings.illuminant, settings.responses) if settings.weights.coloured else ()
+    named = (settings.psf, settings.plain, settings.height, *seen)
+    outputs = [name for name in named if name in recipe.steps]
+    camera = CameraInputs.of(recipe, outputs, code)
+    if settings.at:
+        camera = camera.joined(CameraInputs.of(_at(recipe, settings), outputs, code).named("in the design: "))
+    block = settings.model_dump(mode="json", exclude={"save_every", "start", "at"})
+    nodes = {module: code.digest(module) for module in sorted(_LEARNT_WITH)}
+    folder = Path(__file__).parent
+    own = {f"neusee/workflows/training/mask_design/{name}.py": folder / f"{name}.py" for name in _OPTIMISES}
+    return RecordedInputs(
+        kind="mask",
+        recipe=recipe.name,
+        settings={**camera.settings, **{f"train.mask.{name}": value for name, value in block.items()}},
+        steps=camera.steps,
+        laws=camera.laws,
+        code={**nodes, **{name: outline(file.read_bytes()).digest for name, file in own.items()}},
+        files={} if settings.start is None else {"train.mask.start": RecordedFile.of(settings.start)},
     )
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import losses
-from neusee.nodes.values import BAND_FIELDS, Bands, Psf, Pupil, Stop
+from neusee.nodes.values import Bands, Psf, Pupil, Stop, band_names
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
@@ -216,5 +216,5 @@ def _some(value: Any, chosen: Sequence[int] | None) -> Any:
     if chosen is None:
         return value
     rows = torch.tensor(list(chosen))
-    changed = {name: getattr(value, name) for name in BAND_FIELDS[type(value)]}
+    changed = {name: getattr(value, name) for name in band_names(value)}
     return value._replace(**{name: x.index_select(0, rows.to(x.device)) for name, x in changed.items()})

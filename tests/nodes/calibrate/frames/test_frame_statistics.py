@@ -133,6 +133,19 @@ def test_alike_pixels_show_a_coarse_cut_that_unlike_ones_might_be():
     assert len(one(cut, "temporal").cell_value) == 0
 
 
+@pytest.mark.parametrize("spread", [0.2, 0.5])
+def test_pixels_of_unequal_noise_have_long_tails_and_no_pile(spread):
+    """Their tails exceed those of a Gaussian: the shortest dark frames were left out because of them."""
+    generator = torch.Generator().manual_seed(5)
+    width = torch.exp(spread * torch.randn(1, 400, 400, dtype=torch.float64, generator=generator))
+    noise_of_pixels = width * torch.randn(2, 400, 400, dtype=torch.float64, generator=generator)
+    for sigma in (1.15, 20.0):
+        assert len(one((300 + sigma * noise_of_pixels).round(), "steady").cell_value) == 0
+    numbers = (300 + 20 * noise_of_pixels).round()
+    for cut in (numbers.clamp_min(262), numbers.clamp_max(338)):
+        assert len(one(cut, "steady").cell_value) > 0
+
+
 def test_fixed_patterns_alone_keep_no_histogram():
     pattern = noise(1, 128, 128, sigma=200.0, mean=5000.0)
     frames = pattern + noise(2, 128, 128, mean=0.0, sigma=2.0, seed=9) * 0 + noise(2, 128, 128, mean=50, sigma=2.0)

@@ -154,7 +154,10 @@ def test_levels_that_pile_up_are_left_out_and_coarse_ones_are_not():
     coarse = piled._replace(variance=torch.where(torch.arange(8) == 3, 0.5, levels.variance))
     assert camera(coarse, **SENSOR).degrees_of_freedom.tolist() == [2, 2, 2, 2, 2, 2, 0, 0]
     dark = levels._replace(**{**cell, "cell_level": torch.tensor([0]), "cell_value": torch.tensor([0.0])})
-    assert camera(dark, **SENSOR).degrees_of_freedom.tolist() == [0, 2, 2, 2, 2, 2, 0, 0]
+    found = camera(dark, **SENSOR)
+    assert found.degrees_of_freedom.tolist() == [0, 2, 2, 2, 2, 2, 0, 0]
+    said = [check.text for check in camera.hooks.check(found, dark) if not check.ok]
+    assert said == ["the dark frames of 0.02 s pile up at an end: dark signal and dark noise are those of 0.4 s"]
 
 
 def test_negative_signals_are_weighed_and_what_cannot_be_is_not():

@@ -79,6 +79,53 @@ def test_without_edges_it_is_the_wiener_filter(size):
     torch.testing.assert_close(space(seen, most_likely(seen)), expected, rtol=0, atol=1e-6)
 
 
+def periodic_filter(seen, weight):
+    """Return the Wiener filter (channel, y, x) of a picture without edges whose channels are alike."""
+    signal = (1 + (len(seen.picture) - 1) * seen.grey) * seen.power
+    gain = seen.transfer.conj() * signal / (seen.transfer.abs().square() * signal + 1 / weight)
+    return torch.fft.irfft2(gain * torch.fft.rfft2(seen.picture), s=seen.torus)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("weight", [1e2, 1e8, 1e12, 1e15, 1e18])
+def test_a_picture_without_noise_is_inverted_to_rounding(weight, channels):
+    """The covariance of the pixels has the squared condition of the blur, and lost 4e-5 at a weight of 1e15."""
+    model = problem((12, 10), (12, 10))
+    alike = model.picture.expand(channels, -1, -1), model.transfer.expand(channels, -1, -1)
+    seen = replace(model, picture=alike[0], transfer=alike[1], weight=torch.full_like(alike[0], weight), grey=0.9)
+    expected = periodic_filter(seen, weight)
+    answer = space(seen, most_likely(seen))
+    assert float((answer - expected).abs().max() / expected.abs().max()) < 1e-8
+
+
+@pytest.mark.parametrize("weight", [1e6, 1e9, 1e12])
+def test_a_gradient_is_right_to_rounding_times_the_ratio_of_scene_to_noise(weight):
+    model = problem((12, 10), (12, 10))
+    picture, gradients = model.picture.requires_grad_(), []
+    seen = replace(model, weight=torch.full_like(picture, weight))
+    towards = torch.rand(12, 10, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    for answer in (space(seen, most_likely(seen)), periodic_filter(seen, weight)):
+        gradients.append(torch.autograd.grad((answer * towards).sum(), picture)[0])
+    ratio = weight * float((model.transfer.abs().square() * model.power).max())
+    error = float((gradients[0] - gradients[1]).abs().max() / gradients[1].abs().max())
+    assert error < 1e-16 * ratio
+
+
+@pytest.mark.parametrize("bounded", [0, 1])
+def test_even_glare_over_a_picture_without_noise_takes_its_share_of_the_mean(bounded):
+    """Even glare adds to the variance of the mean of the noise, and to nothing else."""
+    model, weight, count = problem((12, 10), (12, 10)), 1e13, 120
+    even = torch.full_like(model.picture, 5.0)
+    seen = replace(model, weight=torch.full_like(even, weight), glare=(even,), bounded=bounded)
+    noise = 1 / (weight * count)  # variance of its mean
+    glare = 25.0 if bounded else 1e8 * noise
+    scene = float(model.power[0, 0]) / count
+    expected = periodic_filter(seen, weight)
+    expected = expected - expected.mean() + seen.picture.mean() * scene / (scene + noise + glare)
+    answer = space(seen, most_likely(seen))
+    assert float((answer - expected).abs().max() / expected.abs().max()) < 1e-8
+
+
 def test_on_average_no_other_balance_does_better():
     """Pictures drawn from the prior, blurred, noisy and cut off: the right noise level has the least mean error."""
     size, errors = (40, 40), torch.zeros(3)

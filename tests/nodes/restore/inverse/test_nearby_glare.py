@@ -7,7 +7,7 @@ from neusee.nodes import doe, optics, restore, spectra
 from neusee.nodes.restore._inverse import _nearby_glare
 
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
-STOP = optics.stop(samples=48, pitch=168.3e-6, diameter=8.08e-3)
+STOP = optics.stop(samples=48, pitch=168.3e-6, diameter=48 * 168.3e-6)
 LINE = spectra.line(wavelength=532e-9, fwhm=10e-9, count=3)
 RESPONSES = spectra.responses(LINE)
 DIRECTION = torch.tensor([2e-5, -1e-5], dtype=torch.float64)

@@ -13,7 +13,7 @@ from scipy import stats
 from neusee.workflows import load
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.recipe.distributions.joint import Joint, read_posterior, summary
-from neusee.workflows.recipe.distributions.scalar import is_law, read_law
+from neusee.workflows.recipe.distributions.law_text import is_law, read_law
 from neusee.workflows.simulation.simulate_recipe import recipe_text
 
 NOISE = "sensor.read_noise=normal(10.5 e-, 0.5 e-)"
@@ -91,7 +91,7 @@ def test_no_text_breaks_the_reader(text):
 @pytest.mark.parametrize(
     ("law", "message"),
     [
-        ("normal(10.5 e-)", "the distribution normal needs the mean and the standard deviation"),
+        ("normal(10.5 e-)", "the distribution normal needs mean and standard deviation: write normal"),
         ("normal(10.5 e-, 1 nm)", "must have the same unit"),
         ("normal(10.5 e-, 0 e-)", "greater than 0"),
         ("normal(10.5 e-, -1 e-)", "greater than 0"),
@@ -175,19 +175,22 @@ def test_values_that_are_one_and_the_same_are_drawn_as_such():
     [
         ("a.csv", "gain,offset\n1,2\n3\n", "line 3"),
         ("a.csv", "gain\n1\nx\n", "must contain numbers"),
-        ("a.csv", "gain\n" + "1\n" * 50, "all draws of gain are equal"),
-        ("a.csv", "gain\n1\n2\n", "the posterior has 2 draws"),
-        ("a.csv", "gain\n" + "nan\n" * 50, "finite"),
+        ("a.csv", "gain\n" + "1\n" * 50, "all samples of gain are equal"),
+        ("a.csv", "gain\n1\n2\n", "gain has 2 samples, which are too few"),
+        ("a.csv", "gain\n" + "1\n" * 30 + "nan\n" * 50, "sample 31 of gain is nan"),
         ("a.json", "{", "cannot be read"),
         ("a.json", "[1]", "must contain a mapping of keys to values"),
         ("a.json", '{"parameters": {"gain": {}}}', "there is no posterior file"),
         ("a.yaml", "mean: {gain: 1}", "needs mean"),
         ("a.yaml", "mean: {gain: 1}\nsd: {well: 1}", "sd must have a value for each name in mean"),
         ("a.yaml", "mean: {gain: 1}\nsd: {gain: 0}", "greater than 0"),
-        ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 2], [2, 1]]", "eigenvalue"),
+        ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 2], [2, 1]]", "the least eigenvalue is -1, so that no distri"),
+        ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 0.5], [0.4, 1]]", "symmetric"),
+        ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 0], [0, -1]]", "positive variances"),
         ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 2], [1]]", "matrix"),
         ("a.yaml", "mean: {a: 1}\nsd: {a: 1}\nwidth: 1", "unknown key width"),
         ("a.txt", "1", "is not a posterior file"),
+        ("a.csv", "gain [DN/e-],gain\n" + "1,2\n" * 40, "two columns have the name gain"),
         ("a.npz", "1", "cannot be read"),
     ],
 )

@@ -1,5 +1,4 @@
 import math
-import time
 
 import pytest
 from hypothesis import given
@@ -90,7 +89,7 @@ def test_two_duplicates_are_two_problems():
         ("a: [raw, psf[mask]]\n", 'inside [ ], quote a name with brackets: "psf[mask]"'),
         ("a: b: c\n", "f.yaml:1:5 / a second ':' on this line"),
         ("a: 1\n---\nb: 1\n", "a second document"),
-        ("a: *nothing\n", "undefined alias"),
+        ("a: *nothing\n", "no value above has the anchor &nothing"),
         ("a: !!python/object:os.system ls\n", "unknown YAML tag !!python/object:os.system"),
         ("a: !mine 1\n", "unknown YAML tag !mine"),
         ("b: &x {c: 1}\na: {<<: *x}\n", "f.yaml:2:5 / a / merge keys"),
@@ -117,9 +116,7 @@ def test_an_alias_is_the_same_value_again():
 def test_a_bomb_of_aliases_is_refused_at_once():
     rows = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
     rows += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 20)]
-    start = time.process_time()
-    assert "aliases expand this value to more than" in refused("\n".join(rows))
-    assert time.process_time() - start < 20  # 10^20 values would take for ever
+    assert "aliases expand this value to more than" in refused("\n".join(rows))  # 10^20 values would take for ever
 
 
 @pytest.mark.parametrize(

@@ -67,6 +67,15 @@ def test_the_gains_of_the_document_are_mask_less_rival_and_stay_below_the_bounds
 
 
 @pytest.mark.slow
+def test_the_smaller_stop_protects_as_the_mask_with_hardly_a_filter(folder):
+    """Pixels average less of the wider spot of a stop away, so that its diameter is not the fourth root of the peak."""
+    document = found(folder)
+    stop, _, grey = document["rivals"]["smaller stop"].removeprefix("stop ").partition(", filter ")
+    assert float(grey or 1) > 0.975
+    assert float(stop) < 0.99 * document["protection"] ** 0.25
+
+
+@pytest.mark.slow
 def test_under_attack_the_mask_fills_more_pixels_than_the_filter(folder):
     lost = found(folder)["lost"]
     assert set(lost) >= {"open lens", "grey filter", "stop and filter", "mask"}

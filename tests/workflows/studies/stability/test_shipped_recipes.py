@@ -47,7 +47,9 @@ def test_no_cell_of_a_shipped_recipe_fails(recipe, store, tmp_path):
         ("laser_free", "400 nm", "outside[plain]", "pass"),  # the difference of 1 and a sum in float32
         ("laser_free", "1 pixel", "loss background_loss of bsr[mask]", "pass"),  # a gradient of 0 in a loss of 1e4
         ("plain_lens", "700 nm", "spectral", "pass"),  # PSFs in float32 that differ by 1e-6
-        ("plain_lens", "huge", "deconvolved", "warn"),  # roundings in float64 alone change the gradient
+        # a picture of 1e15 has no noise, so that the filter inverts lens and pixel: the covariance lost 3.3e-5. The
+        # gradient is off by 1e-16 of the ratio of scene and noise, as stated, which is more than itself
+        ("plain_lens", "huge", "deconvolved", "warn"),
         ("axicon", "steps past pi", "level", "warn"),  # the slope of a maximum of two nearly equal elements
         ("train_small", "two levels", "laser_psf[mask,drawn]", "pass"),  # 2.1e-6 in speckle, once
         ("first_light +damage=published", "NaN", "dazzle[plain]", "pass"),  # counted as a dark pixel

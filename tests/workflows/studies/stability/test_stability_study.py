@@ -326,13 +326,13 @@ def test_a_fault_planted_in_the_light_fails_on_a_plate(fault, monkeypatch):
         monkeypatch.setattr(_intensity, "KEPT_FIELD_BYTES", 0)
         monkeypatch.setattr(_intensity.PupilIntensity, "backward", staticmethod(wrong))
     else:
-        views = _psf._views
+        points = _psf._points
 
-        def off(pupil, camera, band, scale, dtype):
-            scale *= 1 + 1e-5 * (dtype == torch.float32)
-            return views(pupil, camera, band, scale, dtype)
+        def off(pupil, camera, lights, dtype, method):
+            wrong = 1 + 1e-5 * (dtype == torch.float32)
+            return points(pupil, camera, [wrong * light for light in lights], dtype, method)
 
-        monkeypatch.setattr(_psf, "_views", off)
+        monkeypatch.setattr(_psf, "_points", off)
     cell = judge_step(step, [_plate(), None], USUAL, 0)
     assert cell.mark == "fail", cell
     assert (cell.error > cell.bound) == (fault != "backward")

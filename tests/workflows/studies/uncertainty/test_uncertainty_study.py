@@ -8,19 +8,22 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 from typer.testing import CliRunner
 
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
 from neusee.workflows.engine.runner import run
+from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, Inputs
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.run_study import count_failures, study_recipe
+from neusee.workflows.studies.study_refused import StudyRefused
+from neusee.workflows.studies.uncertainty.allowed_draws import AllowedDraws, refuse_combinations
 from neusee.workflows.studies.uncertainty.output_draws import OutputDraws, quantities
 from neusee.workflows.studies.uncertainty.scatter_estimate import scatter
-from neusee.workflows.studies.uncertainty.sobol_indices import indices
 
 SMALL = ["optics.samples=96", "optics.pitch=84.15 um", "optics.bands=7", "optics.window=[24, 24]"]
 SMALL += ["scene.shape=[32, 32]", "sensor.shape=[24, 24]", "lasers.green.strength=1e6"]
@@ -69,13 +72,17 @@ def test_a_recipe_that_is_sure_of_all_has_nothing_to_draw():
         Inputs.of(small("raw"))
 
 
-def test_a_draw_beyond_a_limit_is_refused_before_anything_runs(tmp_path):
+def test_a_law_beyond_a_limit_is_refused_before_anything_runs(tmp_path):
+    """The share is that of the normal law, and the refusal names the law to write."""
     recipe = small("transfer", "sensor.read_noise=normal(1 e-, 1 e-)")
-    with pytest.raises(
-        ValueError, match=r"argument 9 +sensor\.read_noise = -.* e- +the value is sampled, but must be greater"
-    ):
+    told = (
+        r"argument 9 +sensor\.read_noise = normal\(1 e-, 1 e-\) +15\.87% of this distribution lies outside the allowed "
+        r"values \(must be greater than or equal to 0\): write truncated\(normal\(1 e-, 1 e-\), 0 e-, inf\)"
+    )
+    with pytest.raises(RecipeError, match=told):
         study_recipe("uncertainty", recipe, Store(tmp_path / "store"), tmp_path / "runs")
     assert not (tmp_path / "runs").exists()
+    Inputs.of(small("transfer", "sensor.read_noise=truncated(normal(1 e-, 1 e-), 0 e-, inf)"))
 
 
 def test_a_value_that_is_no_number_cannot_be_drawn():
@@ -209,43 +216,6 @@ def test_what_is_infinite_in_a_draw_is_no_error_of_the_study():
     assert scatter(x).mean[0] == math.inf
 
 
-def test_shares_of_a_variance_are_those_of_the_closed_form():
-    """y = 3 a + 2 b + 2 a b + c**2 / 2: variances 9, 4, 4 and 1/2."""
-    z = np.random.default_rng(1).standard_normal((800, 4))
-    a, b, c, _ = z.T
-    found = indices(["a", "b", "c", "d"], z, 3 * a + 2 * b + 2 * a * b + c**2 / 2, 1)
-    whole = 9 + 4 + 4 + 0.5
-    assert found.explains_enough
-    assert found.total == pytest.approx([13 / whole, 8 / whole, 0.5 / whole, 0.0], abs=0.03)
-    assert found.first == pytest.approx([9 / whole, 4 / whole, 0.5 / whole, 0.0], abs=0.08)
-
-
-def test_shares_of_one_draw_that_differs_are_numbers():
-    z, y = np.random.default_rng(1).standard_normal((64, 1)), np.full(64, 3.0)
-    y[0] = 4.0
-    found = indices(["a"], z, y, 1)
-    assert np.isfinite([*found.first, *found.first_error, *found.total, *found.total_error]).all()
-    assert not found.explains_enough
-
-
-def test_a_polynomial_is_judged_by_draws_that_it_has_not_seen():
-    """As of fitting it again without each draw in turn."""
-    rng = np.random.default_rng(4)
-    z = rng.standard_normal((30, 2))
-    y = z[:, 0] + z[:, 0] * z[:, 1] + rng.standard_normal(30)
-    terms = np.stack([np.ones(30), *z.T, *(z.T**2), z[:, 0] * z[:, 1]], 1)
-    missed = []
-    for i in range(30):
-        fitted = np.linalg.lstsq(np.delete(terms, i, 0), np.delete(y, i), rcond=None)[0]
-        missed.append(y[i] - terms[i] @ fitted)
-    assert indices(["a", "b"], z, y, 1).explained == pytest.approx(1 - np.square(missed).mean() / y.var(), rel=1e-9)
-
-
-def test_a_polynomial_that_tells_nothing_is_not_believed():
-    z = np.random.default_rng(1).standard_normal((400, 2))
-    assert not indices(["a", "b"], z, np.sign(np.sin(9 * z[:, 0])), 1).explains_enough
-
-
 # --- the study --------------------------------------------------------------------------------------------------------
 
 
@@ -375,7 +345,8 @@ def test_only_what_is_named_decides_when_to_stop(store, tmp_path):
     recipe = small("peak, saturated", "lasers.green.strength=lognormal(1e3, 3)")
     whole = study_recipe("uncertainty", recipe, store, tmp_path / "a", most=96, error=0.01)
     every = json.loads((whole / "provenance.json").read_text())
-    (least,) = sorted(every["quantities"], key=lambda name: every["quantities"][name]["error"])[:1]
+    varying = [name for name, found in every["quantities"].items() if found["error"] > 0]
+    least = min(varying, key=lambda name: every["quantities"][name]["error"])
     enough = every["quantities"][least]["error"] * 2
     folder = study_recipe("uncertainty", recipe, store, tmp_path / "b", most=96, error=enough, until=(least,))
     found = json.loads((folder / "provenance.json").read_text())
@@ -393,3 +364,126 @@ def test_a_name_that_nothing_has_is_told_with_the_names_there_are(store, tmp_pat
     told = rf"--until {name.split('.')[0]}.*: no output with numbers has this name; there are peak\[plain\]"
     with pytest.raises(ValueError, match=told):
         study_recipe("uncertainty", recipe, store, tmp_path, most=64, until=(name,))
+
+
+# --- what does not vary, and values that are not allowed --------------------------------------------------------------
+
+
+def told_of(recipe, store, tmp_path, **options):
+    """Return the lines of progress of a study, and its folder."""
+    lines = []
+    folder = study_recipe("uncertainty", recipe, store, tmp_path, progress=lines.append, **options)
+    return lines, folder
+
+
+def test_numbers_that_do_not_vary_are_named_before_any_draw(store, tmp_path):
+    """The count of electrons above an irradiance is 0 everywhere; it was once "known to 0.0 %"."""
+    recipe = small("peak, lsr", "lasers.green.strength=lognormal(1e3, 1.1)", "sensor.read_noise=normal(10 e-, 1 e-)")
+    lines, folder = told_of(recipe, store, tmp_path, most=64, error=1.0)
+    first = next(line for line in lines if "the same in the first" in line)
+    assert first.startswith("peak[plain].above")
+    assert lines.index(first) < lines.index(next(line for line in lines if "draws of about" in line))
+    assert "outputs that depend on no input, and do not vary: lsr[plain], lsr[mask]" in lines
+    text = (folder / "report.html").read_text()
+    assert "does not vary" in text
+    assert ">0.0%<" not in text
+
+
+def test_a_study_of_which_nothing_varies_is_refused_after_a_few_runs(store, tmp_path, monkeypatch):
+    runs = []
+    real = OutputDraws._result
+    monkeypatch.setattr(OutputDraws, "_result", lambda self, row: runs.append(1) or real(self, row))
+    recipe = small("peak", "lasers.green.strength=lognormal(1e3, 1.1)")
+    with pytest.raises(StudyRefused, match=r"nothing varies: peak\[plain\]\.above is the same in 5 runs"):
+        study_recipe("uncertainty", recipe, store, tmp_path, most=64, workers=1, until=("peak[plain].above",))
+    assert len(runs) <= 5
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (
+            ["sensor.read_noise=normal(2 e-, 1 e-)", "outputs=[peak,transfer]"],
+            "2.28% of this distribution",
+        ),
+        (["sensor.quantum_efficiency=normal(0.9, 0.1)", "outputs=[peak]"], "-inf, 1)"),
+        (["lsr"], "no value is uncertain"),
+        (["sensor.read_noise=normal(20 e-, 1 e-)", "outputs=[lsr]"], "no output depends on sensor.read_noise"),
+        (["sensor.read_noise=normal(20 e-, 1 e-)", "outputs=[raw]", "--until", "pea"], "--until pea: no output"),
+    ],
+)
+def test_a_study_that_cannot_be_ends_with_2_before_it_runs(words, told):
+    words = [word for word in words if "=" in word or word.startswith("-") or word == "pea"]
+    done = CliRunner().invoke(app, ["study", "uncertainty", "first_light", *words])
+    assert done.exit_code == 2, done.output
+    assert told in done.output
+
+
+def test_a_negligible_part_outside_is_cut_off_and_told(store, tmp_path):
+    """Of normal(10 e-, 3.1 e-) 6e-4 are below 0: no draw is negative, and the page says what was cut off."""
+    recipe = small("transfer", "sensor.read_noise=normal(10 e-, 3.1 e-)")
+    lines, folder = told_of(recipe, store, tmp_path, most=64, error=1.0)
+    share = 0.5 * math.erfc(10 / 3.1 / math.sqrt(2))
+    statement = f"{share:.2g} of it lies outside the allowed values (must be greater than or equal to 0) and is cut off"
+    assert any(statement in line for line in lines)
+    assert statement in (folder / "report.html").read_text()
+    doc = json.loads((folder / "provenance.json").read_text())
+    assert statement in doc["cut off"]["sensor.read_noise"]
+
+
+def test_what_is_cut_off_leaves_the_conditional_law():
+    inputs = Inputs.of(small("transfer", "sensor.read_noise=normal(10 e-, 3.1 e-)"), negligible=1e-3)
+    drawn = inputs.at(np.linspace(-8, 8, 2001)[:, None])[:, 0]
+    assert drawn.min() >= 0.0
+    law = stats.truncnorm(-10 / 3.1, math.inf, 10, 3.1)
+    assert inputs.at(np.array([[-2.0], [0.0], [2.0]]))[:, 0] == pytest.approx(law.ppf(stats.norm.cdf([-2, 0, 2])))
+
+
+def test_a_training_or_an_evaluation_cuts_nothing_that_matters():
+    with pytest.raises(RecipeError, match="write truncated"):
+        Inputs.of(small("transfer", "sensor.read_noise=normal(10 e-, 3.1 e-)"))
+
+
+def test_rows_of_a_table_outside_the_allowed_values_are_refused_or_left_out(tmp_path):
+    rng = np.random.default_rng(1)
+    rows = np.stack([10 + rng.standard_normal(2000), 0.5 + 0.01 * rng.standard_normal(2000)], 1)
+    rows[7, 0] = -1.0
+    np.savez(tmp_path / "one.npz", **{"read_noise": rows[:, 0], "quantum_efficiency": rows[:, 1]})
+    inputs = Inputs.of(small("transfer", f"posterior={tmp_path / 'one.npz'}"), negligible=1e-3)
+    assert inputs.most == 1999
+    assert "1 of its 2000 rows lie outside" in inputs.notes["sensor.read_noise"]
+    rows[:20, 0] = -1.0
+    np.savez(tmp_path / "many.npz", **{"read_noise": rows[:, 0], "quantum_efficiency": rows[:, 1]})
+    with pytest.raises(RecipeError, match=r"1\.00% of this distribution .* remove these rows of the table"):
+        Inputs.of(small("transfer", f"posterior={tmp_path / 'many.npz'}"), negligible=1e-3)
+
+
+def test_a_joint_normal_law_is_refused_or_cut_off():
+    def inputs(sd):
+        said = {"mean": {"sensor.read_noise": "10 e-"}, "sd": {"sensor.read_noise": f"{sd} e-"}}
+        return Inputs.of(load("first_light", ["outputs=[transfer]", *SMALL], posterior=said), negligible=1e-3)
+
+    cut = inputs(3.1)
+    assert "is cut off" in cut.notes["sensor.read_noise"]
+    drawn = cut.at(np.linspace(-8, 8, 401)[:, None])[:, 0]
+    assert drawn.min() >= 0.0
+    assert (np.diff(drawn) > 0).all()
+    with pytest.raises(RecipeError, match=r"2\.28% of this distribution .* smaller standard deviation"):
+        inputs(5)
+
+
+def test_values_that_exclude_each_other_are_left_out_and_told(tmp_path):
+    """One value of 64 is enough to refuse before the run; later ones are left out, whole blocks of a Sobol sequence."""
+    inputs = Inputs.of(small("transfer", *LAWS))
+    points = inputs.independent(128, 1)
+    points.values[100, 0] = -5.0
+    few, all_draws = AllowedDraws(inputs, points, 0), AllowedDraws(inputs, points, SCRAMBLES)
+    few.extend(64)
+    refuse_combinations(inputs, points.values[:2], few)
+    few.extend(128)
+    all_draws.extend(128)
+    assert (few.left_out, len(few.z)) == (1, 127)
+    assert (all_draws.left_out, len(all_draws.z)) == (8, 120)
+    assert "greater than" in few.reason
+    with pytest.raises(RecipeError, match="1 of the first 128 draws have values that are not allowed together"):
+        refuse_combinations(inputs, points.values[:2], few)

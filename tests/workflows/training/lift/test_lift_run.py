@@ -14,6 +14,7 @@ from safetensors.torch import load_file
 
 from neusee.nodes.spectra import bands, lift_mst_plus_plus, render
 from neusee.workflows import RecipeError, Store, load
+from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.training.lift import lift_run
 from neusee.workflows.training.lift.lift_iteration import LiftLearner, Pairs
 from neusee.workflows.training.lift.lift_run import train_lift
@@ -152,13 +153,22 @@ def test_a_limit_of_the_gradient_that_is_not_positive_is_refused(value):
         load("train_lift", [f"train_lift.clip={value}"])
 
 
-def test_the_usual_limit_leaves_the_folder_of_a_training_that_was_begun_before_the_setting(monkeypatch):
-    blocks = []
-    monkeypatch.setattr(lift_run, "digest", lambda *parts: blocks.append(parts[-1]) or "00000000")
-    for clip in ("10", "0.5", "null"):
-        recipe = load("train_lift", [*TINY, f"train_lift.clip={clip}"])
-        lift_run._key(recipe, recipe.lifting)
-    assert [block.get("clip", "absent") for block in blocks] == ["absent", 0.5, None]
+def test_every_setting_and_file_of_a_lift_is_in_the_name_of_its_folder_and_a_display_setting_is_not(tmp_path):
+    """Reflectances in a file, which another content under the old name makes another training."""
+    table = tmp_path / "paints.csv"
+    table.write_text("nm,one,two\n380,0.1,0.2\n780,0.3,0.4\n")
+
+    def key(*words):
+        recipe = load("train_lift", [*TINY, f"measured.files={table}", *words])
+        return lift_run.lift_inputs(recipe, recipe.lifting, Code(Store(tmp_path / "store").code_memo)).key
+
+    first = key()
+    assert key("train_lift.show=7", "train_lift.keep=3", "train_lift.validation_batches=2") == first
+    assert len({first, key("train_lift.clip=0.5"), key("train_lift.clip=null"), key("seed=9")}) == 4
+    about = table.stat()
+    table.write_text("nm,one,two\n380,0.1,0.2\n780,0.3,0.5\n")
+    os.utime(table, ns=(about.st_atime_ns, about.st_mtime_ns))
+    assert key() != first
 
 
 def test_what_is_not_a_number_stops_and_is_kept(tmp_path, monkeypatch):

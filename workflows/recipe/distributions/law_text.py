@@ -1,0 +1,302 @@
+"""Text of a probability distribution in place of a value of a recipe, such as ``normal(10.5 e-, 0.5 e-)``.
+
+A distribution of samples names a file, whose path is relative to the folder of the recipe.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neusee.nodes.units import read_written
+from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.recipe.distributions.sample_table import read_columns, require_samples, si_unit, with_units
+from neusee.workflows.recipe.distributions.scalar import Law
+from neusee.workflows.recipe.distributions.shapes import (
+    Beta,
+    Discrete,
+    LogNormal,
+    LogUniform,
+    Normal,
+    Shape,
+    Triangular,
+    Uniform,
+)
+
+#: each kind of distribution with its form and the meaning of its arguments
+KINDS = {
+    "normal": ("normal(10.5 e-, 0.5 e-)", "mean and standard deviation"),
+    "lognormal": ("lognormal(0.37, 1.02)", "median, and the factor of one standard deviation"),
+    "uniform": ("uniform(1 um, 2 um)", "least and largest value"),
+    "loguniform": ("loguniform(1, 1e6)", "least and largest value, uniform in the logarithm"),
+    "triangular": ("triangular(9 e-, 10 e-, 12 e-)", "least, most probable and largest value"),
+    "beta": ("beta(2, 5, 0 e-, 20 e-)", "two shape parameters, then least and largest value, which may be left out"),
+    "truncated": (
+        "truncated(normal(2 e-, 1 e-), 0 e-, inf)",
+        "a distribution, its lower bound or -inf, and its upper bound or inf",
+    ),
+    "discrete": (
+        "discrete(10 e- weight 0.2, 12 e- weight 0.8)",
+        "values with weights that sum to 1; without weights all values are equally probable",
+    ),
+    "empirical": (
+        "empirical(noise.csv, column read_noise, unit e-)",
+        "samples in a file, its column, and their unit; column and unit may stand in the file",
+    ),
+}
+_NAMES = "|".join(KINDS)
+_BEGIN = re.compile(rf"\s*({_NAMES})\(")
+_CALL = re.compile(rf"({_NAMES})\((.*)\)", re.DOTALL)
+_WEIGHTED = re.compile(r"(.*\S)\s+weight\s+(\S+)", re.DOTALL)
+_OPTION = re.compile(r"(column|unit)\s+(.*)", re.DOTALL)
+_INFINITE = {"inf": math.inf, "-inf": -math.inf, "+inf": math.inf}
+_SUM = 1e-6  #: largest difference of a sum of weights from 1
+
+
+@dataclass(frozen=True)
+class _Numbers:
+    """Numbers of a distribution in SI, with their unit."""
+
+    values: tuple[float, ...]
+    unit: str
+    reciprocal: bool
+
+
+def is_law(text: Any) -> bool:
+    """Return True if a recipe value is a text that begins with the name of a distribution, such as ``normal(``."""
+    return isinstance(text, str) and _BEGIN.match(text) is not None
+
+
+def read_law(text: str, folder: Path = Path()) -> Law:
+    """Return the probability distribution in a text; raise ValueError with the correct form for an invalid text.
+
+    Args: folder: folder of the recipe, to which the path of a file of samples is relative.
+    """
+    text = text.strip()
+    match = _CALL.fullmatch(text)
+    if match is None or not _is_closed(match[2]):
+        raise ValueError("the text is not a complete distribution: write kind(…, …), in quotes inside [ ] or { }")
+    kind, arguments = match[1], _arguments(match[2])
+    if not all(arguments):
+        raise ValueError(_form(kind))
+    if kind == "truncated":
+        return _truncated(text, arguments, folder)
+    if kind == "empirical":
+        return _empirical(text, arguments, folder)
+    return _READERS[kind](kind, text, arguments)
+
+
+def _form(kind: str) -> str:
+    form, meaning = KINDS[kind]
+    return f"the distribution {kind} needs {meaning}: write {form}"
+
+
+def _is_closed(text: str) -> bool:
+    """Return True if no parenthesis closes before it opens, as in ``normal(1, 2) + normal(3, 4)``."""
+    depth = 0
+    for sign in text:
+        depth += (sign == "(") - (sign == ")")
+        if depth < 0:
+            return False
+    return depth == 0
+
+
+def _arguments(text: str) -> list[str]:
+    """Return the arguments between the outer commas of a text; a comma in quotes or parentheses separates nothing."""
+    parts, depth, quote = [""], 0, ""
+    for sign in text:
+        if quote or sign in "\"'":
+            quote = "" if sign == quote else quote or sign
+        depth += (sign == "(") - (sign == ")")
+        if sign == "," and not depth and not quote:
+            parts.append("")
+        else:
+            parts[-1] += sign
+    return [part.strip() for part in parts]
+
+
+def _numbers(arguments: Sequence[str]) -> _Numbers:
+    """Return numbers of one unit."""
+    read = [read_written(argument) for argument in arguments]
+    _, unit, reciprocal = read[0]
+    for argument, (_, other, also) in zip(arguments, read, strict=True):
+        if (other, also) != (unit, reciprocal):
+            raise ValueError(f"{arguments[0]} and {argument} must have the same unit")
+    return _Numbers(tuple(number for number, _, _ in read), unit, reciprocal)
+
+
+def _plain(argument: str, what: str) -> float:
+    number, unit, _ = read_written(argument)
+    if unit:
+        raise ValueError(f"{what} is a number without a unit, such as 1.1, not {argument}")
+    return number
+
+
+def _law(kind: str, text: str, shape: Shape, numbers: _Numbers) -> Law:
+    return Law(kind, text, shape, numbers.unit, numbers.reciprocal)
+
+
+def _pair(kind: str, text: str, arguments: Sequence[str]) -> Law:
+    """Return a normal, uniform or loguniform distribution."""
+    if len(arguments) != 2:
+        raise ValueError(_form(kind))
+    numbers = _numbers(arguments)
+    first, second = numbers.values
+    if kind == "normal":
+        if not second > 0:
+            raise ValueError("the standard deviation must be greater than 0")
+        return _law(kind, text, Normal(first, second), numbers)
+    if not first < second:
+        raise ValueError("the first value must be smaller than the second")
+    if kind == "uniform":
+        return _law(kind, text, Uniform(first, second), numbers)
+    if not first > 0:
+        raise ValueError("the least value must be greater than 0")
+    return _law(kind, text, LogUniform(first, second), numbers)
+
+
+def _lognormal(kind: str, text: str, arguments: Sequence[str]) -> Law:
+    if len(arguments) != 2:
+        raise ValueError(_form(kind))
+    numbers = _numbers(arguments[:1])
+    median, factor = numbers.values[0], _plain(arguments[1], "the factor of one standard deviation")
+    if not (median > 0 and factor > 1):
+        raise ValueError("the median must be greater than 0, and the factor than 1")
+    return _law(kind, text, LogNormal(median, factor), numbers)
+
+
+def _triangular(kind: str, text: str, arguments: Sequence[str]) -> Law:
+    if len(arguments) != 3:
+        raise ValueError(_form(kind))
+    numbers = _numbers(arguments)
+    low, mode, high = numbers.values
+    if not (low <= mode <= high and low < high):
+        raise ValueError("the least, the most probable and the largest value must stand in this order")
+    return _law(kind, text, Triangular(low, mode, high), numbers)
+
+
+def _beta(kind: str, text: str, arguments: Sequence[str]) -> Law:
+    if len(arguments) not in (2, 4):
+        raise ValueError(_form(kind))
+    a, b = (_plain(argument, "a shape parameter") for argument in arguments[:2])
+    if not (a > 0 and b > 0):
+        raise ValueError("the shape parameters of a beta distribution must be greater than 0")
+    if len(arguments) == 2:
+        return _law(kind, text, Beta(a, b), _Numbers((), "", False))
+    numbers = _numbers(arguments[2:])
+    low, high = numbers.values
+    if not low < high:
+        raise ValueError("the least value must be smaller than the largest")
+    return _law(kind, text, Beta(a, b, low, high), numbers)
+
+
+def _discrete(kind: str, text: str, arguments: Sequence[str]) -> Law:
+    matches = [_WEIGHTED.fullmatch(argument) for argument in arguments]
+    numbers = _numbers([match[1] if match else argument for match, argument in zip(matches, arguments, strict=True)])
+    if len(set(numbers.values)) < len(arguments) or len(arguments) < 2:
+        raise ValueError("a discrete distribution needs two or more values, all different")
+    weights = _weights([match[2] for match in matches if match], len(arguments))
+    return _law(kind, text, Discrete.of(np.array(numbers.values), np.array(weights)), numbers)
+
+
+def _weights(written: Sequence[str], count: int) -> list[float]:
+    """Return the weights of ``count`` values, equal if none is written."""
+    if not written:
+        return [1.0 / count] * count
+    if len(written) < count:
+        raise ValueError("write a weight for every value, or for none: " + KINDS["discrete"][0])
+    weights = [_plain(weight, "a weight") for weight in written]
+    if not min(weights) > 0:
+        raise ValueError("every weight must be greater than 0: remove values that cannot occur")
+    if abs(math.fsum(weights) - 1.0) > _SUM:
+        raise ValueError(f"the weights sum to {math.fsum(weights):.6g}, not to 1")
+    return weights
+
+
+def _truncated(text: str, arguments: Sequence[str], folder: Path) -> Law:
+    """Return a distribution with bounds; a bound of infinity has no unit."""
+    if len(arguments) != 3 or not is_law(arguments[0]):
+        raise ValueError(_form("truncated"))
+    law = read_law(arguments[0], folder)
+    if law.kind == "truncated":
+        raise ValueError("a truncated distribution cannot be truncated again: write one distribution with both bounds")
+    low, high = (_bound(argument, law) for argument in arguments[1:])
+    if math.isinf(low) and math.isinf(high):
+        raise ValueError("a truncated distribution needs a bound: " + KINDS["truncated"][0])
+    return replace(law, kind="truncated", text=text, shape=law.shape.truncated(low, high))
+
+
+def _bound(argument: str, law: Law) -> float:
+    """Return a bound of a distribution in SI, or infinity."""
+    if argument in _INFINITE:
+        return _INFINITE[argument]
+    number, unit, reciprocal = read_written(argument)
+    if (unit, reciprocal) != (law.unit, law.reciprocal):
+        raise ValueError(f"{argument} and {law.text} must have the same unit")
+    return number
+
+
+def _empirical(text: str, arguments: Sequence[str], folder: Path) -> Law:
+    """Return the distribution of the samples in a file, each with the same probability."""
+    options = {}
+    for argument in arguments[1:]:
+        match = _OPTION.fullmatch(argument)
+        if match is None or match[1] in options:
+            raise ValueError(_form("empirical"))
+        options[match[1]] = match[2].strip().strip("\"'")
+    path = folder / Path(arguments[0].strip("\"'")).expanduser()
+    columns, units = with_units(read_columns(path))
+    name = _column(path, list(columns), options.get("column"))
+    samples, unit = columns[name], units.get(name, "")
+    if "unit" in options:
+        if unit:
+            raise ValueError(f"{path.name} gives the unit {unit} of {name}: remove the unit here")
+        scale, unit = _unit(options["unit"])
+        samples = samples * scale
+    if unit and unit != "e-/DN":
+        _unit(unit)
+    require_samples(samples, f"{path.name}, column {name}" if name else path.name)
+    shape = Discrete.of(samples, np.full(len(samples), 1.0 / len(samples)))
+    reciprocal = unit == "e-/DN"
+    return Law(
+        kind="empirical",
+        text=text,
+        shape=shape,
+        unit="DN/e-" if reciprocal else unit,
+        reciprocal=reciprocal,
+        file=path,
+        written_path=arguments[0],
+    )
+
+
+def _column(path: Path, names: Sequence[str], name: str | None) -> str:
+    if name is None and len(names) == 1:
+        return names[0]
+    if name is None:
+        raise ValueError(f"{path.name} has the columns {', '.join(names)}: write empirical({path.name}, column NAME)")
+    if name not in names:
+        raise ValueError(f"{path.name} has no column {name}; {nearest(name, names)}")
+    return name
+
+
+def _unit(unit: str) -> tuple[float, str]:
+    """Return the factor of a unit and its SI unit; raise ValueError for a unit that no value of a recipe has."""
+    read_written(f"1 {unit}")
+    return si_unit(unit)
+
+
+_READERS: dict[str, Callable[[str, str, Sequence[str]], Law]] = {
+    "normal": _pair,
+    "uniform": _pair,
+    "loguniform": _pair,
+    "lognormal": _lognormal,
+    "triangular": _triangular,
+    "beta": _beta,
+    "discrete": _discrete,
+}

@@ -1,0 +1,318 @@
+"""Probability distributions of a number: quantiles at standard normal numbers, and measures for integrals.
+
+Every quantile is a function of a standard normal number ``z``, whose cumulative probability is that of the value.
+Two tails are then equally accurate, and a draw needs one normal number, whatever the distribution is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+_REACH = 11.0  #: standard deviations that contain all of a normal distribution, also times z**20
+_NODES = 4097  #: points of the measure of a continuous distribution
+_ROUNDING = 1e-12  #: probability by which a sum of weights may miss the probability of a step
+_SMALLEST_SHARE = 1e-9  #: smallest probability between the bounds of a truncated distribution
+
+
+class Shape(ABC):
+    """Probability distribution of a number."""
+
+    @abstractmethod
+    def at(self, z: FloatArray) -> FloatArray:
+        """Return the values of the distribution at the cumulative probabilities of standard normal numbers ``z``."""
+
+    @abstractmethod
+    def score(self, x: float) -> float:
+        """Return the standard normal number at which the distribution has the value ``x``."""
+
+    def coordinate(self, z: FloatArray) -> FloatArray:
+        """Return the coordinate in which outputs are expected to be smooth; here the value itself."""
+        return self.at(z)
+
+    def measure(self) -> tuple[FloatArray, FloatArray]:
+        """Return points of `coordinate` and their probabilities, for means of functions of the coordinate."""
+        z, weights = _normal_measure()
+        return self.coordinate(z), weights
+
+    def moments(self) -> tuple[float, float]:
+        """Return mean and standard deviation."""
+        z, weights = _normal_measure()
+        x = self.at(z)
+        mean = float(weights @ x)
+        return mean, math.sqrt(float(weights @ (x - mean) ** 2))
+
+    def truncated(self, low: float, high: float) -> Shape:
+        """Return the distribution under the condition that the value is between ``low`` and ``high``.
+
+        Raises ValueError if less than 1e-9 of the distribution lies there.
+        """
+        if not low < high:
+            raise ValueError(f"the lower bound {low:g} must be smaller than the upper bound {high:g}")
+        cut = Truncated(self, low, high)
+        if not cut.share > _SMALLEST_SHARE:
+            raise ValueError("less than 1e-9 of the distribution lies between the two bounds")
+        return cut
+
+
+@dataclass(frozen=True)
+class Normal(Shape):
+    """Normal distribution; a standard deviation of 0 is a single value."""
+
+    mean: float = 0.0
+    sd: float = 1.0
+
+    def at(self, z: FloatArray) -> FloatArray:
+        return self.mean + self.sd * z
+
+    def score(self, x: float) -> float:
+        return (x - self.mean) / self.sd
+
+    def coordinate(self, z: FloatArray) -> FloatArray:
+        return z
+
+    def moments(self) -> tuple[float, float]:
+        return self.mean, self.sd
+
+
+@dataclass(frozen=True)
+class LogNormal(Shape):
+    """Lognormal distribution with its median and the factor of one standard deviation."""
+
+    median: float
+    factor: float
+
+    def at(self, z: FloatArray) -> FloatArray:
+        with np.errstate(over="ignore"):
+            return np.asarray(self.median * np.exp(np.log(self.factor) * z), np.float64)
+
+    def score(self, x: float) -> float:
+        return math.log(x / self.median) / math.log(self.factor) if x > 0 else -math.inf
+
+    def coordinate(self, z: FloatArray) -> FloatArray:
+        return z
+
+
+@dataclass(frozen=True)
+class Uniform(Shape):
+    """Uniform distribution between two values."""
+
+    low: float
+    high: float
+
+    def at(self, z: FloatArray) -> FloatArray:
+        from scipy.special import ndtr
+
+        return np.asarray(self.low + (self.high - self.low) * ndtr(z), np.float64)
+
+    def score(self, x: float) -> float:
+        return _score((x - self.low) / (self.high - self.low))
+
+
+@dataclass(frozen=True)
+class LogUniform(Shape):
+    """Distribution between two values whose logarithm is uniform."""
+
+    low: float
+    high: float
+
+    def at(self, z: FloatArray) -> FloatArray:
+        from scipy.special import ndtr
+
+        return np.asarray(self.low * np.exp(np.log(self.high / self.low) * ndtr(z)), np.float64)
+
+    def score(self, x: float) -> float:
+        return _score(math.log(x / self.low) / math.log(self.high / self.low)) if x > 0 else -math.inf
+
+    def coordinate(self, z: FloatArray) -> FloatArray:
+        from scipy.special import ndtr
+
+        return np.asarray(ndtr(z), np.float64)
+
+
+@dataclass(frozen=True)
+class Triangular(Shape):
+    """Triangular distribution with its least, most probable and largest value."""
+
+    low: float
+    mode: float
+    high: float
+
+    def at(self, z: FloatArray) -> FloatArray:
+        from scipy.special import ndtr
+
+        width = self.high - self.low
+        below, above = ndtr(z), ndtr(-z)
+        rising = self.low + np.sqrt(below * width * (self.mode - self.low))
+        falling = self.high - np.sqrt(above * width * (self.high - self.mode))
+        return np.asarray(np.where(below * width < self.mode - self.low, rising, falling), np.float64)
+
+    def score(self, x: float) -> float:
+        x, width = min(max(x, self.low), self.high), self.high - self.low
+        if x < self.mode:
+            return _score((x - self.low) ** 2 / (width * (self.mode - self.low)))
+        if x == self.high:
+            return math.inf
+        return -_score((self.high - x) ** 2 / (width * (self.high - self.mode)))
+
+
+@dataclass(frozen=True)
+class Beta(Shape):
+    """Beta distribution with two shape parameters, between two values."""
+
+    a: float
+    b: float
+    low: float = 0.0
+    high: float = 1.0
+
+    def at(self, z: FloatArray) -> FloatArray:
+        from scipy.special import betaincinv, ndtr
+
+        width = self.high - self.low
+        lower = self.low + width * betaincinv(self.a, self.b, ndtr(np.minimum(z, 0.0)))
+        upper = self.high - width * betaincinv(self.b, self.a, ndtr(-np.maximum(z, 0.0)))
+        return np.asarray(np.where(z < 0, lower, upper), np.float64)
+
+    def score(self, x: float) -> float:
+        from scipy.special import betainc
+
+        share = min(max((x - self.low) / (self.high - self.low), 0.0), 1.0)
+        below = float(betainc(self.a, self.b, share))
+        return _score(below) if below < 0.5 else -_score(float(betainc(self.b, self.a, 1.0 - share)))
+
+
+@dataclass(frozen=True)
+class Discrete(Shape):
+    """Distribution of a few values with weights, or of the samples of a file with equal weights."""
+
+    values: FloatArray = field(compare=False)  #: sorted
+    weights: FloatArray = field(compare=False)
+    identity: str = ""  #: digest of values and weights, by which two distributions are compared
+
+    @classmethod
+    def of(cls, values: FloatArray, weights: FloatArray) -> Discrete:
+        """Return the distribution of ``values`` with ``weights``; equal values become one value."""
+        distinct, place = np.unique(values, return_inverse=True)
+        total = np.bincount(place.reshape(-1), weights=weights)
+        total = total / total.sum()
+        identity = hashlib.sha256(distinct.tobytes() + total.tobytes()).hexdigest()
+        return cls(distinct, total, identity)
+
+    def at(self, z: FloatArray) -> FloatArray:
+        from scipy.special import ndtr
+
+        steps = np.cumsum(self.weights)[:-1]
+        return np.asarray(self.values[np.searchsorted(steps + _ROUNDING, ndtr(z))], np.float64)
+
+    def score(self, x: float) -> float:
+        return _score(float(self.weights[self.values <= x].sum()))
+
+    def measure(self) -> tuple[FloatArray, FloatArray]:
+        return self.values, self.weights
+
+    def moments(self) -> tuple[float, float]:
+        mean = float(self.weights @ self.values)
+        return mean, math.sqrt(float(self.weights @ (self.values - mean) ** 2))
+
+    def truncated(self, low: float, high: float) -> Shape:
+        if not low < high:
+            raise ValueError(f"the lower bound {low:g} must be smaller than the upper bound {high:g}")
+        inside = (self.values >= low) & (self.values <= high)
+        if inside.sum() < 2:
+            raise ValueError("fewer than two values of the distribution lie between the two bounds")
+        return Discrete.of(self.values[inside], self.weights[inside])
+
+
+@dataclass(frozen=True)
+class Truncated(Shape):
+    """Continuous distribution under the condition that the value is between two bounds."""
+
+    shape: Shape
+    low: float
+    high: float
+
+    @property
+    def scores(self) -> tuple[float, float]:
+        """Return the standard normal numbers of both bounds in the distribution without bounds."""
+        return (
+            -math.inf if self.low == -math.inf else self.shape.score(self.low),
+            math.inf if self.high == math.inf else self.shape.score(self.high),
+        )
+
+    @property
+    def share(self) -> float:
+        """Return the probability between the bounds in the distribution without bounds."""
+        return share_between(*self.scores)
+
+    def at(self, z: FloatArray) -> FloatArray:
+        x = self.shape.at(scores_between(z, *self.scores))
+        return np.asarray(np.clip(x, self.low, self.high), np.float64)
+
+    def score(self, x: float) -> float:
+        low, high = self.scores
+        z = min(max(self.shape.score(x), low), high)
+        below, above = share_between(low, z) / self.share, share_between(z, high) / self.share
+        return _score(below) if below < above else -_score(above)
+
+    def coordinate(self, z: FloatArray) -> FloatArray:
+        return self.shape.coordinate(scores_between(z, *self.scores))
+
+
+@dataclass(frozen=True)
+class Moved(Shape):
+    """Distribution of a value that is multiplied by a factor, and to which an offset is added."""
+
+    shape: Shape
+    factor: float = 1.0  #: not 0
+    offset: float = 0.0
+
+    def at(self, z: FloatArray) -> FloatArray:
+        return self.offset + self.factor * self.shape.at(z if self.factor > 0 else -z)
+
+    def score(self, x: float) -> float:
+        score = self.shape.score((x - self.offset) / self.factor)
+        return score if self.factor > 0 else -score
+
+
+def share_between(low: float, high: float) -> float:
+    """Return the probability of a standard normal number between ``low`` and ``high``."""
+    from scipy.special import ndtr
+
+    if low > 0:
+        return float(ndtr(-low) - ndtr(-high))
+    return float(ndtr(high) - ndtr(low))
+
+
+def scores_between(z: FloatArray, low: float, high: float) -> FloatArray:
+    """Map standard normal numbers to those of the normal distribution truncated to ``low`` … ``high``.
+
+    The map keeps the order, and both tails keep their accuracy.
+    """
+    from scipy.special import ndtr, ndtri
+
+    share = share_between(low, high)
+    below = ndtr(low) + share * ndtr(z)
+    above = ndtr(-high) + share * ndtr(-np.asarray(z))
+    with np.errstate(divide="ignore"):
+        inside = np.where(below < above, ndtri(below.clip(0.0, 1.0)), -ndtri(above.clip(0.0, 1.0)))
+    return np.asarray(np.clip(inside, low, high), np.float64)
+
+
+def _score(probability: float) -> float:
+    from scipy.special import ndtri
+
+    return float(ndtri(min(max(probability, 0.0), 1.0)))
+
+
+def _normal_measure() -> tuple[FloatArray, FloatArray]:
+    """Return standard normal numbers and their probabilities; the rule is exact to rounding for smooth functions."""
+    z = np.linspace(-_REACH, _REACH, _NODES)
+    weights = np.exp(-(z**2) / 2)
+    return z, weights / weights.sum()
