@@ -122,8 +122,8 @@ def in_process(camera):
     failed = [check.name for check in result.checks if check.mark == "fail"]
     budgets = {budget.key: budget for budget in result.budgets}
     widths = {name: (budgets[name].value, budgets[name].combined) for name in truth if name in budgets}
-    statistics = {c.source: c.share for c in budgets["gain"].contributions}[STATISTICS]
-    return judged(truth, widths, statistics, failed)
+    shares = {c.source: c.share for c in budgets["gain"].contributions if c.share}
+    return judged(truth, widths, shares, failed)
 
 
 def by_command(camera):
@@ -147,11 +147,13 @@ def by_command(camera):
         for name in truth
         if name in quantities
     }
-    shares = {source["source"]: source.get("contribution") for source in quantities["gain"]["sources"]}
-    return judged(truth, widths, shares[STATISTICS], failed)
+    rows = quantities["gain"]["sources"]
+    shares = {row["source"]: row["contribution"] for row in rows if row.get("contribution")}
+    return judged(truth, widths, shares, failed)
 
 
-def judged(truth, widths, statistics, failed):
+def judged(truth, widths, shares, failed):
+    """The line of a camera; ``shares`` are the contributions of the sources to the width of the gain."""
     z = {name: (value - truth[name]) / width for name, (value, width) in widths.items()}
     value, width = widths["gain"]
     return {
@@ -159,7 +161,8 @@ def judged(truth, widths, statistics, failed):
         "failed": failed,
         "z": {name: round(x, 3) for name, x in z.items()},
         "width": round(width / value, 6),
-        "ratio": round(width / statistics, 3),
+        "ratio": round(width / shares[STATISTICS], 3),
+        "sources": {source: round(share / value, 7) for source, share in shares.items()},
     }
 
 

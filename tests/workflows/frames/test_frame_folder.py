@@ -258,6 +258,18 @@ def test_a_folder_becomes_a_sensor_with_its_uncertainty(working, capsys):
 
 
 @pytest.mark.slow
+def test_gain_and_noise_are_tied_where_the_frames_hide_nothing(working, capsys):
+    """A camera that cannot mix pixels or frames has the widths and the correlation of chance alone."""
+    written_by(Camera(seed=3, size=64, darks=3, lit=10, faults={"lamp": 0.003}), working / "lab")
+    raw = ["steps.prior.with.mixing=none", "steps.prior.with.lag=none"]
+    assert typed(["calibrate", "lab", *raw, "--sensor", "raw"]) == 0, capsys.readouterr().err
+    joint = load("first_light", ["sensor=raw"], folder=working).uncertain.joint
+    gain, noise = (joint.names.index(f"sensor.{name}") for name in ("gain", "read_noise"))
+    assert (joint.factor @ joint.factor.T)[gain, noise] < -0.5
+    assert joint.sd[gain] < 0.015 * 0.125, "half of what may hide in such small frames"
+
+
+@pytest.mark.slow
 def test_light_that_is_known_up_to_a_factor_tells_everything_but_the_efficiency(working, capsys):
     written_by(Camera(seed=4, size=64, darks=3, lit=10, faults={"lamp": 0.003}), working / "lab", relative=True)
     assert typed(["calibrate", "lab"]) == 0, capsys.readouterr().err
