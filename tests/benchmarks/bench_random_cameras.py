@@ -39,14 +39,11 @@ SATURATED = "saturated"
 Found = dict[str, Any]
 
 
-def ratios(known: Camera, given: dict[str, Any], metres: Floats, spots: Spots, place: int) -> dict[str, Floats]:
-    """Return exposure over limit of each limit; the spots are those of damage or of saturation."""
-    if spots.pixel.any():
+def ratios(given: dict[str, Any], metres: Floats, spots: Spots, place: int | None) -> dict[str, Floats]:
+    """Return exposure over limit, of saturation without a place in the bracket, else of each part of the light."""
+    if place is None:
         return {SATURATED: own.saturation_ratio(given, metres, spots)}
-    found = {}
-    for part, ratio in own.damage_ratios(given, metres, spots, place).items():
-        found[f"damage: {part}"] = ratio
-    return found
+    return {f"damage: {part}": ratio for part, ratio in own.damage_ratios(given, metres, spots, place).items()}
 
 
 def reference(known: Camera) -> dict[str, Found]:
@@ -56,12 +53,11 @@ def reference(known: Camera) -> dict[str, Found]:
     found = {}
     for damage in (True, False) if known.judged else (False,):
         spots = spots_of(fill, waves, known.half_pixel, damage)
-        nominal = ratios(known, known.given, metres, spots, 0)
-        upper = ratios(known, known.given, metres, spots, 1)
+        nominal, upper = (ratios(known.given, metres, spots, place if damage else None) for place in (0, 1))
         drawn = far_ends(known, metres, spots, damage)
         for name, ratio in nominal.items():
             ratio = upper[name] if above_alone(known, name) else ratio
-            found[name] = summary(metres, ratio) | intervals(drawn[name])
+            found[name] = summary(metres, ratio, waves) | intervals(drawn[name])
     return found
 
 
@@ -70,11 +66,11 @@ def above_alone(known: Camera, name: str) -> bool:
     return known.opens_below and name in ("damage: pulse", "damage: accumulation")
 
 
-def summary(metres: Floats, ratio: Floats) -> Found:
-    """Return the nominal zones of a limit."""
+def summary(metres: Floats, ratio: Floats, waves: Floats) -> Found:
+    """Return the nominal zones of a limit, and the waves of defocus at its far end."""
     ((near, far),) = own.zones(metres, ratio[None])
-    most = float(ratio.max())
-    return {"near": near.tolist(), "far": far.tolist(), "most": most}
+    beyond = metres >= (far[-1] if len(far) else metres[ratio.argmax()]) * 0.97
+    return {"near": near.tolist(), "far": far.tolist(), "most": float(ratio.max()), "waves": float(waves[beyond][0])}
 
 
 def far_ends(known: Camera, metres: Floats, spots: Spots, damage: bool) -> dict[str, Floats]:
@@ -83,7 +79,7 @@ def far_ends(known: Camera, metres: Floats, spots: Spots, damage: bool) -> dict[
     coarse = metres[::6]
     rough = Spots(*(part[None, ::6] for part in (spots.peak, spots.heat, spots.pixel)))
     found = {}
-    for name, rows in bracketed(known, given, coarse, rough).items():
+    for name, rows in bracketed(known, given, coarse, rough, damage).items():
         last = farthest(coarse, rows)
         if np.isnan(last).all():
             found[name] = last
@@ -92,17 +88,17 @@ def far_ends(known: Camera, metres: Floats, spots: Spots, damage: bool) -> dict[
         fine = np.geomspace(float(ends[0]), float(ends[1]), 3 + int(np.log(ends[1] / ends[0]) / 0.015))
         fill, waves = np.broadcast_arrays(*own.taper_and_defocus(given, fine[None, :]))
         shape = table_of(fill, waves, known.half_pixel, damage)(fill, waves)
-        found[name] = farthest(fine, bracketed(known, given, fine, shape)[name])
+        found[name] = farthest(fine, bracketed(known, given, fine, shape, damage)[name])
     return found
 
 
-def bracketed(known: Camera, given: dict[str, Any], metres: Floats, spots: Spots) -> dict[str, Floats]:
+def bracketed(known: Camera, given: dict[str, Any], metres: Floats, spots: Spots, damage: bool) -> dict[str, Floats]:
     """Return the ratios (draw, distance); a third of the draws each has an end or the middle of the bracket."""
-    if spots.pixel.any():
+    if not damage:
         whole = np.ones((OWN_DRAWS, len(metres)))
-        return {name: ratio * whole for name, ratio in ratios(known, given, metres[None, :], spots, 0).items()}
+        return {name: ratio * whole for name, ratio in ratios(given, metres[None, :], spots, None).items()}
     chosen = np.random.default_rng([34, known.number]).integers(-1, 2, (OWN_DRAWS, 1))
-    by_place = {place: ratios(known, given, metres[None, :], spots, place) for place in own.PLACES}
+    by_place = {place: ratios(given, metres[None, :], spots, place) for place in own.PLACES}
     found = {}
     for name, upper in by_place[1].items():
         parts = [upper] * 3 if above_alone(known, name) else [by_place[place][name] for place in own.PLACES]

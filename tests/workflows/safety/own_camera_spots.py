@@ -16,7 +16,8 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.special import ellipk, erf, j0
 
 Floats = NDArray[np.float64]
-MOST_WAVES, MOST_TAPER = 16.0, 30.0  # of the quadrature; beyond, the wave from the rim and a Gaussian spot
+MOST_WAVES, MOST_TAPER = 36.0, 30.0  # of the quadrature; beyond, the wave from the rim and a Gaussian spot
+TABLE_WAVES = 15.5  # of a table
 STEP = 0.12  # of v
 
 
@@ -52,7 +53,7 @@ def light(fill: Floats, waves: Floats, reach: Floats) -> Floats:
 def grouped(fill: Floats, waves: Floats) -> list[NDArray[np.intp]]:
     """Return groups of spots of about equal extent."""
     far = (waves > MOST_WAVES) | (fill > MOST_TAPER)
-    group = np.where(far, 99, np.searchsorted([0.5, 2.0, 6.0], waves))
+    group = np.where(far, 99, np.searchsorted([0.5, 2.0, 6.0, 16.0], waves))
     places = [np.flatnonzero(group == name) for name in np.unique(group)]
     return [part for place in places for part in np.array_split(place, math.ceil(len(place) / 300))]
 
@@ -122,7 +123,7 @@ def table_of(fill: Floats, waves: Floats, half: float, damage: bool) -> Callable
     Beyond the quadrature the bright moments of a spot count, which are less than 1/16 of the distance apart.
     """
     ends = np.log(np.clip([fill.min() * 0.999, fill.max() * 1.001], 1e-3, MOST_TAPER) * [0.999, 1])
-    low, high = np.clip([waves.min() * 0.999, waves.max() * 1.001 + 1e-6], [0, 1e-6], MOST_WAVES - 0.5)
+    low, high = np.clip([waves.min() * 0.999, waves.max() * 1.001 + 1e-6], [0, 1e-6], TABLE_WAVES)
     low = min(low, high - 1e-6)
     taper = np.linspace(*ends, 2 + int((ends[1] - ends[0]) / 0.25))
     defocus = np.linspace(low, high, 3 + int((high - low) / 0.05))
@@ -135,7 +136,7 @@ def table_of(fill: Floats, waves: Floats, half: float, damage: bool) -> Callable
     def interpolated(fill: Floats, waves: Floats) -> Spots:
         at = (np.clip(np.log(np.maximum(fill, 1e-3)), *ends), np.clip(waves, low, high))
         peak, heat, pixel = (table(at) for table in tables)
-        far, narrow = (waves > MOST_WAVES - 0.5) | (fill > MOST_TAPER), fill > MOST_TAPER
+        far, narrow = (waves > TABLE_WAVES) | (fill > MOST_TAPER), fill > MOST_TAPER
         heat = np.where(far, geometric_heat(fill, waves) / envelope(fill, waves), heat)
         return Spots(peak, heat, np.where(narrow, gaussian_pixel(fill, waves, half), pixel))
 
