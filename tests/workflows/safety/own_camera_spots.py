@@ -17,7 +17,7 @@ from scipy.special import ellipk, erf, j0
 
 Floats = NDArray[np.float64]
 MOST_WAVES, MOST_TAPER = 36.0, 30.0  # of the quadrature; beyond, the wave from the rim and a Gaussian spot
-TABLE_WAVES = 15.5  # of a table
+TABLE_WAVES = 15.5  # of a table, unless it begins at stronger defocus
 STEP = 0.12  # of v
 
 
@@ -123,7 +123,8 @@ def table_of(fill: Floats, waves: Floats, half: float, damage: bool) -> Callable
     Beyond the quadrature the bright moments of a spot count, which are less than 1/16 of the distance apart.
     """
     ends = np.log(np.clip([fill.min() * 0.999, fill.max() * 1.001], 1e-3, MOST_TAPER) * [0.999, 1])
-    low, high = np.clip([waves.min() * 0.999, waves.max() * 1.001 + 1e-6], [0, 1e-6], TABLE_WAVES)
+    most = min(max(TABLE_WAVES, waves.min() + 6), MOST_WAVES - 0.5)
+    low, high = np.clip([waves.min() * 0.999, waves.max() * 1.001 + 1e-6], [0, 1e-6], most)
     low = min(low, high - 1e-6)
     taper = np.linspace(*ends, 2 + int((ends[1] - ends[0]) / 0.25))
     defocus = np.linspace(low, high, 3 + int((high - low) / 0.05))
@@ -136,7 +137,7 @@ def table_of(fill: Floats, waves: Floats, half: float, damage: bool) -> Callable
     def interpolated(fill: Floats, waves: Floats) -> Spots:
         at = (np.clip(np.log(np.maximum(fill, 1e-3)), *ends), np.clip(waves, low, high))
         peak, heat, pixel = (table(at) for table in tables)
-        far, narrow = (waves > TABLE_WAVES) | (fill > MOST_TAPER), fill > MOST_TAPER
+        far, narrow = (waves > most) | (fill > MOST_TAPER), fill > MOST_TAPER
         heat = np.where(far, geometric_heat(fill, waves) / envelope(fill, waves), heat)
         return Spots(peak, heat, np.where(narrow, gaussian_pixel(fill, waves, half), pixel))
 
