@@ -1484,8 +1484,8 @@ MUTANTS = (
     *faults(
         "nodes/laser/_round_spot.py",
         within("nodes/laser", "round_spot.py::test_the_spot_is_the_integral_over_the_pupil_in_every_regime"),
-        ("kappa = complex(fill, -2 * math.pi * waves)", "kappa = complex(fill, -math.pi * waves)"),
-        ("kappa = complex(fill, -2 * math.pi * waves)", "kappa = complex(2 * fill, -2 * math.pi * waves)"),
+        ("kappa = complex(fill, -2 * math.pi * abs(waves))", "kappa = complex(fill, -math.pi * abs(waves))"),
+        ("kappa = complex(fill, -2 * math.pi * abs(waves))", "kappa = complex(2 * fill, -2 * math.pi * abs(waves))"),
         ("field.abs().square() * 4", "field.abs() * 2"),
         ("ratio, power = 2 * kappa / v", "ratio, power = kappa / v"),
         ("ratio, power = -safe / (2 * kappa)", "ratio, power = safe / (2 * kappa)"),
