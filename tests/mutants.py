@@ -1194,7 +1194,7 @@ MUTANTS = (
         ),
         ("return max(filled, plane)", "return min(filled, plane)"),
         ("width = diameter / (2 * math.sqrt(FAR_FILL))", "width = diameter / math.sqrt(FAR_FILL)"),
-        ("diameter**2 / (8 * beam.wavelength * FAR_WAVES)", "diameter**2 / (2 * beam.wavelength * FAR_WAVES)"),
+        ("diameter**2 / (8 * beam.wavelength * waves)", "diameter**2 / (2 * beam.wavelength * waves)"),
     ),
     *faults(
         "workflows/safety/distance_ladder.py",
@@ -1212,7 +1212,7 @@ MUTANTS = (
         within(
             "workflows/safety", "distance_ladder.py::test_the_ladder_ends_where_it_is_asked_before_the_laser_is_distant"
         ),
-        ("last = min(furthest, far_distance(beam, diameter))", "last = far_distance(beam, diameter)"),
+        ("last = min(furthest, far_distance(", "last = max(0.0, far_distance("),
     ),
     *faults(
         "workflows/safety/distance_ladder.py",
@@ -1484,8 +1484,8 @@ MUTANTS = (
     *faults(
         "nodes/laser/_round_spot.py",
         within("nodes/laser", "round_spot.py::test_the_spot_is_the_integral_over_the_pupil_in_every_regime"),
-        ("kappa = complex(fill, -2 * math.pi * waves)", "kappa = complex(fill, -math.pi * waves)"),
-        ("kappa = complex(fill, -2 * math.pi * waves)", "kappa = complex(2 * fill, -2 * math.pi * waves)"),
+        ("kappa = complex(fill, -2 * math.pi * abs(waves))", "kappa = complex(fill, -math.pi * abs(waves))"),
+        ("kappa = complex(fill, -2 * math.pi * abs(waves))", "kappa = complex(2 * fill, -2 * math.pi * abs(waves))"),
         ("field.abs().square() * 4", "field.abs() * 2"),
         ("ratio, power = 2 * kappa / v", "ratio, power = kappa / v"),
         ("ratio, power = -safe / (2 * kappa)", "ratio, power = safe / (2 * kappa)"),

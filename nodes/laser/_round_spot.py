@@ -49,7 +49,7 @@ def round_spot(reach: Tensor, fill: float, waves: float) -> Tensor:
     Source: Born and Wolf, Principles of Optics, 7th ed., section 8.8 (Lommel's series); quadrature in between.
     """
     v = reach.double().abs().flatten()
-    kappa = complex(fill, -2 * math.pi * waves)
+    kappa = complex(fill, -2 * math.pi * abs(waves))  # the sign of the defocus turns the phase of the field alone
     size = 2 * abs(kappa)
     if fill > _DARK:
         return _irradiance(_geometric(v, kappa), reach)

@@ -133,7 +133,7 @@ def _round_spots(area: Area, exposures: Exposures, draws: SettingDraws) -> _Roun
     defocus = _defocus(area.safety, beam, diameter)
     bend = np.arcsinh(exposures.waves[name] / _SOFT) - np.arcsinh(defocus(np.exp(place)) / _SOFT)
     spread = np.log(_spreads(area.safety, draws, diameter))
-    bends, spreads = Grid.around(bend, 1.5), Grid.around(spread, 4)
+    bends, spreads = Grid.through_zero(bend, 1.5), Grid.around(spread, 4)
     ends = float(np.exp(place.min())), float(np.exp(place.max()))
     rungs = ladder(beam, lens, diameter, ends, _STEP, _WAVES)
     groups = []

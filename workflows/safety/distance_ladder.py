@@ -12,18 +12,19 @@ from neusee.workflows.recipe.blocks.safety_block import Lens
 from neusee.workflows.recipe.distributions.shapes import FloatArray
 
 FAR_FILL, FAR_WAVES = 0.02, 0.03  #: largest fill and defocus of a spot that is taken as that of a distant laser
+UNFOCUSED_WAVES = 0.002  #: the same for a lens that is out of focus far away, where each wave counts at first order
 _DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
 
 
-def far_distance(beam: Beam, diameter: float) -> float:
+def far_distance(beam: Beam, diameter: float, waves: float = FAR_WAVES) -> float:
     """Return the distance in m from which the beam overfills a lens and its wavefront is plane.
 
     The fill (D / (2 w))^2 is then at most 0.02, which lowers the spot by 2 %, and the curvature at most 0.03 waves,
-    which lowers it by 0.3 %; the power into the lens is exact at every distance.
+    which lowers the spot of a lens in focus by 0.3 %; the power into the lens is exact at every distance.
     """
     width = diameter / (2 * math.sqrt(FAR_FILL))
     filled = 2 * math.sqrt(max(width**2 - beam.waist**2, 0.0)) / beam.divergence
-    plane = diameter**2 / (8 * beam.wavelength * FAR_WAVES)
+    plane = diameter**2 / (8 * beam.wavelength * waves)
     return max(filled, plane)
 
 
@@ -39,8 +40,9 @@ def ladder(beam: Beam, lens: Lens, diameter: float, ends: tuple[float, float], s
     by the share ``step`` of itself at most.
     """
     nearest, furthest = ends
-    last = min(furthest, far_distance(beam, diameter))
     follows = lens.focus == "laser"
+    focused = follows or (lens.focus == "infinity" and not lens.defocus)
+    last = min(furthest, far_distance(beam, diameter, FAR_WAVES if focused else UNFOCUSED_WAVES))
 
     def defocus(distance: float) -> float:
         found = defocus_at(beam, distance, diameter, focus_of(lens), lens.defocus * _DEFOCUS)

@@ -48,7 +48,7 @@ class Zones:
 
     zones: tuple[Zone, ...]  #: at the nominal values
     none: float  #: share of the draws without any zone
-    alike: float  #: share of the draws with as many zones as the nominal values; the ends are taken from these
+    alike: float  #: share of the draws with as many zones as the nominal values; ends between zones are from these
     reach: Spread | None  #: largest distance of any zone, over the draws that have one; None without such a draw
     inside: float  #: share of the draws in which the limit is exceeded at the distance of the recipe
 
@@ -86,7 +86,9 @@ def zones_of(
 ) -> Zones:
     """Return the zones of a limit from the ratio of exposure to limit: nominal (distance,), drawn (draw, distance).
 
-    Zones lie between the two distances ``asked``, whether or not the distance ``at`` of the recipe does.
+    Zones lie between the two distances ``asked``, whether or not the distance ``at`` of the recipe does. The outer
+    ends, such as the farthest distance, have the interval of all draws that have a zone; ends between two zones have
+    that of the draws with as many zones as the nominal values.
     """
     within = _at(distances, drawn, at) >= 1
     if asked is not None:
@@ -96,18 +98,24 @@ def zones_of(
     starts, stops = crossings(distances, drawn)
     count = (~np.isnan(starts)).sum(1)
     alike = count == len(near)
+    furthest = np.nanmax(stops[count > 0], 1) if (count > 0).any() else np.zeros(0)
+    first, last = starts[count > 0, :1].ravel(), len(near) - 1  # outer ends are those of every draw with a zone
     zones = tuple(
         Zone(
-            Spread.of(float(near[i]), starts[alike, i] if alike.any() else near[i : i + 1]),
-            Spread.of(float(far[i]), stops[alike, i] if alike.any() else far[i : i + 1]),
+            Spread.of(float(near[i]), _column(starts[alike], i) if i else first),
+            Spread.of(float(far[i]), _column(stops[alike], i) if i < last else furthest),
             bool(near[i] <= distances[0] * (1 + _ROUNDED)),
             bool(far[i] >= distances[-1] * (1 - _ROUNDED)),
         )
         for i in range(len(near))
     )
-    furthest = np.nanmax(stops[count > 0], 1) if (count > 0).any() else np.zeros(0)
     reach = Spread.of(float(far.max()) if len(far) else float(np.median(furthest)), furthest) if furthest.size else None
     return Zones(zones, float((count == 0).mean()), float(alike.mean()), reach, float(within.mean()))
+
+
+def _column(ends: FloatArray, zone: int) -> FloatArray:
+    """Return the ends (draw,) of one of several zones; none without a draw."""
+    return ends[:, zone] if len(ends) else np.zeros(0)
 
 
 def _at(distances: FloatArray, ratio: FloatArray, at: float) -> FloatArray:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -90,6 +91,16 @@ class Grid:
         if high - low < _CERTAIN:
             return cls(values.ravel()[:1].astype(np.float64))
         return cls(np.linspace(low, high, max(3, 1 + int(np.ceil((high - low) * per_unit)))))
+
+    @classmethod
+    def through_zero(cls, values: FloatArray, per_unit: float) -> Grid:
+        """Return such a grid with a point at 0, so that values of 0 are not interpolated."""
+        known = cls.around(np.append(values, 0.0), per_unit).points
+        if len(known) == 1:
+            return cls(np.zeros(1))
+        step = known[1] - known[0]
+        ends = math.floor(known[0] / step + _ROUNDED), math.ceil(known[-1] / step - _ROUNDED)
+        return cls(np.arange(ends[0], ends[1] + 1) * step)
 
     def weights(self, values: FloatArray) -> list[FloatArray]:
         """Return the weight of each point in the linear interpolation at values."""

@@ -48,6 +48,14 @@ def test_the_spot_is_the_integral_over_the_pupil_in_every_regime(fill, waves):
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=1e-11)
 
 
+@pytest.mark.parametrize(("fill", "waves"), [(0.0, 12.0), (0.3, 34.4), (5.0, 3.0)])
+def test_a_lens_that_is_focused_too_near_has_the_spot_of_one_that_is_focused_too_far(fill, waves):
+    """The sign of the defocus conjugates the field. At the edge of a wide spot the light was 1e5 times too much."""
+    size = 2 * math.hypot(fill, 2 * math.pi * waves)
+    reach = torch.linspace(0.0, 2 * size, 400, dtype=torch.float64)
+    np.testing.assert_array_equal(round_spot(reach, fill, -waves).numpy(), round_spot(reach, fill, waves).numpy())
+
+
 @pytest.mark.parametrize(("fill", "waves"), [(0.0, 30.0), (1.0, 50.0), (6.0, 60.0)])
 def test_the_edge_of_a_wide_spot_is_that_of_the_integral(fill, waves):
     size = 2 * math.hypot(fill, 2 * math.pi * waves)

@@ -70,14 +70,32 @@ def test_a_limit_that_is_met_in_some_draws_only_has_no_zone_but_a_reach():
     assert found.reach == Spread(pytest.approx(5.0), pytest.approx(5.0), pytest.approx(5.0))
 
 
-def test_the_ends_are_those_of_draws_with_as_many_zones():
+def test_the_ends_between_two_zones_are_those_of_draws_with_as_many_zones():
     one, two = np.where(AT < 10, 2.0, 0.1), np.where((AT < 10) | ((AT > 100) & (AT < 1000)), 2.0, 0.1)
     found = zones_of(AT, two, np.stack([one, one, one, two]), 500.0)
     assert len(found.zones) == 2
     assert found.alike == 0.25
-    assert found.zones[1].far.low == pytest.approx(found.zones[1].far.value)
+    assert found.zones[1].near.low == pytest.approx(found.zones[1].near.value)
+    assert found.zones[1].far.low == pytest.approx(10, rel=0.02)
     assert found.inside == 0.25
     assert found.reach.high > 800
+
+
+def test_zones_that_no_draw_shares_have_ends_without_an_interval():
+    one, two = np.where(AT < 10, 2.0, 0.1), np.where((AT < 10) | ((AT > 100) & (AT < 1000)), 2.0, 0.1)
+    found = zones_of(AT, two, np.stack([one, one]), 500.0)
+    assert found.zones[1].near == Spread.of(found.zones[1].near.value, np.zeros(0))
+
+
+def test_the_farthest_distance_has_the_interval_of_every_draw_with_a_zone():
+    """A third of the draws reaches farther in one zone; the two nominal zones hid this as 300 m without an interval."""
+    two = np.where((AT < 100) | ((AT > 200) & (AT < 300)), 1.1, 0.9) / np.where(AT < 900, 1.0, 100.0)
+    found = zones_of(AT, two, np.stack([two] * 60 + [two * 2] * 30 + [two * 0.1] * 10), 50.0)
+    assert len(found.zones) == 2
+    assert found.zones[1].far.value == pytest.approx(300, rel=0.02)
+    assert found.zones[1].far.high == pytest.approx(900, rel=0.02)
+    assert found.zones[1].far == found.reach
+    assert found.none == 0.1
 
 
 def test_an_exposure_that_just_reaches_the_limit_exceeds_it_there():

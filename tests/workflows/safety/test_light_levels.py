@@ -122,6 +122,21 @@ def test_a_grid_holds_its_values_and_interpolates_them_in_straight_lines():
     assert one.weights(at)[0].tolist() == [[1.0]]
 
 
+@pytest.mark.parametrize(("low", "high"), [(-0.75, 0.38), (0.2, 0.9), (-3.0, -0.1), (0.0, 1.0)])
+def test_a_grid_through_zero_holds_its_values_and_gives_zero_without_interpolation(low, high):
+    """The nominal values and all draws far from the laser have the offset 0: a chord there was 6 % too low."""
+    points = Grid.through_zero(np.array([low, high]), 1.5).points
+    assert 0.0 in points.tolist()
+    assert points[0] <= low + 1e-12
+    assert points[-1] >= high - 1e-12
+    assert np.diff(points) == pytest.approx(points[1] - points[0])
+    assert points[1] - points[0] <= 1 / 1.5
+
+
+def test_a_grid_through_zero_of_values_that_are_alike_is_one_point():
+    assert Grid.through_zero(np.array([[1e-9]]), 1.5).points.tolist() == [0.0]
+
+
 def test_levels_are_those_of_their_rungs_and_nearer_than_the_first_the_bound():
     rungs, grid = np.log([2.0, 20.0, 200.0]), Grid(np.array([0.0, 1.0]))
     values = np.random.default_rng(1).standard_normal((3, 2, 2))
