@@ -29,7 +29,6 @@ LONG_FILES = (
     "tests/workflows/safety/test_over_distance.py",
     "tests/workflows/calibration/test_scatter_calibration.py",
     "tests/workflows/cli/test_interrupts.py",
-    "tests/test_packaging.py",
 )
 
 
