@@ -1,6 +1,7 @@
 import gc
 import os
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 # Most of what is tested is over before a second thread is awake, and where others compute, threads that wait for each
@@ -15,6 +16,27 @@ PATIENT = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
 settings.register_profile("same", derandomize=True, **PATIENT)
 settings.register_profile("search", derandomize=False, **PATIENT)
 settings.load_profile("same")
+
+
+#: files of minutes, which come first: at the end no worker waits for the other
+LONG_FILES = (
+    "tests/test_guide_commands.py",
+    "tests/workflows/studies/calibration/test_calibration_study.py",
+    "tests/workflows/calibration/test_real_cameras.py",
+    "tests/workflows/cli/test_cache_faults.py",
+    "tests/workflows/contract/test_node_contract.py",
+    "tests/workflows/tolerance/test_stated_errors.py",
+    "tests/workflows/safety/test_over_distance.py",
+    "tests/workflows/calibration/test_scatter_calibration.py",
+    "tests/workflows/cli/test_interrupts.py",
+)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Put the tests of long files first and leave the others in their order."""
+    assert all((config.rootpath / name).is_file() for name in LONG_FILES), "name the long files as they are"
+    order = {name: place for place, name in enumerate(LONG_FILES)}
+    items.sort(key=lambda item: order.get(item.nodeid.partition("::")[0], len(order)))
 
 
 def pytest_collection_finish() -> None:

@@ -166,8 +166,9 @@ def _rim(image: Tensor, narrow: list[bool]) -> Tensor:
         return torch.stack([0 * total, 0 * total, total])
     distance = float(max(1, min((n - 1) // 2 for n, cut in zip(image.shape, narrow, strict=True) if cut)))
     y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in image.shape)
-    cubes = image.double() * torch.hypot(y[:, None], x).pow(3)
-    sides = [cubes[0], cubes[-1]] * narrow[0] + [cubes[:, 0], cubes[:, -1]] * narrow[1]
+    across = [image[end].double() * torch.hypot(y[end], x).pow(3) for end in (0, -1)]
+    along = [image[:, end].double() * torch.hypot(y, x[end]).pow(3) for end in (0, -1)]
+    sides = across * narrow[0] + along * narrow[1]
     cube = torch.cat(sides).mean()
     half = [n / 2 for n in image.shape]
     outside = 4 * cube * math.hypot(*half) / (half[0] * half[1])  # the integral of cube / r^3 outside of a rectangle

@@ -281,12 +281,13 @@ def steady_heat(image: Tensor, pitch: float) -> Tensor:
     Each pixel is evenly lit; the integral of 1 / r over its square is exact.
     """
     rows, columns = image.shape
-    y, x = (torch.arange(2 * n, dtype=torch.float64, device=image.device) for n in (rows, columns))
-    y, x = torch.minimum(y, 2 * rows - y)[:, None], torch.minimum(x, 2 * columns - x)
-    corners = [(y + j, x + i, 4 * i * j) for j in (-0.5, 0.5) for i in (-0.5, 0.5)]
-    kernel = sum(sign * (u * torch.asinh(v / u.abs()) + v * torch.asinh(u / v.abs())) for u, v, sign in corners)
+    y, x = (torch.arange(n + 1, dtype=torch.float64, device=image.device) for n in (rows, columns))
+    corners = [(y[:, None] + j, x + i, 4 * i * j) for j in (-0.5, 0.5) for i in (-0.5, 0.5)]
+    quarter = sum(sign * (u * torch.asinh(v / u.abs()) + v * torch.asinh(u / v.abs())) for u, v, sign in corners)
+    down, across = (torch.cat([n[:-1], n[1:].flip(0)]).long() for n in (y, x))  # distances of a plane that wraps around
+    kernel = torch.as_tensor(quarter)[down][:, across]
     size = (2 * rows, 2 * columns)
-    heat: Tensor = torch.fft.irfft2(torch.fft.rfft2(image, size) * torch.fft.rfft2(torch.as_tensor(kernel)), size)
+    heat: Tensor = torch.fft.irfft2(torch.fft.rfft2(image, size) * torch.fft.rfft2(kernel), size)
     return heat[:rows, :columns].clamp_min(0) * (pitch / (2 * math.pi))
 
 

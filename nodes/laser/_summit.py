@@ -7,6 +7,7 @@ from neusee.nodes.laser._bright_pixels import light_with_wings
 
 _NEAR = 0.5  #: of the brightest sample, from which the summit of a lobe may be higher than it
 _FLOOR = 1e-30  #: of the brightest sample, below which light is dark
+_CROSS = ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1))  #: a sample and its four neighbours, in samples along y and x
 _WINGS = 0.03  #: share of the light outside a window, at most, that the wings of a spot in the window explain
 
 
@@ -26,14 +27,18 @@ def summit_gain(image: Tensor) -> Tensor:
     top = image.max()
     if min(image.shape) < 3 or not top > 0:
         return torch.ones((), dtype=torch.float64)
-    height = (image.double() / top).clamp_min(_FLOOR).log()
-    here, gain = height[1:-1, 1:-1], torch.zeros_like(height[1:-1, 1:-1])
-    lobe = here > torch.as_tensor(_NEAR).log()
-    for before, after in ((height[:-2, 1:-1], height[2:, 1:-1]), (height[1:-1, :-2], height[1:-1, 2:])):
+    inner = image[1:-1, 1:-1]
+    y, x = (inner > _NEAR * top).nonzero(as_tuple=True)  # a few: no other sample is a summit
+    here, above, below, left, right = (
+        (image[y + 1 + dy, x + 1 + dx].double() / top).clamp_min(_FLOOR).log() for dy, dx in _CROSS
+    )
+    lobe, gain = torch.ones_like(here, dtype=torch.bool), torch.zeros_like(here)
+    for before, after in ((above, below), (left, right)):
         lobe = lobe & (here >= before) & (here >= after)
         bend = (2 * here - before - after).clamp_min(_FLOOR)
         gain = gain + (after - before).square() / (8 * bend)
-    return torch.where(lobe, here + gain, 0.0).max().clamp_min(0).exp()
+    summits = torch.where(lobe, here + gain, 0.0)
+    return torch.cat([summits, summits.new_zeros(1)]).max().clamp_min(0).exp()
 
 
 def unseen_light(image: Tensor, passing: float) -> Tensor:

@@ -144,8 +144,8 @@ def check_bands(call: Call) -> Iterator[Finding]:
 
 def check_skip_bound(call: Call) -> Iterator[Finding]:
     """Find whether leaving the node out changes the result by no more than its bound."""
-    hook, whole = call.node.hooks.skip_bound, call.result()
-    if hook is None or not isinstance(whole, Tensor) or not isinstance(call.inputs[0], Tensor):
+    hook = call.node.hooks.skip_bound
+    if hook is None or not isinstance(whole := call.result(), Tensor) or not isinstance(call.inputs[0], Tensor):
         return
     stats = [TensorStats.of(value) for value in call.inputs]
     bound = float(hook(*stats, **call.params))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.stats import binom, chi2
+from scipy.stats import chi2
 
 from neusee.nodes.calibrate import Likelihood, least_squares, table
 from neusee.workflows.calibration import emcee_sampler, run_calibration
@@ -166,34 +166,50 @@ def test_emcee_draws_from_the_same_posterior(store, tmp_path):
             assert x.std() == pytest.approx(width, rel=0.1)
 
 
-def covered(recipes, store):
-    """By parameter, how many stated intervals hold the truth."""
-    rows = [{row.name: row for row in compare_models(recipe, store)} for recipe in recipes]
-    return {name: sum(row[name].stated.holds(truth) for row in rows) for name, truth in cameras.TRUTH.items()}
+CAMERAS = 12  #: as many show intervals that are too narrow as well as a count of hits in 24 does
+#: of the sum of squares of as many errors in standard deviations: a right interval exceeds it once in a thousand
+BAR = chi2.isf(1e-3, CAMERAS)
+
+
+def compared(recipes, store):
+    """Return, of each camera, its intervals by parameter."""
+    return [{row.name: row for row in compare_models(recipe, store)} for recipe in recipes]
+
+
+def squared_errors(intervals, truth):
+    """Return the sum of squares of the errors of the logarithms, each in standard deviations of its interval."""
+    widths = [math.log(each.high / each.low) / 2 / Z_90 for each in intervals]
+    return sum((math.log(truth / each.value) / width) ** 2 for each, width in zip(intervals, widths, strict=True))
+
+
+def of_stated(cameras_of, name):
+    """Return the sum of squares of the errors of the stated intervals of one parameter."""
+    return squared_errors([rows[name].stated for rows in cameras_of], cameras.TRUTH[name])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [{}, {"bent": 0.02}, {"bent": 0.03, "power": 1}], ids=["linear", "cubic", "bend"])
 def test_stated_intervals_hold_the_truth_of_simulated_cameras(store, tmp_path, how):
-    """Frames with a lamp of 1 or 2 %, and pixels that differ by 1 %. No fewer of 24 than 90 % by chance allow."""
+    """Frames with a lamp of 1 or 2 %, and pixels that differ by 1 %."""
     recipes = []
-    for seed in range(24):
+    for seed in range(CAMERAS):
         found = cameras.measured(seed, lamp=0.01 * (1 + seed % 2), **how)
         recipes.append(of(cameras.written(found, tmp_path / f"{seed}.csv")))
-    held = covered(recipes, store)
-    print(how, held)
-    assert min(held.values()) >= binom.ppf(1e-3, 24, 0.9)
+    rows = compared(recipes, store)
+    squares = {name: of_stated(rows, name) for name in cameras.TRUTH}
+    print(how, squares)
+    assert max(squares.values()) < BAR
 
 
 @pytest.mark.slow
 def test_a_model_that_is_wrong_does_not_make_the_statement_wrong(store, tmp_path):
     """Where a million pixels leave no other error: two terms alone miss a cubic response, the statement does not."""
-    recipes = [of(cameras.tabled(s, tmp_path / f"{s}.csv", pixels=1_000_000, bent=0.05)) for s in range(24)]
-    held = covered(recipes, store)
-    print(held)
-    assert min(held.values()) >= binom.ppf(1e-3, 24, 0.9)
-    alone = [row.models[2].holds(0.25) for r in recipes for row in compare_models(r, store) if row.name == "gain"]
-    assert sum(alone) < binom.ppf(1e-3, 24, 0.9)
+    tables = (cameras.tabled(s, tmp_path / f"{s}.csv", pixels=1_000_000, bent=0.05) for s in range(CAMERAS))
+    rows = compared([of(file) for file in tables], store)
+    squares = {name: of_stated(rows, name) for name in cameras.TRUTH}
+    alone = squared_errors([each["gain"].models[2] for each in rows], cameras.TRUTH["gain"])
+    print(squares, alone)
+    assert max(squares.values()) < BAR < alone
 
 
 def test_the_simulated_set_of_emva_holds_its_truth(store):

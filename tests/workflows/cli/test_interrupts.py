@@ -108,6 +108,9 @@ QUICK = {
     "validate, at an import": (["validate", "laser_free"], "import", "pydantic"),
     "validate, while a recipe is read": (["validate", "laser_free"], "open", "laser_free.yaml"),
 }
+#: settings with which a safety estimate takes seconds
+SMALL = ["safety.draws=100", "optics.samples=640", "wide.window=[401, 401]", "safety.sensor.shape=[101, 101]",
+         "safety.protection.mask=null", "safety.protection.stop=null"]  # fmt: skip
 SLOW = {
     "run, at the import of torch": (["run", "laser_free"], "import", "torch"),
     "run, while the report is written": (["run", "laser_free", "outputs=[lsr]"], "open", "provenance.json"),
@@ -115,7 +118,7 @@ SLOW = {
     "train": (["train", "train_small"], "import", "neusee.workflows.training.run_training"),
     "study": (["study", "stability", "laser_free"], "import", "neusee.workflows.studies.stability"),
     "safety": (["safety", "safety_pointer"], "import", "neusee.workflows.safety.run_safety"),
-    "safety, while it writes": (["safety", "safety_pointer"], "open", "provenance.json"),
+    "safety, while it writes": (["safety", "safety_pointer", *SMALL], "open", "provenance.json"),
     "calibrate": (["calibrate", "calibrate"], "import", "neusee.workflows.calibration.run_calibration"),
     "restore": (["restore", "frame.png", "--camera", "first_light"], "import", "neusee.workflows.recipe.loading"),
     "handbook": (["handbook"], "import", "neusee.workflows.handbook"),

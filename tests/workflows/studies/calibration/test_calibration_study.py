@@ -118,8 +118,11 @@ def test_a_well_beyond_the_converter_ranks_uniformly(tmp_path):
 
 @pytest.mark.slow
 def test_walkers_pass(tmp_path):
-    """A part of `bench_sbc.py`, which draws thousands of sensors."""
-    _, found = simulated(tmp_path, 80, SEEN, walk_draws, 128)
+    """A part of `bench_sbc.py`, which draws thousands of sensors.
+
+    Draws of 0.7 of the right width fail in one parameter with 0.4, and in some of the six with 0.95.
+    """
+    _, found = simulated(tmp_path, 50, SEEN, walk_draws, 128)
     assert not [s.refused for s in found if s.refused]
     assert not any(s.stranded or not s.independent for s in found)
     assert not failing(found)
