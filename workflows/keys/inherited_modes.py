@@ -6,6 +6,7 @@ A umask of 022 would take from the group what the owner of the root gave it.
 from __future__ import annotations
 
 import os
+import stat
 from contextlib import suppress
 
 
@@ -23,6 +24,8 @@ def make_folders(folder: str, root: str) -> None:
     with suppress(FileExistsError):
         os.mkdir(folder)
         inherit(folder, root, 0o7777)
+        if os.stat(folder).st_gid != os.getegid():
+            os.chmod(folder, os.stat(folder).st_mode | stat.S_ISGID)  # what is made in it has its group
 
 
 def inherit(path: str, root: str, mask: int) -> None:
