@@ -144,7 +144,7 @@ def _converted(matrix: Tensor | None, values: NDArray[Any]) -> Tensor:
 
 def _xyz_to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
     """Return the matrix from CIE X, Y and Z to linear sRGB, with Bradford adaptation of the header's white to D65."""
-    import colour
+    from neusee.nodes._colour_science import colour
 
     srgb = colour.RGB_COLOURSPACES["sRGB"]
     own = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)[6:]
@@ -162,7 +162,7 @@ def _to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
 
     Bradford adaptation maps the neutral of the header to D65.
     """
-    import colour
+    from neusee.nodes._colour_science import colour
 
     values = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)
     if np.allclose(values, _REC709, atol=1e-4) and "adoptedNeutral" not in header:

@@ -58,7 +58,7 @@ class Table(NamedTuple):
 @functools.cache
 def observer() -> Table:
     """Return the colour-matching functions of the CIE 1931 observer, 360 to 830 nm in steps of 1 nm."""
-    import colour
+    from neusee.nodes._colour_science import colour
 
     return _table(colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"])
 
@@ -66,7 +66,7 @@ def observer() -> Table:
 @functools.cache
 def measured_camera(name: str) -> Table:
     """Return the measured spectral sensitivities of the red, green and blue channels of a camera."""
-    import colour
+    from neusee.nodes._colour_science import colour
 
     return _table(colour.MSDS_CAMERA_SENSITIVITIES[f"{name} (NPL)"])
 
@@ -74,7 +74,7 @@ def measured_camera(name: str) -> Table:
 @functools.cache
 def light(kind: str) -> Table:
     """Return the relative spectral power of a CIE illuminant."""
-    import colour
+    from neusee.nodes._colour_science import colour
 
     return _table(colour.SDS_ILLUMINANTS[kind])
 
@@ -82,7 +82,7 @@ def light(kind: str) -> Table:
 @functools.cache
 def daylight(temperature: float) -> Table:
     """Return the relative spectral power of CIE daylight at a colour temperature from 4000 to 25 000 K."""
-    import colour
+    from neusee.nodes._colour_science import colour
 
     return _table(colour.sd_CIE_illuminant_D_series(colour.temperature.CCT_to_xy_CIE_D(temperature)))
 
@@ -90,15 +90,15 @@ def daylight(temperature: float) -> Table:
 @functools.cache
 def mallett() -> Table:
     """Return the three basis reflectances of Mallett and Yuksel (2019), 380 to 780 nm in steps of 5 nm."""
-    from colour.recovery import MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019
+    from neusee.nodes._colour_science import colour
 
-    return _table(MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019)
+    return _table(colour.recovery.MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019)
 
 
 @functools.cache
 def paints() -> tuple[Table, ...]:
     """Return the reflectances of 102 patches of colour charts, some of them measured only from 400 to 700 nm."""
-    import colour
+    from neusee.nodes._colour_science import colour
 
     return tuple(_table(sd) for chart in _CHARTS for sd in colour.SDS_COLOURCHECKERS[chart].values())
 
@@ -106,7 +106,7 @@ def paints() -> tuple[Table, ...]:
 @functools.cache
 def gamut_samples(name: str) -> Table:
     """Return the test reflectances of a colour-rendering index: 99 of CIE 2017, or 15 of NIST CQS 9.0."""
-    import colour
+    from neusee.nodes._colour_science import colour
 
     if name == "CQS":
         return _table(colour.colorimetry.sds_and_msds_to_msds(list(colour.quality.SDS_VS["NIST CQS 9.0"].values())))
@@ -117,7 +117,7 @@ def gamut_samples(name: str) -> Table:
 
 def to_srgb(centres: Tensor) -> Tensor:
     """Return the matrix (3, band) from reflectance under D65 to linear sRGB, scaled so that white is (1, 1, 1)."""
-    import colour
+    from neusee.nodes._colour_science import colour
 
     from_xyz = torch.tensor(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB, dtype=torch.float64)
     matrix = from_xyz @ (observer().at(centres) * light("D65").at(centres))

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import xxhash
 from pydantic import TypeAdapter
 
+from neusee.workflows.keys.inherited_modes import inherit, make_folders
 from neusee.workflows.keys.module_origin import distributions_of
 from neusee.workflows.keys.seal import seal_file, seal_record, secrets, unseal_file, unseal_record
 from neusee.workflows.keys.source_summary import Summary
@@ -117,10 +118,15 @@ def _stamp(path: Path) -> tuple[int, ...]:
 
 
 def _write(path: Path, content: bytes, folder: Path) -> None:
-    """Write a file by atomic rename; do nothing if the folder cannot be written."""
+    """Write a file by atomic rename; do nothing if the folder cannot be written.
+
+    ``folder`` is that of temporary files, in the root of the store.
+    """
+    root = str(folder.parent)
     part = folder / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
     with suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-        path.parent.mkdir(exist_ok=True)
+        make_folders(str(folder), root)
+        make_folders(str(path.parent), root)
         part.write_bytes(content)
+        inherit(str(part), root, 0o444)
         os.replace(part, path)

@@ -49,7 +49,7 @@ class RunFolder:
         with (self.path / name).open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(header)
-            writer.writerows(rows)
+            writer.writerows([_plain(cell) for cell in row] for row in rows)
 
     def take(self, name: str, source: Path) -> None:
         """Add a stored file to the folder of a run as a hard link, or as a copy if the file system refuses the link."""
@@ -156,3 +156,8 @@ def find_run(where: str, root: Path) -> Path:
         if (path / "provenance.json").is_file():
             return path
     raise FileNotFoundError(f"no run at {where}: give the name of a folder in {root}, a path, or `latest`")
+
+
+def _plain(cell: Any) -> Any:
+    """Return a cell with a number of Python in place of one of NumPy, whose text its print options decide."""
+    return cell.item() if hasattr(cell, "dtype") and not cell.ndim else cell

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import xxhash
 
+from neusee.workflows.keys.inherited_modes import make_folders
 from neusee.workflows.keys.seal import secrets
 from neusee.workflows.store.result_store import Store
 
@@ -86,7 +87,7 @@ class DerivedFiles:
 
     def _written(self, key: str, suffix: str, write: Callable[[Path], None]) -> Path:
         path = self._path(key, suffix)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folders(str(path.parent), str(self.store.root))
         part = path.with_name(f".{key}.{os.getpid()}{suffix}")
         try:
             write(part)

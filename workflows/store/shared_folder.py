@@ -19,6 +19,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
+from neusee.workflows.keys.inherited_modes import inherit, make_folders
 from neusee.workflows.store.process_owner import me, owner_of
 
 MOST_READ = 64 << 20  #: bytes of metadata that are read at once
@@ -59,6 +60,7 @@ class Disk:
         part = f"{self.folder}/tmp/{name}.{me()}.{next(_count)}"
         try:
             with open(part, "xb") as file:
+                self.share(part, 0o444)
                 yield part, file
         finally:
             with suppress(OSError):
@@ -103,16 +105,11 @@ class Disk:
 
     def make_folder(self, folder: str) -> None:
         """Make a folder with write permission for every user who may write in the root folder of the store."""
-        with suppress(FileExistsError):
-            os.mkdir(folder)
-            self.share(folder, 0o7777)
+        make_folders(folder, self.folder)
 
     def share(self, path: str, mask: int = 0o666) -> None:
         """Give other users the permissions on ``path`` that they have on the root folder of the store."""
-        due, mode = os.stat(self.folder).st_mode & mask, os.stat(path).st_mode
-        if due & ~mode:
-            with suppress(OSError):
-                os.chmod(path, (mode | due) & 0o7777)
+        inherit(path, self.folder, mask)
 
     @contextmanager
     def lock(self) -> Iterator[None]:

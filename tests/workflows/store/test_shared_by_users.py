@@ -1,0 +1,165 @@
+"""A cache of a group: real users of one group store and load, and a user without rights harms nothing."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+GROUP = 60_001
+FIRST, SECOND, STRANGER = 60_011, 60_012, 60_013  #: numbers of users; no account is needed
+
+RUN = """
+import json, sys, warnings
+from pathlib import Path
+
+from neusee.workflows import load
+from neusee.workflows.engine.runner import run
+from neusee.workflows.store.derived_files import DerivedFiles
+from neusee.workflows.store.result_store import Store
+
+small = ["optics.samples=64", "optics.pitch=120 um", "optics.window=[32, 32]", "optics.bands=3", "scene.shape=[32, 32]",
+         "sensor.shape=[24, 24]", "restore=null", "steps.restored_quality=null", "outputs=[raw, lsr]", "expect={}"]
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    store = Store(sys.argv[1])
+    result = run(load("first_light", [*small, *sys.argv[2:]]), store)
+    DerivedFiles(store).keep(f"{len(sys.argv):032x}", ".txt", "a file", lambda path: path.write_text("words"))
+states = {name: record.state for name, record in result.done.items()}
+print(json.dumps({"states": states, "kept": [r.kept for r in result.done.values() if r.state == "run"],
+                  "warnings": [str(each.message) for each in caught if "is not compiled" not in str(each.message)]}))
+"""
+
+
+#: what a user must read, and what the home folder of root may hide
+NEEDED = tuple(dict.fromkeys(map(os.path.realpath, (sys.base_prefix, sys.prefix, Path(__file__).parents[3]))))
+
+
+def hidden_above(path):
+    """The highest folder above a path that other users may not enter, or None."""
+    above = [path, *map(str, Path(path).parents)]
+    return next((folder for folder in reversed(above) if not os.stat(folder).st_mode & 0o001), None)
+
+
+def opened(place):
+    """Lines of a shell that, in a mount namespace of their own, let every user enter what Python needs."""
+    lines, known = ["set -e", "mount --make-rprivate /"], {}
+    for path in NEEDED:
+        top = hidden_above(path)
+        if top is None:
+            continue
+        if top not in known:
+            known[top] = f"{place}/real-{len(known)}"
+            lines += [
+                f"mkdir {known[top]}",
+                f"mount --bind {top} {known[top]}",
+                f"mount -t tmpfs -o mode=755 none {top}",
+            ]
+        inside = os.path.relpath(path, top)
+        lines += [f"mkdir -p {path}", f"mount --bind {known[top]}/{inside} {path}"]
+    return lines
+
+
+@pytest.fixture
+def place():
+    """A folder that every user may enter."""
+    folder = Path(tempfile.mkdtemp(prefix="neusee-users-"))
+    folder.chmod(0o755)
+    yield folder
+    shutil.rmtree(folder)
+
+
+def command_of(place, user, groups, umask, *words):
+    """The command that runs Python as a user; in a test, ``words`` are its arguments."""
+    who = ["setpriv", f"--reuid={user}", f"--regid={user}", f"--groups={groups}" if groups else "--clear-groups"]
+    script = "; ".join([*opened(tempfile.mkdtemp(dir=place)), f"umask {umask:04o}", 'exec "$@"'])
+    return ["unshare", "--mount", "sh", "-c", script, "sh", *who, sys.executable, "-c", *words]
+
+
+def as_user(user, cache, *words, groups=str(GROUP), umask=0o022):
+    """What a user's process says of a run with a cache; its own group is not that of the cache."""
+    home = cache.parent / f"home-{user}"
+    if not home.exists():
+        home.mkdir()
+        os.chown(home, user, user)
+    environment = {**os.environ, "HOME": str(home), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    environment["CXX"] = "/bin/false"  # a new user has no compiled code
+    environment.pop("NEUSEE_CACHE", None)
+    command = command_of(cache.parent, user, groups, umask, RUN, str(cache), *words)
+    done = subprocess.run(command, env=environment, cwd=home, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.fixture
+def cache(place):
+    if not hasattr(os, "geteuid") or os.geteuid() != 0:
+        pytest.skip("only root can start processes of other users")
+    if not (shutil.which("unshare") and shutil.which("setpriv")):
+        pytest.skip("there is no unshare and setpriv of util-linux")
+    tried = subprocess.run(
+        command_of(place, STRANGER, "", 0o022, "import neusee"), capture_output=True, text=True, cwd="/"
+    )
+    if tried.returncode:
+        pytest.skip(f"other users cannot read this Python, and mounts are not allowed: {tried.stderr[-200:]}")
+    folder = place / "cache"
+    folder.mkdir()
+    os.chown(folder, FIRST, GROUP)
+    return folder
+
+
+def owners(cache):
+    return {file.stat().st_uid for file in cache.rglob("*") if file.is_file()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("mode", "umask"),
+    [(0o2775, 0o022), (0o775, 0o022), (0o2770, 0o077)],
+    ids=["a group folder", "without the bit that hands the group on", "for the group alone"],
+)
+def test_two_users_of_a_group_store_and_load(cache, mode, umask):
+    cache.chmod(mode)
+    first = as_user(FIRST, cache, umask=umask)
+    second = as_user(SECOND, cache, "sensor.read_noise=20 e-", umask=umask)
+    assert first["warnings"] == second["warnings"] == []
+    assert "cached" in second["states"].values(), "the second user loads what the first one stored"
+    assert second["kept"], "one changed value is computed"
+    assert {FIRST, SECOND} <= owners(cache), "the second user stores"
+    results = [path for path in cache.rglob("*") if path.parent.name != "tmp"]
+    assert {path.stat().st_gid for path in results} == {GROUP}
+    again = as_user(FIRST, cache, "sensor.read_noise=20 e-", umask=umask)
+    assert set(again["states"].values()) <= {"cached", "not needed", "left out"}
+    assert again["warnings"] == []
+
+
+@pytest.mark.slow
+def test_a_user_without_rights_reads_and_harms_nothing(cache):
+    cache.chmod(0o2775)
+    as_user(FIRST, cache)
+    before = {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in cache.rglob("*") if path.is_file()}
+    stranger = as_user(STRANGER, cache, groups="")
+    assert set(stranger["states"].values()) <= {"cached", "not needed", "left out"}
+    changed = as_user(STRANGER, cache, "sensor.read_noise=20 e-", groups="")
+    assert "run" in changed["states"].values()
+    assert {
+        path: (path.stat().st_mtime_ns, path.stat().st_size) for path in cache.rglob("*") if path.is_file()
+    } == before
+    hidden = cache.parent / "hidden"
+    hidden.mkdir(mode=0o700)
+    assert "run" in as_user(STRANGER, hidden, groups="")["states"].values(), "a cache that cannot be read stops no run"
+
+
+@pytest.mark.slow
+def test_the_folder_of_the_cache_may_be_read_only_to_its_own_user(cache):
+    cache.chmod(0o2775)
+    as_user(FIRST, cache)
+    cache.chmod(0o555)
+    for folder in [cache, *(path for path in cache.rglob("*") if path.is_dir())]:
+        folder.chmod(0o555)
+    again = as_user(SECOND, cache)
+    assert set(again["states"].values()) <= {"cached", "not needed", "left out"}
