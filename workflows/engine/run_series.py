@@ -27,6 +27,10 @@ class RunSeries:
         """Return a series without a run, whose code is read now."""
         return cls(KnownKeys(Code(store.code_memo)))
 
+    def read_code_again(self, store: Store) -> None:
+        """Forget the digests of code and the keys that rest on them."""
+        self.known_keys = KnownKeys(Code(store.code_memo))
+
     def keep(self, facts: Mapping[Key, TensorStats | None], keys: Iterable[Key]) -> None:
         """Keep the statistics of the results ``keys`` for the next run, in place of those of earlier runs."""
         self.facts = {key: found for key in keys if (found := facts.get(key)) is not None}

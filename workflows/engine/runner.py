@@ -17,8 +17,9 @@ from neusee.workflows.engine.memory_use import give_back, process_peak
 from neusee.workflows.engine.memory_watch import limited
 from neusee.workflows.engine.node_call import to_device
 from neusee.workflows.engine.placement_inputs import past_costs, running_peak
+from neusee.workflows.engine.private_steps import TaintedRun
 from neusee.workflows.engine.run_series import RunSeries
-from neusee.workflows.engine.step_job import Executor, Show
+from neusee.workflows.engine.step_job import Executor, Outcome, Show
 from neusee.workflows.engine.step_order import shortest_first
 from neusee.workflows.graph.recipe_graph import Recipe, needed, unknown_step
 from neusee.workflows.graph.step_record import Event, StepRecord
@@ -115,16 +116,20 @@ def run(
         if name not in recipe.steps:
             raise ValueError(unknown_step(name, recipe.steps))
     recipe, store, watch = with_substitutions(recipe, wanted), store or open_store(), watch or (lambda event: None)
+    series = series or RunSeries.begun(store)
     how = (executor, memory, show or (lambda *_: None), series)
-    attempt = 0
+    attempt, carried = 1, dict[str, Outcome]()
     while True:
-        attempt += 1
-        work = Execution(recipe, store, device.split(","), watch, wanted, *how)
+        work = Execution(recipe, store, device.split(","), watch, wanted, *how, carried)
         try:
             with limited(memory_limit(memory)):
                 return replace(_attempt(work, wanted, began, show is not None), attempts=attempt)
+        except TaintedRun as seen:
+            carried[seen.outcome.work.step.name] = seen.outcome
+            series.read_code_again(store)
         except ToleranceNotProven as failed:
             scale = stricter_scale(recipe, failed.over) if attempt == 1 else 0.0  # a third attempt is exact
+            attempt += 1
             whole = recipe.unsubstituted or recipe
             recipe = with_substitutions(replace(whole, tolerance_scale=scale, exact=scale == 0.0), wanted)
             if not recipe.exact and _futile(recipe, work, wanted):
