@@ -25,7 +25,7 @@ from neusee.workflows.engine.private_steps import refuse_taints
 from neusee.workflows.engine.run_series import RunSeries
 from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, Show, StepJob
 from neusee.workflows.engine.values_in_memory import ValuesInMemory
-from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order, needed, nodes_of
+from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, dependents, in_order, needed, nodes_of
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key, is_private
@@ -54,6 +54,7 @@ class Execution:
         show: Show = lambda *_: None,
         series: RunSeries | None = None,
         carried: Mapping[str, Outcome] | None = None,
+        anew: Collection[str] = (),
     ) -> None:
         self.recipe, self.store, self.devices, self.watch, self.show = recipe, store, devices, watch, show
         self.wanted = frozenset(wanted)
@@ -62,6 +63,8 @@ class Execution:
         self.series = series or RunSeries.begun(store)
         self.code, self.began = self.series.known_keys.code, time.time()
         self._carried = carried or {}
+        self._anew = set[Key]()  # of steps that are computed although the store has their results
+        self._asked_anew = dependents(recipe, anew) if anew else frozenset[str]()
         self.keys: dict[str, Key] = {}
         self.makers: dict[Key, Step] = {}  # the first step of each key
         self.origins: dict[Key, dict[str, Any]] = {}  # the parts of each key
@@ -94,6 +97,8 @@ class Execution:
             except (OSError, LookupError, TypeError) as error:
                 raise RunError(step, [], error) from error
             self.keys[name] = key
+            if name in self._asked_anew:
+                self._anew.add(key)
             if key not in self.makers:
                 self.makers[key], self.origins[key] = step, origin
                 self._take_over(name, key, origin)
@@ -169,7 +174,7 @@ class Execution:
         """Return True if a value is in memory or in the store; remember the metadata of a value that was not stored."""
         if key in self.values:
             return True
-        about = self.store.about(key)
+        about = None if key in self._anew else self.store.about(key)
         if about is None or about.get("kept", True):
             return about is not None
         self.receipts[key] = about
@@ -276,6 +281,7 @@ class Execution:
             self._finish(self._cached(key, "another process computed this result"))
             return
         refuse_taints(outcome)
+        self._anew.discard(key)
         self.facts[key] = outcome.facts
         path = step.node.path
         self.took[path] = max(outcome.seconds, self.took.get(path, 0.0))
@@ -312,7 +318,7 @@ class Execution:
     def known_facts(self, name: str) -> TensorStats | None:
         """Return the statistics of the result of a step, from this run or from an earlier run."""
         key = self.keys[name]
-        if key not in self.facts and (about := self.store.about(key)) is not None:
+        if key not in self.facts and key not in self._anew and (about := self.store.about(key)) is not None:
             self.facts[key] = facts_in(about)
         return self.facts.get(key)
 

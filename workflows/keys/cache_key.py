@@ -46,7 +46,7 @@ def key_of(
     }
     if node.random:
         parts["stream"] = [seed, step.name, device_kind(device)]
-    private = any(map(is_private, [parts["code"], *(keys[name] for name in step.sources)]))
+    private = not step.cached or any(map(is_private, [parts["code"], *(keys[name] for name in step.sources)]))
     return (PRIVATE + digest(parts)[:24] if private else digest(parts)), parts
 
 

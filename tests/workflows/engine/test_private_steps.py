@@ -79,3 +79,26 @@ def test_a_tainted_step_and_all_that_follow_are_not_stored(lab):
     assert again["last"].tolist() == [400.0] * 3
     assert again.done["first"].state == "cached"
     assert {again.done[name].state for name in ("read", "last")} == {"run"}
+
+
+def test_a_step_without_cache_is_computed_in_each_run(lab):
+    store = Store(lab / "cache")
+    keep = ["steps.read=null", "steps.last.from=first"]
+    states = []
+    for words in ([], [], ["steps.first.cache=false"], ["steps.first.cache=false"], []):
+        result = run(load("lab.yaml", [*keep, *words], lab), store)
+        assert result["last"].tolist() == [4.0] * 3
+        states.append((result.done["first"].state, result.done["last"].state))
+    assert states == [("run", "run"), ("not needed", "cached"), ("run", "run"), ("run", "run"), ("not needed", "cached")]
+
+
+def test_rerun_computes_a_step_and_all_that_follow_again(lab):
+    store = Store(lab / "cache")
+    recipe = load("lab.yaml", ["steps.read=null", "steps.last.from=first"], lab)
+    run(recipe, store)
+    again = run(recipe, store, anew=["first"])
+    assert (again.done["first"].state, again.done["last"].state) == ("run", "run")
+    assert run(recipe, store).done["last"].state == "cached"
+    assert run(recipe, store, anew=["last"]).done["first"].state == "cached"
+    with pytest.raises(ValueError, match="no step 'lost'"):
+        run(recipe, store, anew=["lost"])
