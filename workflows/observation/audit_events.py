@@ -1,7 +1,7 @@
 """What Python's own audit events say of an observed call.
 
-Where the kernel watches, they add only what it cannot know: which thread started which, and that a child process is
-one of the program. Elsewhere they are the layer that sees files, processes and sockets, as far as Python code asks.
+Where the kernel watches, they add only what it cannot know: that a child process is one of the program. Elsewhere they
+are the layer that sees files, processes and sockets, as far as Python code asks for them.
 """
 
 from __future__ import annotations
@@ -26,19 +26,12 @@ def listen() -> None:
 
 
 def _heard(event: str, arguments: tuple[Any, ...]) -> None:
-    if event not in _EVENTS:
+    if event not in _EVENTS or (watch := watch_here()) is None:
         return
-    watch = watch_here()
-    if watch is None:
-        return
-    if event in _ALWAYS:
-        _ALWAYS[event](watch, arguments)
+    if event == "subprocess.Popen":
+        _program(watch, arguments)
     elif not watch.kernel and not watch.trusted():
         _HANDLERS[event](watch, arguments)
-
-
-def _thread(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    watch.started(arguments[0])
 
 
 def _program(watch: Watch, arguments: tuple[Any, ...]) -> None:
@@ -65,10 +58,14 @@ def _called_by_program() -> bool:
 
 
 def _file(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    path, _, flags = arguments
-    if not isinstance(path, int):
-        real = os.path.realpath(os.fsdecode(path))
-        watch.records.append(Record("open", real, "", flags & 0x7FFFFFFF, os.path.lexists(real)))
+    path, mode, flags = arguments
+    if isinstance(path, int):
+        return
+    text = os.fsdecode(path)
+    real = os.path.realpath(text)
+    if mode is None and not os.path.isabs(text) and not os.path.lexists(real):
+        real = text  # below an open folder, which the event of ``os.open`` does not name
+    watch.records.append(Record("open", real, "", flags & 0x7FFFFFFF, os.path.lexists(real)))
 
 
 def _of_path(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
@@ -104,11 +101,16 @@ def _database(watch: Watch, arguments: tuple[Any, ...]) -> None:
         watch.records.append(Record("open", real, "", os.O_RDWR | os.O_CREAT, os.path.lexists(real)))
 
 
-def _address(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    address = arguments[1]
-    unix = isinstance(address, str | bytes)
-    where = os.path.realpath(os.fsdecode(address)) if unix else ":".join(map(str, address))
-    watch.records.append(Record("connect", where, "unix" if unix else "internet"))
+def _of_address(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
+    """Return what takes note of an event with a socket and an address."""
+
+    def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
+        address = arguments[1]
+        unix = isinstance(address, str | bytes)
+        where = os.path.realpath(os.fsdecode(address)) if unix else ":".join(map(str, address))
+        watch.records.append(Record(does, where, "unix" if unix else "internet"))
+
+    return note
 
 
 def _named(does: Does, what: str) -> Callable[[Watch, tuple[Any, ...]], None]:
@@ -121,11 +123,6 @@ def _command(watch: Watch, arguments: tuple[Any, ...]) -> None:
 
 
 _Handler = Callable[[Watch, tuple[Any, ...]], None]
-_ALWAYS: dict[str, _Handler] = {
-    "_thread.start_new_thread": _thread,
-    "_thread.start_joinable_thread": _thread,
-    "subprocess.Popen": _program,
-}
 _HANDLERS: dict[str, _Handler] = {
     "open": _file,
     "os.listdir": _of_path("list"),
@@ -143,9 +140,9 @@ _HANDLERS: dict[str, _Handler] = {
     "os.fork": _named("fork", "fork"),
     "os.forkpty": _named("fork", "fork"),
     "pty.spawn": lambda watch, arguments: watch.records.append(Record("exec", str(arguments[0]))),
-    "socket.connect": _address,
-    "socket.sendto": _address,
-    "socket.bind": _address,
+    "socket.connect": _of_address("connect"),
+    "socket.sendto": _of_address("connect"),
+    "socket.bind": _of_address("bind"),
     "socket.getaddrinfo": lambda watch, arguments: watch.records.append(
         Record("connect", str(arguments[0]), "internet")
     ),
@@ -153,4 +150,4 @@ _HANDLERS: dict[str, _Handler] = {
     "ctypes.dlopen": _library,
     "builtins.input": _named("input", "the terminal"),
 }
-_EVENTS = frozenset({*_ALWAYS, *_HANDLERS})
+_EVENTS = frozenset({"subprocess.Popen", *_HANDLERS})

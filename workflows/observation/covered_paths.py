@@ -123,6 +123,11 @@ def _is_searched_library(path: str) -> bool:
     return ".so" in os.path.basename(path) and _is_below(path, _real(folders))
 
 
+def is_searched_program(path: str) -> bool:
+    """Return True for a program, there or not, where programs are searched: to look is nothing, to run it a taint."""
+    return os.path.dirname(path) in _real(filter(None, os.environ.get("PATH", "").split(os.pathsep)))
+
+
 @functools.cache
 def _plain_entries() -> tuple[str, ...]:
     return tuple(entry for entry in SYSTEM if not entry.endswith("*"))

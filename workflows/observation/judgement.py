@@ -11,6 +11,7 @@ from neusee.workflows.observation.covered_paths import (
     is_chance,
     is_installed,
     is_of_system,
+    is_searched_program,
     looked_at,
     program,
 )
@@ -32,7 +33,8 @@ class Judgement:
         self._made: set[str] = set()  #: files and folders that the call itself made
         self._caches = set(caches())
         self._folders = _with_all_parents((*self._files, *program(), *self._caches, *looked_at()))
-        self.taints: dict[Taint, None] = {}
+        self._looks: dict[str, None] = {}  #: paths that were looked at and are not covered
+        self._taints: dict[Taint, None] = {}
 
     def judge(self, records: Iterable[Record]) -> None:
         """Add the taints of records."""
@@ -41,13 +43,22 @@ class Judgement:
 
     def add(self, kind: Kind, what: str) -> None:
         """Add a taint."""
-        self.taints[taint(kind, what)] = None
+        self._taints[taint(kind, what)] = None
 
     def judge_modules(self) -> None:
         """Add a taint for each module of the user that was executed and that the key does not follow."""
         for name in self._bodies:
             if not self._covered.modules(name):
                 self.add("import", name)
+
+    def taints(self) -> tuple[Taint, ...]:
+        """Return the taints, each once; a look at a folder on the way to another one is none."""
+        reached = [each.what for each in self._taints if each.kind in ("file", "folder")]
+        on_the_way = {above for path in (*reached, *self._looks) for above in _with_parents(path)[1:]}
+        for path in self._looks:
+            if path not in on_the_way:
+                self._read(path)
+        return tuple(self._taints)
 
     # --- what was done ------------------------------------------------------------------------------------------------
 
@@ -80,8 +91,8 @@ class Judgement:
         self._move(record)
 
     def _check(self, record: Record) -> None:
-        if record.path not in self._folders:
-            self._read(record.path)
+        if not (record.path in self._folders or self._is_covered(record.path) or is_searched_program(record.path)):
+            self._looks[record.path] = None
 
     def _list(self, record: Record) -> None:
         if not self._is_covered(record.path):
@@ -148,6 +159,8 @@ class Judgement:
                 yield module
 
     def _is_made(self, path: str) -> bool:
+        if not os.path.isabs(path):  # below an open folder that nobody named
+            return any(made.endswith(f"/{path}") for made in self._made)
         return not self._made.isdisjoint(_with_parents(path))
 
     def _add_made(self, path: str) -> None:

@@ -20,7 +20,7 @@ import socket
 
 from neusee.workflows.observation.recorded_call import Record, recorded, without_reading
 from neusee.workflows.observation.stopped_task import Task
-from neusee.workflows.observation.system_calls import audit_arch, machine, numbers
+from neusee.workflows.observation.system_calls import Call, audit_arch, machine, numbers
 from neusee.workflows.observation.trusted_tasks import MARKS, TrustedTasks
 
 SECCOMP_USER_NOTIF_FLAG_CONTINUE = 1
@@ -78,24 +78,23 @@ class Observation:
             self.records[Record("unseen", "a call of 32 bits")] = None
             return
         task, arguments = Task(stopped.pid), tuple(stopped.data.args)
+        if call.does == "check" and call.number >= 0 and arguments[call.number] in MARKS:
+            self._tasks.mark(task.thread, arguments[call.number])
+            return
         try:
-            if call.does == "check" and self._is_mark(task, call.path.pointer if call.path else 0, arguments):
-                return
-            trusted = self._tasks.holds(task)
-            if trusted and call.does not in ("open", "openat2", "creat", "make", "move"):
-                return
-            record = recorded(task, call, arguments)
-            kept = without_reading(record) if trusted else record
+            kept = self._kept(task, call, arguments)
         except (OSError, StopIteration, ValueError) as error:
             kept = Record("unseen", f"{call.name}: {error}")
         if kept is not None:
             self.records[kept] = None
 
-    def _is_mark(self, task: Task, pointer: int, arguments: tuple[int, ...]) -> bool:
-        text = task.text(arguments[pointer])
-        if text.startswith(MARKS):
-            self._tasks.mark(task.thread, text.removeprefix(MARKS))
-        return text.startswith(MARKS)
+    def _kept(self, task: Task, call: Call, arguments: tuple[int, ...]) -> Record | None:
+        if not self._tasks.holds(task):
+            return recorded(task, call, arguments)
+        if call.does == "open" and not arguments[call.number] & (os.O_CREAT | os.O_TRUNC):
+            return None  # an import makes hundreds of these
+        makes = call.does in ("open", "openat2", "creat", "make", "move")
+        return without_reading(recorded(task, call, arguments)) if makes else None
 
 
 class Server:

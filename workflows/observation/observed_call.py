@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from neusee.workflows.observation import audit_events, kernel_layer, python_watch
 from neusee.workflows.observation.judgement import Judgement
+from neusee.workflows.observation.legacy_numpy import WatchedLegacyGenerators
 from neusee.workflows.observation.notification_client import NoServer, NotificationClient
 from neusee.workflows.observation.python_watch import Watch
 from neusee.workflows.observation.random_states import RandomStates, WatchedChance
@@ -16,6 +17,7 @@ from neusee.workflows.observation.recorded_call import Record
 from neusee.workflows.observation.step_thread import StepThread
 from neusee.workflows.observation.taints import Covered, Taint
 from neusee.workflows.observation.watched_imports import WatchedImports
+from neusee.workflows.observation.watched_threads import WatchedThreads
 
 T = TypeVar("T")
 _turn = [threading.Lock()]  #: one observed call at a time: hooks and generators belong to the process
@@ -70,7 +72,7 @@ def _run(function: Callable[[], T], client: NotificationClient | None) -> tuple[
     step = StepThread(function, lambda: kernel_layer.stop_here(client) if client else None)
     watch.add(step.thread)
     audit_events.listen()
-    with WatchedChance(), WatchedImports():
+    with WatchedChance(), WatchedLegacyGenerators(), WatchedImports(), WatchedThreads():
         states = RandomStates()
         python_watch.begin(watch)
         try:
@@ -85,15 +87,16 @@ def _run(function: Callable[[], T], client: NotificationClient | None) -> tuple[
 
 
 def _judged(watch: Watch, covered: Covered, records: list[Record]) -> tuple[Taint, ...]:
-    if not (records or watch.bodies or watch.draws):
+    chance = watch.chance()
+    if not (records or watch.bodies or chance):
         return ()
     judgement = Judgement(covered, watch.bodies)
     # where Python knows which source of chance was asked, what the kernel says of it is the same once more
-    judgement.judge(record for record in records if record.does != "entropy" or not watch.draws)
+    judgement.judge(record for record in records if record.does != "entropy" or not chance)
     judgement.judge_modules()
-    for source in sorted(watch.draws):
+    for source in sorted(chance):
         judgement.add("random", source)
-    return tuple(judgement.taints)
+    return judgement.taints()
 
 
 def _in_child() -> None:

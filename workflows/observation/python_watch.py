@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
-from typing import Any
+from typing import Protocol
 
 from neusee.workflows.observation.recorded_call import Record
-from neusee.workflows.observation.trusted_tasks import CHILD, MARKS, TRUSTED, UNTRUSTED
+from neusee.workflows.observation.trusted_tasks import CHILD, TRUSTED, UNTRUSTED
+
+
+class Seedable(Protocol):
+    """A generator that knows whether a seed decides what it draws."""
+
+    def is_seeded(self) -> bool:
+        """Return True if it does."""
 
 
 class Watch:
@@ -18,6 +24,7 @@ class Watch:
         self.kernel = kernel  #: True if the kernel watches too: then it sees all that is opened, and more
         self.records: list[Record] = []
         self.draws: set[str] = set()  #: sources of chance that were asked
+        self.generators: list[Seedable] = []  #: that were made before their seed, if any, was known
         self.bodies: dict[str, str] = {}  #: file of each module of the user that was executed, by name
         self._threads: set[threading.Thread] = set()
         self._local = threading.local()
@@ -26,17 +33,14 @@ class Watch:
         """Count a thread as one of the call."""
         self._threads.add(thread)
 
-    def started(self, begin: Callable[..., Any]) -> None:
-        """Count the thread that is about to begin with a function as one of the call."""
-        thread = getattr(begin, "__self__", None)
-        if isinstance(thread, threading.Thread):
-            self.add(thread)
-        elif not self.kernel:  # a thread without a name: nobody knows whose calls are its
-            self.records.append(Record("unseen", "a thread that _thread started"))
-
     def is_here(self) -> bool:
         """Return True if the current thread is one of the call."""
         return threading._active.get(threading.get_ident()) in self._threads  # type: ignore[attr-defined]
+
+    def chance(self) -> set[str]:
+        """Return the sources of chance that the call has asked, up to now."""
+        unseeded = any(not each.is_seeded() for each in self.generators)
+        return self.draws | ({"numpy.random.RandomState without a seed"} if unseeded else set())
 
     def trusted(self) -> bool:
         """Return True if the current thread imports an installed package, or searches for a module."""
@@ -54,10 +58,10 @@ class Watch:
         """Trust the next child process that this process starts."""
         self._mark(CHILD)
 
-    def _mark(self, word: str) -> None:
-        """Stop at a call whose path says whose the next calls are; its answer is always no."""
+    def _mark(self, mark: int) -> None:
+        """Stop at a call that says whose the next calls are; its answer is always no."""
         if self.kernel:
-            os.access(MARKS + word, os.F_OK)
+            os.access("/", mark)
 
 
 _current: list[Watch] = []  #: the call under way, at most one

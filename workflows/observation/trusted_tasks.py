@@ -1,14 +1,16 @@
 """Threads and processes whose calls need no record, because the program, or an installed package, makes them.
 
-The observed process says so itself, in order with its calls: it asks for a path that no file has, and the call stops.
+The observed process says so itself, in order with its calls: it asks for rights to a file that nobody can have, and the
+call stops.
 """
 
 from __future__ import annotations
 
 from neusee.workflows.observation.stopped_task import Task
 
-MARKS = "/neusee.observation/"
-TRUSTED, UNTRUSTED, CHILD = "trusted", "untrusted", "child"
+#: marks in place of the rights that ``access`` asks for: whose calls follow. The kernel refuses them.
+TRUSTED, UNTRUSTED, CHILD = 0x6E650001, 0x6E650002, 0x6E650003
+MARKS = (TRUSTED, UNTRUSTED, CHILD)
 
 
 class TrustedTasks:
@@ -20,12 +22,12 @@ class TrustedTasks:
         self._of_thread: dict[int, bool] = {}
         self._of_process: dict[int, bool] = {}
 
-    def mark(self, thread: int, word: str) -> None:
+    def mark(self, thread: int, mark: int) -> None:
         """Take note of a mark that the observed process made."""
-        if word == CHILD:
+        if mark == CHILD:
             self._children += 1
         else:
-            self._of_thread[thread] = word == TRUSTED
+            self._of_thread[thread] = mark == TRUSTED
 
     def holds(self, task: Task) -> bool:
         """Return True if the calls of a task need no record."""
