@@ -6,6 +6,16 @@ from neusee.workflows.engine.step_job import Outcome
 from neusee.workflows.keys.loaded_source import say_once
 from neusee.workflows.keys.tainted_code import taint_code
 
+_WORDS = {
+    "file": "reads",
+    "folder": "lists",
+    "process": "starts",
+    "network": "asks",
+    "random": "draws from",
+    "import": "imports",
+    "unknown": "could not be watched:",
+}
+
 
 class TaintedRun(Exception):
     """Signal of a run whose keys no longer hold: an own step reached what its key does not cover.
@@ -27,7 +37,10 @@ def refuse_taints(outcome: Outcome) -> None:
         return
     step = outcome.work.step
     for taint in outcome.taints:
-        text = f"{step.name} ({step.node.path}): {taint.text}, which its cache key does not cover"
-        say_once(step.node.fn.__module__, f"{text}: its result, and all that follow, are not stored; {taint.fix}")
+        text = f"{step.name} ({step.node.path}): {_WORDS[taint.kind]} {taint.what}, which its cache key does not cover"
+        say_once(
+            step.node.fn.__module__,
+            f"{text}: its result, and all that follow, are not stored. {taint.fix[0].upper()}{taint.fix[1:]}",
+        )
     if taint_code(outcome.work.own.modules, outcome.taints):
         raise TaintedRun(outcome)

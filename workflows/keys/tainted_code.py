@@ -7,33 +7,21 @@ Therefore a taint stays until the process ends, for all code that uses one of th
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal, NamedTuple
+from typing import Any
 
 from neusee.workflows.keys.loaded_source import edited_since
 
-Reached = Literal["file", "folder", "process", "network", "random", "import", "unknown"]
+_taints: dict[str, tuple[Any, ...]] = {}  #: by module, what it reached: `observation.taints.Taint`
 
 
-class Taint(NamedTuple):
-    """What a call of own code reached although its key does not cover it."""
-
-    kind: Reached
-    what: str  #: path, command, address or generator
-    text: str  #: what was done, as "reads table.csv"
-    fix: str  #: what to write in the code or in the recipe
-
-
-_taints: dict[str, tuple[Taint, ...]] = {}  #: by module
-
-
-def taint_code(modules: Iterable[str], taints: tuple[Taint, ...]) -> bool:
+def taint_code(modules: Iterable[str], taints: tuple[Any, ...]) -> bool:
     """Mark own modules as code whose results no other process may use; return True if one was not marked before."""
     new = [module for module in modules if module not in _taints]
     _taints.update(dict.fromkeys(new, taints))
     return bool(new)
 
 
-def taints_of(modules: Iterable[str]) -> tuple[Taint, ...]:
+def taints_of(modules: Iterable[str]) -> tuple[Any, ...]:
     """Return what modules have reached in this process although their keys do not cover it."""
     return tuple(dict.fromkeys(taint for module in modules for taint in _taints.get(module, ())))
 
