@@ -254,10 +254,9 @@ class Execution:
         device, lanes = places(step, self.devices)[0], executor.lanes
         lane = next(iter(lanes)) if len(lanes) == 1 else ""
         wanted, name, seed = target or step.name in self.wanted, self.recipe.name, self.recipe.seed
-        own = own_code(step, self.code)
-        return StepJob(
-            step, key, self.origins[key], reads, seed, name, device, lane, wanted, recompute=recompute, own=own
-        )
+        recompute = recompute or key in self._anew
+        work = StepJob(step, key, self.origins[key], reads, seed, name, device, lane, wanted, recompute=recompute)
+        return replace(work, own=own_code(step, self.code))
 
     def _read(self, wire: Wire) -> Read:
         return self.keys[wire] if isinstance(wire, str) else wire and tuple(self.keys[name] for name in wire)
