@@ -5,16 +5,7 @@ from __future__ import annotations
 from neusee.workflows.engine.step_job import Outcome
 from neusee.workflows.keys.loaded_source import say_once
 from neusee.workflows.keys.tainted_code import taint_code
-
-_WORDS = {
-    "file": "reads",
-    "folder": "lists",
-    "process": "starts",
-    "network": "asks",
-    "random": "draws from",
-    "import": "imports",
-    "unknown": "could not be watched:",
-}
+from neusee.workflows.observation.own_call import WORDS
 
 
 class TaintedRun(Exception):
@@ -37,7 +28,7 @@ def refuse_taints(outcome: Outcome) -> None:
         return
     step = outcome.work.step
     for taint in outcome.taints:
-        text = f"{step.name} ({step.node.path}): {_WORDS[taint.kind]} {taint.what}, which its cache key does not cover"
+        text = f"{step.name} ({step.node.path}): {WORDS[taint.kind]} {taint.what}, which its cache key does not cover"
         say_once(
             step.node.fn.__module__,
             f"{text}: its result, and all that follow, are not stored. {taint.fix[0].upper()}{taint.fix[1:]}",

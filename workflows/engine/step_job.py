@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
-from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import torch
@@ -28,8 +27,8 @@ from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, device_kind, is_private, plain
 from neusee.workflows.keys.input_file_digest import file_stamps
 from neusee.workflows.keys.own_code import OwnCode
-from neusee.workflows.observation.observed_call import observed
-from neusee.workflows.observation.taints import Covered, Taint
+from neusee.workflows.observation.own_call import observed_call
+from neusee.workflows.observation.taints import Taint
 from neusee.workflows.store.lease import Lease
 from neusee.workflows.store.metadata import INLINE
 from neusee.workflows.store.result_store import Store
@@ -200,9 +199,8 @@ def _observing(function: Callable[..., T], own: OwnCode | None, taints: list[Tai
         return function
 
     def watched(*args: Any, **more: Any) -> T:
-        covered = Covered(frozenset(map(Path, own.files)), own.followed.__contains__)
-        value, found = observed(partial(function, *args, **more), covered)
-        taints.extend(taint for taint in found if not own.free & {taint.kind, taint.what, Path(taint.what).name})
+        value, found = observed_call(partial(function, *args, **more), own)
+        taints.extend(found)
         return value
 
     return watched
