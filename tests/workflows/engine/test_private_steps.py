@@ -103,3 +103,39 @@ def test_rerun_computes_a_step_and_all_that_follow_again(lab):
     assert run(recipe, store, anew=["last"]).done["first"].state == "cached"
     with pytest.raises(ValueError, match="no step 'lost'"):
         run(recipe, store, anew=["lost"])
+
+
+@pytest.mark.filterwarnings("ignore:.*when it is imported, which no cache key covers")
+def test_what_a_module_reads_when_it_is_imported_taints_its_nodes(lab):
+    (lab / "dark.ini").write_text("[camera]\ngain = 3\n")
+    name = f"importer_{abs(hash(str(lab))) % 10**9}"
+    code = """
+        import configparser
+
+        from torch import Tensor
+
+        from neusee.nodes import node
+
+        SETTINGS = configparser.ConfigParser()
+        SETTINGS.read("{folder}/dark" + ".ini")
+        GAIN = float(SETTINGS["camera"]["gain"])
+
+
+        @node()
+        def amplified(x: Tensor) -> Tensor:
+            return GAIN * x
+    """.replace("{folder}", str(lab))
+    (lab / f"{name}.py").write_text(textwrap.dedent(code))
+    recipe = (lab / "lab.yaml").read_text()
+    plain = (
+        next(line for line in recipe.splitlines() if line.startswith("  first:"))
+        .partition("node: ")[2]
+        .partition(".")[0]
+    )
+    (lab / "own.yaml").write_text(
+        f"nodes: [./{plain}.py, ./{name}.py]\nseed: 1\ntolerance: 1e-3\noutputs: [last]\nsteps:\n"
+        f"  first: {{node: {plain}.even, with: {{size: 2}}}}\n  last: {{node: {name}.amplified, from: first}}\n"
+    )
+    result = run(load("own.yaml", [], lab), Store(lab / "cache"))
+    assert result["last"].tolist() == [6.0] * 3
+    assert [is_private(result.keys[step]) for step in ("first", "last")] == [False, True]
