@@ -153,9 +153,13 @@ class Judgement:
     def _modules_of(self, source: str) -> Iterator[str]:
         """Yield the modules that were made from a file."""
         yield from (module for module, file in self._bodies.items() if file == source)
-        for module, loaded in list(sys.modules.items()):
-            file = getattr(loaded, "__file__", None)
-            if file and os.path.basename(file) == os.path.basename(source) and os.path.realpath(file) == source:
+        for module, loaded in sys.modules.copy().items():
+            file = getattr(loaded, "__dict__", {}).get("__file__")  # to ask a lazy module would import it
+            if (
+                isinstance(file, str)
+                and os.path.basename(file) == os.path.basename(source)
+                and os.path.realpath(file) == source
+            ):
                 yield module
 
     def _is_made(self, path: str) -> bool:

@@ -5,6 +5,7 @@ So does all that takes ``random_state=3``. While a call is observed, such a gene
 
 from __future__ import annotations
 
+import abc
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ _PLACE: Any = np.random.mtrand
 _NAME = "_MT19937"  #: what ``RandomState`` begins with; where it is missing, a seeded one counts as chance
 
 
-class _Replacement(type):
+class _Replacement(abc.ABCMeta):
     """Class of a class that stands for `MT19937`: a ``RandomState`` asks whether its generator is an instance."""
 
     def __instancecheck__(cls, instance: object) -> bool:
@@ -52,6 +53,9 @@ class LegacyGenerator(np.random.MT19937, metaclass=_Replacement):
         made: tuple[Any, ...] = super().__reduce__()
         make, arguments, *rest = made
         return make, tuple(np.random.MT19937 if each is LegacyGenerator else each for each in arguments), *rest
+
+
+LegacyGenerator.__name__ = np.random.MT19937.__name__  # its state names its class, and a file keeps its state
 
 
 class WatchedLegacyGenerators:

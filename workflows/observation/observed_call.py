@@ -76,8 +76,7 @@ def _run(function: Callable[[], T], client: NotificationClient | None) -> tuple[
         states = RandomStates()
         python_watch.begin(watch)
         try:
-            step.start()
-            step.wait()
+            step.run()
         finally:
             python_watch.end()
         watch.draws.update(states.changed())

@@ -29,19 +29,19 @@ class StepThread(Generic[T]):
         self._value: T
         self._error: BaseException | None = None
         self.unprepared: Exception | None = None  #: the error of ``prepare``; the function did not run
-        self.thread = threading.Thread(target=self._run, name="neusee step", daemon=True)
+        self._ended = False
+        self._end = threading.Lock()
+        self._end.acquire()
+        self.thread = threading.Thread(target=self._keep, name="neusee step", daemon=True)
 
-    def start(self) -> None:
-        """Start the thread."""
-        self.thread.start()
-
-    def wait(self) -> None:
-        """Wait until the function has ended.
+    def run(self) -> None:
+        """Run the function in the thread, and wait until it has ended.
 
         An exception that is raised in the waiting thread is raised in the step too. A Ctrl-C does not wait for the step
         to end, any other one does: the memory of a step that was stopped must be free.
         """
         try:
+            self.thread.start()
             self._join()
         except KeyboardInterrupt:
             self._stop(KeyboardInterrupt)
@@ -61,28 +61,35 @@ class StepThread(Generic[T]):
         return self._value
 
     def _join(self) -> None:
-        while self.thread.is_alive():
-            self.thread.join(_LOOK)
+        """Wait for the end; an exception in the middle of `Thread.join` would leave a thread that only seems to end."""
+        while not self._ended:
+            self._end.acquire(timeout=_LOOK)
 
     def _stop(self, kind: type[BaseException]) -> None:
         if self.thread.ident is not None:
             _raise_in(ctypes.c_ulong(self.thread.ident), ctypes.py_object(kind))
 
-    def _run(self) -> None:
+    def _keep(self) -> None:
+        try:
+            if self._is_prepared():
+                self._value = self._context.run(self._in_modes)
+        except BaseException as error:
+            self._error = error
+        finally:
+            self._ended = True
+            self._end.release()
+
+    def _is_prepared(self) -> bool:
         with_garbage = gc.isenabled()
         gc.disable()  # a finalizer could make a call that is stopped before there is anybody to answer it
         try:
             self._prepare()
         except Exception as error:
             self.unprepared = error
-            return
         finally:
             if with_garbage:
                 gc.enable()
-        try:
-            self._value = self._context.run(self._in_modes)
-        except BaseException as error:
-            self._error = error
+        return self.unprepared is None
 
     def _in_modes(self) -> T:
         grad, inference, threads, device = self._modes
