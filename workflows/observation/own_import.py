@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import importlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -16,14 +18,15 @@ from neusee.workflows.observation.own_call import WORDS
 from neusee.workflows.observation.taints import Covered, Taint
 
 
-def import_observed(name: str, load: Callable[[], ModuleType]) -> ModuleType:
-    """Import a module of a user by ``load``; taint it, and those that it imports, by what they reach meanwhile.
+def import_observed(name: str) -> ModuleType:
+    """Import a module of a user; taint it, and those that it imports, by what they reach meanwhile.
 
     What a module declares in ``__depends__`` is no taint. A module that is loaded already is not observed again.
     """
     if name in sys.modules:
-        return load()
+        return sys.modules[name]
     before = set(sys.modules)
+    load = functools.partial(importlib.import_module, name)
     module, found = observed_import(load, Covered(frozenset(), lambda _: True))
     new = [each for each in sys.modules if each not in before and origin_of(each, frozenset()).kind == "source"]
     taints = tuple(taint for taint in found if not any(_declares(each, taint) for each in new))

@@ -153,9 +153,8 @@ def import_own(where: str, folder: Path) -> ModuleType:
     path = Path(folder, where).expanduser()
     try:
         if is_path:
-            full = path.absolute() if where not in (".", "..") else path.resolve()
-            return import_observed(full.stem, functools.partial(import_file, full))
-        return import_observed(where, functools.partial(importlib.import_module, where))
+            return import_file(path.absolute() if where not in (".", "..") else path.resolve(), import_observed)
+        return import_observed(where)
     except ModuleNotFoundError as error:
         if not is_path and error.name and f"{where}.".startswith(f"{error.name}."):
             beside = f"; write ./{where} for the folder" if path.is_dir() else ""
