@@ -128,11 +128,6 @@ def is_searched_program(path: str) -> bool:
     return os.path.dirname(path) in _real(filter(None, os.environ.get("PATH", "").split(os.pathsep)))
 
 
-def is_search_path(path: str) -> bool:
-    """Return True for a folder where modules are searched: which ones are there says nothing, to import one does."""
-    return path in _real(folder or os.getcwd() for folder in sys.path)
-
-
 @functools.cache
 def _plain_entries() -> tuple[str, ...]:
     return tuple(entry for entry in SYSTEM if not entry.endswith("*"))

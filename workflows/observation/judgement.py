@@ -11,7 +11,6 @@ from neusee.workflows.observation.covered_paths import (
     is_chance,
     is_installed,
     is_of_system,
-    is_search_path,
     is_searched_program,
     looked_at,
     program,
@@ -92,12 +91,11 @@ class Judgement:
         self._move(record)
 
     def _check(self, record: Record) -> None:
-        searched = is_search_path(record.path) or is_searched_program(record.path)
-        if not (record.path in self._folders or searched or self._is_covered(record.path)):
+        if not (record.path in self._folders or self._is_covered(record.path) or is_searched_program(record.path)):
             self._looks[record.path] = None
 
     def _list(self, record: Record) -> None:
-        if not (self._is_covered(record.path) or is_search_path(record.path)):
+        if not self._is_covered(record.path):
             self.add("folder", record.path)
 
     def _input(self, record: Record) -> None:
