@@ -10,16 +10,17 @@ import ast
 import importlib
 import importlib.util
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
 _files: dict[str, Path] = {}  #: file of each module that was imported here, by name
 
 
-def import_file(path: Path) -> ModuleType:
+def import_file(path: Path, load: Callable[[str], ModuleType] = importlib.import_module) -> ModuleType:
     """Import a file such as ``bloom.py``, or a package folder with ``__init__.py``, and return the module.
 
+    ``load`` imports the module by its name.
     Raises `ImportError` if there is no such file, if another module has its name or the name of a helper beside it, and
     whatever the code raises.
     """
@@ -36,7 +37,7 @@ def import_file(path: Path) -> ModuleType:
     importlib.invalidate_caches()
     known = set(sys.modules)
     try:
-        module = importlib.import_module(name)
+        module = load(name)
     except BaseException:
         for added in [module for module in sys.modules if module not in known and f"{module}.".startswith(f"{name}.")]:
             del sys.modules[added]

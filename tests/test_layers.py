@@ -25,7 +25,7 @@ FORBIDDEN_IN_NODES = {"yaml", "ruamel", "emcee", "typer", "rich", "jinja2", "log
 
 #: The rooms in order: a file imports its own room and earlier ones.
 ROOMS = (
-    "graph", "keys", "recipe.text", "recipe.blocks", "recipe.distributions", "recipe", "store", "placement",
+    "graph", "keys", "observation", "recipe.text", "recipe.blocks", "recipe.distributions", "recipe", "store", "placement",
     "tolerance", "engine", "report.figures", "report", "contract", "explain", "simulation", "comparison", "safety",
     "restoration", "protection", "priors", "sweeps", "training.loop",
     "training.parallel", "training.mask_design", "training", "training.lift", "evaluation", "frames", "calibration",

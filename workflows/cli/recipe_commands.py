@@ -34,6 +34,10 @@ if TYPE_CHECKING:
     from neusee.workflows.simulation.simulate_recipe import Simulation
     from neusee.workflows.store.result_store import Store
 
+Rerun = Annotated[
+    list[str] | None,
+    typer.Option("--rerun", metavar="STEP", help="Compute this step, and all that follow, though stored; repeatable."),
+]
 Where = Annotated[
     str, typer.Option("--executor", help="Who computes: local, dask, dask:4 (workers), or tcp://scheduler:8786.")
 ]
@@ -48,6 +52,7 @@ def run(
     executor: Where = "local",
     memory: Memory = "",
     exact: Exact = False,
+    rerun: Rerun = None,
     out: Out = Path("runs"),
 ) -> None:
     """Run a recipe and write its report.
@@ -56,6 +61,7 @@ def run(
     of results holds report.html, the numbers, the pictures and the recipe with every final value.
     """
     recipe, command = load(words, "run", exact=exact)
+    _check_rerun(recipe, rerun or [])
     from neusee.workflows.report import console, contents
     from neusee.workflows.simulation.simulate_recipe import simulate
     from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -74,7 +80,7 @@ def run(
         executor_of(executor, store) as cluster,
         table,
     ):
-        done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit)
+        done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit, rerun or [])
     hints = [] if silent else commands_to_try(recipe, command[2 : -1 if exact else None], _loads)
     if silent:
         _say_briefly(done, as_json)
@@ -82,8 +88,18 @@ def run(
         say(console.closing(done.document, str(done.page), hints))
     if done.document["missed"]:
         raise typer.Exit(MISSED)
-    if executor == "local":
+    if executor == "local" and not rerun:
         keep_run(_text([*before, *table.printed()], done, hints), as_json, out, done, recipe, store)
+
+
+def _check_rerun(recipe: Recipe, names: Sequence[str]) -> None:
+    """End the command for a name in ``--rerun`` that is of no step."""
+    from neusee.workflows.graph.recipe_graph import copies_of
+
+    try:
+        copies_of(recipe, names)
+    except ValueError as error:
+        fail(f"--rerun: {error}")
 
 
 def _text(before: Sequence[str], done: Simulation, hints: Sequence[str]) -> Callable[[str, str], str]:

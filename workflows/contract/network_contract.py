@@ -64,14 +64,14 @@ def _check_docstring(network: type[nn.Module]) -> Iterator[Finding]:
 
 
 def _check_key(network: type[nn.Module]) -> Iterator[Finding]:
-    """Find whether a cache key covers all that the code of the class reads."""
+    """Find whether a cache key can follow the code of the class."""
     with tempfile.TemporaryDirectory() as folder:
         try:
             Code(Path(folder) / "code.json").of(restore.network, ((network.__module__, network.__qualname__),))
         except LookupError as error:
             yield Finding("key", False, str(error.args[0]))
         else:
-            yield Finding("key", True, "a cache key covers all that the code reads")
+            yield Finding("key", True, "follows the code and all that it names")
 
 
 def _check_picture(make: Make) -> Iterator[Finding]:

@@ -22,6 +22,25 @@ from neusee.workflows.contract.value_rules import (
     check_skip_bound,
 )
 from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.keys.own_code import own_code_of
+from neusee.workflows.observation.own_call import WORDS, observed_call
+
+
+def check_reach(call: Call) -> Iterator[Finding]:
+    """Find whether a call of own code reaches more than its cache key covers."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            own = own_code_of(call.node, call.params, [], Code(Path(folder) / "code.json"))
+        except LookupError:
+            return  # the rule on the key says so
+    if own is None:
+        return
+    _, taints = observed_call(call.result, own)
+    for taint in taints:
+        yield Finding("reach", False, f"{WORDS[taint.kind]} {taint.what}, which the key does not cover: {taint.fix}")
+    if not taints:
+        yield Finding("reach", True, "this call reached no file, process, network or chance beyond its key")
+
 
 _OF_VALUES: tuple[Callable[[Call], Iterator[Finding]], ...] = (
     check_result,
@@ -30,6 +49,7 @@ _OF_VALUES: tuple[Callable[[Call], Iterator[Finding]], ...] = (
     check_bands,
     check_skip_bound,
     check_shape,
+    check_reach,
 )
 
 
@@ -52,14 +72,14 @@ def check_values(call: Call) -> list[Finding]:
 
 
 def _check_key(node: Node) -> Iterator[Finding]:
-    """Find whether a cache key covers all that the code of the node reads."""
+    """Find whether a cache key can follow the code of the node."""
     with tempfile.TemporaryDirectory() as folder:
         try:
             Code(Path(folder) / "code.json").of(node)
         except LookupError as error:
             yield Finding("key", False, str(error.args[0]))
         else:
-            yield Finding("key", True, "a cache key covers all that the code reads")
+            yield Finding("key", True, "follows the code and all that it names")
 
 
 def _call(node: Node, example: Mapping[str, Any] | None) -> Call | Finding:

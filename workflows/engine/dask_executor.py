@@ -23,7 +23,9 @@ from neusee.workflows.engine.step_job import InputMissing, Lane, Outcome, StepJo
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, code_of, is_private
 from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.keys.own_code import own_code
 from neusee.workflows.keys.seal import Unsigned, check_signature, secrets, signature
+from neusee.workflows.keys.tainted_code import taint_code, taints_of
 from neusee.workflows.recipe.node_families import all_nodes
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
@@ -197,7 +199,13 @@ def _one_here(work: StepJob, here: _Here) -> Outcome:
     if code_of(work.step, here.code) != work.origin["code"]:
         text = f"the code of {work.step.node.path} differs on a worker: install the same version there"
         return Outcome(work, error=RunError(work.step, [], OSError(text)))
+    work = replace(work, own=own_code(work.step, here.code))
+    if work.own and (known := taints_of(work.own.modules)):  # of an earlier job, whose memo may still hold it
+        return Outcome(work, taints=known)
     outcome = carry_out(work, partial(here.fetch, kinds=kinds_of(work)), here.store)
+    if work.own and outcome.taints:
+        taint_code(work.own.modules, outcome.taints)
+        outcome.value = None
     if outcome.value is not None:
         here.keep(work.key, outcome.value)
     return outcome

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,13 +21,15 @@ from neusee.workflows.engine.load_or_recompute import Upstream, cheaper_to_recom
 from neusee.workflows.engine.local_executor import Local
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare, room_for, small_result
+from neusee.workflows.engine.private_steps import refuse_taints
 from neusee.workflows.engine.run_series import RunSeries
 from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, Show, StepJob
 from neusee.workflows.engine.values_in_memory import ValuesInMemory
-from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, in_order, needed, nodes_of
+from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, dependents, in_order, needed, nodes_of
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event, StepRecord
-from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.keys.cache_key import Key, is_private
+from neusee.workflows.keys.own_code import own_code
 from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.error_budget import ErrorBudget
@@ -51,6 +53,8 @@ class Execution:
         memory: int | None,
         show: Show = lambda *_: None,
         series: RunSeries | None = None,
+        carried: Mapping[str, Outcome] | None = None,
+        anew: Collection[str] = (),
     ) -> None:
         self.recipe, self.store, self.devices, self.watch, self.show = recipe, store, devices, watch, show
         self.wanted = frozenset(wanted)
@@ -58,6 +62,9 @@ class Execution:
         self.executor = executor or self.own
         self.series = series or RunSeries.begun(store)
         self.code, self.began = self.series.known_keys.code, time.time()
+        self._carried = carried or {}
+        self._anew = set[Key]()  # of steps that are computed although the store has their results
+        self._asked_anew = dependents(recipe, anew) if anew else frozenset[str]()
         self.keys: dict[str, Key] = {}
         self.makers: dict[Key, Step] = {}  # the first step of each key
         self.origins: dict[Key, dict[str, Any]] = {}  # the parts of each key
@@ -90,8 +97,22 @@ class Execution:
             except (OSError, LookupError, TypeError) as error:
                 raise RunError(step, [], error) from error
             self.keys[name] = key
+            if name in self._asked_anew:
+                self._anew.add(key)
             if key not in self.makers:
                 self.makers[key], self.origins[key] = step, origin
+                self._take_over(name, key, origin)
+
+    def _take_over(self, name: str, key: Key, origin: dict[str, Any]) -> None:
+        """Use the value that an attempt before this one computed and could not store, if its inputs are the same."""
+        before = self._carried.get(name)
+        if before is None or any(before.work.origin[part] != origin[part] for part in ("params", "inputs")):
+            return
+        outcome = replace(before, work=replace(before.work, key=key, origin=origin))
+        self.values.add(outcome)
+        self.facts[key] = outcome.facts
+        self.again[key] = outcome.seconds + outcome.work.refetch_seconds
+        self._finish(ran(outcome, "not stored", self._bound(name), self.began, None))
 
     def make(self, targets: list[Key], keep: bool, later: Sequence[Key] = ()) -> None:
         """Load or compute the values with the cache keys ``targets``.
@@ -153,7 +174,7 @@ class Execution:
         """Return True if a value is in memory or in the store; remember the metadata of a value that was not stored."""
         if key in self.values:
             return True
-        about = self.store.about(key)
+        about = None if key in self._anew else self.store.about(key)
         if about is None or about.get("kept", True):
             return about is not None
         self.receipts[key] = about
@@ -183,8 +204,9 @@ class Execution:
         self, plan: list[Key], again: frozenset[Key], targets: list[Key], keep: bool, uses: Counter[Key], asked: bool
     ) -> None:
         self.values.free(list(self.values), uses, keep)
-        if plan:
-            for outcome in self._outcomes(plan, again, targets, asked):
+        for part, executor in self._by_executor(plan):
+            read = {key for each in plan if each not in part for key in self.sources(each)}
+            for outcome in self._outcomes(part, again, {*targets, *read}, asked, executor):
                 key, sources = outcome.work.key, outcome.work.sources
                 if outcome.value is not None or not outcome.kept:
                     self.values.add(outcome)
@@ -194,37 +216,47 @@ class Execution:
         for key in targets:
             self._fetch(key)
 
-    def _outcomes(self, plan: list[Key], again: frozenset[Key], targets: list[Key], asked: bool) -> Iterator[Outcome]:
+    def _by_executor(self, plan: list[Key]) -> list[tuple[list[Key], Executor]]:
+        """Return the steps that other processes may compute, and then those whose results hold for this one alone."""
+        private = [key for key in plan if self.executor is not self.own and is_private(key)]
+        public = [key for key in plan if key not in private]
+        return [part for part in ((public, self.executor), (private, self.own)) if part[0]]
+
+    def _outcomes(
+        self, plan: list[Key], again: frozenset[Key], targets: Collection[Key], asked: bool, executor: Executor
+    ) -> Iterator[Outcome]:
         """Compute the values with the keys ``plan`` and yield each outcome; after an error no further step begins."""
         self.costs = self.costs or past_costs(self.store, sizes_of(self.recipe, needed(self.recipe, self.wanted)))
-        most = 0.0 if asked else small_result(self.executor)  # a small one stays in memory until it is read
+        most = 0.0 if asked else small_result(executor)  # a small one stays in memory until it is read
         kept = {key for key in targets if self.costs.size_of(self.makers[key].name) >= most}
-        works = [self._work(key, key in again, key in kept) for key in plan]
+        works = [self._work(key, key in again, key in kept, executor) for key in plan]
         try:
-            prepared = prepare(works, self.costs, self.receipts, self.executor.lanes, targets, self.values)
+            prepared = prepare(works, self.costs, self.receipts, executor.lanes, targets, self.values)
         except TooLarge as error:
             raise RunError(self.recipe.steps[error.task], [], error) from error
         self.schedule = joined(self.schedule, prepared.schedule)
-        chains = chains_of(prepared.works, fused=not self.executor.shares)
-        if not self.executor.shares:  # values for other chains must be in the store
+        chains = chains_of(prepared.works, fused=not executor.shares)
+        if not executor.shares:  # values for other chains must be in the store
             chains = [(*chain[:-1], replace(chain[-1], wanted=True)) for chain in chains]
         self.expected = prepared.expected
-        room = room_for(prepared.expected, self.executor, self.values)
+        room = room_for(prepared.expected, executor, self.values)
         try:
-            for outcome in Loop(chains, self.executor, self._begin, room).outcomes():
+            for outcome in Loop(chains, executor, self._begin, room).outcomes():
                 self._note(outcome)
                 yield outcome
         except BaseException:
-            self.executor.cancel()
+            executor.cancel()
             raise
 
-    def _work(self, key: Key, recompute: bool, target: bool) -> StepJob:
+    def _work(self, key: Key, recompute: bool, target: bool, executor: Executor) -> StepJob:
         step = self.makers[key]
         reads = tuple(self._read(step.wires.get(name)) for name in step.node.inputs)
-        device, lanes = places(step, self.devices)[0], self.executor.lanes
+        device, lanes = places(step, self.devices)[0], executor.lanes
         lane = next(iter(lanes)) if len(lanes) == 1 else ""
         wanted, name, seed = target or step.name in self.wanted, self.recipe.name, self.recipe.seed
-        return StepJob(step, key, self.origins[key], reads, seed, name, device, lane, wanted, recompute=recompute)
+        recompute = recompute or key in self._anew
+        work = StepJob(step, key, self.origins[key], reads, seed, name, device, lane, wanted, recompute=recompute)
+        return replace(work, own=own_code(step, self.code))
 
     def _read(self, wire: Wire) -> Read:
         return self.keys[wire] if isinstance(wire, str) else wire and tuple(self.keys[name] for name in wire)
@@ -247,6 +279,8 @@ class Execution:
         if outcome.found:
             self._finish(self._cached(key, "another process computed this result"))
             return
+        refuse_taints(outcome)
+        self._anew.discard(key)
         self.facts[key] = outcome.facts
         path = step.node.path
         self.took[path] = max(outcome.seconds, self.took.get(path, 0.0))
@@ -283,7 +317,7 @@ class Execution:
     def known_facts(self, name: str) -> TensorStats | None:
         """Return the statistics of the result of a step, from this run or from an earlier run."""
         key = self.keys[name]
-        if key not in self.facts and (about := self.store.about(key)) is not None:
+        if key not in self.facts and key not in self._anew and (about := self.store.about(key)) is not None:
             self.facts[key] = facts_in(about)
         return self.facts.get(key)
 

@@ -42,7 +42,7 @@ def loaded(name: str, key: Key, about: Mapping[str, Any], bound: float | None, w
     return StepRecord(name, "cached", why, seconds, key, facts_in(about), checks, "cpu", size, bound, error=error)
 
 
-def ran(outcome: Outcome, why: str, bound: float | None, began: float, expected: Estimate) -> StepRecord:
+def ran(outcome: Outcome, why: str, bound: float | None, began: float, expected: Estimate | None) -> StepRecord:
     """Return the record of a step that was computed in the run that started at the time ``began``."""
     work = outcome.work
     return StepRecord(
@@ -59,8 +59,8 @@ def ran(outcome: Outcome, why: str, bound: float | None, began: float, expected:
         outcome.began - began,
         work.lane,
         outcome.peak,
-        expected.seconds[device_kind(work.device)] if expected.known else None,
+        expected.seconds[device_kind(work.device)] if expected and expected.known else None,
         outcome.deviation,
-        expected.peak if expected.known else None,
+        expected.peak if expected and expected.known else None,
         outcome.kept,
     )

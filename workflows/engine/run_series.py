@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from neusee.nodes import TensorStats
-from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.keys.cache_key import Key, is_private
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.known_keys import KnownKeys
 from neusee.workflows.store.result_store import Store
@@ -27,6 +27,14 @@ class RunSeries:
         """Return a series without a run, whose code is read now."""
         return cls(KnownKeys(Code(store.code_memo)))
 
+    def read_code_again(self, store: Store) -> None:
+        """Forget the digests of code and the keys that rest on them."""
+        self.known_keys = KnownKeys(Code(store.code_memo))
+
     def keep(self, facts: Mapping[Key, TensorStats | None], keys: Iterable[Key]) -> None:
-        """Keep the statistics of the results ``keys`` for the next run, in place of those of earlier runs."""
-        self.facts = {key: found for key in keys if (found := facts.get(key)) is not None}
+        """Keep the statistics of the results ``keys`` for the next run, in place of those of earlier runs.
+
+        The next run computes private results again, which may differ then.
+        """
+        public = [key for key in keys if not is_private(key)]
+        self.facts = {key: found for key in public if (found := facts.get(key)) is not None}

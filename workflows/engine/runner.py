@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,10 +17,11 @@ from neusee.workflows.engine.memory_use import give_back, process_peak
 from neusee.workflows.engine.memory_watch import limited
 from neusee.workflows.engine.node_call import to_device
 from neusee.workflows.engine.placement_inputs import past_costs, running_peak
+from neusee.workflows.engine.private_steps import TaintedRun
 from neusee.workflows.engine.run_series import RunSeries
-from neusee.workflows.engine.step_job import Executor, Show
+from neusee.workflows.engine.step_job import Executor, Outcome, Show
 from neusee.workflows.engine.step_order import shortest_first
-from neusee.workflows.graph.recipe_graph import Recipe, needed, unknown_step
+from neusee.workflows.graph.recipe_graph import Recipe, copies_of, needed, unknown_step
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.keys.code_memo import Parts
@@ -98,6 +99,7 @@ def run(
     memory: int | None = None,
     show: Show | None = None,
     series: RunSeries | None = None,
+    anew: Collection[str] = (),
 ) -> Result:
     """Return the values of the steps ``outputs``; compute the values that are not in ``store``.
 
@@ -105,7 +107,7 @@ def run(
     ``cuda:0,cuda:1,cpu``, the preferred device first. executor: computes the steps in place of this process.
     memory: bytes that this process, and each GPU, may use; if None, most of the memory that is free.
     show: is told each computed result, while later steps wait. series: what earlier runs found that holds for this
-    one as well.
+    one as well. anew: steps that are computed, with all that follow from them, although their results are stored.
     Raises `RunError`, which names the step, and ValueError for a device that this machine does not have.
     """
     began = time.perf_counter()
@@ -114,17 +116,22 @@ def run(
     for name in wanted:
         if name not in recipe.steps:
             raise ValueError(unknown_step(name, recipe.steps))
+    again = copies_of(recipe, anew)
     recipe, store, watch = with_substitutions(recipe, wanted), store or open_store(), watch or (lambda event: None)
+    series = series or RunSeries.begun(store)
     how = (executor, memory, show or (lambda *_: None), series)
-    attempt = 0
+    attempt, carried = 1, dict[str, Outcome]()
     while True:
-        attempt += 1
-        work = Execution(recipe, store, device.split(","), watch, wanted, *how)
+        work = Execution(recipe, store, device.split(","), watch, wanted, *how, carried, again)
         try:
             with limited(memory_limit(memory)):
                 return replace(_attempt(work, wanted, began, show is not None), attempts=attempt)
+        except TaintedRun as seen:
+            carried[seen.outcome.work.step.name] = seen.outcome
+            series.read_code_again(store)
         except ToleranceNotProven as failed:
             scale = stricter_scale(recipe, failed.over) if attempt == 1 else 0.0  # a third attempt is exact
+            attempt += 1
             whole = recipe.unsubstituted or recipe
             recipe = with_substitutions(replace(whole, tolerance_scale=scale, exact=scale == 0.0), wanted)
             if not recipe.exact and _futile(recipe, work, wanted):

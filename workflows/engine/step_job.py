@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import torch
 
@@ -26,6 +26,9 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, device_kind, is_private, plain
 from neusee.workflows.keys.input_file_digest import file_stamps
+from neusee.workflows.keys.own_code import OwnCode
+from neusee.workflows.observation.own_call import observed_call
+from neusee.workflows.observation.taints import Taint
 from neusee.workflows.store.lease import Lease
 from neusee.workflows.store.metadata import INLINE
 from neusee.workflows.store.result_store import Store
@@ -35,6 +38,7 @@ Read = Key | tuple[Key, ...] | None  #: content of one input: one value, a list 
 Fetch = Callable[[Key], Any]
 #: function that is told each computed result: the recipe of the run, the keys known so far, the step and its value
 Show = Callable[[Recipe, Mapping[str, Key], str, Any], None]
+T = TypeVar("T")
 _STATS = tuple(field.name for field in fields(TensorStats))
 _WATCHED = 1 << 20  #: bytes of inputs from which the memory of a step is measured
 
@@ -60,6 +64,7 @@ class StepJob:
     recompute: bool = False  #: True to compute a stored result because computing is faster than reading
     refetch_seconds: float = 0.0  #: s to obtain the inputs again if this result is not kept
     parts: int = 1  #: number of passes over the bands, for less memory
+    own: OwnCode | None = None  #: the code of a step that is not of neusee, which is observed while it computes
 
     @property
     def sources(self) -> tuple[Key, ...]:
@@ -87,6 +92,7 @@ class Outcome:
     found: bool = False  #: True if another process has already stored this result
     error: BaseException | None = None
     lost: tuple[Key, ...] = ()  #: inputs that could not be read
+    taints: tuple[Taint, ...] = ()  #: what an own step reached that its key does not cover; its value is not stored
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +169,8 @@ def gathered(read: Read, fetch: Fetch) -> Any:
 def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     """Compute a step and return its value with statistics, checks and costs."""
     step = work.step
-    evaluate = partial(call, step, params=step.params, seed=work.seed, device=work.device)
+    taints: list[Taint] = []
+    evaluate = _observing(partial(call, step, params=step.params, seed=work.seed, device=work.device), work.own, taints)
     stamps = file_stamps(step.params)
     began, clock = time.time(), time.perf_counter()
     size = sum(t.nbytes for t in tensors_in(inputs))
@@ -173,7 +180,7 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
         else:
             value = evaluate(inputs)
         bare = plain_of(value)
-        checks = examine(step, bare, inputs)
+        checks = _observing(examine, work.own, taints)(step, bare, inputs)
     seconds = time.perf_counter() - clock
     same = stamps == file_stamps(step.params)
     if not same or work.origin["params"] != {name: plain(param) for name, param in step.params.items()}:
@@ -181,12 +188,27 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     found = sum(t.nbytes for t in tensors_in(bare))
     sized = measured_size(step.node, inputs, step.params, bare)
     deviation = step.node.hooks.approximation_error(bare) if step.node.hooks.approximation_error else None
-    return Outcome(work, value, TensorStats.of(bare), checks, began, seconds, found, deviation, peak.bytes, sized)
+    facts = TensorStats.of(bare)
+    found_here = tuple(dict.fromkeys(taints))
+    return Outcome(work, value, facts, checks, began, seconds, found, deviation, peak.bytes, sized, taints=found_here)
+
+
+def _observing(function: Callable[..., T], own: OwnCode | None, taints: list[Taint]) -> Callable[..., T]:
+    """Return a function that is observed where the code is not of neusee, and that adds what it finds to ``taints``."""
+    if own is None:
+        return function
+
+    def watched(*args: Any, **more: Any) -> T:
+        value, found = observed_call(partial(function, *args, **more), own)
+        taints.extend(found)
+        return value
+
+    return watched
 
 
 def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:
     """Store the metadata of a result, and also its value if reading is faster than computing the result again."""
-    if is_private(outcome.work.key):
+    if is_private(outcome.work.key) or outcome.taints:
         outcome.value = plain_of(outcome.value)
         return outcome
     work, value, about = outcome.work, outcome.value, _about(outcome)

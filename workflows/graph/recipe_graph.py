@@ -39,6 +39,7 @@ class Step:
     mark: Location
     param_marks: Mapping[str, Location]  #: location of each given value
     device: str = ""  #: requested device: ``cpu``, ``gpu``, ``cuda:1``; empty if any; never part of a key
+    cached: bool = True  #: False for ``cache: false``: computed in each run, and never stored
     #: names of all steps whose results are inputs of this step, in the order of the inputs
     sources: tuple[str, ...] = field(init=False, repr=False, compare=False)
 
@@ -137,6 +138,20 @@ class Recipe:
         from neusee.workflows.report.notebook import recipe_html
 
         return recipe_html(self)
+
+
+def copies_of(recipe: Recipe, names: Iterable[str]) -> set[str]:
+    """Return the steps ``names``; a name without items, such as ``psf``, stands for all copies.
+
+    Raises `ValueError` for a name of no step.
+    """
+    found = set[str]()
+    for name in names:
+        own = {step for step in recipe.steps if name in (step, step.partition("[")[0])}
+        if not own:
+            raise ValueError(unknown_step(name, recipe.steps))
+        found |= own
+    return found
 
 
 def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:

@@ -30,6 +30,7 @@ Schema = dict[str, Any]
 REFERENCE: Schema = {"type": "string", "pattern": rf"\$\{{.+\}}|^({'|'.join(KINDS)})\(.+\)$"}
 _WIRE: Schema = {"type": ["string", "null"], "pattern": r"^[^\[\]\s]+(\[[^\[\]]+\])?$|\$\{"}
 _DEVICE: Schema = {"type": ["string", "null"], "pattern": r"^(any|cpu|gpu|mps|cuda(:\d+)?)$|\$\{"}
+_CACHED: Schema = {"anyOf": [{"type": ["boolean", "null"]}, {"type": "string", "pattern": r"\$\{"}]}
 _ANY: Schema = {}
 _FAMILY: Schema = {"type": "object", "additionalProperties": {"type": "string"}, "maxProperties": 1}
 _NODES: Schema = {"anyOf": [{"type": "string"}, _FAMILY]}
@@ -114,7 +115,7 @@ def _step(nodes: Mapping[str, Node]) -> Schema:
     names: Schema = {"anyOf": [{"enum": list(nodes)}, REFERENCE]}
     return {
         "type": ["object", "null"],
-        "properties": {"node": names, "each": each, "from": _ANY, "with": _ANY, "device": _DEVICE},
+        "properties": {"node": names, "each": each, "from": _ANY, "with": _ANY, "device": _DEVICE, "cache": _CACHED},
         "additionalProperties": False,
         "allOf": [
             {

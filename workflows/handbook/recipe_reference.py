@@ -17,6 +17,7 @@ _STEP = {
     "with": "The parameters.",
     "each": "A block: one copy of the step for each item.",
     "device": "Where to compute: `any`, `cpu`, `gpu` or `cuda:0`.",
+    "cache": "`false` computes the step in each run, and stores neither its result nor what follows from it.",
 }
 
 

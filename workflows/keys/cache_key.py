@@ -46,14 +46,18 @@ def key_of(
     }
     if node.random:
         parts["stream"] = [seed, step.name, device_kind(device)]
-    private = any(map(is_private, [parts["code"], *(keys[name] for name in step.sources)]))
+    private = not step.cached or any(map(is_private, [parts["code"], *(keys[name] for name in step.sources)]))
     return (PRIVATE + digest(parts)[:24] if private else digest(parts)), parts
 
 
 def code_of(step: Step, code: Code) -> str:
     """Return the digest of the code of a step: of its node, and of the network classes that its parameters name."""
-    classes = [network for value in step.params.values() if (network := _network_of(value))]
-    return code.of(step.node, tuple(dict.fromkeys((each.__module__, each.__qualname__) for each in classes)))
+    return code.of(step.node, tuple(dict.fromkeys((each.__module__, each.__qualname__) for each in networks_of(step))))
+
+
+def networks_of(step: Step) -> list[type[Any]]:
+    """Return the network classes that the parameters of a step name."""
+    return [network for value in step.params.values() if (network := _network_of(value))]
 
 
 def _network_of(value: Any) -> type[Any] | None:

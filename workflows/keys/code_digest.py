@@ -17,7 +17,6 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
 
 from neusee.nodes import Node
 from neusee.workflows.keys.cache_key import PRIVATE, digest, is_private
@@ -25,41 +24,20 @@ from neusee.workflows.keys.code_memo import EDITION, Parts, is_complete, read_me
 from neusee.workflows.keys.code_objects import PYTHON
 from neusee.workflows.keys.declared_dependencies import FREE, changing_refusal, refusal, resolve, uncovered
 from neusee.workflows.keys.followed_imports import Imports
-from neusee.workflows.keys.loaded_source import compiled_as_written, edited_since, imported, say_once, source_of
+from neusee.workflows.keys.loaded_source import compiled_as_written, imported, say_once, source_of
 from neusee.workflows.keys.loaded_state import LoadedState, counted_values
+from neusee.workflows.keys.module_look import Look, Names, Whole, digest_of, parts_of
 from neusee.workflows.keys.module_origin import Origin, look_again, module_path, origin_of
 from neusee.workflows.keys.process_settings import settings, workflows_digest
 from neusee.workflows.keys.reachable_code import reached, read_names
 from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
+from neusee.workflows.keys.tainted_code import holds_here_alone
 
 #: modules that decide no result
 _LEFT_OUT = frozenset({"neusee", ROOT} | {f"{ROOT}.{n}" for n in ("_hooks", "_node", "import_times", "own_modules")})
 _WORKFLOWS = "neusee.workflows"
 _THIS_PROCESS = os.urandom(8).hex()
 _PYTHON = "Python {}.{}".format(*sys.version_info)
-
-Names = dict[str, set[str]]  #: names that are used of each module; an empty name stands for all of them
-
-
-class Look(NamedTuple):
-    """What one module adds to a digest, and the modules that it leads to."""
-
-    parts: Parts
-    imports: Names
-    summary: Summary | None = None  #: None for a module that counts by its version
-    path: Path | None = None
-    state: str = ""
-    changing: Mapping[str, str] = {}  #: types of loaded objects that no digest covers, such as generators, by name
-    private: bool = False  #: True if the loaded code is not that of the file
-
-
-class Whole(NamedTuple):
-    """The digest of a module with all that it imports."""
-
-    code: str
-    looks: dict[str, Look]
-    names: Names
-    parts: Parts
 
 
 class Code:
@@ -101,6 +79,10 @@ class Code:
         """
         return self._whole(module).code
 
+    def looks(self, module: str) -> Mapping[str, Look]:
+        """Return what a module and each module that it leads to add to the digest, by name."""
+        return self._whole(module).looks
+
     def save(self) -> None:
         """Save the new digests of source files and of their functions; do nothing if the folder cannot be written."""
         if self._new or not is_complete(self._memo):
@@ -122,7 +104,7 @@ class Code:
         parts, private = dict(declared.parts), is_private(code)
         for name in declared.modules:
             below = self._whole(name)
-            parts, private = {**parts, **_parts(below.looks)}, private or is_private(below.code)
+            parts, private = {**parts, **parts_of(below.looks)}, private or is_private(below.code)
         if declared.changed:
             private = True
             say_once(module, f"{source.parent / declared.changed[0]} was changed after the import of {source}: restart")
@@ -154,9 +136,9 @@ class Code:
         if module not in looks or looks[module].summary is None:
             raise LookupError(f"{module} has no source file, so its nodes have no cache key: save the module as a file")
         documents = any(look.summary.documents for look in looks.values() if look.summary)
-        state = {name: _digest_of(look, documents) for name, look in looks.items()}
+        state = {name: digest_of(look, documents) for name, look in looks.items()}
         code = digest(_PYTHON, settings(), state)
-        parts = {"Python": {"version": _PYTHON}, "settings": settings(), **_parts(looks)}
+        parts = {"Python": {"version": _PYTHON}, "settings": settings(), **parts_of(looks)}
         code = self._named(code, parts, any(look.private for look in looks.values()))
         self._wholes[module] = Whole(code, looks, names, parts)
         return self._wholes[module]
@@ -216,7 +198,7 @@ class Code:
         )
         free = {entry.removeprefix(FREE) for entry in summary.depends if entry.startswith(FREE)}
         imports = {name: used for name, used in inner.names(summary).items() if name.partition(".")[0] not in free}
-        state, private, parts = "", edited_since(module), {module: summary.definitions}
+        state, private, parts = "", holds_here_alone(module), {module: summary.definitions}
         changing: Mapping[str, str] = {}
         if known:
             loaded = LoadedState(sys.modules[module], summary.functions if compiled_as_written(module) else (), follows)
@@ -284,16 +266,3 @@ def _decides_nothing(module: str) -> bool:
 def _packages(module: str) -> frozenset[str]:
     """Return the packages that are followed by source though they are installed: that of a node, and this one."""
     return frozenset({"neusee", module.partition(".")[0]})
-
-
-def _parts(looks: dict[str, Look]) -> Parts:
-    return {name: part for look in looks.values() for name, part in look.parts.items()}
-
-
-def _digest_of(look: Look, documents: bool) -> list[Any]:
-    """Return what a module adds to the digest of a node."""
-    if look.summary is None:
-        return [look.parts]
-    source = look.summary.whole if documents else look.summary.tree
-    other = {name: part for name, part in look.parts.items() if name.startswith(("file ", "environment "))}
-    return [source, look.state, other]

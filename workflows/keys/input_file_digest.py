@@ -44,18 +44,19 @@ def file_stamps(value: Any) -> list[Stamp]:
     Equal stamps before and after a reading say that the file was not replaced in between, not even by a file that was
     taken away again. A file that changed in this moment is waited for, because its next change could have its stamp.
     """
-    stamps = [_stamp(path) for path in _paths(value)]
+    stamps = [_stamp(path) for path in files_in(value)]
     if stamps and time.time_ns() - max(max(stamp[-2:]) for stamp in stamps) < _TICK:
         time.sleep(_TICK / 1e9)
     return stamps
 
 
-def _paths(value: Any) -> Iterable[Path]:
+def files_in(value: Any) -> Iterable[Path]:
+    """Return the files in a parameter or a collection of parameters."""
     if isinstance(value, Path):
         return [value]
     if isinstance(value, Mapping):
-        return [path for part in value.values() for path in _paths(part)]
-    return [path for part in value for path in _paths(part)] if isinstance(value, tuple | list) else []
+        return [path for part in value.values() for path in files_in(part)]
+    return [path for part in value for path in files_in(part)] if isinstance(value, tuple | list) else []
 
 
 def _stamp(path: Path) -> Stamp:

@@ -50,7 +50,8 @@ def _is_same(step: Step, other: Step) -> bool:
     """Return True if two steps of one name have the same node, inputs and parameters, to the sign of each zero."""
     if step is other:
         return True
-    same = step.node is other.node and step.wires == other.wires and step.params.keys() == other.params.keys()
+    same = step.node is other.node and step.wires == other.wires and step.cached == other.cached
+    same = same and step.params.keys() == other.params.keys()
     return same and all(_is_equal(value, other.params[name]) for name, value in step.params.items())
 
 

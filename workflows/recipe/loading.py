@@ -25,7 +25,7 @@ from neusee.workflows.recipe.other_cameras import with_cameras
 from neusee.workflows.recipe.own_families import KEY, OwnFamilies, read_own_families
 from neusee.workflows.recipe.parameters import Checker
 from neusee.workflows.recipe.recipe_settings import final_values, settings_of
-from neusee.workflows.recipe.step_declarations import Declared, declare, device_of
+from neusee.workflows.recipe.step_declarations import Declared, cached_of, declare, device_of
 from neusee.workflows.recipe.text.composition import Composed, compose
 from neusee.workflows.recipe.text.option_groups import groups_of, shared_folders
 from neusee.workflows.recipe.text.overrides import Override
@@ -213,7 +213,7 @@ def _bind(wiring: Wiring, checker: Checker, graph: CachedGraph | None, checked: 
     known, memory = (graph.wires, graph.memory) if graph else ({}, None)
     for step in wiring.steps.values():
         if not step.items:
-            for part in ("from", "with", "device"):
+            for part in ("from", "with", "device", "cache"):
                 wiring.references.touch(step.part(part), step.dims)
         for items in step.items:
             name = step.instance(items)
@@ -225,11 +225,12 @@ def _bind(wiring: Wiring, checker: Checker, graph: CachedGraph | None, checked: 
             given = wiring.references.resolve(step.part("with"), scope)
             wires = known[name] if name in known else wiring.wires(step, items)
             device = device_of(step, wiring.references, scope, checker.diagnostics)
+            cached = cached_of(step, wiring.references, scope, checker.diagnostics)
             if step.node is None:
                 continue
             params = checker.read(step.node, given, step.value.key)
             marks = {str(name): value.mark for name, value in given.items.items()}
-            found = Step(name, step.node, params or {}, wires, step.value.key, marks, device)
+            found = Step(name, step.node, params or {}, wires, step.value.key, marks, device, cached)
             if params is not None:
                 checked.append(CheckedStep(found, given, step.value))
                 attempt.remember(name, checked[-1], memory)

@@ -25,6 +25,7 @@ from neusee.nodes import Node
 from neusee.nodes.network_classes import FAMILY, network_classes
 from neusee.nodes.own_modules import import_file
 from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.observation.own_import import import_observed
 from neusee.workflows.recipe.text.renamed_keys import instead
 
 GROUP = "neusee.nodes"  #: group of the entry points by which packages install families of nodes
@@ -152,8 +153,8 @@ def import_own(where: str, folder: Path) -> ModuleType:
     path = Path(folder, where).expanduser()
     try:
         if is_path:
-            return import_file(path.absolute() if where not in (".", "..") else path.resolve())
-        return importlib.import_module(where)
+            return import_file(path.absolute() if where not in (".", "..") else path.resolve(), import_observed)
+        return import_observed(where)
     except ModuleNotFoundError as error:
         if not is_path and error.name and f"{where}.".startswith(f"{error.name}."):
             beside = f"; write ./{where} for the folder" if path.is_dir() else ""

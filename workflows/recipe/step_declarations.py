@@ -17,7 +17,7 @@ from neusee.workflows.recipe.text.references import References, Scope, broken
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
 _MOST = 20_000  #: steps of a recipe, at most, with all copies
-_KEYS = ("node", "each", "from", "with", "device")
+_KEYS = ("node", "each", "from", "with", "device", "cache")
 _DEVICE = re.compile(r"any|cpu|gpu|mps|cuda(:\d+)?")
 _NAME = re.compile(r"[^\W\d][\w-]*")
 _ITEM = re.compile(r"[^\[\],\s]+")
@@ -41,7 +41,7 @@ class Declared:
         return tuple(map(self.instance, self.items))
 
     def part(self, key: str) -> Value:
-        """Return the value of a step's key ``from``, ``with`` or ``device``, or an empty mapping for a missing key."""
+        """Return the value of a key of a step, such as ``from`` or ``cache``, or an empty mapping for a missing key."""
         given = self.value.items.get(key)
         return Value({}, self.value.key, self.value.key, (*self.value.path, key)) if given is None else given
 
@@ -165,6 +165,17 @@ def device_of(step: Declared, references: References, scope: Scope, diagnostics:
     if only != "any" and (only == "cpu") != (given.data == "cpu"):
         message = f"{step.node and step.node.path} runs only on a {only.upper()}"
         diagnostics.append(Diagnostic(given.mark, f"{given.name} = {given.data}", message))
+    return given.data
+
+
+def cached_of(step: Declared, references: References, scope: Scope, diagnostics: list[Diagnostic]) -> bool:
+    """Return False for a step with ``cache: false``, whose result is computed in each run and never stored."""
+    given = references.resolve(step.part("cache"), scope)
+    if broken(given) or given.data in ({}, None):
+        return True
+    if not isinstance(given.data, bool):
+        diagnostics.append(Diagnostic(given.mark, f"{given.name} = {given.plain}", "must be true or false"))
+        return True
     return given.data
 
 

@@ -63,8 +63,12 @@ def simulate(
     watch: Callable[[Event], None] | None = None,
     executor: Executor | None = None,
     memory: int | None = None,
+    anew: Sequence[str] = (),
 ) -> Simulation:
-    """Run a recipe and write the folder ``runs/<date>_<recipe>_<key>/``; after an error no folder remains."""
+    """Run a recipe and write the folder ``runs/<date>_<recipe>_<key>/``; after an error no folder remains.
+
+    The steps ``anew``, and all that follow from them, are computed although their results are stored.
+    """
     finished: dict[str, StepRecord] = {}
     began = timestamp()
 
@@ -87,7 +91,7 @@ def simulate(
             beside(*result)
             graph(*result)
 
-        result = run(recipe, store, wanted(recipe), told, device, executor, memory, show)
+        result = run(recipe, store, wanted(recipe), told, device, executor, memory, show, anew=anew)
         result = replace(result, done={name: finished.get(name, done) for name, done in result.done.items()})
         key = digest([[name, result.keys[name]] for name in wanted(result.recipe)])
         with limited(memory_limit(memory)), _watched(), new_run(runs, recipe.name, key) as folder:

@@ -1,0 +1,58 @@
+"""The code of a step that is not of neusee: its modules, and the files that its key covers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from neusee.workflows.keys.cache_key import networks_of
+from neusee.workflows.keys.declared_dependencies import FREE
+from neusee.workflows.keys.input_file_digest import files_in
+
+if TYPE_CHECKING:
+    from neusee.nodes import Node
+    from neusee.workflows.graph.recipe_graph import Step
+    from neusee.workflows.keys.code_digest import Code
+
+PROVEN = ("neusee.",)  #: packages whose nodes are not observed
+
+
+@dataclass(frozen=True, slots=True)
+class OwnCode:
+    """The modules of a user that compute a step, and what their key covers beside their source."""
+
+    modules: frozenset[str]  #: those outside of neusee
+    followed: frozenset[str]  #: all modules whose source counts
+    files: frozenset[str]  #: real paths of parameter files, and of declared files and folders
+    free: frozenset[str]  #: what the author states to decide no result: a kind, a name or a path
+
+
+def own_code(step: Step, code: Code) -> OwnCode | None:
+    """Return the code of a step that is not of neusee, or None for a step of the package alone."""
+    return own_code_of(step.node, step.params, [each.__module__ for each in networks_of(step)], code)
+
+
+def own_code_of(node: Node, params: Mapping[str, Any], networks: Sequence[str], code: Code) -> OwnCode | None:
+    """Return the code of a call of a node, as `own_code` does; ``networks`` are the modules of its network classes."""
+    roots = [node.fn.__module__, *networks]
+    if not any(map(is_own, roots)):
+        return None
+    looks = {name: look for root in roots for name, look in code.looks(root).items()}
+    followed = {name: look for name, look in looks.items() if look.summary is not None}
+    modules = frozenset(filter(is_own, followed))
+    files = {os.path.realpath(file) for file in files_in(params)}
+    free = set[str]()
+    declared = [(look.path, look.summary.depends) for look in followed.values() if look.summary]
+    declared.append((looks[roots[0]].path, [*node.depends]))
+    for source, entries in declared:
+        free.update(entry.removeprefix(FREE) for entry in entries if entry.startswith(FREE))
+        beside = [source.parent / entry for entry in entries] if source else []
+        files.update(os.path.realpath(path) for path in beside if path.exists())
+    return OwnCode(modules, frozenset(looks), frozenset(files), frozenset(free))
+
+
+def is_own(module: str) -> bool:
+    """Return True for a module outside of neusee, whose nodes are proven by its own tests."""
+    return not f"{module}.".startswith(PROVEN)

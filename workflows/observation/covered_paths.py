@@ -1,0 +1,146 @@
+"""What a step may reach without a word: the program, Python with its packages, and the system below them.
+
+The key holds versions of packages, and the system is not an input: every entry has its reason here.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import site
+import sys
+import sysconfig
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+import neusee.nodes
+import neusee.workflows
+
+#: folders and files of the system that a library reads on its own, with the reason why no result depends on them
+SYSTEM = {
+    "/proc": "processes and memory, as the machine is now",
+    "/sys": "processors and devices, as the machine is now",
+    "/dev/null": "holds nothing",
+    "/dev/zero": "holds zeros",
+    "/dev/full": "holds zeros",
+    "/dev/tty": "the terminal",
+    "/dev/pts": "terminals",
+    "/dev/ptmx": "terminals",
+    "/dev/nvidia*": "the graphics processor, which the key names by its kind",
+    "/dev/kfd": "the graphics processor",
+    "/dev/dri": "the graphics processor",
+    "/dev/infiniband": "links between graphics processors",
+    **dict.fromkeys(("/bin", "/sbin", "/lib*", "/usr/bin", "/usr/sbin"), "installed programs and libraries"),
+    **dict.fromkeys(("/usr/lib*", "/usr/include", "/usr/local/lib*", "/usr/local/bin"), "installed libraries"),
+    **dict.fromkeys(("/usr/local/cuda*", "/System", "/Library/Frameworks"), "installed libraries"),
+    "/usr/share": "time zones, languages, fonts and tables of installed programs",
+    "/etc/ld.so.*": "where the libraries are",
+    "/etc/alternatives": "which of several installed programs has a name",
+    **dict.fromkeys(("/etc/localtime", "/etc/timezone"), "the time zone"),
+    "/etc/locale*": "the language",
+    **dict.fromkeys(("/etc/nsswitch.conf", "/etc/passwd", "/etc/group"), "names of users"),
+    **dict.fromkeys(("/run/nscd", "/run/systemd/userdb"), "names of users, asked of a process"),
+    **dict.fromkeys(("/etc/hosts", "/etc/host.conf", "/etc/resolv.conf", "/etc/gai.conf"), "a connection is a taint"),
+    **dict.fromkeys(("/etc/ssl", "/etc/pki", "/etc/crypto-policies"), "settings of ciphers, read with hashlib"),
+    "/etc/mime.types": "names of kinds of files",
+    "/etc/fonts": "settings of fonts",
+    "/etc/OpenCL": "where the driver of the graphics processor is",
+    "/etc/nvidia*": "settings of the driver of the graphics processor",
+    **dict.fromkeys(("/etc/os-release", "/etc/debian_version"), "the name of the system"),
+}  # fmt: skip
+
+#: files in the folders above that give chance
+CHANCE = ("/dev/random", "/dev/urandom", "/dev/hwrng", "/proc/sys/kernel/random")
+_OF_PYTHON = ("lib", "lib64", "bin", "include", "share", "ssl", "etc", "conda-meta", "DLLs", "Library", "pyvenv.cfg")
+
+
+@functools.cache
+def program() -> tuple[str, ...]:
+    """Return the real paths of the program, and of Python with its packages.
+
+    A virtual environment may be made in the folder of a project, so only its parts count, not its whole folder.
+    """
+    inside = [path for package in (neusee.nodes, neusee.workflows) for path in package.__path__]
+    prefixes = {sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix}
+    python = [os.path.join(prefix, part) for prefix in prefixes for part in _OF_PYTHON]
+    paths = sysconfig.get_paths()
+    installed = [paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
+    packaged = [Path(neusee.__file__ or "").parent / name for name in ("__init__.py", "__main__.py", "__pycache__")]
+    zipped = os.path.join(sys.base_prefix, "lib", f"python{sys.version_info[0]}{sys.version_info[1]}.zip")
+    return _real([*inside, *packaged, *python, *installed, zipped, site.getusersitepackages()])
+
+
+def caches() -> tuple[str, ...]:
+    """Return the folders of code that libraries compile for this machine, and that no result depends on."""
+    home = Path.home()
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache")
+    named = [os.environ[name] for name in ("CUDA_CACHE_PATH", "TRITON_CACHE_DIR") if os.environ.get(name)]
+    # the first is `folder` of neusee.nodes._cpp_library
+    return _real([cache / "neusee" / "build", cache / "torch" / "kernels", home / ".nv", home / ".triton", *named])
+
+
+def looked_at() -> tuple[str, ...]:
+    """Return folders whose existence says nothing: of work, of temporary files, and of the user."""
+    return _real([os.getcwd(), tempfile.gettempdir(), Path.home()])
+
+
+@functools.cache
+def _of_distributions(folder: str) -> bool:
+    """Return True for a folder that ``pip install --target`` filled."""
+    try:
+        return any(name.endswith(".dist-info") for name in os.listdir(folder))
+    except OSError:
+        return False
+
+
+def is_installed(path: str) -> bool:
+    """Return True for a file of the program, of Python, or of an installed package."""
+    if _is_below(path, program()):
+        return True
+    return any(
+        _is_below(path, [os.path.realpath(folder)]) for folder in sys.path if folder and _of_distributions(folder)
+    )
+
+
+def is_of_system(path: str) -> bool:
+    """Return True for a file of the system that no result depends on."""
+    if is_chance(path):
+        return False
+    if any(_is_below(path, [entry]) for entry in _plain_entries()):
+        return True
+    return any(path.startswith(entry) for entry in _starts()) or _is_searched_library(path)
+
+
+def is_chance(path: str) -> bool:
+    """Return True for a file that gives chance."""
+    return _is_below(path, CHANCE)
+
+
+def _is_searched_library(path: str) -> bool:
+    """Return True for a library, there or not, in a folder where the loader of the system was told to search."""
+    folders = filter(None, os.environ.get("LD_LIBRARY_PATH", "").split(":"))
+    return ".so" in os.path.basename(path) and _is_below(path, _real(folders))
+
+
+def is_searched_program(path: str) -> bool:
+    """Return True for a program, there or not, where programs are searched: to look is nothing, to run it a taint."""
+    return os.path.dirname(path) in _real(filter(None, os.environ.get("PATH", "").split(os.pathsep)))
+
+
+@functools.cache
+def _plain_entries() -> tuple[str, ...]:
+    return tuple(entry for entry in SYSTEM if not entry.endswith("*"))
+
+
+@functools.cache
+def _starts() -> tuple[str, ...]:
+    return tuple(entry[:-1] for entry in SYSTEM if entry.endswith("*"))
+
+
+def _is_below(path: str, folders: Iterable[str]) -> bool:
+    return any(path == folder or path.startswith(f"{folder}/") for folder in folders)
+
+
+def _real(paths: Iterable[str | Path]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(os.path.realpath(path) for path in paths))

@@ -1,0 +1,57 @@
+"""Observed import of own modules: what they read while they are imported stays in them, and no later call shows it."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+from neusee.workflows.keys.declared_dependencies import FREE
+from neusee.workflows.keys.loaded_source import say_once
+from neusee.workflows.keys.module_origin import origin_of
+from neusee.workflows.keys.tainted_code import taint_code
+from neusee.workflows.observation.observed_call import observed_import
+from neusee.workflows.observation.own_call import WORDS
+from neusee.workflows.observation.taints import Covered, Taint
+
+
+def import_observed(name: str) -> ModuleType:
+    """Import a module of a user; taint it, and those that it imports, by what they reach meanwhile.
+
+    What a module declares in ``__depends__`` is no taint. A module that is loaded already is not observed again.
+    """
+    if name in sys.modules:
+        return sys.modules[name]
+    before = set(sys.modules)
+    load = functools.partial(importlib.import_module, name)
+    module, found = observed_import(load, Covered(frozenset(), lambda _: True))
+    new = [each for each in sys.modules if each not in before and origin_of(each, frozenset()).kind == "source"]
+    taints = tuple(taint for taint in found if not any(_declares(each, taint) for each in new))
+    if taints:
+        taint_code(new, taints)
+        for taint in taints:
+            reached = f"{WORDS[taint.kind]} {taint.what} when it is imported, which no cache key covers"
+            say_once(
+                name, f"{name} {reached}: the results of its nodes are not stored; to have them stored, {taint.fix}"
+            )
+    return module
+
+
+def _declares(module: str, taint: Taint) -> bool:
+    """Return True if the ``__depends__`` of a module has what was reached."""
+    loaded = sys.modules[module]
+    entries = [entry for entry in getattr(loaded, "__depends__", ()) if isinstance(entry, str)]
+    free = {entry.removeprefix(FREE) for entry in entries if entry.startswith(FREE)}
+    if free & {taint.kind, taint.what, Path(taint.what).name}:
+        return True
+    return any(path == Path(taint.what) or path in Path(taint.what).parents for path in _beside(loaded, entries))
+
+
+def _beside(module: ModuleType, entries: list[str]) -> Iterator[Path]:
+    """Yield the files and folders that a module declares beside itself."""
+    file = getattr(module, "__file__", None)
+    if file is not None:
+        yield from (Path(file).resolve().parent / entry for entry in entries)

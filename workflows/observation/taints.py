@@ -1,0 +1,41 @@
+"""What is covered by the key of a step, and what a step reached beyond it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+Kind = Literal["file", "folder", "process", "network", "random", "import", "unknown"]
+
+
+class Covered(NamedTuple):
+    """What the key of a step knows: a step may reach it."""
+
+    files: frozenset[Path]  #: real paths of files and folders; a folder covers what is in it
+    modules: Callable[[str], bool]  #: True for a module whose source the key follows
+
+
+class Taint(NamedTuple):
+    """One thing that a step reached and its key does not know."""
+
+    kind: Kind
+    what: str  #: path, command, address, generator or module
+    fix: str  #: what to write
+
+
+_FIX: dict[Kind, str] = {
+    "file": 'declare it, depends=["{name}"], or make it a parameter of type DataFile; or write cache: false',
+    "folder": 'declare the folder, depends=["{name}"], or make its files a parameter of type DataFiles; or write '
+    "cache: false",
+    "process": "compute it in the node, or run it before and give its output as a DataFile; or write cache: false",
+    "network": "fetch it before and give the file as a DataFile; or write cache: false",
+    "random": "give the node an argument rng, a generator that the engine seeds, and draw from it; or write cache: false",
+    "import": 'write the import as a statement, or declare the module: depends=["{name}"]; or write cache: false',
+    "unknown": "write cache: false",
+}
+
+
+def taint(kind: Kind, what: str) -> Taint:
+    """Return a taint with what to write against it."""
+    return Taint(kind, what, _FIX[kind].format(name=Path(what).name if kind in ("file", "folder") else what))
