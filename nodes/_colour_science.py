@@ -1,12 +1,20 @@
 """The package colour-science, imported without what it changes: how NumPy prints every number of the process."""
 
+from __future__ import annotations
+
+import functools
+from typing import Any
+
 import numpy as np
 
 __depends__ = ("unaffected:state",)  # how numbers are printed decides no result
 
-_before = np.get_printoptions()
-import colour  # noqa: E402
 
-np.set_printoptions(**_before)
+@functools.cache
+def colour_science() -> Any:
+    """Return the module ``colour``."""
+    before = np.get_printoptions()
+    import colour
 
-__all__ = ["colour"]
+    np.set_printoptions(**before)
+    return colour

@@ -25,9 +25,9 @@ FORBIDDEN_IN_NODES = {"yaml", "ruamel", "emcee", "typer", "rich", "jinja2", "log
 
 #: The rooms in order: a file imports its own room and earlier ones.
 ROOMS = (
-    "graph", "keys", "observation", "recipe.text", "recipe.blocks", "recipe.distributions", "recipe", "store", "placement",
-    "tolerance", "engine", "report.figures", "report", "contract", "explain", "simulation", "comparison", "safety",
-    "restoration", "protection", "priors", "sweeps", "training.loop",
+    "graph", "keys", "observation", "recipe.text", "recipe.blocks", "recipe.distributions", "recipe", "store",
+    "placement", "tolerance", "engine", "report.figures", "report", "contract", "explain", "simulation", "comparison",
+    "safety", "restoration", "protection", "priors", "sweeps", "training.loop",
     "training.parallel", "training.mask_design", "training", "training.lift", "evaluation", "frames", "calibration",
     "studies", "studies.accuracy", "studies.stability", "studies.leave_out", "studies.uncertainty",
     "studies.calibration", "studies.protection", "api",

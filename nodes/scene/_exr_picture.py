@@ -12,6 +12,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
+from neusee.nodes._colour_science import colour_science
 from neusee.nodes.input_files import not_finite, once_per_version, refuse_large_picture
 from neusee.nodes.scene._crop_to_frame import enlarged
 from neusee.nodes.scene._large_picture import Linear, bands_of, linear_light
@@ -144,7 +145,7 @@ def _converted(matrix: Tensor | None, values: NDArray[Any]) -> Tensor:
 
 def _xyz_to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
     """Return the matrix from CIE X, Y and Z to linear sRGB, with Bradford adaptation of the header's white to D65."""
-    from neusee.nodes._colour_science import colour
+    colour = colour_science()
 
     srgb = colour.RGB_COLOURSPACES["sRGB"]
     own = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)[6:]
@@ -162,7 +163,7 @@ def _to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
 
     Bradford adaptation maps the neutral of the header to D65.
     """
-    from neusee.nodes._colour_science import colour
+    colour = colour_science()
 
     values = np.asarray(header.get("chromaticities", _REC709), dtype=np.float64)
     if np.allclose(values, _REC709, atol=1e-4) and "adoptedNeutral" not in header:

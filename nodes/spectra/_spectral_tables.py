@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from neusee.nodes._colour_science import colour_science
 from neusee.nodes.values import Bands
 
 _ROUNDING = 1e-3  #: nm
@@ -58,7 +59,7 @@ class Table(NamedTuple):
 @functools.cache
 def observer() -> Table:
     """Return the colour-matching functions of the CIE 1931 observer, 360 to 830 nm in steps of 1 nm."""
-    from neusee.nodes._colour_science import colour
+    colour = colour_science()
 
     return _table(colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"])
 
@@ -66,7 +67,7 @@ def observer() -> Table:
 @functools.cache
 def measured_camera(name: str) -> Table:
     """Return the measured spectral sensitivities of the red, green and blue channels of a camera."""
-    from neusee.nodes._colour_science import colour
+    colour = colour_science()
 
     return _table(colour.MSDS_CAMERA_SENSITIVITIES[f"{name} (NPL)"])
 
@@ -74,7 +75,7 @@ def measured_camera(name: str) -> Table:
 @functools.cache
 def light(kind: str) -> Table:
     """Return the relative spectral power of a CIE illuminant."""
-    from neusee.nodes._colour_science import colour
+    colour = colour_science()
 
     return _table(colour.SDS_ILLUMINANTS[kind])
 
@@ -82,7 +83,7 @@ def light(kind: str) -> Table:
 @functools.cache
 def daylight(temperature: float) -> Table:
     """Return the relative spectral power of CIE daylight at a colour temperature from 4000 to 25 000 K."""
-    from neusee.nodes._colour_science import colour
+    colour = colour_science()
 
     return _table(colour.sd_CIE_illuminant_D_series(colour.temperature.CCT_to_xy_CIE_D(temperature)))
 
@@ -90,7 +91,7 @@ def daylight(temperature: float) -> Table:
 @functools.cache
 def mallett() -> Table:
     """Return the three basis reflectances of Mallett and Yuksel (2019), 380 to 780 nm in steps of 5 nm."""
-    from neusee.nodes._colour_science import colour
+    colour = colour_science()
 
     return _table(colour.recovery.MSDS_BASIS_FUNCTIONS_sRGB_MALLETT2019)
 
@@ -98,7 +99,7 @@ def mallett() -> Table:
 @functools.cache
 def paints() -> tuple[Table, ...]:
     """Return the reflectances of 102 patches of colour charts, some of them measured only from 400 to 700 nm."""
-    from neusee.nodes._colour_science import colour
+    colour = colour_science()
 
     return tuple(_table(sd) for chart in _CHARTS for sd in colour.SDS_COLOURCHECKERS[chart].values())
 
@@ -106,7 +107,7 @@ def paints() -> tuple[Table, ...]:
 @functools.cache
 def gamut_samples(name: str) -> Table:
     """Return the test reflectances of a colour-rendering index: 99 of CIE 2017, or 15 of NIST CQS 9.0."""
-    from neusee.nodes._colour_science import colour
+    colour = colour_science()
 
     if name == "CQS":
         return _table(colour.colorimetry.sds_and_msds_to_msds(list(colour.quality.SDS_VS["NIST CQS 9.0"].values())))
@@ -117,7 +118,7 @@ def gamut_samples(name: str) -> Table:
 
 def to_srgb(centres: Tensor) -> Tensor:
     """Return the matrix (3, band) from reflectance under D65 to linear sRGB, scaled so that white is (1, 1, 1)."""
-    from neusee.nodes._colour_science import colour
+    colour = colour_science()
 
     from_xyz = torch.tensor(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB, dtype=torch.float64)
     matrix = from_xyz @ (observer().at(centres) * light("D65").at(centres))

@@ -22,8 +22,8 @@ from neusee.workflows.contract.value_rules import (
     check_skip_bound,
 )
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.own_code import own_code_of
-from neusee.workflows.observation.own_call import WORDS, observed_call
+from neusee.workflows.keys.user_code import own_code_of
+from neusee.workflows.observation.own_call import WORDS, call_observed
 
 
 def check_reach(call: Call) -> Iterator[Finding]:
@@ -35,7 +35,7 @@ def check_reach(call: Call) -> Iterator[Finding]:
             return  # the rule on the key says so
     if own is None:
         return
-    _, taints = observed_call(call.result, own)
+    _, taints = call_observed(call.result, own)
     for taint in taints:
         yield Finding("reach", False, f"{WORDS[taint.kind]} {taint.what}, which the key does not cover: {taint.fix}")
     if not taints:

@@ -23,9 +23,9 @@ from neusee.workflows.engine.step_job import InputMissing, Lane, Outcome, StepJo
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, code_of, is_private
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.own_code import own_code
 from neusee.workflows.keys.seal import Unsigned, check_signature, secrets, signature
 from neusee.workflows.keys.tainted_code import taint_code, taints_of
+from neusee.workflows.keys.user_code import own_code
 from neusee.workflows.recipe.node_families import all_nodes
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store

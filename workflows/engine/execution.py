@@ -29,7 +29,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, dependents, 
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key, is_private
-from neusee.workflows.keys.own_code import own_code
+from neusee.workflows.keys.user_code import own_code
 from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.error_budget import ErrorBudget

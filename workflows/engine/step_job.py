@@ -26,8 +26,8 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, device_kind, is_private, plain
 from neusee.workflows.keys.input_file_digest import file_stamps
-from neusee.workflows.keys.own_code import OwnCode
-from neusee.workflows.observation.own_call import observed_call
+from neusee.workflows.keys.user_code import OwnCode
+from neusee.workflows.observation.own_call import call_observed
 from neusee.workflows.observation.taints import Taint
 from neusee.workflows.store.lease import Lease
 from neusee.workflows.store.metadata import INLINE
@@ -199,7 +199,7 @@ def _observing(function: Callable[..., T], own: OwnCode | None, taints: list[Tai
         return function
 
     def watched(*args: Any, **more: Any) -> T:
-        value, found = observed_call(partial(function, *args, **more), own)
+        value, found = call_observed(partial(function, *args, **more), own)
         taints.extend(found)
         return value
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from neusee.workflows.keys.own_code import OwnCode
+from neusee.workflows.keys.user_code import OwnCode
 from neusee.workflows.observation.observed_call import observed
 from neusee.workflows.observation.taints import Covered, Taint
 
@@ -23,7 +23,7 @@ WORDS = {
 }
 
 
-def observed_call(function: Callable[[], T], own: OwnCode) -> tuple[T, list[Taint]]:
+def call_observed(function: Callable[[], T], own: OwnCode) -> tuple[T, list[Taint]]:
     """Return the value of a function of own code, and what it reached that its key does not cover."""
     covered = Covered(frozenset(map(Path, own.files)), own.followed.__contains__)
     value, found = observed(function, covered)

@@ -30,7 +30,7 @@ _FIX: dict[Kind, str] = {
     "cache: false",
     "process": "compute it in the node, or run it before and give its output as a DataFile; or write cache: false",
     "network": "fetch it before and give the file as a DataFile; or write cache: false",
-    "random": "give the node an argument rng, a generator that the engine seeds, and draw from it; or write cache: false",
+    "random": "draw from an argument rng of the node, a generator that the engine seeds; or write cache: false",
     "import": 'write the import as a statement, or declare the module: depends=["{name}"]; or write cache: false',
     "unknown": "write cache: false",
 }

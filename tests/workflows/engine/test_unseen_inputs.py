@@ -187,14 +187,14 @@ def run_node(place, parts, lab):
     return result.keys["it"]
 
 
-@pytest.mark.filterwarnings("ignore")
+@pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize("kind", UNSEEN)
 def test_what_a_key_does_not_cover_is_refused_or_not_stored(kind, place, tmp_path_factory):
     key = run_node(place, UNSEEN[kind], tmp_path_factory.mktemp("lab"))
     assert key is None or is_private(key)
 
 
-@pytest.mark.filterwarnings("ignore")
+@pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize("kind", HONEST)
 def test_an_honest_node_is_stored(kind, place, tmp_path_factory):
     lab = tmp_path_factory.mktemp("lab")
