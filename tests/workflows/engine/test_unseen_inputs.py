@@ -7,6 +7,7 @@ stored, stand beside them.
 import shutil
 import sys
 import textwrap
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -150,7 +151,7 @@ def place(tmp_path):
     (tmp_path / "one.mtx").write_text("%%MatrixMarket matrix coordinate real general\n1 1 1\n1 1 7.0\n")
     (tmp_path / "one_hidden.py").write_text("VALUE = 7\n")
     np.array([7.0]).tofile(tmp_path / "one.bin")
-    with sqlite3.connect(tmp_path / "one.db") as base:
+    with closing(sqlite3.connect(tmp_path / "one.db")) as base, base:
         base.execute("create table t (x real)")
         base.execute("insert into t values (7)")
     with shelve.open(str(tmp_path / "shelf")) as shelf:
@@ -187,14 +188,14 @@ def run_node(place, parts, lab):
     return result.keys["it"]
 
 
-@pytest.mark.filterwarnings("default")
+@pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("kind", UNSEEN)
 def test_what_a_key_does_not_cover_is_refused_or_not_stored(kind, place, tmp_path_factory):
     key = run_node(place, UNSEEN[kind], tmp_path_factory.mktemp("lab"))
     assert key is None or is_private(key)
 
 
-@pytest.mark.filterwarnings("default")
+@pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("kind", HONEST)
 def test_an_honest_node_is_stored(kind, place, tmp_path_factory):
     lab = tmp_path_factory.mktemp("lab")
