@@ -15,7 +15,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import neusee.nodes
-import neusee.workflows
 
 #: folders and files of the system that a library reads on its own, with the reason why no result depends on them
 SYSTEM = {
@@ -61,7 +60,7 @@ def program() -> tuple[str, ...]:
 
     A virtual environment may be made in the folder of a project, so only its parts count, not its whole folder.
     """
-    inside = [path for package in (neusee.nodes, neusee.workflows) for path in package.__path__]
+    inside = [*neusee.nodes.__path__, Path(__file__).parents[1]]
     prefixes = {sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix}
     python = [os.path.join(prefix, part) for prefix in prefixes for part in _OF_PYTHON]
     paths = sysconfig.get_paths()
