@@ -32,6 +32,7 @@ SYSTEM = {
     "/dev/infiniband": "links between graphics processors",
     **dict.fromkeys(("/bin", "/sbin", "/lib*", "/usr/bin", "/usr/sbin"), "installed programs and libraries"),
     **dict.fromkeys(("/usr/lib*", "/usr/include", "/usr/local/lib*", "/usr/local/bin"), "installed libraries"),
+    "/usr/local/include": "installed libraries",
     **dict.fromkeys(("/usr/local/cuda*", "/System", "/Library/Frameworks"), "installed libraries"),
     "/usr/share": "time zones, languages, fonts and tables of installed programs",
     "/etc/ld.so.*": "where the libraries are",
@@ -60,7 +61,7 @@ def program() -> tuple[str, ...]:
 
     A virtual environment may be made in the folder of a project, so only its parts count, not its whole folder.
     """
-    inside = [*neusee.nodes.__path__, str(Path(__file__).parents[1])]
+    inside = [*map(Path, neusee.nodes.__path__), Path(__file__).parents[1]]
     prefixes = {sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix}
     python = [os.path.join(prefix, part) for prefix in prefixes for part in _OF_PYTHON]
     paths = sysconfig.get_paths()

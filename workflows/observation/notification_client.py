@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import json
 import os
@@ -35,11 +34,12 @@ class NotificationClient:
     def __init__(self) -> None:
         """Start the process; raise `NoServer` if it does not answer or may not read the memory of this process."""
         self.process = os.getpid()
+        self._server: subprocess.Popen[bytes] | None = None
         self._socket, theirs = socket.socketpair()
         try:
             with theirs:
                 self._server = self._started(theirs)
-            self._ask_for_sight()
+            self._ask_for_sight(self._server.pid)
         except (OSError, ValueError) as error:
             self.close()
             raise NoServer(f"the process that watches a step did not start: {error}") from error
@@ -60,9 +60,9 @@ class NotificationClient:
             start_new_session=True,
         )
 
-    def _ask_for_sight(self) -> None:
+    def _ask_for_sight(self, server: int) -> None:
         """Let the server read the memory of this process, and see that it does."""
-        ctypes.CDLL(None).prctl(PR_SET_PTRACER, ctypes.c_ulong(self._server.pid), 0, 0, 0)  # where Yama asks for it
+        ctypes.CDLL(None).prctl(PR_SET_PTRACER, ctypes.c_ulong(server), 0, 0, 0)  # where Yama asks for it
         probe = ctypes.create_string_buffer(_PROBE)
         self._socket.settimeout(_PATIENCE)
         if self._asked(b"P", ctypes.addressof(probe)) != _PROBE.decode():
@@ -83,16 +83,19 @@ class NotificationClient:
         except (OSError, ValueError) as error:
             raise NoServer("the process that watches a step ended") from error
 
+    def server(self) -> int:
+        """Return the number of the process that answers."""
+        return self._server.pid if self._server is not None else 0
+
     def alive(self) -> bool:
         """Return True if the server is that of this process, not of the process that it was forked from, and runs."""
-        return self.process == os.getpid() and self._server.poll() is None
+        return self.process == os.getpid() and self._server is not None and self._server.poll() is None
 
     def close(self) -> None:
-        """Let the server end as soon as no thread is left whose calls it answers."""
+        """Let the server end as soon as no thread is left whose calls it answers; nobody waits for that."""
         self._socket.close()
-        if self.process == os.getpid() and hasattr(self, "_server"):
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._server.wait(_PATIENCE if self._server.poll() is None else 0)
+        if self._server is not None and self._server.poll() is None:
+            self._server.returncode = 0  # no status is wanted, and so no warning that it still runs
 
     def _asked(self, kind: bytes, number: int) -> Any:
         self._socket.sendall(kind + number.to_bytes(HEADER - 1, "little"))

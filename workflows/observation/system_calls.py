@@ -95,6 +95,7 @@ CALLS = (
     Call("bind", "bind", 49, 200, Path(1), number=2),
     Call("sendto", "connect", 44, 206, Path(4), number=5, when=Condition(4, "nonzero")),
     Call("shmget", "unseen", 29, 194, when=Condition(0, "nonzero")),
+    Call("msgget", "unseen", 68, 186, when=Condition(0, "nonzero")),
     Call("mq_open", "unseen", 240, 180),
     Call("process_vm_readv", "unseen", 310, 270),
     Call("ptrace", "unseen", 101, 117),

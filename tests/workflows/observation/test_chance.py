@@ -23,6 +23,7 @@ DRAWS = {
     "default_rng": (lambda: np.random.default_rng().normal(), "os.urandom"),
     "PCG64": (lambda: np.random.PCG64(), "os.urandom"),
     "RandomState": (lambda: np.random.RandomState().normal(), "numpy.random.RandomState without a seed"),
+    "torch generator": (lambda: torch.Generator().seed(), "/dev/urandom"),
     "Random": (lambda: random.Random().random(), "random.Random without a seed"),
     "SystemRandom": (lambda: random.SystemRandom().random(), "os.urandom"),
     "secrets": (lambda: secrets.token_bytes(8), "os.urandom"),
@@ -36,6 +37,8 @@ DRAWS = {
 @pytest.mark.parametrize("draw", DRAWS)
 def test_a_draw_without_a_seed_is_found(draw, taints, layer):
     draws, source = DRAWS[draw]
+    if (draw, layer) == ("torch generator", "python"):
+        pytest.skip("native code opens the device")
     assert taints(draws) == [("random", source)]
 
 

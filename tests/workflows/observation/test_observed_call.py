@@ -166,7 +166,7 @@ def test_an_exception_that_another_thread_raises_in_the_caller_waits_for_the_ste
 
 
 def server():
-    return kernel_layer.client()._server.pid
+    return kernel_layer.client().server()
 
 
 def test_one_process_answers_for_all_calls(watched):
