@@ -15,6 +15,7 @@ import typer
 from neusee.workflows.cli.command_frame import fail, say
 from neusee.workflows.cli.command_list import FAILED, INTERRUPTED, TYPED
 from neusee.workflows.cli.interrupt_signal import say_stopped
+from neusee.workflows.keys.regular_file import text_of
 from neusee.workflows.report.json_output import json_line
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def say_folder(folder: Path, as_json: bool, *more: str) -> None:
     if not as_json:
         return say([page])
     files = ("provenance.json", *more)
-    found = [json.loads((folder / name).read_text(encoding="utf-8")) for name in files]
+    found = [json.loads(text_of(folder / name)) for name in files]
     say_json({"report": page, **{name: value for document in found for name, value in document.items()}})
 
 
