@@ -21,6 +21,17 @@ _MAT_MATRIX, _MAT_COMPRESSED, _MAT_INT32 = 14, 15, 5  #: types of elements
 _MAT_COMPLEX = 0x0800
 #: bytes of a value by the class of an array; a cell, a struct or a sparse array has none
 _MAT_CLASSES = {4: 4, 6: 8, 7: 4, 8: 1, 9: 1, 10: 2, 11: 2, 12: 4, 13: 4, 14: 8, 15: 8}
+#: errors of an archive that is damaged or none, whose reader says what is wrong
+_BROKEN = (
+    zipfile.BadZipFile,
+    ValueError,
+    EOFError,
+    SyntaxError,
+    OSError,
+    NotImplementedError,
+    RuntimeError,
+    zlib.error,
+)
 _CHUNK = 1 << 18  #: bytes that are decompressed at once to count them
 _HEADER = 100_000_000  #: bytes of the header of a .safetensors file, at most, as its library has it
 
@@ -47,7 +58,7 @@ def _numbers(shape: tuple[int, ...], dtype: Any) -> str:
     return f"{' x '.join(map(str, shape)) or 'one'} numbers of type {dtype}"
 
 
-def _npy_header(raw: BinaryIO) -> tuple[tuple[int, ...], "np.dtype[Any]"]:
+def _npy_header(raw: Any) -> tuple[tuple[int, ...], "np.dtype[Any]"]:
     version = np.lib.format.read_magic(raw)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, dtype = read(raw)
@@ -63,18 +74,24 @@ def npz_needs(file: Path | str, copies: float, beside: float = 0.0, parameter: s
     Raises ParameterError for an array of more bytes than the archive states for it.
     """
     archive_needs(file, copies, parameter)
-    with opened(file, parameter) as raw, suppress(zipfile.BadZipFile, ValueError, EOFError, SyntaxError, OSError):
-        total, last = 0.0, ""
-        with zipfile.ZipFile(raw) as archive:
-            for entry in archive.infolist():
-                with archive.open(entry) as inner:
-                    shape, dtype = _npy_header(inner)  # type: ignore[arg-type]
-                count = math.prod(map(int, shape))
-                if not dtype.hasobject and count * dtype.itemsize > entry.file_size:
-                    text = f"its array {entry.filename} states {_numbers(shape, dtype)}, and {entry.file_size} bytes"
-                    raise ParameterError(parameter, f"{file} cannot be read: {text}: copy or save the file again")
-                total, last = total + count * (copies * dtype.itemsize + beside), _numbers(shape, dtype)
-        needs(total, file, f"{len(archive.infolist())} arrays, the last of {last}", parameter)
+    total, count = 0.0, 0
+    for name, there, shape, dtype in _npz_headers(file, parameter):
+        size = math.prod(map(int, shape))
+        if not dtype.hasobject and size * dtype.itemsize > there:
+            text = f"its array {name} states {_numbers(shape, dtype)}, and {in_bytes(there)} follow"
+            raise ParameterError(parameter, f"{file} cannot be read: {text}: copy or save the file again")
+        total, count = total + size * (copies * dtype.itemsize + beside), count + 1
+    needs(total, file, f"{count} arrays", parameter)
+
+
+def _npz_headers(file: Path | str, parameter: str) -> list[tuple[str, int, tuple[int, ...], "np.dtype[Any]"]]:
+    """Return name, stated bytes, shape and type of each array in a .npz file, as far as its headers can be read."""
+    found = []
+    with opened(file, parameter) as raw, suppress(*_BROKEN), zipfile.ZipFile(raw) as archive:
+        for entry in archive.infolist():
+            with archive.open(entry) as inner:
+                found.append((entry.filename, entry.file_size, *_npy_header(inner)))
+    return found
 
 
 def archive_needs(file: Path | str, copies: float, parameter: str = "file") -> None:
@@ -82,13 +99,14 @@ def archive_needs(file: Path | str, copies: float, parameter: str = "file") -> N
 
     Readers of archives stop at the size that the archive states for each file. Any other file counts as it is.
     """
+    sizes = list[int]()
     with opened(file, parameter) as raw:
-        size = os.fstat(raw.fileno()).st_size
-        needs(copies * size, file, f"a file of {in_bytes(size)}", parameter)
-        with suppress(zipfile.BadZipFile, ValueError, OSError), zipfile.ZipFile(raw) as archive:
-            entries = archive.infolist()
-            total = sum(entry.file_size for entry in entries)
-            needs(copies * total, file, f"{len(entries)} files of {in_bytes(total)} in {in_bytes(size)}", parameter)
+        packed = os.fstat(raw.fileno()).st_size
+        needs(copies * packed, file, f"a file of {in_bytes(packed)}", parameter)
+        with suppress(*_BROKEN), zipfile.ZipFile(raw) as archive:
+            sizes = [entry.file_size for entry in archive.infolist()]
+    what = f"{len(sizes)} files of {in_bytes(sum(sizes))} in {in_bytes(packed)}"
+    needs(copies * sum(sizes), file, what, parameter)
 
 
 # --- .safetensors -----------------------------------------------------------------------------------------------------

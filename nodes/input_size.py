@@ -105,8 +105,11 @@ def kind_of(mode: int) -> str:
 
 def refuse_other_than_file(file: Path | str, parameter: str = "file") -> None:
     """Raise ParameterError for a pipe, a device, a socket or a folder; a file that is missing passes."""
-    with suppress(FileNotFoundError):
-        _refuse(file, os.stat(file).st_mode, parameter)
+    try:
+        mode = os.stat(file).st_mode
+    except OSError:
+        return
+    _refuse(file, mode, parameter)
 
 
 def _refuse(file: Path | str, mode: int, parameter: str) -> None:

@@ -104,12 +104,12 @@ def zipped(path, members):
                     file.write(_ZEROS)
 
 
-def npz(path, names, megabytes=280):
+def npz(path, names, megabytes=120):
     count = megabytes * MB // 8
     zipped(path, {f"{name}.npy": (npy_head((count,)), megabytes) for name in names})
 
 
-def checkpoint(path, megabytes=280):
+def checkpoint(path, megabytes=120):
     """Write a file of `torch.save` whose tensor is ``megabytes`` of zeros, compressed."""
     import io
 
@@ -122,7 +122,7 @@ def checkpoint(path, megabytes=280):
     zipped(path, members)
 
 
-def mat(path, name, megabytes=280, lies=False):
+def mat(path, name, megabytes=120, lies=False):
     """Write a .mat file of one compressed array of zeros; if it ``lies``, its dimensions state one number."""
     count = megabytes * MB // 8
     body = struct.pack("<IIII", 6, 8, 6, 0) + struct.pack("<IIii", 5, 8, 1, 1 if lies else count)

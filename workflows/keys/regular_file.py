@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import stat
-from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -22,8 +21,11 @@ class NotRead(OSError, ValueError):
 
 def refuse_other_than_file(path: Path | str) -> None:
     """Raise `NotRead` for a pipe, a device, a socket or a folder; a file that is missing passes."""
-    with suppress(FileNotFoundError):
-        _refuse(path, os.stat(path).st_mode)
+    try:
+        mode = os.stat(path).st_mode
+    except OSError:
+        return
+    _refuse(path, mode)
 
 
 def _refuse(path: Path | str, mode: int) -> None:
