@@ -121,13 +121,15 @@ def safetensors_need(file: Path | str, copies: float = 1.0, parameter: str = "fi
         size, first = os.fstat(raw.fileno()).st_size, raw.read(8)
         length = int.from_bytes(first, "little")
         if len(first) < 8 or length > min(size - 8, _HEADER):
-            text = f"its header states a length of {in_bytes(length)}, and the file has {in_bytes(size)}"
-            raise ParameterError(parameter, f"{file} is not a safetensors file ({text}): copy or save the file again")
+            text = f"because its header states a length of {in_bytes(length)}, and the file has {in_bytes(size)}"
+            raise ParameterError(
+                parameter, f"{file} cannot be read: it is not a safetensors file, {text}: save it again"
+            )
         needs(16.0 * length + copies * size, file, f"tensors of {in_bytes(size)}", parameter)
         stated = _last_byte(raw.read(length))
     if stated > size - 8 - length:
-        text = f"its header states {in_bytes(stated)} of tensors, and {in_bytes(size - 8 - length)} follow"
-        raise ParameterError(parameter, f"{file} is not a whole safetensors file ({text}): copy the file again")
+        text = f"because its header states {in_bytes(stated)} of tensors, and {in_bytes(size - 8 - length)} follow"
+        raise ParameterError(parameter, f"{file} cannot be read: it is not a safetensors file, {text}: copy it again")
 
 
 def _last_byte(header: bytes) -> int:

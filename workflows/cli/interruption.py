@@ -59,7 +59,9 @@ def kept_training(out: Path, recipe: str) -> str:
     if not states:
         return "no checkpoint is written yet, so nothing is kept"
     newest = max(states, key=lambda path: path.stat().st_mtime)
-    state = StateFile(newest).read(strict=False)
+    state: dict[str, Any] = {}
+    with suppress(ValueError):
+        state = StateFile(newest).read(strict=False)
     stage = f" of stage {state['stage']}" if state.get("stage") else ""
     upto = f" up to iteration {state['iteration']}{stage}" if "iteration" in state else ""
     return f"the training{upto} is kept in {newest.parent}"

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.final_values import flow
-from neusee.workflows.keys.regular_file import NotRead, text_of
+from neusee.workflows.keys.regular_file import NotRegular, text_of
 from neusee.workflows.recipe.text.yaml_values import read
 from neusee.workflows.report.run_code import CODE
 from neusee.workflows.report.run_folder import find_run
@@ -121,7 +121,7 @@ def _json(path: Path) -> Any:
         return json.loads(text_of(path))
     except json.JSONDecodeError as error:
         raise NotComparable(f"{path}:{error.lineno}:{error.colno}: {error.msg}: {_AGAIN}") from None
-    except NotRead as error:
+    except NotRegular as error:
         raise NotComparable(str(error)) from None
     except UnicodeDecodeError as error:
         raise NotComparable(f"{path}: byte {error.start} is not UTF-8: {_AGAIN}") from None

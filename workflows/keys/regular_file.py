@@ -15,12 +15,12 @@ MOST = 64 << 20  #: bytes of a document or a record, at most
 _KINDS = ((stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"), (stat.S_ISDIR, "a folder"))
 
 
-class NotRead(OSError, ValueError):
+class NotRegular(OSError, ValueError):
     """Error for what is no regular file, or is longer than a file of its kind."""
 
 
 def refuse_other_than_file(path: Path | str) -> None:
-    """Raise `NotRead` for a pipe, a device, a socket or a folder; a file that is missing passes."""
+    """Raise `NotRegular` for a pipe, a device, a socket or a folder; a file that is missing passes."""
     try:
         mode = os.stat(path).st_mode
     except OSError:
@@ -31,27 +31,27 @@ def refuse_other_than_file(path: Path | str) -> None:
 def _refuse(path: Path | str, mode: int) -> None:
     if not stat.S_ISREG(mode):
         kind = next((kind for fits, kind in _KINDS if fits(mode)), "a device")
-        raise NotRead(f"{path} is not a regular file but {kind}: give the path of a file")
+        raise NotRegular(f"{path} is not a regular file but {kind}: give the path of a file")
 
 
 def opened(path: Path | str) -> BinaryIO:
-    """Open a regular file to read its bytes, without waiting; raise `NotRead` for anything else."""
+    """Open a regular file to read its bytes, without waiting; raise `NotRegular` for anything else."""
     refuse_other_than_file(path)  # some devices do something when they are opened
     number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         _refuse(path, os.fstat(number).st_mode)
-    except NotRead:
+    except NotRegular:
         os.close(number)
         raise
     return os.fdopen(number, "rb")
 
 
 def bytes_of(path: Path | str, most: int = MOST) -> bytes:
-    """Return the bytes of a regular file; raise `NotRead` for anything else, and for more than ``most`` bytes."""
+    """Return the bytes of a regular file; raise `NotRegular` for anything else, and for more than ``most`` bytes."""
     with opened(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
-            raise NotRead(f"{path} has {size} bytes, more than the limit of {most}: give a shorter file")
+            raise NotRegular(f"{path} has {size} bytes, more than the limit of {most}: give a shorter file")
         return file.read(size)
 
 
@@ -62,5 +62,5 @@ def head_of(path: Path | str, count: int) -> bytes:
 
 
 def text_of(path: Path | str, encoding: str = "utf-8", errors: str = "strict", most: int = MOST) -> str:
-    """Return the text of a regular file, with ``\\n`` at the end of each line; raise `NotRead` as `bytes_of` does."""
+    """Return the text of a regular file, with ``\\n`` at the end of each line; raise `NotRegular` as `bytes_of` does."""
     return bytes_of(path, most).decode(encoding, errors).replace("\r\n", "\n").replace("\r", "\n")

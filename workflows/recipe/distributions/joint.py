@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from neusee.nodes.units import read_any, read_written
-from neusee.workflows.keys.regular_file import refuse_other_than_file, text_of
+from neusee.workflows.keys.regular_file import NotRegular, refuse_other_than_file, text_of
 from neusee.workflows.recipe.distributions.sample_table import read_columns, require_samples, with_units
 from neusee.workflows.recipe.distributions.shapes import FloatArray, scores_between
 from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
@@ -148,6 +148,8 @@ def read_posterior(path: Path) -> Posterior:
             return _drawn(*with_units(read_columns(path)))
         if path.suffix in (".json", ".yaml", ".yml"):
             return _document(path)
+    except NotRegular:
+        raise
     except (OSError, KeyError, TypeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path.name} cannot be read as a posterior: {error!r}") from None
     raise ValueError(f"{path.name} is not a posterior file: give {_FILES}")

@@ -16,7 +16,7 @@ from ruamel.yaml.error import YAMLError, YAMLStreamError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
-from neusee.workflows.keys.regular_file import NotRead, opened
+from neusee.workflows.keys.regular_file import NotRegular, opened
 from neusee.workflows.recipe.text.yaml_mistakes import YamlMistake, directive_mistake, explained
 
 Where = tuple[str | int, ...]  #: path of a value: keys and indices from the top of a recipe
@@ -117,7 +117,7 @@ def read(path: Path, shown: str) -> Document:
                 message = f"the file has {size} bytes, more than the limit of {_LARGEST}: split the recipe into groups"
                 raise RecipeError([Diagnostic(Location(shown), "", message)])
             text = file.read(_LARGEST).decode("utf-8-sig")
-    except NotRead as error:
+    except NotRegular as error:
         raise RecipeError([Diagnostic(Location(shown), "", str(error))]) from None
     except UnicodeDecodeError as error:
         before = error.object[: error.start].decode("utf-8", "replace")

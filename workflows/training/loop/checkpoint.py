@@ -51,12 +51,13 @@ class StateFile:
     def read(self, device: str = "cpu", strict: bool = True) -> dict[str, Any]:
         """Return the training state from the checkpoint file, or an empty dictionary if there is no file.
 
-        Raises ValueError for a file that cannot be read; if not ``strict``, an unreadable file counts as absent.
+        Raises ValueError for a file that cannot be read, or that needs more memory than is left; if not ``strict``,
+        an unreadable file counts as absent.
         """
         if not self.path.exists():
             return {}
+        archive_needs(self.path, 1.0)  # a state without room in memory is not absent
         try:
-            archive_needs(self.path, 1.0)
             state: dict[str, Any] = torch.load(self.path, map_location=device, weights_only=True)
             if state.get("edition", _FORMAT) != _FORMAT:
                 raise ValueError(f"the training state has format {state['edition']}, not {_FORMAT}")
