@@ -121,15 +121,20 @@ def safetensors_need(file: Path | str, copies: float = 1.0, parameter: str = "fi
         size, first = os.fstat(raw.fileno()).st_size, raw.read(8)
         length = int.from_bytes(first, "little")
         if len(first) < 8 or length > min(size - 8, _HEADER):
-            text = f"because its header states a length of {in_bytes(length)}, and the file has {in_bytes(size)}"
+            text = f"a length of {in_bytes(length)}, and the file has {in_bytes(size)}"
             raise ParameterError(
-                parameter, f"{file} cannot be read: it is not a safetensors file, {text}: save it again"
+                parameter, f"{file} cannot be read: it is not a safetensors file, {text}: copy it again"
             )
         needs(16.0 * length + copies * size, file, f"tensors of {in_bytes(size)}", parameter)
         stated = _last_byte(raw.read(length))
     if stated > size - 8 - length:
-        text = f"because its header states {in_bytes(stated)} of tensors, and {in_bytes(size - 8 - length)} follow"
-        raise ParameterError(parameter, f"{file} cannot be read: it is not a safetensors file, {text}: copy it again")
+        text = f"{in_bytes(stated)} of tensors, and {in_bytes(size - 8 - length)} follow"
+        raise _not_whole(file, text, parameter)
+
+
+def _not_whole(file: Path | str, why: str, parameter: str) -> ParameterError:
+    text = f"it is not a safetensors file, because its header states {why}: copy or save the file again"
+    return ParameterError(parameter, f"{file} cannot be read: {text}")
 
 
 def _last_byte(header: bytes) -> int:
@@ -199,7 +204,7 @@ def _mat_stated(part: bytes, order: str) -> int:
     each = _MAT_CLASSES.get(flags & 0xFF, 0) * (2 if flags & _MAT_COMPLEX else 1)
     if kind != _MAT_INT32 or not each or length > len(part) - 24:
         return 0
-    return each * math.prod(struct.unpack(f"{order}{length // 4}i", part[24 : 24 + length // 4 * 4]))
+    return each * math.prod(int(n) for n in struct.unpack(f"{order}{length // 4}i", part[24 : 24 + length // 4 * 4]))
 
 
 def _inflated(raw: BinaryIO, length: int) -> Iterator[bytes]:

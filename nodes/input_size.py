@@ -9,9 +9,9 @@ import resource
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from io import TextIOWrapper
+from io import BufferedReader, TextIOWrapper
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 from neusee.nodes import ParameterError
 
@@ -117,7 +117,7 @@ def _refuse(file: Path | str, mode: int, parameter: str) -> None:
         raise ParameterError(parameter, f"{file} is not a regular file but {kind}: give the path of a file")
 
 
-def opened(file: Path | str, parameter: str = "file") -> BinaryIO:
+def opened(file: Path | str, parameter: str = "file") -> BufferedReader:
     """Open a regular file to read its bytes, without waiting for a pipe; raise ParameterError for anything else."""
     refuse_other_than_file(file, parameter)  # some devices do something when they are opened
     number = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)

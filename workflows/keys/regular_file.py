@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import os
 import stat
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 MOST = 64 << 20  #: bytes of a document or a record, at most
 _KINDS = ((stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"), (stat.S_ISDIR, "a folder"))
@@ -34,7 +34,7 @@ def _refuse(path: Path | str, mode: int) -> None:
         raise NotRegular(f"{path} is not a regular file but {kind}: give the path of a file")
 
 
-def opened(path: Path | str) -> BinaryIO:
+def opened(path: Path | str) -> BufferedReader:
     """Open a regular file to read its bytes, without waiting; raise `NotRegular` for anything else."""
     refuse_other_than_file(path)  # some devices do something when they are opened
     number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -62,5 +62,5 @@ def head_of(path: Path | str, count: int) -> bytes:
 
 
 def text_of(path: Path | str, encoding: str = "utf-8", errors: str = "strict", most: int = MOST) -> str:
-    """Return the text of a regular file, with ``\\n`` at the end of each line; raise `NotRegular` as `bytes_of` does."""
+    """Return the text of a regular file, with ``\\n`` at the end of each line; raise what `bytes_of` raises."""
     return bytes_of(path, most).decode(encoding, errors).replace("\r\n", "\n").replace("\r", "\n")
