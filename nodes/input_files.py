@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from neusee.nodes import ParameterError
+from neusee.nodes.input_size import lines_of
 
 PIXELS = 64_000_000  #: of a picture, at most; a PNG of this size takes 1.3 GB of memory to decode and convert
 VALUES = 1_000_000_000  #: numbers in a cube, a height map or a frame, at most; 4 GB as float32
 ROWS = 1_000_000  #: lines of a table, at most
 __depends__ = ["unaffected:time"]  #: the clock decides whether a file is read again, and no result
 _SETTLED = 2_000_000_000  #: ns after a change of a file in which a second change may not change its times
+_CELLS = 8.0  #: bytes in memory for each byte of a table, in texts of cells of several digits
 _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "vertical bars"}
 
 Result = TypeVar("Result")
@@ -79,21 +81,20 @@ def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
 
     Raises ValueError for text that is not UTF-8, for another separator than a comma, and for more rows than the limit.
     """
-    with file.open(newline="", encoding="utf-8-sig") as opened:
-        reader = csv.reader("" if line.startswith("#") else line for line in opened)
-        first = True
-        try:
-            for count, row in enumerate(reader):
-                if count > ROWS:
-                    raise ValueError(f"{file.name} has more than {ROWS} rows: give a shorter table")
-                if not row:
-                    continue
-                if first:
-                    _refuse_separator(file, row)
-                first = False
-                yield reader.line_num, row
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(f"{file.name} is not a CSV file in UTF-8 ({error}): save the table as CSV") from None
+    reader = csv.reader("" if line.startswith("#") else line for line in lines_of(file, _CELLS))
+    first = True
+    try:
+        for count, row in enumerate(reader):
+            if count > ROWS:
+                raise ValueError(f"{file.name} has more than {ROWS} rows: give a shorter table")
+            if not row:
+                continue
+            if first:
+                _refuse_separator(file, row)
+            first = False
+            yield reader.line_num, row
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{file.name} is not a CSV file in UTF-8 ({error}): save the table as CSV") from None
 
 
 def _refuse_separator(file: Path, header: list[str]) -> None:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes import ParameterError
+from neusee.nodes.array_bytes import safetensors_need
 from neusee.nodes.input_files import once_per_version
 
 Net = TypeVar("Net", bound=nn.Module)
@@ -25,6 +26,7 @@ def loaded(make: Callable[[], Net], weights: Path) -> Net:
     """Return a network in single precision, with the weights of a file."""
     from safetensors.torch import load_file
 
+    safetensors_need(weights, parameter="weights")
     net = empty(make)
     net.load_state_dict(load_file(weights), assign=True)
     return net.float()
@@ -49,6 +51,7 @@ def fits(net: nn.Module, weights: Path, called: str, options: Mapping[str, Any])
     """
     from safetensors import SafetensorError, safe_open
 
+    safetensors_need(weights, parameter="weights")
     shapes = {name: tuple(tensor.shape) for name, tensor in net.state_dict().items()}
     try:
         with safe_open(weights, framework="pt") as tensors:
@@ -71,6 +74,7 @@ def _not_finite(weights: Path) -> str:
     """Return a message for the first tensor in a weights file with values that are not finite, or an empty text."""
     from safetensors import safe_open
 
+    safetensors_need(weights, parameter="weights")
     with safe_open(weights, framework="pt") as tensors:
         found = (wrong_weights(weights, name, tensors.get_tensor(name)) for name in tensors.keys())  # noqa: SIM118
         return next(filter(None, found), "")

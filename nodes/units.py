@@ -261,7 +261,8 @@ def _existing(path: Path) -> Path:
     if path.is_dir():
         raise ValueError(f"{path} is a folder, not a file: give a file in this folder")
     if not path.is_file():
-        raise ValueError(f"no such file: {path}")
+        other = "is not a regular file but a pipe, a device or a socket: give the path of a file"
+        raise ValueError(f"{path} {other}" if path.exists() else f"no such file: {path}")
     return path
 
 

@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes import ParameterError
+from neusee.nodes.array_bytes import mat_needs, npy_needs, safetensors_need
 from neusee.nodes.input_files import once_per_version, refuse_large_array
+from neusee.nodes.input_size import head_of, refuse_other_than_file
+from neusee.nodes.picture_bytes import picture_needs
 from neusee.nodes.scene._spectral_exr import exr_header, exr_parts
 from neusee.nodes.units import read_quantity
 
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
 _GREYS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}  #: the level of white in each mode of a grey picture
 _WORDS = ("unit", "depth", "pitch")  #: what a file may state beside the heights
 _HALF = ("float16", "F16", "BF16")  #: names of types with 8 or 11 bits
+_SINGLE = 4  #: bytes of a height
 _MAT_73 = b"MATLAB 7.3 MAT-file"
 _REAL_MAT = {"double", "single", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "logical"}
 
@@ -50,6 +54,7 @@ def map_header(file: Path) -> MapHeader:
         raise ParameterError(
             "file", f"{file.name}: a height map is read from .exr, .mat, .npy, .safetensors or grey .png"
         )
+    refuse_other_than_file(file)
     try:
         header: MapHeader = _HEADERS[suffix](file)
     except ParameterError:
@@ -78,13 +83,18 @@ def _array(file: Path, suffix: str) -> Tensor:
     if suffix == ".safetensors":
         from safetensors.torch import load_file
 
+        safetensors_need(file, 2.0)
         tensors = load_file(file)
         return tensors[_name(file, list(tensors))]
     if suffix == ".exr":
         with exr_parts(file) as opened:
             channels = opened.channels()
             return torch.from_numpy(np.array(channels[_name(file, list(channels))].pixels))
-    values = _mat_value(file, _mat_name(file)) if suffix == ".mat" else np.load(file, allow_pickle=False)
+    if suffix == ".mat":
+        values = _mat_value(file, _mat_name(file))
+    else:
+        npy_needs(file, 1.0, _SINGLE)
+        values = np.load(file, allow_pickle=False)
     return torch.from_numpy(np.ascontiguousarray(_native(values)))
 
 
@@ -103,6 +113,7 @@ def _stated(file: Path, found: dict[str, Any]) -> dict[str, float]:
 
 
 def _npy(file: Path) -> MapHeader:
+    npy_needs(file, 1.0, _SINGLE)
     head = np.load(file, mmap_mode="r", allow_pickle=False)
     _refuse_other_than_numbers(file, str(head.dtype), head.dtype.kind in "fiu")
     return MapHeader(tuple(head.shape), {})
@@ -111,6 +122,7 @@ def _npy(file: Path) -> MapHeader:
 def _safetensors(file: Path) -> MapHeader:
     from safetensors import safe_open
 
+    safetensors_need(file, 2.0)
     with safe_open(file, framework="pt") as tensors:
         heights = tensors.get_slice(_name(file, list(tensors.keys())))
         kind = str(heights.get_dtype())
@@ -159,12 +171,14 @@ def _levels(file: Path) -> "Image":
     """Open a greyscale picture file; raise ParameterError for a picture that is not greyscale."""
     from PIL import Image
 
+    refuse_other_than_file(file)
     picture = Image.open(file)
     if picture.mode not in _GREYS:
         picture.close()
         raise ParameterError(
             "file", f"{file.name} is {picture.mode}, not grey: store one grey level per sample, in 8 or 16 bits"
         )
+    picture_needs(file, picture, 8 + 8 + _SINGLE)  # levels and heights in float64, and the result
     return picture
 
 
@@ -179,10 +193,10 @@ def _mat_listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
     """Return the shape and the type of each variable of a .mat file."""
     from scipy.io import whosmat
 
-    with file.open("rb") as opened:
-        if opened.read(len(_MAT_73)) == _MAT_73:
-            fix = f"save it in MATLAB by save('{file.name}', 'height', '-v7')"
-            raise ParameterError("file", f"{file.name} is a .mat file of version 7.3, which is HDF5: {fix}")
+    if head_of(file, len(_MAT_73)) == _MAT_73:
+        fix = f"save it in MATLAB by save('{file.name}', 'height', '-v7')"
+        raise ParameterError("file", f"{file.name} is a .mat file of version 7.3, which is HDF5: {fix}")
+    mat_needs(file)
     try:
         return {name: (tuple(size), kind) for name, size, kind in whosmat(file)}
     except Exception as error:  # scipy raises many kinds of errors for foreign bytes
@@ -196,6 +210,7 @@ def _mat_name(file: Path) -> str:
 def _mat_value(file: Path, name: str) -> NDArray[Any]:
     from scipy.io import loadmat
 
+    mat_needs(file)
     values: NDArray[Any] = loadmat(file, variable_names=[name])[name]
     return values
 

@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes import ParameterError
+from neusee.nodes.array_bytes import mat_needs, npy_needs
 from neusee.nodes.input_files import not_finite, once_per_version, refuse_large_array
 from neusee.nodes.scene._spectral_exr import exr_header, read_spectral, spectral_channels
 
 Layout = Literal["y x band", "band y x"]
 _TYPES = {"double": "float64", "single": "float32", "logical": "bool", "char": "str", "cell": "O", "struct": "O"}
+_SINGLE = 4  #: bytes of a number of the cube that is made
 
 
 def cube_and_wavelengths(
@@ -25,7 +27,7 @@ def cube_and_wavelengths(
         return cube, known
     if start is None or stop is None:
         raise ValueError(f"{file.name} has no wavelengths: give the first and the last wavelength in start and stop")
-    values = np.load(file) if file.suffix == ".npy" else _mat(file, _cube_name(file, variable))
+    values = _npy(file) if file.suffix == ".npy" else _mat(file, _cube_name(file, variable))
     scale = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else 1.0
     first = np.moveaxis(values, -1, 0) if layout == "y x band" else values
     cube = torch.from_numpy(np.ascontiguousarray(first, dtype=np.float32)) / scale
@@ -56,7 +58,9 @@ def wrong_values(file: Path, variable: str | None) -> str:
         if file.suffix == ".exr":
             values: Any = read_spectral(file)[0].numpy()
         else:
-            values = np.load(file) if file.suffix == ".npy" else _mat(file, _cube_name(file, variable))
+            values = _npy(file) if file.suffix == ".npy" else _mat(file, _cube_name(file, variable))
+    except ParameterError:
+        raise
     except Exception as error:  # scipy raises many kinds of errors for damaged bytes
         return f"{file.name} cannot be read to its end ({error}): copy or save the file again"
     if np.iscomplexobj(values):
@@ -66,6 +70,7 @@ def wrong_values(file: Path, variable: str | None) -> str:
 
 def _numpy_header(file: Path) -> tuple[tuple[int, ...], str]:
     """Return the shape and the data type in the header of a .npy file, whose data must be as long as stated."""
+    npy_needs(file, 1.0, _SINGLE)
     try:
         head = np.load(file, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, SyntaxError) as error:
@@ -88,6 +93,7 @@ def _listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
     """Return the shape and the data type of each variable in a .mat file."""
     from scipy.io import whosmat
 
+    mat_needs(file)
     try:
         return {name: (size, _TYPES.get(kind, kind)) for name, size, kind in whosmat(file)}
     except Exception:  # scipy raises many kinds of errors for foreign bytes
@@ -108,8 +114,15 @@ def _cube_name(file: Path, variable: str | None) -> str:
     raise ParameterError("variable", f"{file.name} {problem}: set variable to one of {', '.join(variables)}")
 
 
+def _npy(file: Path) -> NDArray[Any]:
+    npy_needs(file, 1.0, _SINGLE)
+    values: NDArray[Any] = np.load(file, allow_pickle=False)
+    return values
+
+
 def _mat(file: Path, variable: str) -> NDArray[Any]:
     from scipy.io import loadmat
 
+    mat_needs(file)
     values: NDArray[Any] = loadmat(file, variable_names=[variable])[variable]
     return values

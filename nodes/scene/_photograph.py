@@ -10,6 +10,8 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.input_files import once_per_version, refuse_large_picture
+from neusee.nodes.input_size import head_of, needs, refuse_other_than_file
+from neusee.nodes.picture_bytes import picture_needs
 from neusee.nodes.scene._crop_to_frame import DrawnCrop, drawn_crop, enlarged, framed
 from neusee.nodes.scene._large_picture import Codes, linear_light
 from neusee.nodes.units import DataFile, Shape
@@ -19,6 +21,7 @@ _FIX = "convert the file to 8- or 16-bit sRGB: magick {name} -alpha off -colorsp
 _DAMAGED = "{name} is damaged ({error}): copy the file again, or give another picture"
 _ORIENTATION = 0x0112  #: EXIF tag
 _ROTATED = range(5, 9)  #: EXIF orientations that exchange width and height
+_LIGHT = 12  #: bytes of a pixel in linear light
 
 
 @node(rtol=1e-5)
@@ -71,6 +74,7 @@ def read_header(file: Path) -> tuple[str, int, tuple[int, int]]:
         with Image.open(file) as image:
             refuse_large_picture(file, image.height, image.width)
             _refuse(file, image)
+            picture_needs(file, image, _LIGHT)
             turned = image.getexif().get(_ORIENTATION, 1)
             return _profile(image), turned, image.size if turned in _ROTATED else image.size[::-1]
     except UnidentifiedImageError:
@@ -83,8 +87,7 @@ def read_header(file: Path) -> tuple[str, int, tuple[int, int]]:
 
 def _png_size(file: Path) -> tuple[int, int]:
     """Return the numbers of rows and columns in the first 24 bytes of a PNG file, or (0, 0) for another file."""
-    with file.open("rb") as opened:
-        head = opened.read(24)
+    head = head_of(file, 24)
     png = head.startswith(b"\x89PNG") and len(head) == 24
     return (int.from_bytes(head[20:24]), int.from_bytes(head[16:20])) if png else (0, 0)
 
@@ -99,11 +102,14 @@ def _damage(file: Path) -> str:
 
     try:
         with Image.open(file) as image:
+            picture_needs(file, image, 0)
             if image.format == "PNG":
                 image.verify()
             else:
                 image.draft("RGB", (1, 1))
                 image.load()
+    except ParameterError:
+        raise
     except (OSError, SyntaxError, ValueError) as error:
         return _DAMAGED.format(name=file.name, error=error)
     return ""
@@ -184,8 +190,10 @@ def _codes(file: Path) -> Codes:
     """
     from PIL import Image, ImageOps
 
+    refuse_other_than_file(file)
     with Image.open(file) as image:
         _refuse(file, image)
+        picture_needs(file, image, _LIGHT)
         turned = image.getexif().get(_ORIENTATION, 1)
         if image.mode == "RGB" and _depth(file) == 16:
             return _words(file, turned)
@@ -194,7 +202,7 @@ def _codes(file: Path) -> Codes:
 
 def _depth(file: Path) -> int:
     """Return the number of bits per channel of a PNG or JPEG file, which is always 8 for JPEG."""
-    head = file.read_bytes()[:26]
+    head = head_of(file, 26)
     return head[24] if head.startswith(b"\x89PNG") else 8
 
 
@@ -202,6 +210,8 @@ def _words(file: Path, turned: int) -> NDArray[Any]:
     """Read a 16-bit RGB PNG file, and turn the picture upright by the EXIF orientation ``turned``."""
     from kornia_rs.io import read_image_png_u16
 
+    rows, columns = _png_size(file)
+    needs(18.0 * rows * columns, file, f"{columns} x {rows} pixels of 16 bits")
     values = np.asarray(read_image_png_u16(str(file), "rgb"))
     values = values.transpose(1, 0, 2) if turned in _ROTATED else values
     flip_y, flip_x = turned in (3, 4, 7, 8), turned in (2, 3, 6, 7)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from neusee.nodes import ParameterError
 from neusee.nodes.input_files import file_version
+from neusee.nodes.input_size import opened
 from neusee.nodes.scene._crop_to_frame import drawn_crop
 from neusee.nodes.scene._photograph import photograph, read_header
 
@@ -38,8 +39,13 @@ def list_photographs(root: Path) -> tuple[list[Path], list[tuple[Path, str]]]:
 
 
 def _files(root: Path) -> list[Path]:
-    pictures = []
+    pictures, above = list[Path](), dict[str, frozenset[tuple[int, int]]]()
     for folder, below, names in os.walk(root, followlinks=True):
+        about, around = os.stat(folder), above.get(os.path.dirname(folder), frozenset())
+        if (place := (about.st_dev, about.st_ino)) in around:  # a link that leads back
+            below.clear()
+            continue
+        above[folder] = around | {place}
         below[:] = sorted(name for name in below if not name.startswith("."))
         pictures += [Path(folder, n) for n in names if not n.startswith(".") and Path(n).suffix.lower() in _PICTURES]
     return sorted(pictures, key=lambda path: path.relative_to(root).parts)
@@ -49,10 +55,10 @@ def _problem(path: Path) -> str:
     """Return the reason why a file cannot be read as a photograph, or an empty text."""
     try:
         read_header(path)
-        with path.open("rb") as file:
+        with opened(path) as file:
             end = _ENDS[file.read(2)]
             file.seek(max(0, path.stat().st_size - _TAIL))
-            return "" if end in file.read() else f"{path.name} stops before its end"
+            return "" if end in file.read(_TAIL) else f"{path.name} stops before its end"
     except (ParameterError, OSError, KeyError, ValueError, SyntaxError) as error:
         return str(error)
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from neusee.nodes import ParameterError
 from neusee.nodes.constants import SPEED_OF_LIGHT
+from neusee.nodes.picture_bytes import exr_needs
 from neusee.nodes.scene._plain_exr import write_lines
 
 _NAME = re.compile(r"(S0|T)\.(\d*,?\d*(?:[eE][-+]?\d+)?)(Y|Z|E|P|T|G|M|k|h|da|d|c|m|u|n|p)?(m|Hz)")
@@ -35,6 +36,7 @@ def exr_parts(file: Path | str) -> Iterator[Any]:
     """
     import OpenEXR
 
+    exr_needs(file)
     with OpenEXR.File(str(file), header_only=True) as opened:
         count = len(opened.parts)
     with redirect_stdout(StringIO()):
@@ -55,9 +57,10 @@ class PartHeader(NamedTuple):
 
 
 def part_headers(file: Path) -> list[PartHeader]:
-    """Read the header of each part of an OpenEXR file."""
+    """Read the header of each part of an OpenEXR file, whose pixels must have room in memory."""
     import OpenEXR
 
+    exr_needs(file)
     try:
         with OpenEXR.File(str(file), header_only=True) as opened:
             headers = [dict(part.header) for part in opened.parts]

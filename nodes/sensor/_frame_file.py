@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.array_bytes import npy_needs
 from neusee.nodes.input_files import once_per_version, refuse_large_array, refuse_large_picture
+from neusee.nodes.input_size import head_of, needs, refuse_other_than_file
+from neusee.nodes.picture_bytes import exr_needs, tiff_needs
 from neusee.nodes.sensor._digitization import Bits
 from neusee.nodes.sensor._tone_curve import tone_curve_sign
 from neusee.nodes.units import DataFile, Shape
@@ -19,6 +22,7 @@ Curve = Literal["linear"]  #: what a user states of the tone curve of numbers th
 _DAMAGED = "{name} is damaged or no picture ({error}): copy the file again"
 _STATE = "frame.curve=linear"
 _COLOURS = {0: 1, 2: 3}  #: channels of a PNG by its colour type
+_SINGLE = 4  #: bytes of a number of the frame that is made
 _ARRAY = "(y, x), (y, x, 3) or (3, y, x)"
 
 
@@ -150,6 +154,7 @@ def read_frame(file: Path) -> FrameNumbers:
     if reader is None:
         known = ", ".join(_READERS)
         raise ParameterError("file", f"{file.name} is no frame that can be read: give {known}")
+    refuse_other_than_file(file)
     try:
         return reader(file)
     except ParameterError:
@@ -163,14 +168,16 @@ def _png(file: Path) -> FrameNumbers:
     from kornia_rs import io
     from PIL import Image
 
-    head = file.read_bytes()[:26]
+    head = head_of(file, 26)
     if not head.startswith(b"\x89PNG") or len(head) < 26:
         raise ParameterError("file", f"{file.name} is no PNG file, whatever its name says: save the frame as PNG")
     depth, channels = head[24], _COLOURS.get(head[25], 0)
     if not channels or depth not in (8, 16):
         text = f"{file.name} has a palette, transparency or {depth} bits: save raw numbers of 8 or 16 bits"
         raise ParameterError("file", text)
-    refuse_large_picture(file, int.from_bytes(head[20:24]), int.from_bytes(head[16:20]))
+    rows, columns = int.from_bytes(head[20:24]), int.from_bytes(head[16:20])
+    refuse_large_picture(file, rows, columns)
+    needs(rows * columns * channels * (depth // 8 + _SINGLE), file, f"{columns} x {rows} pixels in {channels} channels")
     with Image.open(file) as image:
         image.verify()
     read = io.read_image_png_u16 if depth == 16 else io.read_image_png_u8
@@ -181,10 +188,11 @@ def _tiff(file: Path) -> FrameNumbers:
     from kornia_rs import io
 
     kinds = ((io.read_image_tiff_u16, 16), (io.read_image_tiff_u8, 8), (io.read_image_tiff_f32, None))
+    tiff_needs(file, 1.0, 3 * _SINGLE, first=True)
     said = ""
     for read, depth in kinds:
         for mode in ("rgb", "mono"):
-            try:
+            try:  # each reader looks at the kind of pixels first
                 return FrameNumbers(_first(np.asarray(read(str(file), mode))), depth)
             except Exception as error:  # another kind of pixels, or a damaged file
                 said = str(error).partition("\n")[0]
@@ -195,6 +203,7 @@ def _tiff(file: Path) -> FrameNumbers:
 def _exr(file: Path) -> FrameNumbers:
     import OpenEXR
 
+    exr_needs(file, 4 * _SINGLE)
     with OpenEXR.File(str(file), separate_channels=True) as opened:
         channels = {name: np.array(channel.pixels) for name, channel in opened.channels().items()}
     names = ["R", "G", "B"] if {"R", "G", "B"} <= channels.keys() else list(channels)
@@ -205,6 +214,7 @@ def _exr(file: Path) -> FrameNumbers:
 
 
 def _npy(file: Path) -> FrameNumbers:
+    npy_needs(file, 1.0, _SINGLE)
     array = np.load(file, mmap_mode="r", allow_pickle=False)
     refuse_large_array(file, array.shape)
     if array.dtype.kind not in "uif" or array.ndim not in (2, 3) or not array.size:

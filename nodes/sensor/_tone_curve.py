@@ -8,6 +8,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from neusee.nodes.input_size import bytes_of
+
 _BYTE = 8  #: bits of the pictures of displays, whose numbers have a tone curve
 _LINEAR_GAMMA = 100_000  #: value of the chunk gAMA of a PNG that is proportional to the light
 _LINEAR_TRANSFER = 8  #: code point of a linear transfer characteristic in the chunk cICP (ITU-T H.273)
@@ -29,9 +31,9 @@ def tone_curve_sign(file: Path, values: NDArray[Any], depth: int | None, bits: i
                 return f"has only multiples of {factor}: numbers of 8 bits that were {done} to 16"
     with suppress(OSError, struct.error):
         if file.suffix.lower() == ".png":
-            return _png_sign(file.read_bytes())
+            return _png_sign(bytes_of(file))
         if file.suffix.lower() in (".tif", ".tiff"):
-            return _tiff_sign(file.read_bytes())
+            return _tiff_sign(bytes_of(file))
     return ""
 
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.array_bytes import mat_needs, npz_needs
 from neusee.nodes.input_files import once_per_version
 from neusee.nodes.spectra._linear_lift import inside_charts
 from neusee.nodes.spectra._spectral_tables import Table, gamut_samples, paints, require_range
@@ -87,6 +88,8 @@ def _read(file: Path) -> Table:
         raise ParameterError("files", f"{file.name} holds no reflectances: {_FILES}")
     try:
         wavelengths, values = reader(file)
+    except ParameterError:
+        raise
     except (OSError, KeyError, ValueError, TypeError, BadZipFile, UnicodeDecodeError) as error:
         raise ParameterError("files", f"{file.name} cannot be read as reflectances ({error}): {_FILES}") from None
     wrong = _wrong(wavelengths, values)
@@ -107,6 +110,7 @@ def _wrong(wavelengths: Numbers, values: Numbers) -> str:
 
 
 def _npz(file: Path) -> tuple[Numbers, Numbers]:
+    npz_needs(file, 1.0, 8.0, "files")
     with np.load(file, allow_pickle=False) as arrays:
         return _real(arrays["wavelengths"]), _real(arrays["reflectances"])
 
@@ -114,6 +118,7 @@ def _npz(file: Path) -> tuple[Numbers, Numbers]:
 def _mat(file: Path) -> tuple[Numbers, Numbers]:
     from scipy.io import loadmat
 
+    mat_needs(file, 2.0, together=True, parameter="files")
     try:
         variables = loadmat(file)
     except Exception as why:  # scipy raises many kinds of errors for foreign bytes

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.array_bytes import archive_needs, safetensors_need
 from neusee.nodes.network_weights import empty, wrong_weights
 from neusee.nodes.spectra._linear_lift import lift_checks, needs_rgb
 from neusee.nodes.spectra._mst_plus_plus import BANDS, MSTPlusPlus
@@ -149,8 +150,13 @@ def _read(weights: Path) -> dict[str, Tensor]:
 
     The file is .safetensors or a pickle that holds only tensors, with or without the key `state_dict`.
     """
+    is_plain = weights.suffix == ".safetensors"
+    if is_plain:
+        safetensors_need(weights, parameter="weights")
+    else:
+        archive_needs(weights, 2.0, "weights")
     try:
-        if weights.suffix == ".safetensors":
+        if is_plain:
             from safetensors.torch import load_file
 
             return load_file(weights)

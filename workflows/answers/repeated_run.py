@@ -7,6 +7,7 @@ is made of the document and the pictures, as `neusee report` makes it.
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,6 +17,7 @@ from neusee.workflows.answers.results_folder import DOCUMENT, NotRepeatable
 from neusee.workflows.answers.stored_answer import RUN, Answer
 from neusee.workflows.answers.stored_results import taken_from
 from neusee.workflows.engine.memory_use import process_peak
+from neusee.workflows.keys.regular_file import bytes_of
 from neusee.workflows.report.json_output import json_line
 from neusee.workflows.report.run_crate import CRATE
 from neusee.workflows.report.run_folder import new_run
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 FOLDER, TOOK = "@neusee-folder@", "@neusee-took@"  #: marks in the text of the terminal
 PAGE = "report.html"
 _FIGURES = "figures/"
+_ANY = sys.maxsize  #: bytes of a file of a run, which this program wrote
 _SERVED = {"cached", "not needed", "left out"}  #: states of a step that was not computed
 
 
@@ -51,13 +54,13 @@ class RunResults(NamedTuple):
         if {each["state"] for each in document["steps"]} - _SERVED or document["warnings"] or document["missed"]:
             raise NotRepeatable("a run that computed a step, warned or missed a number")
         files = {
-            name: path.read_bytes()
+            name: bytes_of(path, _ANY)
             for path in sorted(folder.rglob("*"))
             if path.is_file() and (name := path.relative_to(folder).as_posix()) not in (CRATE, PAGE, *self.taken)
         }
         said = json.loads(files[DOCUMENT])
         made = page(said, _pictures(folder, self.taken))
-        if made.encode() != (folder / PAGE).read_bytes() or document_text(said).encode() != files[DOCUMENT]:
+        if made.encode() != bytes_of(folder / PAGE, _ANY) or document_text(said).encode() != files[DOCUMENT]:
             raise NotRepeatable("the page or the document is not the same when it is written again")
         return {"kind": RUN, "files": files, "stored": taken_from(self.store, self.taken)}
 
@@ -101,4 +104,4 @@ def _of_now(document: dict[str, Any], seconds: float) -> dict[str, Any]:
 def _pictures(folder: Path, taken: Mapping[str, Any]) -> dict[str, bytes]:
     """Return the pictures of a run by name, in the order in which the run added them."""
     names = [name for name in taken if name.startswith(_FIGURES)]
-    return {name[len(_FIGURES) :].removesuffix(".png"): (folder / name).read_bytes() for name in names}
+    return {name[len(_FIGURES) :].removesuffix(".png"): bytes_of(folder / name, _ANY) for name in names}

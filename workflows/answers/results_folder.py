@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.answers.stored_answer import Answer
+from neusee.workflows.keys.regular_file import bytes_of
 from neusee.workflows.report.run_crate import CRATE
 from neusee.workflows.report.run_folder import RunFolder, new_run
 
@@ -30,7 +32,7 @@ def kept_files(folder: Path, report: StudyReport) -> dict[str, bytes]:
     Raises `NotRepeatable` if the marks do not give the same bytes again.
     """
     files = {
-        path.relative_to(folder).as_posix(): path.read_bytes()
+        path.relative_to(folder).as_posix(): bytes_of(path, sys.maxsize)
         for path in sorted(folder.rglob("*"))
         if path.is_file() and path.name != CRATE
     }

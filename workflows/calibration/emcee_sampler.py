@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 import emcee
 import numpy as np
 
+from neusee.nodes.array_bytes import hdf5_needs
+from neusee.nodes.input_size import bytes_of
 from neusee.workflows.calibration.ensembles import Walk, walk_until
 from neusee.workflows.calibration.guided_move import GuidedMove
 from neusee.workflows.calibration.log_posterior import SensorPosterior
@@ -186,10 +188,13 @@ def _gathered(runs: Sequence[Walk], tau: float, steps: int, long: bool) -> Chain
 def _read(file: Path, index: int) -> Any:
     """Read the draws of an ensemble into a backend in memory; return None if the file cannot be read or trusted."""
     try:
-        with open(file, "rb") as raw:
-            unseal_file(file.stem, raw.read(_SEAL).rstrip(b"\0"), raw.read())
+        content = bytes_of(file)
+        unseal_file(file.stem, content[:_SEAL].rstrip(b"\0"), content[_SEAL:])
+        del content
         kept = emcee.backends.HDFBackend(str(file), name=f"ensemble{index}", read_only=True)
         memory = emcee.backends.Backend()
+        with kept.open() as opened:
+            hdf5_needs(file, [opened[kept.name]])
         memory.reset(*kept.shape)
         memory.chain, memory.log_prob = kept.get_chain(), kept.get_log_prob()
         memory.accepted, memory.iteration = kept.accepted, kept.iteration

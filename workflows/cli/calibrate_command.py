@@ -13,6 +13,7 @@ from neusee.workflows.cli.command_frame import fail, failing, load, refusing, sa
 from neusee.workflows.cli.command_list import FAILED, MISSED
 from neusee.workflows.cli.command_options import AsJson, Debug, FewLines, Out, Quiet, Words, option_words
 from neusee.workflows.cli.interruption import kept_in, resumable, say_folder
+from neusee.workflows.keys.regular_file import text_of
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -70,7 +71,7 @@ def calibrate(
 
 def _say_results(folder: Path, quiet: bool, as_json: bool) -> None:
     """Print a line for each parameter, and the folder; end the command with the reason if a check fails."""
-    document = json.loads((folder / "posterior.json").read_text())
+    document = json.loads(text_of(folder / "posterior.json"))
     if not quiet and not as_json:
         say(_lines(document["parameters"]))
     say_folder(folder, as_json)

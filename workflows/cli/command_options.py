@@ -135,6 +135,19 @@ def memory_limit(text: str) -> int | None:
 
 
 @contextmanager
+def within_memory(text: str) -> Iterator[int | None]:
+    """Yield the value of ``--memory`` in bytes, as `memory_limit`, and hold the readers of input files to it."""
+    limit = memory_limit(text)
+    if limit is None:
+        yield None
+        return
+    from neusee.workflows.engine.memory_watch import limited
+
+    with limited(limit):
+        yield limit
+
+
+@contextmanager
 def executor_of(place: str, store: Store) -> Iterator[Executor | None]:
     """Yield None for ``local``, or an executor on the cluster ``place``, and close it after the ``with`` block."""
     if place == "local":

@@ -6,7 +6,7 @@ import json
 import shlex
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ import typer
 from neusee.workflows.cli.command_frame import fail, say
 from neusee.workflows.cli.command_list import FAILED, INTERRUPTED, TYPED
 from neusee.workflows.cli.interrupt_signal import say_stopped
+from neusee.workflows.keys.regular_file import text_of
 from neusee.workflows.report.json_output import json_line
 
 if TYPE_CHECKING:
@@ -58,7 +59,9 @@ def kept_training(out: Path, recipe: str) -> str:
     if not states:
         return "no checkpoint is written yet, so nothing is kept"
     newest = max(states, key=lambda path: path.stat().st_mtime)
-    state = StateFile(newest).read(strict=False)
+    state: dict[str, Any] = {}
+    with suppress(ValueError):
+        state = StateFile(newest).read(strict=False)
     stage = f" of stage {state['stage']}" if state.get("stage") else ""
     upto = f" up to iteration {state['iteration']}{stage}" if "iteration" in state else ""
     return f"the training{upto} is kept in {newest.parent}"
@@ -75,7 +78,7 @@ def say_folder(folder: Path, as_json: bool, *more: str) -> None:
     if not as_json:
         return say([page])
     files = ("provenance.json", *more)
-    found = [json.loads((folder / name).read_text(encoding="utf-8")) for name in files]
+    found = [json.loads(text_of(folder / name)) for name in files]
     say_json({"report": page, **{name: value for document in found for name, value in document.items()}})
 
 

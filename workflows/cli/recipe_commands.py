@@ -22,7 +22,7 @@ from neusee.workflows.cli.command_options import (
     Words,
     check_device,
     executor_of,
-    memory_limit,
+    within_memory,
 )
 from neusee.workflows.cli.interruption import kept_in, print_warning, resumable, say_json
 from neusee.workflows.cli.repetition import keep_run, say_and_keep
@@ -60,14 +60,15 @@ def run(
     Steps whose results are in the cache are not computed again. Without a name the recipe is first_light. The folder
     of results holds report.html, the numbers, the pictures and the recipe with every final value.
     """
-    recipe, command = load(words, "run", exact=exact)
+    with within_memory(memory) as limit:
+        recipe, command = load(words, "run", exact=exact)
     _check_rerun(recipe, rerun or [])
     from neusee.workflows.report import console, contents
     from neusee.workflows.simulation.simulate_recipe import simulate
     from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
     check_device(device)
-    limit, silent = memory_limit(memory), as_json or quiet
+    silent = as_json or quiet
     before = [] if silent else console.opening(recipe, shlex.join(command[1:]))
     if not silent:
         say(before)
@@ -194,7 +195,8 @@ def plan(
     measurement is marked and counts at its upper end. With --devices the run is simulated on machines that you do
     not have: makespan, utilisation and critical path.
     """
-    recipe, command = load(words, "plan", exact=exact)
+    with within_memory(memory) as limit:
+        recipe, command = load(words, "plan", exact=exact)
     from neusee.workflows.explain import run_forecast
 
     check_device(device)
@@ -203,7 +205,7 @@ def plan(
         with refusing():
             found = run_forecast.Forecast(run_forecast.simulated_lines(recipe, store, devices), [], {}, False)
     else:
-        found = run_forecast.forecast(recipe, store, device, memory_limit(memory))
+        found = run_forecast.forecast(recipe, store, device, limit)
     text = json_line({"command": shlex.join(command), **asdict(found)}) if as_json else "\n".join(found.lines)
     if found.totals.get("steps") == 0 and not found.refused:
         say_and_keep(text, recipe, store, found.totals["memory_of_report"] or 0.0)

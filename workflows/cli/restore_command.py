@@ -18,8 +18,8 @@ from neusee.workflows.cli.command_options import (
     Out,
     Quiet,
     check_device,
-    memory_limit,
     option_words,
+    within_memory,
 )
 from neusee.workflows.cli.interruption import kept_in, print_warning, resumable, say_json
 
@@ -59,11 +59,11 @@ def restore(
     """
     frames, changes, first = split_frames(words)
     check_device(device)
-    limit, folder = memory_limit(memory), Path.cwd()
+    folder = Path.cwd()
     from neusee.workflows.restoration.frame_files import named_frames
     from neusee.workflows.restoration.frame_recipes import recipes_of
 
-    with refusing():
+    with within_memory(memory) as limit, refusing():
         files = named_frames(frames, folder)
         recipes = recipes_of(files, camera, mask, changes, folder, first, psf)
     store, silent = the_store(), quiet or as_json

@@ -13,6 +13,7 @@ from neusee.workflows.cli.command_frame import fail, failing, load, refusing, sa
 from neusee.workflows.cli.command_list import FAILED, MISSED
 from neusee.workflows.cli.command_options import AsJson, Debug, Out, Quiet, Words, option_words
 from neusee.workflows.cli.interruption import say_folder
+from neusee.workflows.keys.regular_file import text_of
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.emva_frames import Release
@@ -65,7 +66,7 @@ def sheet(
     command += [*option_words({"release": chosen, "relative": relative}), *said]
     with failing(RunError, code=FAILED), failing(ValueError):
         folder = write_sheet(recipe, the_store(), out, command, release=chosen, relative=relative, state=state or ())
-    document = json.loads((folder / "emva1288.json").read_text(encoding="utf-8"))
+    document = json.loads(text_of(folder / "emva1288.json"))
     if not quiet and not as_json:
         say([*(_line(each) for each in document["quantities"].values()), document["temporal variance"]])
     say_folder(folder, as_json)

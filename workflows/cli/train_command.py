@@ -16,6 +16,7 @@ from neusee.workflows.cli.command_frame import fail, failing, load, refusing, sa
 from neusee.workflows.cli.command_list import FAILED
 from neusee.workflows.cli.command_options import AsJson, Debug, Out, ProgressLines, Words, check_device, progress_lines
 from neusee.workflows.cli.interruption import kept_training, resumable, say_json
+from neusee.workflows.keys.regular_file import text_of
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -91,7 +92,7 @@ def _say_results(folder: Path, as_json: bool, lines: list[str]) -> None:
     if not as_json:
         return say([*lines, str(folder)])
     files = (folder / name for name in ("mask.json", "training.json"))
-    found = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in files if path.is_file()}
+    found = {path.stem: json.loads(text_of(path)) for path in files if path.is_file()}
     say_json({"folder": str(folder), **found})
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows.comparison.run_record import NotComparable
+from neusee.workflows.keys.regular_file import refuse_other_than_file
 from neusee.workflows.report.figures.style import canvas, drawn, picture
 
 _TIMES = frozenset({"timeline", "graph", "error_time"})  #: figures of one run's times and states, which are no results
@@ -99,9 +100,15 @@ def _levels(path: Path) -> Any:
     import numpy as np
     from PIL import Image, UnidentifiedImageError
 
+    from neusee.nodes.picture_bytes import picture_needs
+
     try:
+        refuse_other_than_file(path)
         with Image.open(path) as image:
+            picture_needs(path, image, 3)
             return np.asarray(image.convert("RGB"))
+    except ValueError as error:
+        raise NotComparable(str(error)) from None
     except (UnidentifiedImageError, OSError, SyntaxError) as error:
         raise NotComparable(f"{path}: {error}: {_BROKEN}") from None
 
@@ -125,7 +132,10 @@ def _exr(name: str, left: Path, right: Path) -> FileDifference:
 def _channels(path: Path) -> dict[str, Any]:
     import OpenEXR
 
+    from neusee.nodes.picture_bytes import exr_needs
+
     try:
+        exr_needs(path, 8.0)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             return {name: channel.pixels for name, channel in file.parts[0].channels.items()}
     except Exception as error:  # OpenEXR raises plain errors of several kinds
@@ -164,9 +174,12 @@ def _loaded(path: Path) -> dict[str, Any]:
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
+    from neusee.nodes.array_bytes import safetensors_need
+
     try:
+        safetensors_need(path, 3.0)
         return {key: value.double().numpy() for key, value in load_file(path).items()}
-    except (SafetensorError, OSError) as error:
+    except (SafetensorError, OSError, ValueError) as error:
         raise NotComparable(f"{path}: {error}: {_BROKEN}") from None
 
 

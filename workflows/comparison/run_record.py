@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.final_values import flow
+from neusee.workflows.keys.regular_file import NotRegular, text_of
 from neusee.workflows.recipe.text.yaml_values import read
 from neusee.workflows.report.run_code import CODE
 from neusee.workflows.report.run_folder import find_run
@@ -117,9 +118,11 @@ def read_record(where: str, root: Path) -> RunRecord:
 
 def _json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(text_of(path))
     except json.JSONDecodeError as error:
         raise NotComparable(f"{path}:{error.lineno}:{error.colno}: {error.msg}: {_AGAIN}") from None
+    except NotRegular as error:
+        raise NotComparable(str(error)) from None
     except UnicodeDecodeError as error:
         raise NotComparable(f"{path}: byte {error.start} is not UTF-8: {_AGAIN}") from None
     except OSError as error:
@@ -141,7 +144,7 @@ def _values(path: Path) -> dict[str, FinalValue]:
         document = read(path, str(path))
     except RecipeError as error:
         raise NotComparable(str(error)) from None
-    lines = path.read_text(encoding="utf-8-sig").splitlines()
+    lines = text_of(path, "utf-8-sig").splitlines()
     sources = [line.rpartition(" # ")[::2] for line in lines]
     found = {}
     for leaf in document.root.leaves():

@@ -2,7 +2,7 @@
 
 A thread reads the resident memory some fifty times a second and raises `MemoryLimit` in its thread, which
 stops when its current call of a library returns. A single call that allocates too much is covered by the prediction
-before the run alone.
+before the run, and where it reads a file by the size that the header of the file states.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from neusee.nodes.input_size import Room, measured_by
+from neusee.nodes.input_size import free_memory as free_anywhere
 from neusee.workflows.engine.memory_use import give_back, process_memory
 from neusee.workflows.store.byte_sizes import format_size
 
@@ -50,6 +52,18 @@ def limited(limit: float) -> Iterator[None]:
     finally:
         with _guard:
             _limits.remove(limit)
+
+
+def _room() -> Room:
+    """Return the memory that the readers of input files may still use: what the limits leave, or what is free."""
+    found = free_anywhere()
+    if not _limits:
+        return found
+    limit = min(_limits)
+    return Room(min(limit - process_memory(), found.free), limit)
+
+
+measured_by(_room)
 
 
 @contextmanager

@@ -5,12 +5,22 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from neusee.workflows.keys.regular_file import text_of
+
 _LEVEL = re.compile(r"^[bd]\s+[\d.,]+(\s|$)", re.MULTILINE)  #: a line of a descriptor that begins a light level
 
 
 def descriptors_in(folder: Path) -> list[Path]:
     """Return the descriptor files of a folder."""
-    return [file for file in sorted(folder.glob("*.txt")) if _LEVEL.search(file.read_text("utf-8-sig", "replace"))]
+    return [file for file in sorted(folder.glob("*.txt")) if _LEVEL.search(_text(file))]
+
+
+def _text(file: Path) -> str:
+    """Return the text of a file, or nothing of what is no text file, such as a pipe."""
+    try:
+        return text_of(file, "utf-8-sig", "replace")
+    except ValueError:
+        return ""
 
 
 def descriptor_of(path: Path) -> Path:

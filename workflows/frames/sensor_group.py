@@ -11,10 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neusee.nodes.array_bytes import npz_needs
 from neusee.nodes.calibrate import SaturationSignal, frame_header, saturation_signal
 from neusee.nodes.values import Levels
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.keys.regular_file import head_of, text_of
 from neusee.workflows.store.result_store import Store
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -55,7 +57,7 @@ def sensor_target(name: str, folder: Path) -> Path:
     if not _NAME.fullmatch(name):
         raise ValueError(f"--sensor {name}: write a word of a-z, 0-9 and _, such as mine")
     file = folder / "sensor" / f"{name}.yaml"
-    if file.exists() and not file.read_text(encoding="utf-8", errors="replace").startswith(FIRST):
+    if file.exists() and not head_of(file, len(FIRST)).decode("utf-8", "replace").startswith(FIRST):
         raise ValueError(f"--sensor {name}: {file} exists and was not written by a calibration: choose another name")
     return file
 
@@ -86,12 +88,13 @@ def sensor_text(results: Path, frames: SensorFrames) -> str:
     Values and standard uncertainties are those of the budget, correlations those of the draws.
     Raises: ValueError for a calibration that failed a check, or whose frames do not tell the gain.
     """
-    posterior = json.loads((results / "posterior.json").read_text(encoding="utf-8"))
-    budget = json.loads((results / "budget.json").read_text(encoding="utf-8"))["quantities"]
+    posterior = json.loads(text_of(results / "posterior.json"))
+    budget = json.loads(text_of(results / "budget.json"))["quantities"]
     if posterior["failed"]:
         raise ValueError(f"{posterior['failed']} checks of the calibration fail, so that no sensor group is written")
     if "gain" not in budget:
         raise ValueError("the frames do not tell the gain, so that no sensor group is written")
+    npz_needs(results / "draws.npz", 1.0, 8.0)
     with np.load(results / "draws.npz") as file:
         draws = {name: np.asarray(file[name], np.float64) for name in file}
     values = _values(budget, draws, frames)

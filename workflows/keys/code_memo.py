@@ -19,6 +19,7 @@ from pydantic import TypeAdapter
 
 from neusee.workflows.keys.inherited_modes import inherit, make_folders
 from neusee.workflows.keys.module_origin import distributions_of
+from neusee.workflows.keys.regular_file import bytes_of
 from neusee.workflows.keys.seal import seal_file, seal_record, secrets, unseal_file, unseal_record
 from neusee.workflows.keys.source_summary import Summary
 
@@ -58,7 +59,7 @@ def read_memo(memo: Path) -> dict[str, Summary]:
     """Return the saved summaries of source files, or an empty dict if their file is missing or damaged."""
     _saved[memo] = 0
     try:
-        known, summaries = _read(memo.name, memo.read_bytes(), secrets())
+        known, summaries = _read(memo.name, bytes_of(memo), secrets())
     except (OSError, ValueError):
         return {}
     for module, distributions in known.distributions.items():
@@ -95,7 +96,7 @@ def write_memo(memo: Path, summaries: Mapping[str, Summary]) -> None:
 def read_parts(root: Path, code: str) -> Parts:
     """Return the digest of each definition that the digest ``code`` covers; {} if the record is missing or damaged."""
     try:
-        record = unseal_record((root / "code" / f"{code}.json").read_bytes())
+        record = unseal_record(bytes_of(root / "code" / f"{code}.json"))
         return _PARTS.validate_python(record) if record.pop("key", "") == f"code/{code}" else {}
     except (OSError, ValueError):
         return {}

@@ -11,6 +11,8 @@ from typing import Any
 
 import xxhash
 
+from neusee.workflows.keys.regular_file import opened
+
 _SETTLED = 2_000_000_000  #: ns after a change of a file in which a second change may not change the time stamp
 _TICK = 20_000_000  #: ns, longer than a tick of the clock of a file system
 _TRIES = 3  #: readings of a file that changes while it is read
@@ -29,7 +31,7 @@ def file_digest(path: Path) -> str:
         stamp = _stamp(path)
         if stamp in _files:
             return _files[stamp]
-        with open(path, "rb") as file:
+        with opened(path) as file:
             digits = hashlib.file_digest(file, xxhash.xxh3_128).hexdigest()
         if _stamp(path) == stamp:
             if time.time_ns() - max(stamp[-2:]) > _SETTLED:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.final_values import Config
 from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.keys.regular_file import head_of
 from neusee.workflows.recipe.bound_steps import Attempt
 from neusee.workflows.recipe.distributions.mismatch_laws import read_mismatch
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
@@ -270,7 +271,9 @@ def groups(beside: Path | None = None) -> dict[str, list[Titled]]:
     }
 
 
+_TITLE = 4096  #: bytes of the first line of a recipe, at most
+
+
 def _titled(path: Path) -> Titled:
-    with path.open(encoding="utf-8") as file:
-        first = file.readline().strip()
+    first = head_of(path, _TITLE).decode("utf-8", "replace").partition("\n")[0].strip()
     return Titled(path.stem, first.lstrip("# ") if first.startswith("#") else "")

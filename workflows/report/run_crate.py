@@ -13,6 +13,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+from neusee.workflows.keys.regular_file import text_of
 from neusee.workflows.report.crate_sources import (
     Entity,
     inputs,
@@ -63,7 +64,7 @@ def remove_crate(folder: Path) -> dict[str, Any] | None:
     """
     path = folder / CRATE
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(text_of(path))
     except FileNotFoundError:
         return None
     except ValueError:

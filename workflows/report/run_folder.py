@@ -14,8 +14,10 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+from neusee.workflows.keys.regular_file import head_of
 from neusee.workflows.report.run_crate import write_crate
 
+_NAME = 4096  #: bytes of the name of a folder, at most
 _OTHER_FOLDER = "name another folder with --out"
 _ABANDONED = 3600.0  #: s without a change, after which an unfinished folder is removed
 
@@ -152,7 +154,7 @@ def find_run(where: str, root: Path) -> Path:
     """Return the folder of a run; ``where`` is ``latest``, the name of a folder in ``root`` or a path."""
     for path in (root / where, Path(where)):
         if path.is_file():
-            path = path.with_name(path.read_text(encoding="utf-8").strip())
+            path = path.with_name(head_of(path, _NAME).decode("utf-8", "replace").strip())
         if (path / "provenance.json").is_file():
             return path
     raise FileNotFoundError(f"no run at {where}: give the name of a folder in {root}, a path, or `latest`")

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import base64
 import json
+import sys
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from neusee.workflows.keys.regular_file import bytes_of, text_of
 from neusee.workflows.report.run_crate import remove_crate, restore_crate
 from neusee.workflows.report.study_page import compiled, filled
 
@@ -42,8 +44,8 @@ def page(doc: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
 
 def rebuild(folder: Path) -> Path:
     """Write ``report.html`` of a run again, from the document and the pictures in ``folder``, and return its path."""
-    doc = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
-    pictures = {p.stem: p.read_bytes() for p in sorted((folder / "figures").glob("*.png"))}
+    doc = json.loads(text_of(folder / "provenance.json"))
+    pictures = {p.stem: bytes_of(p, sys.maxsize) for p in sorted((folder / "figures").glob("*.png"))}
     target = folder / "report.html"
     part = folder / ".report.html.part"
     part.write_text(page(doc, pictures), encoding="utf-8")

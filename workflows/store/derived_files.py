@@ -22,6 +22,7 @@ import xxhash
 from neusee.workflows.keys.inherited_modes import make_folders
 from neusee.workflows.keys.seal import secrets
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.shared_folder import open_now
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -121,5 +122,5 @@ def _digest(path: Path, how: Any) -> Tensor:
     """Return a digest of a file as bytes."""
     import torch
 
-    with path.open("rb") as file:
+    with open(path, "rb", opener=open_now) as file:
         return torch.tensor(list(hashlib.file_digest(file, how).digest()), dtype=torch.uint8)

@@ -16,7 +16,7 @@ import time
 from contextlib import suppress
 
 from neusee.workflows.store.process_owner import me, owner_of
-from neusee.workflows.store.shared_folder import Disk, append
+from neusee.workflows.store.shared_folder import Disk, append, open_now
 
 BEAT = 2.0  #: s between heartbeats
 WINDOW = 10.0  #: s without a heartbeat after which an owner on another machine counts as dead
@@ -142,7 +142,7 @@ class Leases:
 def _look(path: str) -> tuple[object, ...] | None:
     """Return the content, inode, size and change time of the file of a lease, or None if the file does not exist."""
     try:
-        with open(path, "rb") as file:
+        with open(path, "rb", opener=open_now) as file:
             stat, text = os.fstat(file.fileno()), file.readline(200).decode(errors="replace")
     except FileNotFoundError:
         return None

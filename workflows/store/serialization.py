@@ -21,6 +21,7 @@ from torch import Tensor
 
 from neusee.workflows.store.band_files import Blobs, Stacked, bytes_of, dtype_of
 from neusee.workflows.store.layout_check import checked_layout, is_count, is_shape
+from neusee.workflows.store.shared_folder import open_now
 from neusee.workflows.store.stored_types import is_registered, made, stored_type, type_name
 
 _ALIGN = 64
@@ -241,7 +242,7 @@ def read(path: str, expected: str | None, sha256: str | None = None) -> list[Ten
     Compare the file with the checksum ``expected`` and the digest ``sha256`` if given. Raises `ValueError` for a file
     that differs, or that `write` did not write.
     """
-    with open(path, "rb") as file:
+    with open(path, "rb", opener=open_now) as file:
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
     if expected is not None and xxhash.xxh3_128_hexdigest(data) != expected:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")

@@ -260,7 +260,7 @@ def _abandoned(entry: os.DirEntry[str], patience: float) -> bool:
     words = entry.name.split(".")
     shows_owner = words[-1] == "lease" or words[0] == "badge"
     if words[-1] == "lease" and entry.is_file(follow_symlinks=False):
-        with open(entry.path, "rb") as file:
+        with open(entry.path, "rb", opener=open_now) as file:
             words = file.readline(200).decode(errors="replace").split()
     owner = next(filter(None, map(owner_of, words)), None)
     state = owner.state if owner else "foreign"

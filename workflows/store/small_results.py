@@ -16,7 +16,7 @@ from stat import S_ISREG
 from neusee.workflows.keys.seal import seal_record
 from neusee.workflows.store import metadata
 from neusee.workflows.store.metadata import UNREADABLE, Metadata
-from neusee.workflows.store.shared_folder import Disk, append
+from neusee.workflows.store.shared_folder import Disk, append, open_now
 
 MOST = 64 << 20  #: bytes of the file above which the older half is dropped
 _HEAD = b'{"key":"'
@@ -100,7 +100,7 @@ class SmallResults:
             return
         if not S_ISREG(stat.st_mode):
             return
-        with self._guard, suppress(OSError), open(self._path, "rb") as file:
+        with self._guard, suppress(OSError), open(self._path, "rb", opener=open_now) as file:
             if stat.st_ino != self._file or stat.st_size < self._offset:
                 self._lines, self._offset = {}, 0
             file.seek(self._offset)

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.keys.regular_file import text_of
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 
@@ -47,5 +48,5 @@ def study_recipe(
 
 def count_failures(folder: Path) -> int:
     """Return the number of failed tests of a finished study, from its ``provenance.json``."""
-    found: dict[str, Any] = json.loads((folder / "provenance.json").read_text())
+    found: dict[str, Any] = json.loads(text_of(folder / "provenance.json"))
     return int(found.get("failed", 0))

@@ -6,6 +6,7 @@ import copy
 from pathlib import Path
 
 from neusee.nodes import ParameterError
+from neusee.nodes.array_bytes import safetensors_need
 from neusee.nodes.restore import Restorer, export_network, require_exportable
 from neusee.workflows.recipe.blocks.train_block import KEY, Training
 
@@ -26,7 +27,9 @@ def write_exports(folder: Path, net: Restorer, settings: Training) -> None:
     from safetensors.torch import load_file
 
     name = "best" if (folder / "best.safetensors").is_file() else "network"
+    file = folder / f"{name}.safetensors"
+    safetensors_need(file, 2.0)
     whole = copy.deepcopy(net).cpu().float()
-    whole.stored.load_state_dict(load_file(folder / f"{name}.safetensors"))
+    whole.stored.load_state_dict(load_file(file))
     for kind in settings.export:
         export_network(whole, folder / f"{name}.{kind}")

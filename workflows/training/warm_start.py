@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from neusee.nodes import ParameterError
+from neusee.nodes.array_bytes import safetensors_need
+from neusee.nodes.input_size import bytes_of
 from neusee.nodes.network_weights import fits
 from neusee.nodes.restore import Restorer
 from neusee.workflows.graph.recipe_graph import Recipe
@@ -37,12 +39,13 @@ class WarmStart:
         if file.suffix != ".safetensors" or not file.is_file():
             text = f"{file} is no file of weights: give a .safetensors file, or the folder of a training that ended"
             raise ValueError(f"{source}   {KEY}.start   {text}")
-        return cls(file, hashlib.sha256(file.read_bytes()).hexdigest(), source)
+        return cls(file, hashlib.sha256(bytes_of(file, parameter="train.start")).hexdigest(), source)
 
     def load_into(self, net: Restorer) -> None:
         """Give the weights to a network; raise ValueError with the name of the first layer that does not fit."""
         from safetensors.torch import load_file
 
+        safetensors_need(self.file, 2.0, "train.start")
         options: Any = getattr(net, "options", {})
         try:
             fits(net.stored, self.file, "the network of this training", options)

@@ -9,8 +9,11 @@ from typing import Any
 import numpy as np
 
 from neusee.nodes import ParameterError
+from neusee.nodes.array_bytes import npy_needs
 from neusee.nodes.calibrate._frames._image_files import FITS, fits_image, read, refuse_page
 from neusee.nodes.input_files import VALUES, once_per_version
+from neusee.nodes.input_size import refuse_other_than_file
+from neusee.nodes.picture_bytes import pages_need
 
 _STRIP_STARTS, _STRIP_LENGTHS = 273, 279  #: TIFF tags
 
@@ -20,6 +23,7 @@ def frame_problem(file: Path) -> str:
     """Return a message for a file that is damaged or holds no raw frames, as far as headers show it, else nothing."""
     check = _CHECKS.get(file.suffix.lower())
     try:
+        refuse_other_than_file(file)
         return check(file) if check else ""
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         return str(error) if isinstance(error, ValueError) else f"{file} is damaged ({error}): copy the file again"
@@ -31,6 +35,7 @@ def _picture(file: Path) -> str:
     try:
         with Image.open(file) as image:
             refuse_page(file, image)
+            pages_need(file, image, 2.0)
             ends = zip(*(_numbers(image, tag) for tag in (_STRIP_STARTS, _STRIP_LENGTHS)), strict=False)
             if image.format == "PNG":
                 image.verify()
@@ -50,6 +55,7 @@ def _numbers(image: Any, tag: int) -> tuple[int, ...]:
 
 
 def _numpy(file: Path) -> str:
+    npy_needs(file, 1.0)
     head = np.load(file, mmap_mode="r", allow_pickle=False)
     if head.dtype.kind not in "uif":
         return f"{file} holds values of type {head.dtype}: save raw frames as whole numbers"

@@ -14,6 +14,7 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes.calibrate._frames._frame_statistics import Temporal, levels, reduce
 from neusee.nodes.calibrate._frames._level_frames import refuse_unreadable, stack
+from neusee.nodes.input_size import text_of
 from neusee.nodes.units import IsFile
 from neusee.nodes.values import Levels
 
@@ -169,7 +170,7 @@ def _parsed(path: Path) -> _Measurement:
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield the number and the text of each descriptor line that is neither empty nor a comment."""
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    text = text_of(path, "utf-8-sig", "replace")
     for number, line in enumerate(text.splitlines(), 1):
         if line.strip() and not line.lstrip().startswith("#"):
             yield number, line.strip().replace("\t", " ")

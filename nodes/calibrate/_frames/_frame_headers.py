@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from neusee.nodes.array_bytes import npy_needs, refuse_packed
 from neusee.nodes.calibrate._frames._damaged_frames import frame_problem
 from neusee.nodes.calibrate._frames._image_files import FITS, fits_image, read, readable
 from neusee.nodes.input_files import once_per_version
+from neusee.nodes.picture_bytes import exr_needs, pages_need
 
 _EXIF, _EXPOSURE, _DESCRIPTION = 0x8769, 33434, 270  #: tags of TIFF and Exif
 _TIMES = ("exposuretime", "exptime", "exposure", "integrationtime")  #: keys of an exposure, in seconds without a unit
@@ -79,6 +81,7 @@ def _picture(file: Path) -> _Found:
     from PIL import Image
 
     with Image.open(file) as image:
+        pages_need(file, image, 1.0, 0.0)
         exif = image.getexif()
         said: dict[str, Any] = {**_texts(image.info), **_described(str(exif.get(_DESCRIPTION, "")))}
         for tags in (exif, exif.get_ifd(_EXIF)):
@@ -100,6 +103,7 @@ def _described(text: str) -> dict[str, str]:
 def _fits(file: Path) -> _Found:
     from astropy.io import fits
 
+    refuse_packed(file)
     with fits.open(file) as opened:
         header = next(part.header for part in opened if getattr(part, "is_image", False) and part.shape)
         said = {key: header[key] for key in header if key and isinstance(header[key], int | float | str)}
@@ -111,6 +115,7 @@ def _fits(file: Path) -> _Found:
 def _exr(file: Path) -> _Found:
     import OpenEXR
 
+    exr_needs(file)
     with OpenEXR.File(str(file), separate_channels=True) as opened:
         header = dict(opened.header())
         shape = next(iter(opened.channels().values())).pixels.shape
@@ -119,6 +124,7 @@ def _exr(file: Path) -> _Found:
 
 
 def _plain(file: Path) -> _Found:
+    npy_needs(file, 1.0)
     head = np.load(file, mmap_mode="r", allow_pickle=False)
     return *_stack(head.shape), 8 * head.dtype.itemsize, {}
 

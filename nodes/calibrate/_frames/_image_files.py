@@ -5,21 +5,26 @@ from __future__ import annotations
 import importlib.util
 import math
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neusee.nodes.array_bytes import fits_needs, npy_needs, refuse_packed
+from neusee.nodes.input_size import head_of, refuse_other_than_file
+from neusee.nodes.picture_bytes import exr_needs, pages_need
+
 _GREY = ("L", "I", "I;16", "I;16B", "I;16L", "F")  #: pixel modes that Pillow reads without conversion
 FITS = (".fits", ".fit", ".fts")  #: suffixes
 _TOP = 1 << 24  #: DN; above any converter
+_WHOLE = 11  #: bytes of a number while it is compared with a whole number: 8, and 3 of flags
 
 
 def read(file: Path) -> NDArray[np.int32]:
     """Read the frames of a file, (frame, y, x) int32; raise ValueError for a file without raw frames."""
     reader = readable(file)
+    refuse_other_than_file(file)
     stack = reader(file)
     if stack.ndim not in (2, 3) or not stack.size:
         raise ValueError(f"{file}: shape {stack.shape} is neither (y, x) nor (frame, y, x): give raw frames")
@@ -49,6 +54,7 @@ def _picture(file: Path) -> NDArray[Any]:
 
     try:
         with Image.open(file) as image:
+            pages_need(file, image, 2.0, _WHOLE)
             pages = [_page(file, page) for page in ImageSequence.Iterator(image)]
     except UnidentifiedImageError:
         raise ValueError(f"{file} is not a readable picture: save the frame as 16-bit grey PNG") from None
@@ -64,7 +70,7 @@ def _page(file: Path, page: Any) -> NDArray[Any]:
 
 def refuse_page(file: Path, page: Any) -> None:
     """Raise ValueError for a page of a picture file that does not hold raw grey numbers."""
-    depth = file.read_bytes()[24:25] if page.format == "PNG" else b"\x08"
+    depth = head_of(file, 25)[24:] if page.format == "PNG" else b"\x08"
     if page.mode not in _GREY or page.format not in ("PNG", "TIFF") or depth not in (b"\x08", b"\x10"):
         raise ValueError(f"{file} is {page.format} with pixels of kind {page.mode}, not raw grey of 8 or 16 bits: save "
                          "one channel as PNG or TIFF, without colour and without lossy compression")  # fmt: skip
@@ -73,6 +79,7 @@ def refuse_page(file: Path, page: Any) -> None:
 def _exr(file: Path) -> NDArray[Any]:
     import OpenEXR
 
+    exr_needs(file, 4 + _WHOLE)
     with OpenEXR.File(str(file), separate_channels=True) as opened:
         channels = opened.channels()
         if len(channels) != 1:
@@ -84,8 +91,26 @@ def _fits(file: Path) -> NDArray[Any]:
     """Read the first image of a FITS file, with the zero point and scale of the header applied."""
     from astropy.io import fits
 
+    shape, bits = fits_header(file)
+    fits_needs(file, shape, bits)
     with fits.open(file) as opened:
         return np.array(_first_image(file, opened).data)
+
+
+def _npy(file: Path) -> NDArray[Any]:
+    npy_needs(file, 1.0, _WHOLE)
+    values: NDArray[Any] = np.load(file, allow_pickle=False)
+    return values
+
+
+def fits_header(file: Path) -> tuple[tuple[int, ...], int]:
+    """Return the shape of the first image of a FITS file, and the bits of its numbers; only headers are read."""
+    from astropy.io import fits
+
+    refuse_packed(file)
+    with fits.open(file) as opened:
+        image = _first_image(file, opened)
+        return tuple(image.shape), int(image.header["BITPIX"])
 
 
 def fits_image(file: Path) -> tuple[tuple[int, ...], int, bool]:
@@ -97,6 +122,7 @@ def fits_image(file: Path) -> tuple[tuple[int, ...], int, bool]:
     """
     from astropy.io import fits
 
+    refuse_packed(file)
     with fits.open(file) as opened:
         image = _first_image(file, opened)
         header, about = image.header, image.fileinfo()
@@ -121,6 +147,6 @@ _READERS: dict[str, Callable[[Path], NDArray[Any]]] = {
     ".tif": _picture,
     ".tiff": _picture,
     ".exr": _exr,
-    ".npy": partial(np.load, allow_pickle=False),
+    ".npy": _npy,
     **dict.fromkeys(FITS, _fits),
 }

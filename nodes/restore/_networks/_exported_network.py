@@ -18,7 +18,9 @@ import torch
 from torch import nn
 
 from neusee.nodes import ParameterError
+from neusee.nodes.array_bytes import archive_needs
 from neusee.nodes.input_files import once_per_version
+from neusee.nodes.input_size import bytes_of
 from neusee.nodes.restore._networks._own_network import OwnNetwork, try_network
 
 EXPORTED = ".pt2"  #: suffix of a file of `torch.export`
@@ -52,7 +54,7 @@ class Graph(NamedTuple):
 
 def exported_network(file: Path, multiple: int | None = None) -> OwnNetwork:
     """Return the network of a file as a restorer; raise ParameterError for a file that is not to be read."""
-    data = file.read_bytes()
+    data = _bytes(file)
     graph = _checked(file, data)
     try:
         inner: nn.Module = torch.export.load(io.BytesIO(data)).module()
@@ -98,13 +100,19 @@ def read_sizes(file: Path, multiple: int | None, sizes: tuple[int, int] | None) 
 def _tried(file: Path, multiple: int) -> tuple[Side, Side]:
     """Try an exported network on a small picture with sides of a multiple, and return the sizes that it takes."""
     net = exported_network(file)
-    sides = _checked(file, file.read_bytes()).sides
+    sides = _checked(file, _bytes(file)).sides
     steps = [math.lcm(side.multiple, multiple) for side in sides]
     y, x = (step * math.ceil(max(side.least, 33) / step) for side, step in zip(sides, steps, strict=True))
     y, x = int(min(y, sides[0].most)), int(min(x, sides[1].most))
     if y * x <= _TRIED:
         try_network(net, sizes=(y, x))
     return sides
+
+
+def _bytes(file: Path) -> bytes:
+    """Return the bytes of a file whose content has room in memory: itself, a part that is checked, and the network."""
+    archive_needs(file, 3.0, "weights")
+    return bytes_of(file, parameter="weights")
 
 
 def _checked(file: Path, data: bytes) -> Graph:

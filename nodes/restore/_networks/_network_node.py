@@ -7,6 +7,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from neusee.nodes import ParameterError, node
+from neusee.nodes.array_bytes import safetensors_need
 from neusee.nodes.network_classes import Architecture, NetworkClass
 from neusee.nodes.network_weights import fits
 from neusee.nodes.restore._networks._exported_network import EXPORTED, exported_network, read_sizes
@@ -60,6 +61,7 @@ def _ready(
         return exported_network(file, multiple)
     from safetensors.torch import load_file
 
+    safetensors_need(file, parameter="weights")
     net = own_network(_class(architecture), parameters, multiple)
     net.inner.load_state_dict(load_file(file))
     net.float()

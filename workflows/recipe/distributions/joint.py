@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from neusee.nodes.units import read_any, read_written
+from neusee.workflows.keys.regular_file import NotRegular, refuse_other_than_file, text_of
 from neusee.workflows.recipe.distributions.sample_table import read_columns, require_samples, with_units
 from neusee.workflows.recipe.distributions.shapes import FloatArray, scores_between
 from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
@@ -21,6 +22,7 @@ BARE_GAIN = (
     "the folder of `neusee calibrate` contains the unit"
 )
 Z_90 = 1.6448536269514722  #: standard deviations around the mean that contain 90 % of a normal distribution
+_LARGEST = 4_000_000  #: bytes of a posterior that is a document, as of a recipe
 _JITTER = 1e-10  #: added to the diagonal of a correlation so that its Cholesky factor exists
 _FILES = "the folder of `neusee calibrate`, its posterior.json, draws in .npz or .csv, or a mean and sd in .json, .yaml"
 
@@ -138,6 +140,7 @@ def read_posterior(path: Path) -> Posterior:
         path = max(map(Path, glob(str(path))), key=lambda each: (each.stat().st_mtime, each), default=path)
     if path.is_dir():
         path = path / "posterior.json"
+    refuse_other_than_file(path)
     if not path.is_file():
         raise ValueError(f"there is no posterior file {path}: give {_FILES}")
     try:
@@ -145,6 +148,8 @@ def read_posterior(path: Path) -> Posterior:
             return _drawn(*with_units(read_columns(path)))
         if path.suffix in (".json", ".yaml", ".yml"):
             return _document(path)
+    except NotRegular:
+        raise
     except (OSError, KeyError, TypeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path.name} cannot be read as a posterior: {error!r}") from None
     raise ValueError(f"{path.name} is not a posterior file: give {_FILES}")
@@ -156,7 +161,7 @@ def _document(path: Path) -> Posterior:
     from ruamel.yaml.error import YAMLError
 
     try:
-        doc: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+        doc: Any = YAML(typ="safe", pure=True).load(text_of(path, most=_LARGEST))
     except YAMLError as error:
         raise ValueError(f"{path.name} cannot be read: {' '.join(str(error).split())}") from None
     if not isinstance(doc, dict):

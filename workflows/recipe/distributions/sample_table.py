@@ -10,11 +10,14 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from neusee.nodes.array_bytes import npy_needs, npz_needs
+from neusee.nodes.input_size import head_of, lines_of, refuse_other_than_file
 from neusee.nodes.units import read_written
 from neusee.workflows.recipe.distributions.shapes import FloatArray
 
 Line = tuple[int, list[str]]  #: number and cells of a line of a table
 
+_CELLS = 24.0  #: bytes in memory for each byte of a table: all cells as texts, and their numbers
 FEWEST = 30  #: smallest number of samples that stand for a distribution
 _HEADING = re.compile(r"\s*(.*?)\s*\[([^\[\]]*)\]\s*")  #: ``gain [DN/e-]``
 _SUFFIXES = (".csv", ".txt", ".npy", ".npz")
@@ -29,12 +32,14 @@ def read_columns(path: Path) -> dict[str, FloatArray]:
     suffix = path.suffix.lower()
     if suffix not in _SUFFIXES:
         raise ValueError(f"{path.name} is not a table of samples: give a file in .csv, .txt, .npy or .npz")
+    refuse_other_than_file(path)
     if not path.is_file():
         raise ValueError(f"there is no file {path}")
     try:
         if suffix == ".npz":
             return _arrays(path)
         if suffix == ".npy":
+            npy_needs(path, 1.0, 8.0)
             return {"": _one_column(path, np.load(path, allow_pickle=False))}
         return _text_columns(path)
     except (OSError, EOFError, BadZipFile, UnicodeDecodeError) as error:
@@ -42,9 +47,9 @@ def read_columns(path: Path) -> dict[str, FloatArray]:
 
 
 def _arrays(path: Path) -> dict[str, FloatArray]:
-    with path.open("rb") as file:
-        if file.read(2) != b"PK":
-            raise ValueError(f"{path.name} cannot be read: the file does not have the format .npz")
+    if head_of(path, 2) != b"PK":
+        raise ValueError(f"{path.name} cannot be read: the file does not have the format .npz")
+    npz_needs(path, 1.0, 8.0)
     with np.load(path, allow_pickle=False) as arrays:
         return {name: np.asarray(arrays[name], np.float64).reshape(-1) for name in arrays}
 
@@ -56,8 +61,8 @@ def _one_column(path: Path, array: FloatArray) -> FloatArray:
 
 
 def _text_columns(path: Path) -> dict[str, FloatArray]:
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        rows = [(n, row) for n, row in enumerate(csv.reader(file), 1) if any(cell.strip() for cell in row)]
+    lines = csv.reader(lines_of(path, _CELLS))
+    rows = [(n, row) for n, row in enumerate(lines, 1) if any(cell.strip() for cell in row)]
     if not rows:
         raise ValueError(f"{path.name} is empty")
     headings, rows = _take_headings(path, rows)

@@ -48,7 +48,7 @@ def locate(recipe: str | Path, folder: Path) -> Path:
     """Return the path of a recipe file from a name, such as that of a packaged recipe, or from a path to ``.yaml``."""
     if str(recipe).endswith((".yaml", ".yml")):
         path = folder / Path(recipe).expanduser()
-        if path.is_file():
+        if path.exists() and not path.is_dir():
             return path
         there = [str(p.relative_to(folder)) for p in path.parent.glob("*.yaml") if p.is_relative_to(folder)]
         raise RecipeError([Diagnostic(Location("recipe"), str(recipe), f"no such file; {nearest(str(recipe), there)}")])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from ruamel.yaml.error import YAMLError, YAMLStreamError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
+from neusee.workflows.keys.regular_file import NotRegular, opened
 from neusee.workflows.recipe.text.yaml_mistakes import YamlMistake, directive_mistake, explained
 
 Where = tuple[str | int, ...]  #: path of a value: keys and indices from the top of a recipe
@@ -109,11 +111,14 @@ def read(path: Path, shown: str) -> Document:
     Raises one `RecipeError` with all mistakes of the file.
     """
     try:
-        size = path.stat().st_size
-        if size > _LARGEST:
-            message = f"the file has {size} bytes, more than the limit of {_LARGEST}: split the recipe into groups"
-            raise RecipeError([Diagnostic(Location(shown), "", message)])
-        text = path.read_bytes().decode("utf-8-sig")
+        with opened(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > _LARGEST:
+                message = f"the file has {size} bytes, more than the limit of {_LARGEST}: split the recipe into groups"
+                raise RecipeError([Diagnostic(Location(shown), "", message)])
+            text = file.read(_LARGEST).decode("utf-8-sig")
+    except NotRegular as error:
+        raise RecipeError([Diagnostic(Location(shown), "", str(error))]) from None
     except UnicodeDecodeError as error:
         before = error.object[: error.start].decode("utf-8", "replace")
         mark = Location(shown, before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1)

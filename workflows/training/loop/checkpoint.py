@@ -13,7 +13,11 @@ from typing import Any
 
 import torch
 
+from neusee.nodes.array_bytes import archive_needs
+from neusee.nodes.input_size import lines_of
+
 _FORMAT = 1  #: format of a state; a state of another format is refused
+_CELLS = 24.0  #: bytes in memory for each byte of a table of losses
 _NAMES = {"relief": "mask"}  #: names in a state of version 0.1, with the present names
 
 
@@ -47,10 +51,12 @@ class StateFile:
     def read(self, device: str = "cpu", strict: bool = True) -> dict[str, Any]:
         """Return the training state from the checkpoint file, or an empty dictionary if there is no file.
 
-        Raises ValueError for a file that cannot be read; if not ``strict``, an unreadable file counts as absent.
+        Raises ValueError for a file that cannot be read, or that needs more memory than is left; if not ``strict``,
+        an unreadable file counts as absent.
         """
         if not self.path.exists():
             return {}
+        archive_needs(self.path, 1.0)  # a state without room in memory is not absent
         try:
             state: dict[str, Any] = torch.load(self.path, map_location=device, weights_only=True)
             if state.get("edition", _FORMAT) != _FORMAT:
@@ -75,8 +81,8 @@ class Rows:
     def cut(self, stage: int, iteration: int, write: bool = True) -> None:
         """Read the loss table from its file, and discard the rows of the given iteration and of later iterations."""
         if self._path.exists():
-            with self._path.open(newline="", encoding="utf-8") as file:
-                self.rows = [row for row in csv.DictReader(file) if _place(row) < (stage, iteration)]
+            lines = csv.DictReader(lines_of(self._path, _CELLS))
+            self.rows = [row for row in lines if _place(row) < (stage, iteration)]
         self._kept = 0
         if write:
             self.keep()

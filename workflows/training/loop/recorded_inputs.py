@@ -20,6 +20,7 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.keys.cache_key import code_of, digest, plain
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.input_file_digest import file_digest
+from neusee.workflows.keys.regular_file import text_of
 from neusee.workflows.training.loop.checkpoint import write_whole
 
 FILE = "inputs.json"  #: in the folder of a training
@@ -85,7 +86,7 @@ class RecordedInputs:
     def read(cls, folder: Path) -> RecordedInputs | None:
         """Return the inputs that the folder of a training keeps, or None for a folder without them."""
         try:
-            written = json.loads((folder / FILE).read_text(encoding="utf-8"))
+            written = json.loads(text_of(folder / FILE))
             if written.pop("format") != _FORMAT:
                 return None
             stated = written.pop("digest")
