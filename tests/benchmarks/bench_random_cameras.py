@@ -28,6 +28,7 @@ import torch
 
 from neusee.workflows import RecipeError, load
 from neusee.workflows.safety import safety_estimate
+from neusee.workflows.safety.limit_ratios import limit_ratio
 from neusee.workflows.safety.run_safety import document
 from tests.benchmarks.random_cameras import DRAWS, OWN_DRAWS, Camera, camera
 from tests.workflows.safety import own_camera_limits as own
@@ -206,6 +207,19 @@ def line_of(number: int, folder: Path, draws: int = DRAWS) -> Found:
     rows = list(compared(known, ours, theirs))
     safe = theirs["verdict"] == "below" and not known.judged
     return line | {"verdict": theirs["verdict"], "unjudged_reads_safe": safe, "rows": rows}
+
+
+def light_along(known: Camera, folder: Path) -> tuple[Floats, Floats, Floats]:
+    """Return the light of the brightest pixel by neusee and by the reference, and the defocus, over the distance."""
+    (folder / "camera.yaml").write_text(known.recipe(DRAWS))
+    with mock.patch.object(safety_estimate, "remedies", return_value=()):
+        found = safety_estimate.estimate(load("camera.yaml", [], folder))
+    finding = next(each for each in found.findings if each.limit.effect != "damage")
+    theirs = limit_ratio(found.safety, "plain lens", finding.limit, found.exposures)[0]
+    metres = found.exposures.distances
+    fill, waves = own.taper_and_defocus(known.given, metres)
+    ours = own.saturation_ratio(known.given, metres, spots_of(fill, waves, known.half_pixel, False))
+    return np.asarray(theirs), np.asarray(ours), np.abs(waves)
 
 
 def table(lines: list[Found]) -> str:

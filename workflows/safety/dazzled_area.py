@@ -13,14 +13,15 @@ import torch
 from neusee.nodes.laser import Beam, BrightPixels, defocus_at, round_pixels
 from neusee.workflows.recipe.blocks.safety_block import Safety
 from neusee.workflows.recipe.distributions.shapes import FloatArray
-from neusee.workflows.safety.distance_ladder import as_wide, fill_at, focus_of, ladder
+from neusee.workflows.safety.distance_ladder import FOLLOWED_WAVES, as_wide, fill_at, focus_of, ladder
 from neusee.workflows.safety.exposures import Exposures, Option
 from neusee.workflows.safety.light_levels import Grid, Levels, Veil, levels_of, veil_of
 from neusee.workflows.safety.spots_along import Ranked
 from neusee.workflows.safety.uncertain_values import SettingDraws
 
 _RANKS = 80  #: numbers of pixels at which levels are computed
-_STEP, _WAVES = 0.3, 0.5  #: of the ladder of a clear round lens
+_STEP, _WAVES = 0.3, 0.25  #: of the ladder of a clear round lens
+_MIDDLE = 16.0  #: pixels of a wide spot that turn bright and dark together with its middle
 _SOFT = 0.1  #: waves below which a change of the defocus does not change the spot
 _DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
 
@@ -117,7 +118,8 @@ class _RoundSpots:
 
     rungs: FloatArray  #: (rung,) m
     grids: tuple[Grid, Grid]  #: of the defocus beside the nominal one, and of the logarithm of the size in pixels
-    groups: tuple[BrightPixels, ...]  #: at each rung and each point of the grids, the last of which runs fastest
+    #: at each rung and each point of the grids, the last of which runs fastest: spots of one phase, or of several
+    groups: tuple[tuple[BrightPixels, ...], ...]
     place: FloatArray  #: (1 + draw or 1, distance) logarithm of the distance at which the nominal beam is as wide
     others: tuple[FloatArray, FloatArray]  #: the defocus and the size there, in the scales of the grids
 
@@ -143,8 +145,19 @@ def _round_spots(area: Area, exposures: Exposures, draws: SettingDraws) -> _Roun
         for offset, size in itertools.product(bends.points.tolist(), spreads.points.tolist()):
             waves = _SOFT * math.sinh(nominal + offset)
             feature = dazzle.feature if dazzle else 1.0
-            groups.append(round_pixels(fill, waves, math.exp(size), sensor.shape, feature))
+            phases = [round_pixels(fill, w, math.exp(size), sensor.shape, feature) for w in _phases(waves)]
+            groups.append(tuple(phases))
     return _RoundSpots(rungs, (bends, spreads), tuple(groups), place, (bend, spread))
+
+
+def _phases(waves: float) -> list[float]:
+    """Return the defoci whose brightest pixels bound those of a spot: itself, or one wave of them where it oscillates.
+
+    With each wave of defocus the middle of a wide spot turns from bright to dark, faster than the rungs follow.
+    """
+    if abs(waves) <= FOLLOWED_WAVES:
+        return [waves]
+    return [waves + quarter / 4 for quarter in range(4)]
 
 
 def _number(levels: FloatArray, ranks: FloatArray, light: FloatArray) -> FloatArray:
@@ -181,7 +194,13 @@ def _spreads(safety: Safety, draws: SettingDraws, diameter: float) -> FloatArray
 def _of_clear(area: Area, spots: _RoundSpots, veil: Veil | None, share: FloatArray, veiled: bool) -> Levels:
     """Return the levels of a clear round lens, from its spots."""
     shares, shape = Grid.around(share, 2), area.safety.settings.sensor.shape
-    levels = [levels_of(groups, shape, area.ranks, veil, np.exp(shares.points), veiled) for groups in spots.groups]
+
+    def brightest(phases: Sequence[BrightPixels]) -> tuple[FloatArray, FloatArray]:
+        each = [levels_of(groups, shape, area.ranks, veil, np.exp(shares.points), veiled) for groups in phases]
+        values, beyond = each[0]
+        return np.where(area.ranks <= _MIDDLE, np.max([value for value, _ in each], axis=0), values), beyond
+
+    levels = list(map(brightest, spots.groups))
     points = [len(grid.points) for grid in (*spots.grids, shares)]
     values, beyond = (
         np.stack(part).reshape(len(spots.rungs), *points, len(area.ranks)) for part in zip(*levels, strict=True)

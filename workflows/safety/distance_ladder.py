@@ -13,6 +13,7 @@ from neusee.workflows.recipe.distributions.shapes import FloatArray
 
 FAR_FILL, FAR_WAVES = 0.02, 0.03  #: largest fill and defocus of a spot that is taken as that of a distant laser
 UNFOCUSED_WAVES = 0.002  #: the same for a lens that is out of focus far away, where each wave counts at first order
+FOLLOWED_WAVES = 2.0  #: defocus up to which rungs follow how the middle of a spot turns bright and dark
 _DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
 
 
@@ -36,8 +37,8 @@ def focus_of(lens: Lens) -> float:
 def ladder(beam: Beam, lens: Lens, diameter: float, ends: tuple[float, float], step: float, waves: float) -> FloatArray:
     """Return rising distances from the nearest to the furthest of ``ends``, or to that of a distant laser.
 
-    Between two of them the distance grows by the factor 1 + ``step`` at most, and the defocus changes by ``waves`` or
-    by the share ``step`` of itself at most.
+    Between two of them the distance grows by the factor 1 + ``step`` at most, and the defocus changes by ``waves`` or,
+    from `FOLLOWED_WAVES`, by the share ``step`` of itself at most.
     """
     nearest, furthest = ends
     follows = lens.focus == "laser"
@@ -51,7 +52,7 @@ def ladder(beam: Beam, lens: Lens, diameter: float, ends: tuple[float, float], s
     rungs = [last]
     while rungs[-1] > nearest:
         here, factor = rungs[-1], 1 + step
-        allowed = max(waves, step * abs(defocus(here)))
+        allowed = waves if abs(defocus(here)) < FOLLOWED_WAVES else max(waves, step * abs(defocus(here)))
         while abs(defocus(here / factor) - defocus(here)) > allowed and factor > 1.002:
             factor = math.sqrt(factor)
         rungs.append(max(here / factor, nearest))
