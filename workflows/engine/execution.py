@@ -106,7 +106,9 @@ class Execution:
     def _take_over(self, name: str, key: Key, origin: dict[str, Any]) -> None:
         """Use the value that an attempt before this one computed and could not store, if its inputs are the same."""
         before = self._carried.get(name)
-        if before is None or any(before.work.origin[part] != origin[part] for part in ("params", "inputs")):
+        if before is None or before.value is None:  # a worker sends no value
+            return
+        if any(before.work.origin[part] != origin[part] for part in ("params", "inputs")):
             return
         outcome = replace(before, work=replace(before.work, key=key, origin=origin))
         self.values.add(outcome)

@@ -139,3 +139,18 @@ def test_what_a_module_reads_when_it_is_imported_taints_its_nodes(lab):
     result = run(load("own.yaml", [], lab), Store(lab / "cache"))
     assert result["last"].tolist() == [6.0] * 3
     assert [is_private(result.keys[step]) for step in ("first", "last")] == [False, True]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_step_that_a_worker_taints_is_computed_by_the_caller(lab):
+    """The worker sees what the step reads, keeps nothing of it, and the caller computes the rest."""
+    pytest.importorskip("distributed")
+    from neusee.workflows.engine.dask_executor import cluster
+
+    store = Store(lab / "cache")
+    with cluster("dask:1", store) as executor:
+        result = run(load("lab.yaml", [], lab), store, executor=executor)
+    assert result["last"].tolist() == [40.0] * 3
+    assert [is_private(result.keys[name]) for name in ("first", "read", "last")] == [False, True, True]
+    assert {key for key, _ in store.entries()} == {result.keys["first"]}
