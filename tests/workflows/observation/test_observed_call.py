@@ -110,7 +110,15 @@ def test_garbage_is_collected_again(layer):
     assert gc.isenabled()
 
 
-def test_a_ctrl_c_does_not_wait_and_stops_the_step(layer):
+@pytest.fixture
+def heard():
+    """Ctrl-C raises, also in a process that was started in the background and ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_a_ctrl_c_does_not_wait_and_stops_the_step(layer, heard):
     began, ended = threading.Event(), threading.Event()
 
     def step():
