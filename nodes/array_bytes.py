@@ -121,10 +121,8 @@ def safetensors_need(file: Path | str, copies: float = 1.0, parameter: str = "fi
         size, first = os.fstat(raw.fileno()).st_size, raw.read(8)
         length = int.from_bytes(first, "little")
         if len(first) < 8 or length > min(size - 8, _HEADER):
-            text = f"a length of {in_bytes(length)}, and the file has {in_bytes(size)}"
-            raise ParameterError(
-                parameter, f"{file} cannot be read: it is not a safetensors file, {text}: copy it again"
-            )
+            text = f"{in_bytes(length)} of header, and the file has {in_bytes(size)}"
+            raise _not_whole(file, text, parameter)
         needs(16.0 * length + copies * size, file, f"tensors of {in_bytes(size)}", parameter)
         stated = _last_byte(raw.read(length))
     if stated > size - 8 - length:
@@ -133,8 +131,8 @@ def safetensors_need(file: Path | str, copies: float = 1.0, parameter: str = "fi
 
 
 def _not_whole(file: Path | str, why: str, parameter: str) -> ParameterError:
-    text = f"it is not a safetensors file, because its header states {why}: copy or save the file again"
-    return ParameterError(parameter, f"{file} cannot be read: {text}")
+    text = f"{Path(file).name} is not a safetensors file: its header states {why}: copy or save the file again"
+    return ParameterError(parameter, text)
 
 
 def _last_byte(header: bytes) -> int:

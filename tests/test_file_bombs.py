@@ -62,7 +62,7 @@ BOMBS = {
     "mat of reflectances": (partial(bombs.mat, name="sur_a"), "a.mat", "reflectances(path)", MEMORY),
     "safetensors that lie": (partial(bombs.safetensors, count=10**10), "a.safetensors", HEIGHT, "its header states"),
     "safetensors of a long header": (
-        partial(bombs.safetensors, count=1, header=1 << 40), "a.safetensors", "weights(path)", "a length of"
+        partial(bombs.safetensors, count=1, header=1 << 40), "a.safetensors", "weights(path)", "of header"
     ),
     "pt of weights": (bombs.checkpoint, "a.pth", "lift_weights(path)", MEMORY),
     "pt of a training": (bombs.checkpoint, "state.pt", "StateFile(path).read()", MEMORY),

@@ -76,6 +76,8 @@ NO_SIZE = {
     "workflows/engine/memory_use.py:process_memory": SYSTEM,
     "workflows/engine/memory_use.py:there_is": SYSTEM,
     "workflows/engine/processors.py:free_processors": SYSTEM,
+    "workflows/observation/stopped_task.py:memory": SYSTEM,
+    "workflows/observation/stopped_task.py:status": SYSTEM,
     "workflows/explain/code_changes.py:_lines": SOURCE,
     "workflows/frames/frame_folder.py:_found": "read_table of frames, whose lines `csv_rows` reads",
     "workflows/handbook/guide_pages.py:read_pages": PACKAGED,

@@ -83,10 +83,7 @@ def run(
     ):
         done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit, rerun or [])
     hints = [] if silent else commands_to_try(recipe, command[2 : -1 if exact else None], _loads)
-    if silent:
-        _say_briefly(done, as_json)
-    else:
-        say(console.closing(done.document, str(done.page), hints))
+    _say_briefly(done, as_json) if silent else say(console.closing(done.document, str(done.page), hints))
     if done.document["missed"]:
         raise typer.Exit(MISSED)
     if executor == "local" and not rerun:

@@ -131,8 +131,7 @@ def run(
             series.read_code_again(store)
         except ToleranceNotProven as failed:
             scale = stricter_scale(recipe, failed.over) if attempt == 1 else 0.0  # a third attempt is exact
-            attempt += 1
-            whole = recipe.unsubstituted or recipe
+            attempt, whole = attempt + 1, recipe.unsubstituted or recipe
             recipe = with_substitutions(replace(whole, tolerance_scale=scale, exact=scale == 0.0), wanted)
             if not recipe.exact and _futile(recipe, work, wanted):
                 recipe = replace(whole, tolerance_scale=0.0, exact=True)

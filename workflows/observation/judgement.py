@@ -21,7 +21,7 @@ from neusee.workflows.observation.taints import Covered, Kind, Taint, taint
 _ACCESS = os.O_RDONLY | os.O_WRONLY | os.O_RDWR
 _PATH = getattr(os, "O_PATH", 0)
 _TMPFILE = getattr(os, "O_TMPFILE", 0)
-_GRND_NONBLOCK = 1
+_GRND_NONBLOCK, _GRND_INSECURE = 1, 4
 
 
 class Judgement:
@@ -120,6 +120,8 @@ class Judgement:
             self._connect(record)
 
     def _entropy(self, record: Record) -> None:
+        if record.flags & _GRND_INSECURE:
+            return  # seeds of the hash tables of Rust, as in safetensors
         if not record.flags & _GRND_NONBLOCK or record.there:
             self.add("random", record.path)
 

@@ -14,6 +14,7 @@ import sqlite3
 import tarfile
 import tempfile
 import threading
+import time
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -301,7 +302,7 @@ def test_files_of_other_threads_are_not_those_of_the_step(data, taints, layer):
     def step():
         before = len(reads)
         while len(reads) < before + 20:
-            stop.wait(0.001)
+            time.sleep(0.001)
 
     thread = threading.Thread(target=read)
     thread.start()
