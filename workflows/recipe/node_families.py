@@ -25,7 +25,6 @@ from neusee.nodes import Node
 from neusee.nodes.network_classes import FAMILY, network_classes
 from neusee.nodes.own_modules import import_file
 from neusee.workflows.graph.diagnostics import nearest
-from neusee.workflows.observation.own_import import import_observed
 from neusee.workflows.recipe.text.renamed_keys import instead
 
 GROUP = "neusee.nodes"  #: group of the entry points by which packages install families of nodes
@@ -149,6 +148,8 @@ def import_own(where: str, folder: Path) -> ModuleType:
 
     Raises `LookupError` with place and cause.
     """
+    from neusee.workflows.observation.own_import import import_observed  # imports torch
+
     is_path = where.endswith(".py") or "/" in where or "\\" in where or where in (".", "..")
     path = Path(folder, where).expanduser()
     try:
