@@ -131,8 +131,8 @@ def safetensors_need(file: Path | str, copies: float = 1.0, parameter: str = "fi
 
 
 def _not_whole(file: Path | str, why: str, parameter: str) -> ParameterError:
-    text = f"{Path(file).name} is not a safetensors file: its header states {why}: copy or save the file again"
-    return ParameterError(parameter, text)
+    text = f"{Path(file).name} is not a safetensors file and cannot be read: its header states {why}"
+    return ParameterError(parameter, f"{text}: copy or save the file again")
 
 
 def _last_byte(header: bytes) -> int:
