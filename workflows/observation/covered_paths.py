@@ -81,7 +81,7 @@ def caches() -> tuple[str, ...]:
 
 
 def looked_at() -> tuple[str, ...]:
-    """Return folders whose existence says nothing: of work, of temporary files, and of the user."""
+    """Return folders that always exist: the working folder, that of temporary files, and the home folder."""
     return _real([os.getcwd(), tempfile.gettempdir(), Path.home()])
 
 
