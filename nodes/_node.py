@@ -161,7 +161,9 @@ class Node:
     def params(self) -> type[BaseModel]:
         """Return the pydantic model that validates the parameters of the node and rejects unknown parameters."""
         fields = {p.name: (self.hints[p.name], ... if p.default is p.empty else p.default) for p in self._keyword_only}
-        model: type[BaseModel] = create_model(self.fn.__name__, __base__=ParameterModel, **fields)  # type: ignore[call-overload]
+        model: type[BaseModel] = create_model(
+            self.fn.__name__, __base__=ParameterModel, __module__=self.fn.__module__, **fields
+        )  # type: ignore[call-overload]
         return model
 
     reference, preflight, check = _attaches("reference"), _attaches("preflight"), _attaches("check")

@@ -87,3 +87,8 @@ def test_truth_values_and_numbers_that_are_not_finite_are_refused(wrong):
     assert counted.params.model_validate(right).share == 0.5
     with pytest.raises(ValidationError):
         counted.params.model_validate(right | wrong)
+
+
+def test_the_settings_of_an_own_node_are_not_those_of_the_package():
+    assert counted.params.__module__ == __name__
+    assert counted.params not in set(models())

@@ -30,12 +30,12 @@ def __getattr__(name: str) -> Any:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit; print an error as one line, or with ``--debug`` as a traceback."""
     interrupts = Interrupts()
-    if arguments is None:  # else a caller inside Python, whose signals are its own
+    if arguments is None:  # else a caller inside Python, whose signals and garbage are its own
         interrupts.watch()
+        gc.disable()  # a search for garbage among imported modules takes a tenth of the start-up time
     arguments = sys.argv[1:] if arguments is None else arguments
     TYPED[:] = arguments
     said.clear()
-    gc.disable()  # a search for garbage among imported modules takes a tenth of the start-up time
     _print_any_character()
     try:
         code = _run(arguments)

@@ -1,5 +1,6 @@
 """The program as a whole: its version, help of every command, and completion in a shell."""
 
+import gc
 import importlib
 import inspect
 import os
@@ -152,3 +153,9 @@ def test_the_script_of_a_shell_asks_this_program(shell, tmp_path):
     )
     assert "_NEUSEE_COMPLETE" in done.stdout
     assert f"complete_{shell}" in done.stdout
+
+
+def test_a_call_from_python_leaves_its_search_for_garbage(said):
+    assert gc.isenabled()
+    said("run", "--help")
+    assert gc.isenabled()
