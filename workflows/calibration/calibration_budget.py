@@ -25,7 +25,7 @@ from neusee.nodes.calibrate import (
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration.frame_validity import errors_of_parameters
 from neusee.workflows.calibration.laboratory import EFFICIENCY
-from neusee.workflows.calibration.model_spread import TERMS
+from neusee.workflows.calibration.model_spread import TERMS, width_of_mean
 from neusee.workflows.recipe.distributions.joint import Z_90
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class _Estimate(NamedTuple):
     """What is stated of a parameter, and the standard uncertainty that its posterior and its models give."""
 
     value: float
-    posterior: float  #: of the widest model, before any widening
+    posterior: float  #: of the mean of two models, before any widening
     model: float | None  #: half the distance of two models of the response; None where there is one model
 
 
@@ -107,9 +107,10 @@ def _estimate(result: CalibrationResult, row: ParameterEstimate) -> _Estimate:
     model = models[row.name]
     linear = row.name in result.problem.coordinates.linear
     pairs = [_centre_and_width(each.value, each.low, each.high, linear) for each in model.models[-2:]]
+    (fewer, narrow), (more, wide) = pairs[0], pairs[-1]
     scale = 1.0 if linear else model.stated.value
-    apart = abs(pairs[0][0] - pairs[-1][0]) / 2
-    return _Estimate(model.stated.value, scale * max(width for _, width in pairs), scale * apart)
+    apart = abs(fewer - more) / 2
+    return _Estimate(model.stated.value, scale * width_of_mean(narrow, wide), scale * apart)
 
 
 def _centre_and_width(value: float, low: float, high: float, linear: bool) -> tuple[float, float]:

