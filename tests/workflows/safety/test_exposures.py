@@ -180,7 +180,7 @@ def test_out_of_focus_the_heated_spot_is_wider_and_in_focus_it_is_not():
     assert wider[-1] == pytest.approx(1, abs=1e-3)  # a lens focused at infinity has a far laser in focus
     mask = Option("mask", peak=0.04, masked=True)
     found = exposures(case(), PLAIN, mask, at=(100.0,))
-    assert found.spot["mask"][0] == pytest.approx(found.spot["plain lens"][0])  # `Option.heated` has its width
+    assert found.spot["mask"][0] == pytest.approx(found.spot["plain lens"][0], rel=0.04)  # `Option.heated` has the rest
 
 
 def test_hot_spots_and_turbulence_multiply_each_other():
