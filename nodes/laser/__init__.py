@@ -102,7 +102,13 @@ from neusee.nodes.laser._protection import (
 )
 from neusee.nodes.laser._round_spot import defocused_peak, round_spot, spot_peak
 from neusee.nodes.laser._silicon_absorption import absorbed_share, absorption_bracket, silicon_absorption
-from neusee.nodes.laser._spot_on_sensor import frame_power, heated_diameter, spot_in_pixels, widest_heated_diameter
+from neusee.nodes.laser._spot_on_sensor import (
+    frame_power,
+    heated_diameter,
+    heated_in_spot,
+    spot_in_pixels,
+    widest_heated_diameter,
+)
 from neusee.nodes.laser._summit import summit_gain, unseen_light
 
 __all__ = [
@@ -175,6 +181,7 @@ __all__ = [
     "frame_power",
     "hazard_distance",
     "heated_diameter",
+    "heated_in_spot",
     "heated_spot",
     "hidden_light",
     "light",

@@ -232,9 +232,14 @@ def density_in_spot(
     The lens and the air pass all light. 2 / (pi w^2) (pi D^2 / (4 lambda f))^2 times `spot_peak` of the fill
     (D / (2 w))^2 and of the ``waves`` of defocus, with ``within`` as there. In focus it is `sensor_density`.
     """
-    gain = (math.pi * diameter**2 / (4 * beam.wavelength * focal_length)) ** 2
     fill = diameter**2 / (4 * _radius_squared(beam, distance))
-    return axis_density(beam, distance) * gain * spot_peak(fill, waves, within)
+    return even_density(beam, distance, diameter, focal_length) * spot_peak(fill, waves, within)
+
+
+def even_density(beam: Beam, distance: Tensor, diameter: Tensor, focal_length: Tensor) -> Tensor:
+    """Return the share of a beam's power per m2 at the focus if the lens were lit evenly as on its axis."""
+    gain = (math.pi * diameter**2 / (4 * beam.wavelength * focal_length)) ** 2
+    return axis_density(beam, distance) * gain
 
 
 def scintillation(wavelength: float, distance: float | Tensor, cn2: float | Tensor, worst: float) -> Tensor:

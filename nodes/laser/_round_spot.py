@@ -257,11 +257,11 @@ def _ring_share(fill: Tensor, waves: Tensor) -> Tensor:
     """Return the irradiance of the brightest ring over `_ring_limit`, which is 1 for strong defocus."""
     row = ((waves - _FIRST) / (_TABLE_WAVES - _FIRST) * (_WAVE_STEPS - 1)).clamp(0, _WAVE_STEPS - 1)
     column = (fill / _TABLE_FILL * (_FILL_STEPS - 1)).clamp(0, _FILL_STEPS - 1)
-    share = _SURE * _bilinear(_ring_table(), row, column)
+    share = _SURE * bilinear(_ring_table(), row, column)
     return share.where(waves < _TABLE_WAVES, share.clamp_min(1.0))
 
 
-def _bilinear(table: Tensor, row: Tensor, column: Tensor) -> Tensor:
+def bilinear(table: Tensor, row: Tensor, column: Tensor) -> Tensor:
     """Return a table interpolated between its entries, at fractional rows and columns."""
     top = row.floor().long().clamp_max(table.shape[0] - 2)
     left = column.floor().long().clamp_max(table.shape[1] - 2)

@@ -5,8 +5,9 @@ from typing import TypeVar
 
 from torch import Tensor
 
-from neusee.nodes.laser._beam import Beam, beam_radius, underfilled
+from neusee.nodes.laser._beam import Beam, beam_radius, even_density, underfilled
 from neusee.nodes.laser._damage_distances import airy_diameter
+from neusee.nodes.laser._spot_heat import spot_heat
 
 Number = TypeVar("Number", float, Tensor)
 
@@ -39,6 +40,19 @@ def heated_diameter(beam: Beam, distance: Number, diameter: Number, focal_length
     overfilled: Number = airy_diameter(beam.wavelength, focal_length / diameter)  # type: ignore[assignment,arg-type]
     wider: Number = underfilled(filled) ** -0.5
     return overfilled * wider
+
+
+def heated_in_spot(
+    beam: Beam, distance: Tensor, diameter: Tensor, focal_length: Tensor, waves: Tensor, density: Tensor
+) -> Tensor:
+    """Return the 1/e2 diameter in m of the Gaussian spot that heats as the spot behind a clear round lens with defocus.
+
+    ``density`` is what counts as the peak of the spot, as a share of the beam's power per m2 (`density_in_spot`). A
+    peak that is stated too high has a spot that is too narrow, and the same heat.
+    """
+    fill = diameter**2 / (4 * beam_radius(beam, distance) ** 2)
+    airy: Tensor = airy_diameter(beam.wavelength, focal_length / diameter)  # type: ignore[assignment,arg-type]
+    return airy * spot_heat(fill, waves) * even_density(beam, distance, diameter, focal_length) / density
 
 
 def widest_heated_diameter(clear: Number, peak_ratio: Number) -> Number:

@@ -19,6 +19,7 @@ from neusee.nodes.laser import (
     defocus_at,
     density_in_spot,
     heated_diameter,
+    heated_in_spot,
     scintillation,
     sensor_density,
     share_through,
@@ -117,8 +118,12 @@ def compute_exposures(
             density_in_spot(beam, where, aperture, focal_length, waves, WITHIN)
         )  # fmt: skip
         columns["sensor"][option.name] = (density * passing).numpy()
-        heated: Any = heated_diameter(beam, where, aperture, focal_length)
-        columns["spot"][option.name] = (heated * _widened(option, density / focused)).numpy()
+        heated: Any = (
+            heated_diameter(beam, where, aperture, focal_length) * _widened(option, density / focused)
+            if option.masked
+            else heated_in_spot(beam, where, aperture, focal_length, waves, density)
+        )
+        columns["spot"][option.name] = heated.numpy()
         columns["through"][option.name] = (share_through(beam, where, aperture) * passing).numpy()
         columns["fill"][option.name] = (aperture**2 / (4 * beam_radius(beam, where) ** 2)).numpy()
         columns["waves"][option.name] = waves.numpy()

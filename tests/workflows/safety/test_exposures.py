@@ -169,15 +169,18 @@ def test_distances_are_those_that_are_asked_for_and_that_of_the_recipe():
 
 
 def test_out_of_focus_the_heated_spot_is_wider_and_in_focus_it_is_not():
-    """By the root of the loss of the peak, the same light over as much more area, times 1.178 of an even disc."""
+    """By less than an even disc of the same light and peak has, the bound that counts behind a mask."""
     focus, off = (exposures(case({"focus": name}), at=(10.0, 100.0, 1e5)) for name in ("laser", "infinity"))
     loss = (focus.sensor["plain lens"] / off.sensor["plain lens"])[0]
     wider = (off.spot["plain lens"] / focus.spot["plain lens"])[0]
     assert loss[0] > 5
-    np.testing.assert_allclose(wider, 3 * math.pi / 8 * np.sqrt(loss), rtol=1e-6)
+    disc = 3 * math.pi / 8 * np.sqrt(loss)
+    assert (wider < disc).all()
+    assert wider[0] > 0.7 * disc[0]
+    assert wider[-1] == pytest.approx(1, abs=1e-3)  # a lens focused at infinity has a far laser in focus
     mask = Option("mask", peak=0.04, masked=True)
     found = exposures(case(), PLAIN, mask, at=(100.0,))
-    assert found.spot["mask"][0] == pytest.approx(found.spot["plain lens"][0])  # `Option.heated` has its width
+    assert found.spot["mask"][0] == pytest.approx(found.spot["plain lens"][0], rel=0.04)  # `Option.heated` has the rest
 
 
 def test_hot_spots_and_turbulence_multiply_each_other():
