@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from neusee.nodes import Node
@@ -24,12 +24,14 @@ from neusee.workflows.keys.code_memo import EDITION, Parts, is_complete, read_me
 from neusee.workflows.keys.code_objects import PYTHON
 from neusee.workflows.keys.declared_dependencies import FREE, changing_refusal, refusal, resolve, uncovered
 from neusee.workflows.keys.followed_imports import Imports
+from neusee.workflows.keys.installed_content import counted
 from neusee.workflows.keys.loaded_source import compiled_as_written, imported, say_once, source_of
 from neusee.workflows.keys.loaded_state import LoadedState, counted_values
 from neusee.workflows.keys.module_look import Look, Names, Whole, digest_of, parts_of
 from neusee.workflows.keys.module_origin import Origin, look_again, module_path, origin_of
 from neusee.workflows.keys.process_settings import settings, workflows_digest
 from neusee.workflows.keys.reachable_code import reached, read_names
+from neusee.workflows.keys.sibling_modules import Siblings
 from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
 from neusee.workflows.keys.tainted_code import holds_here_alone
 
@@ -38,6 +40,7 @@ _LEFT_OUT = frozenset({"neusee", ROOT} | {f"{ROOT}.{n}" for n in ("_hooks", "_no
 _WORKFLOWS = "neusee.workflows"
 _THIS_PROCESS = os.urandom(8).hex()
 _PYTHON = "Python {}.{}".format(*sys.version_info)
+_OURS = frozenset({"neusee"})  #: packages that are followed by source for a node of neusee
 
 
 class Code:
@@ -52,6 +55,7 @@ class Code:
         self._looks: dict[tuple[str, frozenset[str], bool], Look | None] = {}
         self._followed: dict[frozenset[str], Callable[[str], bool]] = {}
         self._origins: dict[tuple[str, frozenset[str]], Origin] = {}
+        self._siblings = Siblings(self._whole)
         self._codes: dict[int, tuple[Node, str]] = {}  # digest of each node, by id
         self._parts: dict[str, Parts] = {}  # by digest, not saved yet
         self.parts: dict[str, Parts] = {}  #: what each digest covers
@@ -70,7 +74,20 @@ class Code:
             self._refuse(whole, module, node, {name.partition(".")[0]})
             parts = {**self._whole(node.fn.__module__).parts, **whole.parts}
             code = self._named(digest(code, whole.code), parts, is_private(code) or is_private(whole.code))
-        return code
+        return self._beside(code, node, [node.fn.__module__, *(module for module, _ in classes)])
+
+    def _beside(self, code: str, node: Node, roots: Sequence[str]) -> str:
+        """Return the digest of a node with the other modules of a user that may change what it computes."""
+        wholes = {name: self._whole(name) for name in self._siblings.of(roots)}
+        if not wholes:
+            return code
+        for name, whole in wholes.items():
+            self._refuse(whole, name, node, {"_"})
+        parts = dict(self.parts.get(code, {}))
+        for whole in wholes.values():
+            parts |= whole.parts
+        codes = [whole.code for whole in wholes.values()]
+        return self._named(digest(code, codes), parts, any(map(is_private, [code, *codes])))
 
     def digest(self, module: str) -> str:
         """Return the digest of a module and of all that it imports, directly or not.
@@ -180,8 +197,7 @@ class Code:
         if origin.kind in ("python", "folder"):
             return None
         if origin.kind in ("distribution", "absent"):
-            top = module.partition(".")[0]
-            return Look({f"package {top}": {"version": origin.version or "not installed"}}, {})
+            return _installed(module, origin.version, packages)
         if origin.path is None:
             raise LookupError(f"{module} has no source file, so its nodes have no cache key: save the module as a file")
         if origin.kind == "binary":
@@ -258,6 +274,16 @@ class Code:
 _summarised = functools.lru_cache(1000)(summarise)  #: several stores in one process parse a source once
 
 
+def _installed(module: str, version: str, packages: frozenset[str]) -> Look:
+    """Return what a module of an installed package adds; of a missing one, that it is missing."""
+    if not version or packages == _OURS:
+        return Look({f"package {module.partition('.')[0]}": {"version": version or "not installed"}}, {})
+    found = counted(module, version)
+    if found.edited:
+        say_once(module, f"the package {found.edited} was changed after its import: restart Python to store results")
+    return Look(found.parts, {}, private=bool(found.edited))
+
+
 def _decides_nothing(module: str) -> bool:
     """Return True for a module that decides no result, such as the rules for the shapes of a family of nodes."""
     return module in _LEFT_OUT or (module.startswith(f"{ROOT}.") and module.endswith("._result_shapes"))
@@ -265,4 +291,4 @@ def _decides_nothing(module: str) -> bool:
 
 def _packages(module: str) -> frozenset[str]:
     """Return the packages that are followed by source though they are installed: that of a node, and this one."""
-    return frozenset({"neusee", module.partition(".")[0]})
+    return _OURS | {module.partition(".")[0]}

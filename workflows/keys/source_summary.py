@@ -12,6 +12,7 @@ from typing import NamedTuple
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_objects import functions_of
 from neusee.workflows.keys.module_origin import module_file
+from neusee.workflows.keys.outward_code import Reach, reach_of
 from neusee.workflows.keys.reachable_code import Statement, statements
 from neusee.workflows.keys.syntax_pass import Kinds, Syntax, each
 from neusee.workflows.keys.unfollowed_constructs import Construct, constructs, literal_import
@@ -42,6 +43,7 @@ class Summary(NamedTuple):
     constructs: list[Construct]
     statements: list[Statement]
     depends: list[str]  #: the entries of ``__depends__``
+    reach: Reach
 
 
 def summarise(source: bytes) -> Summary:
@@ -70,6 +72,7 @@ def summarise(source: bytes) -> Summary:
         constructs(tree, names),
         statements(tree.blocks),
         depends,
+        reach_of(parsed, {name: _full(ways) for name, ways in bound.items()}),
     )
 
 
@@ -132,6 +135,12 @@ def _declared(item: ast.stmt) -> list[str]:
             f"line {item.lineno}: __depends__ must be a tuple of texts, not {ast.unparse(item.value)[:60]}"
         )
     return list(entries)
+
+
+def _full(ways: set[Import]) -> str:
+    """Return the full name of what an import binds, with the dots of a relative import."""
+    level, *names = min(ways)
+    return "." * level + ".".join(filter(None, names))
 
 
 def _chained(way: Import) -> bool:
