@@ -24,23 +24,22 @@ from neusee.workflows.keys.code_memo import EDITION, Parts, is_complete, read_me
 from neusee.workflows.keys.code_objects import PYTHON
 from neusee.workflows.keys.declared_dependencies import FREE, changing_refusal, refusal, resolve, uncovered
 from neusee.workflows.keys.followed_imports import Imports
-from neusee.workflows.keys.installed_content import counted
 from neusee.workflows.keys.loaded_source import compiled_as_written, imported, say_once, source_of
 from neusee.workflows.keys.loaded_state import LoadedState, counted_values
-from neusee.workflows.keys.module_look import Look, Names, Whole, digest_of, parts_of
+from neusee.workflows.keys.module_look import OURS, Look, Names, Whole, digest_of, installed_look, parts_of
 from neusee.workflows.keys.module_origin import Origin, look_again, module_path, origin_of
-from neusee.workflows.keys.process_settings import settings, workflows_digest
+from neusee.workflows.keys.process_settings import own_settings, settings, workflows_digest
 from neusee.workflows.keys.reachable_code import reached, read_names
 from neusee.workflows.keys.sibling_modules import Siblings
 from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
 from neusee.workflows.keys.tainted_code import holds_here_alone
+from neusee.workflows.keys.user_code import is_own, reads_time
 
 #: modules that decide no result
 _LEFT_OUT = frozenset({"neusee", ROOT} | {f"{ROOT}.{n}" for n in ("_hooks", "_node", "import_times", "own_modules")})
 _WORKFLOWS = "neusee.workflows"
 _THIS_PROCESS = os.urandom(8).hex()
 _PYTHON = "Python {}.{}".format(*sys.version_info)
-_OURS = frozenset({"neusee"})  #: packages that are followed by source for a node of neusee
 
 
 class Code:
@@ -154,8 +153,9 @@ class Code:
             raise LookupError(f"{module} has no source file, so its nodes have no cache key: save the module as a file")
         documents = any(look.summary.documents for look in looks.values() if look.summary)
         state = {name: digest_of(look, documents) for name, look in looks.items()}
-        code = digest(_PYTHON, settings(), state)
-        parts = {"Python": {"version": _PYTHON}, "settings": settings(), **parts_of(looks)}
+        now = settings() | (own_settings(reads_time(looks)) if is_own(module) else {})
+        code = digest(_PYTHON, now, state)
+        parts = {"Python": {"version": _PYTHON}, "settings": now, **parts_of(looks)}
         code = self._named(code, parts, any(look.private for look in looks.values()))
         self._wholes[module] = Whole(code, looks, names, parts)
         return self._wholes[module]
@@ -179,7 +179,8 @@ class Code:
                 if held in read and f"{FREE}{held}" not in free:
                     raise LookupError(changing_refusal(held, kind, look.path))
             lines = [r for r in reached(look.summary.statements, None if "" in used else used)]
-            found = [item for item in look.summary.constructs if any(item.line in r for r in lines)]
+            items = [item for item in look.summary.constructs if item.kind != "hash" or is_own(name)]
+            found = [item for item in items if any(item.line in r for r in lines)]
             left = uncovered(found, free)
             if left is not None:
                 raise LookupError(refusal(left, look.path))
@@ -197,7 +198,7 @@ class Code:
         if origin.kind in ("python", "folder"):
             return None
         if origin.kind in ("distribution", "absent"):
-            return _installed(module, origin.version, packages)
+            return installed_look(module, origin.version, packages)
         if origin.path is None:
             raise LookupError(f"{module} has no source file, so its nodes have no cache key: save the module as a file")
         if origin.kind == "binary":
@@ -274,16 +275,6 @@ class Code:
 _summarised = functools.lru_cache(1000)(summarise)  #: several stores in one process parse a source once
 
 
-def _installed(module: str, version: str, packages: frozenset[str]) -> Look:
-    """Return what a module of an installed package adds; of a missing one, that it is missing."""
-    if not version or packages == _OURS:
-        return Look({f"package {module.partition('.')[0]}": {"version": version or "not installed"}}, {})
-    found = counted(module, version)
-    if found.edited:
-        say_once(module, f"the package {found.edited} was changed after its import: restart Python to store results")
-    return Look(found.parts, {}, private=bool(found.edited))
-
-
 def _decides_nothing(module: str) -> bool:
     """Return True for a module that decides no result, such as the rules for the shapes of a family of nodes."""
     return module in _LEFT_OUT or (module.startswith(f"{ROOT}.") and module.endswith("._result_shapes"))
@@ -291,4 +282,4 @@ def _decides_nothing(module: str) -> bool:
 
 def _packages(module: str) -> frozenset[str]:
     """Return the packages that are followed by source though they are installed: that of a node, and this one."""
-    return _OURS | {module.partition(".")[0]}
+    return OURS | {module.partition(".")[0]}

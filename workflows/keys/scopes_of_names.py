@@ -142,6 +142,6 @@ def _assigned(item: ast.AST) -> Iterator[tuple[ast.expr, ast.expr | None]]:
     elif isinstance(item, ast.AnnAssign | ast.AugAssign | ast.NamedExpr):
         yield item.target, item.value
     elif isinstance(item, ast.For | ast.AsyncFor | ast.comprehension):
-        yield item.target, item.iter
+        yield item.target, ast.Starred(item.iter)  # one of its parts
     elif isinstance(item, ast.withitem) and item.optional_vars is not None:
         yield item.optional_vars, item.context_expr

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_objects import functions_of
+from neusee.workflows.keys.hash_order import orders
 from neusee.workflows.keys.module_origin import module_file
 from neusee.workflows.keys.outward_code import Reach, reach_of
 from neusee.workflows.keys.reachable_code import Statement, statements
@@ -69,7 +70,7 @@ def summarise(source: bytes) -> Summary:
         _uses(tree.all, {name: {way for way in ways if _chained(way)} for name, ways in bound.items()}),
         _definitions(tree.texts),
         functions,
-        constructs(tree, names),
+        sorted({*constructs(tree, names), *orders(parsed)}, key=lambda item: (item.line, item)),
         statements(tree.blocks),
         depends,
         reach_of(parsed, {name: _full(ways) for name, ways in bound.items()}),
