@@ -179,8 +179,7 @@ class Code:
                 if held in read and f"{FREE}{held}" not in free:
                     raise LookupError(changing_refusal(held, kind, look.path))
             lines = [r for r in reached(look.summary.statements, None if "" in used else used)]
-            items = [item for item in look.summary.constructs if item.kind != "hash" or is_own(name)]
-            found = [item for item in items if any(item.line in r for r in lines)]
+            found = [item for item in look.summary.constructs if any(item.line in r for r in lines)]
             left = uncovered(found, free)
             if left is not None:
                 raise LookupError(refusal(left, look.path))
@@ -261,11 +260,11 @@ class Code:
         return origin.path, self._summary(module, origin.path)
 
     def _summary(self, module: str, path: Path) -> Summary:
-        source, found = source_of(module, path)
-        name = f"{PYTHON}:{EDITION}:{found}"
+        (source, found), own = source_of(module, path), is_own(module)
+        name = f"{PYTHON}:{EDITION}:{found}{':own' * own}"
         if name not in self._summaries:
             try:
-                self._summaries[name] = _summarised(source)
+                self._summaries[name] = _summarised(source, own)
             except (SyntaxError, ValueError) as error:
                 raise LookupError(f"{path}: {error}") from error
             self._new = True

@@ -62,6 +62,9 @@ class Reach(NamedTuple):
     seeks: bool  #: True if it looks for classes and objects that no import names
 
 
+NOWHERE = Reach([], [], [], False, False, False)
+
+
 def reach_of(tree: ast.Module, bound: Mapping[str, str]) -> Reach:
     """Return what a module reaches; ``bound`` has the full name of each imported name, relative ones with a dot."""
     found = _Pass(bound)

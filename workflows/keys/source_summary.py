@@ -13,7 +13,7 @@ from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_objects import functions_of
 from neusee.workflows.keys.hash_order import orders
 from neusee.workflows.keys.module_origin import module_file
-from neusee.workflows.keys.outward_code import Reach, reach_of
+from neusee.workflows.keys.outward_code import NOWHERE, Reach, reach_of
 from neusee.workflows.keys.reachable_code import Statement, statements
 from neusee.workflows.keys.syntax_pass import Kinds, Syntax, each
 from neusee.workflows.keys.unfollowed_constructs import Construct, constructs, literal_import
@@ -44,11 +44,14 @@ class Summary(NamedTuple):
     constructs: list[Construct]
     statements: list[Statement]
     depends: list[str]  #: the entries of ``__depends__``
-    reach: Reach
+    reach: Reach  #: of the code of a user
 
 
-def summarise(source: bytes) -> Summary:
-    """Return the summary of a source file; comments, layout and docstrings do not affect the digests."""
+def summarise(source: bytes, own: bool = False) -> Summary:
+    """Return the summary of a source file; comments, layout and docstrings do not affect the digests.
+
+    What only matters in code of a user is looked for if the file is the user's ``own``.
+    """
     with _parsing:
         parsed = ast.parse(source)
         functions = functions_of(source)
@@ -70,10 +73,10 @@ def summarise(source: bytes) -> Summary:
         _uses(tree.all, {name: {way for way in ways if _chained(way)} for name, ways in bound.items()}),
         _definitions(tree.texts),
         functions,
-        sorted({*constructs(tree, names), *orders(parsed)}, key=lambda item: (item.line, item)),
+        sorted({*constructs(tree, names), *(orders(parsed) if own else ())}, key=lambda item: (item.line, item)),
         statements(tree.blocks),
         depends,
-        reach_of(parsed, {name: _full(ways) for name, ways in bound.items()}),
+        reach_of(parsed, {name: _full(ways) for name, ways in bound.items()}) if own else NOWHERE,
     )
 
 

@@ -50,7 +50,7 @@ QUIET = {
 
 
 def reach(code):
-    return summarise(code.encode()).reach
+    return summarise(code.encode(), own=True).reach
 
 
 @pytest.mark.parametrize("kind", OUTWARD)
