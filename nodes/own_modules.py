@@ -9,12 +9,14 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
-_files: dict[str, Path] = {}  #: file of each module that was imported here, by name
+#: file of each module that was imported here, by name, in the order of the imports; None for one imported by its name
+_files: dict[str, Path | None] = {}
 
 
 def import_file(path: Path, load: Callable[[str], ModuleType] = importlib.import_module) -> ModuleType:
@@ -48,16 +50,29 @@ def import_file(path: Path, load: Callable[[str], ModuleType] = importlib.import
     return module
 
 
+def note_module(name: str) -> None:
+    """Note a module with nodes of a user that was imported by its name."""
+    _files.setdefault(name, None)
+
+
+def own_modules() -> tuple[str, ...]:
+    """Return the names of the modules with nodes of a user that this process has imported, in their order."""
+    return tuple(_files)
+
+
 def own_files() -> tuple[str, ...]:
-    """Return the files and folders that this process has imported as modules of nodes."""
-    return tuple(map(str, _files.values()))
+    """Return the files and folders that this process has imported as modules of nodes, and the names of others."""
+    return tuple(str(file or name) for name, file in _files.items())
 
 
 def import_missing(files: tuple[str, ...]) -> None:
     """Import the modules of another process that this process lacks; raise `ImportError` for a missing file."""
-    for file in map(Path, files):
-        if _files.get(file.stem) != file:
-            import_file(file)
+    for each in files:
+        if not os.path.isabs(each):
+            importlib.import_module(each)
+            note_module(each)
+        elif _files.get(Path(each).stem) != Path(each):
+            import_file(Path(each))
 
 
 def _refuse_taken(name: str, file: Path) -> None:

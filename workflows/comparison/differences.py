@@ -121,7 +121,7 @@ def environment(left: RunRecord, right: RunRecord) -> list[ValueDifference]:
         each |= {"command": document.command}
     for each, record in zip(facts, (left, right), strict=True):
         parts = record.code.parts if record.code else {}
-        packages = {name.removeprefix(_PACKAGE): p["version"] for name, p in parts.items() if name.startswith(_PACKAGE)}
+        packages = {name.removeprefix(_PACKAGE): _release(p) for name, p in parts.items() if name.startswith(_PACKAGE)}
         settings = parts.get(_SETTINGS, {})
         each |= {name: version for name, version in packages.items() if name not in each} | settings
     names = dict.fromkeys([*facts[0], *facts[1]])
@@ -136,6 +136,12 @@ def steps(left: RunRecord, right: RunRecord) -> list[str]:
     differ = [name for name in one if name in both and one[name] != other[name]]
     lines = [f"{len(differ)} of {len(both)} common steps have another cache key: {_listed(differ)}"] if differ else []
     return [*lines, *(f"only the {side} run has the step {name}" for side, name in _only(one, other))]
+
+
+def _release(package: Mapping[str, str]) -> str:
+    """Return the version of a package, with the digest of its files where this digest counts."""
+    content = package.get("content")
+    return f"{package['version']} (files {content[:8]})" if content else package["version"]
 
 
 def _definitions(

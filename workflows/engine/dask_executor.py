@@ -18,6 +18,7 @@ from typing import Any, get_args, get_origin
 
 import torch
 
+from neusee.nodes.own_modules import own_modules
 from neusee.workflows.engine.memory_use import there_is
 from neusee.workflows.engine.step_job import InputMissing, Lane, Outcome, StepJob, carry_out
 from neusee.workflows.graph.run_error import RunError
@@ -129,9 +130,14 @@ class _Here:
 
     def __init__(self, where: str, room: float) -> None:
         self.store = open_store(where)
-        self.code = Code(self.store.code_memo)
+        self.code, self.own = Code(self.store.code_memo), own_modules()
         self.values: OrderedDict[Key, Any] = OrderedDict()
         self.room, self.held = room, 0
+
+    def look_again(self) -> None:
+        """Compute digests of code anew if a job has brought modules of a user, which may change what others compute."""
+        if self.own != own_modules():
+            self.code, self.own = Code(self.store.code_memo), own_modules()
 
     def fetch(self, key: Key, kinds: Mapping[Key, Any]) -> Any:
         """Return the value of a key; ``kinds`` are the annotated types of the inputs of a step, by their keys."""
@@ -173,6 +179,7 @@ def work_here(chain: tuple[StepJob, ...], where: str, threads: int, room: float,
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
     here = _here.get(where) or _here.setdefault(where, _Here(where, room))
+    here.look_again()
     outcomes: list[Outcome] = []
     refetch = chain[0].refetch_seconds
     for work in chain:
@@ -197,7 +204,10 @@ def _one_here(work: StepJob, here: _Here) -> Outcome:
         text = "the loaded code is not that of its file, so no other process can use the result: restart Python"
         return Outcome(work, error=RunError(work.step, [], OSError(text)))
     if code_of(work.step, here.code) != work.origin["code"]:
-        text = f"the code of {work.step.node.path} differs on a worker: install the same version there"
+        text = (
+            f"the code of {work.step.node.path} differs on a worker: install the same version and packages there, and "
+            "set the same time zone and settings of NumPy and torch"
+        )
         return Outcome(work, error=RunError(work.step, [], OSError(text)))
     work = replace(work, own=own_code(work.step, here.code))
     if work.own and (known := taints_of(work.own.modules)):  # of an earlier job, whose memo may still hold it

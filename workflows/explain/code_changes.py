@@ -54,6 +54,8 @@ def _beside(name: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
         before, after = old.get("version"), new.get("version")
         if not before or not after:
             return [f"{name} is {'used now' if after else 'no longer used'}"]
+        if before == after:
+            return [f"{name} has other files, under the same version: {after}"]
         return [f"{before} -> {after}{', an installed package' if name != 'Python' else ''}"]
     if name == "closure":
         return ["a value that the function of the node holds from the function around it changed"]

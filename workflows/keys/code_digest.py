@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from neusee.nodes import Node
@@ -26,12 +26,14 @@ from neusee.workflows.keys.declared_dependencies import FREE, changing_refusal, 
 from neusee.workflows.keys.followed_imports import Imports
 from neusee.workflows.keys.loaded_source import compiled_as_written, imported, say_once, source_of
 from neusee.workflows.keys.loaded_state import LoadedState, counted_values
-from neusee.workflows.keys.module_look import Look, Names, Whole, digest_of, parts_of
+from neusee.workflows.keys.module_look import OURS, Look, Names, Whole, digest_of, installed_look, parts_of
 from neusee.workflows.keys.module_origin import Origin, look_again, module_path, origin_of
-from neusee.workflows.keys.process_settings import settings, workflows_digest
+from neusee.workflows.keys.process_settings import own_settings, settings, workflows_digest
 from neusee.workflows.keys.reachable_code import reached, read_names
+from neusee.workflows.keys.sibling_modules import Siblings
 from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
 from neusee.workflows.keys.tainted_code import holds_here_alone
+from neusee.workflows.keys.user_code import is_own, reads_time
 
 #: modules that decide no result
 _LEFT_OUT = frozenset({"neusee", ROOT} | {f"{ROOT}.{n}" for n in ("_hooks", "_node", "import_times", "own_modules")})
@@ -52,6 +54,7 @@ class Code:
         self._looks: dict[tuple[str, frozenset[str], bool], Look | None] = {}
         self._followed: dict[frozenset[str], Callable[[str], bool]] = {}
         self._origins: dict[tuple[str, frozenset[str]], Origin] = {}
+        self._siblings = Siblings(self._whole)
         self._codes: dict[int, tuple[Node, str]] = {}  # digest of each node, by id
         self._parts: dict[str, Parts] = {}  # by digest, not saved yet
         self.parts: dict[str, Parts] = {}  #: what each digest covers
@@ -70,7 +73,20 @@ class Code:
             self._refuse(whole, module, node, {name.partition(".")[0]})
             parts = {**self._whole(node.fn.__module__).parts, **whole.parts}
             code = self._named(digest(code, whole.code), parts, is_private(code) or is_private(whole.code))
-        return code
+        return self._beside(code, node, [node.fn.__module__, *(module for module, _ in classes)])
+
+    def _beside(self, code: str, node: Node, roots: Sequence[str]) -> str:
+        """Return the digest of a node with the other modules of a user that may change what it computes."""
+        wholes = {name: self._whole(name) for name in self._siblings.of(roots)}
+        if not wholes:
+            return code
+        for name, whole in wholes.items():
+            self._refuse(whole, name, node, {"_"})
+        parts = dict(self.parts.get(code, {}))
+        for whole in wholes.values():
+            parts |= whole.parts
+        codes = [whole.code for whole in wholes.values()]
+        return self._named(digest(code, codes), parts, any(map(is_private, [code, *codes])))
 
     def digest(self, module: str) -> str:
         """Return the digest of a module and of all that it imports, directly or not.
@@ -137,8 +153,9 @@ class Code:
             raise LookupError(f"{module} has no source file, so its nodes have no cache key: save the module as a file")
         documents = any(look.summary.documents for look in looks.values() if look.summary)
         state = {name: digest_of(look, documents) for name, look in looks.items()}
-        code = digest(_PYTHON, settings(), state)
-        parts = {"Python": {"version": _PYTHON}, "settings": settings(), **parts_of(looks)}
+        now = settings() | (own_settings(reads_time(looks)) if is_own(module) else {})
+        code = digest(_PYTHON, now, state)
+        parts = {"Python": {"version": _PYTHON}, "settings": now, **parts_of(looks)}
         code = self._named(code, parts, any(look.private for look in looks.values()))
         self._wholes[module] = Whole(code, looks, names, parts)
         return self._wholes[module]
@@ -180,8 +197,7 @@ class Code:
         if origin.kind in ("python", "folder"):
             return None
         if origin.kind in ("distribution", "absent"):
-            top = module.partition(".")[0]
-            return Look({f"package {top}": {"version": origin.version or "not installed"}}, {})
+            return installed_look(module, origin.version, packages)
         if origin.path is None:
             raise LookupError(f"{module} has no source file, so its nodes have no cache key: save the module as a file")
         if origin.kind == "binary":
@@ -244,11 +260,11 @@ class Code:
         return origin.path, self._summary(module, origin.path)
 
     def _summary(self, module: str, path: Path) -> Summary:
-        source, found = source_of(module, path)
-        name = f"{PYTHON}:{EDITION}:{found}"
+        (source, found), own = source_of(module, path), is_own(module)
+        name = f"{PYTHON}:{EDITION}:{found}{':own' * own}"
         if name not in self._summaries:
             try:
-                self._summaries[name] = _summarised(source)
+                self._summaries[name] = _summarised(source, own)
             except (SyntaxError, ValueError) as error:
                 raise LookupError(f"{path}: {error}") from error
             self._new = True
@@ -265,4 +281,4 @@ def _decides_nothing(module: str) -> bool:
 
 def _packages(module: str) -> frozenset[str]:
     """Return the packages that are followed by source though they are installed: that of a node, and this one."""
-    return frozenset({"neusee", module.partition(".")[0]})
+    return OURS | {module.partition(".")[0]}

@@ -23,7 +23,10 @@ from neusee.workflows.keys.regular_file import bytes_of
 from neusee.workflows.keys.seal import seal_file, seal_record, secrets, unseal_file, unseal_record
 from neusee.workflows.keys.source_summary import Summary
 
-_SUMMARISING = ("source_summary", "unfollowed_constructs", "reachable_code", "code_objects", "syntax_pass")
+_SUMMARISING = (
+    *("source_summary", "unfollowed_constructs", "reachable_code", "code_objects", "syntax_pass", "outward_code"),
+    *("scopes_of_names", "hash_order"),
+)
 #: digest of the code that summarises a source file, so that an older summary is not used
 EDITION = xxhash.xxh3_64_hexdigest(b"".join(Path(__file__).with_name(f"{n}.py").read_bytes() for n in _SUMMARISING))
 _KEPT = 1000  #: number of summaries in the file
@@ -40,6 +43,7 @@ class Outline(NamedTuple):
 
 
 outlines: dict[str, Outline] = {}  #: of source files of the program, by the edition and the digest of the source
+known_contents: dict[str, str] = {}  #: digests of the files of packages, by the digest of the stamps of the files
 
 
 class _Known(NamedTuple):
@@ -47,12 +51,13 @@ class _Known(NamedTuple):
 
     distributions: dict[str, list[str]]
     outlines: dict[str, Outline]
+    contents: dict[str, str]
 
 
 _SUMMARIES = TypeAdapter(dict[str, Summary])
 _KNOWN = TypeAdapter(_Known)
 _PARTS = TypeAdapter(Parts)
-_saved: dict[Path, int] = {}  #: number of outlines in each memo
+_saved: dict[Path, int] = {}  #: number of outlines and of digests of packages in each memo
 
 
 def read_memo(memo: Path) -> dict[str, Summary]:
@@ -66,7 +71,9 @@ def read_memo(memo: Path) -> dict[str, Summary]:
         distributions_of.setdefault(module, distributions)
     for name, outline in known.outlines.items():
         outlines.setdefault(name, outline)
-    _saved[memo] = len(known.outlines)
+    for stamps, content in known.contents.items():
+        known_contents.setdefault(stamps, content)
+    _saved[memo] = len(known.outlines) + len(known.contents)
     return dict(summaries)
 
 
@@ -79,15 +86,16 @@ def _read(name: str, raw: bytes, signed_by: tuple[bytes, ...]) -> tuple[_Known, 
 
 
 def is_complete(memo: Path) -> bool:
-    """Return True if a memo has an outline of each source file of the program that this process has read."""
-    return _saved.get(memo, 0) >= len(outlines)
+    """Return True if a memo has an outline of each source file of the program, and of each package, that was read."""
+    return _saved.get(memo, 0) >= len(outlines) + len(known_contents)
 
 
 def write_memo(memo: Path, summaries: Mapping[str, Summary]) -> None:
     """Save the newest summaries of source files; do nothing if the folder cannot be written."""
     newest = dict(list(outlines.items())[-_KEPT:])
-    _saved[memo] = len(outlines)
-    known = _KNOWN.dump_json(_Known(distributions_of, newest))
+    packages = dict(list(known_contents.items())[-_KEPT:])
+    _saved[memo] = len(outlines) + len(known_contents)
+    known = _KNOWN.dump_json(_Known(distributions_of, newest, packages))
     text = json.dumps(dict(list(summaries.items())[-_KEPT:])).encode()
     content = b"\n".join([known, text])
     _write(memo, b"\n".join([seal_file(memo.name, content), content]), memo.parent / "tmp")

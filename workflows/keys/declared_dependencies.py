@@ -24,6 +24,7 @@ _FIX = {
     "import": 'write the import as a statement, or declare each module: depends=["package.module"]',
     "run": 'declare the file or the module that it runs: depends=["kernel.cpp"]',
     "state": "make it a parameter",
+    "hash": "write sorted(...) around the set, or a digest of hashlib",
 }
 _NAME = {"file": "table.csv", "env": "NAME"}
 

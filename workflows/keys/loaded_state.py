@@ -159,9 +159,12 @@ class LoadedState:
         return type(value).__name__, self._of(getattr(value, "__func__", None) or getattr(value, "func", None))
 
     def _object(self, value: Any) -> Any:
-        """Return an object that is no container: by its parts if the source of its class is followed, else by type."""
+        """Return an object that is no container: by its parts if the source of its class is followed, else by type.
+
+        A module of torch counts by its parts, whose weights others may have set.
+        """
         kind = type(value)
-        if kind is SimpleNamespace or self._followed(kind.__module__):
+        if kind is SimpleNamespace or isinstance(value, nn.Module) or self._followed(kind.__module__):
             return self._typed(value), [(name, self._of(part)) for name, part in _attributes(value)]
         inner = getattr(value, "__wrapped__", None) if kind.__module__ != "typing" else None
         return self._typed(value), self._of(inner) if callable(inner) else ""

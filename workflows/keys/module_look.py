@@ -7,8 +7,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from neusee.workflows.keys.code_memo import Parts
+from neusee.workflows.keys.installed_content import counted
+from neusee.workflows.keys.loaded_source import say_once
 from neusee.workflows.keys.source_summary import Summary
 
+OURS = frozenset({"neusee"})  #: packages that are followed by source for a node of neusee
 Names = dict[str, set[str]]  #: names that are used of each module; an empty name stands for all of them
 
 
@@ -44,3 +47,15 @@ def digest_of(look: Look, documents: bool) -> list[Any]:
     source = look.summary.whole if documents else look.summary.tree
     other = {name: part for name, part in look.parts.items() if name.startswith(("file ", "environment "))}
     return [source, look.state, other]
+
+
+def installed_look(module: str, version: str, packages: frozenset[str]) -> Look:
+    """Return what a module of an installed package adds, where ``packages`` are followed by source; without a version,
+    that it is missing.
+    """
+    if not version or packages == OURS:
+        return Look({f"package {module.partition('.')[0]}": {"version": version or "not installed"}}, {})
+    found = counted(module, version)
+    if found.edited:
+        say_once(module, f"the package {found.edited} was changed after its import: restart Python to store results")
+    return Look(found.parts, {}, private=bool(found.edited))

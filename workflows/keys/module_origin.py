@@ -99,31 +99,46 @@ def module_file(folder: str | Path, names: Sequence[str]) -> Path | None:
 
 def version_of(top: str) -> str:
     """Return name and version of the distribution that contains a top-level module, or an empty text."""
-    found = _released(top)
-    if not found:
-        if top not in distributions_of or not all(map(_released, distributions_of[top])):
-            distributions_of[top] = _distributions(top)
-        found = ", ".join(map(_released, distributions_of[top]))
-    return found
+    return ", ".join(map(released, distributions_with(top)))
 
 
-def _released(name: str) -> str:
+def distributions_with(top: str) -> list[str]:
+    """Return the names of the distributions that contain a top-level module."""
+    if released(top):
+        return [top]
+    if top not in distributions_of or not all(map(released, distributions_of[top])):
+        distributions_of[top] = _distributions(top)
+    return distributions_of[top]
+
+
+def released(name: str) -> str:
     """Return name and version of an installed distribution, or an empty text."""
-    version = _releases().get(_plain(name), "")
+    version = _releases().get(plain(name), ("", ""))[0]
     return version and f"{name} {version.partition('+')[0] if name in _BUILD_IN_VERSION else version}"
 
 
-def _plain(name: str) -> str:
+def metadata_folder(name: str) -> str:
+    """Return the folder with the metadata of an installed distribution, or an empty text."""
+    return _releases().get(plain(name), ("", ""))[1]
+
+
+def metadata_text(name: str, file: str) -> bytes:
+    """Return a file of the metadata of an installed distribution, or nothing if it has none."""
+    return _text(metadata_folder(name), file)
+
+
+def plain(name: str) -> str:
+    """Return the name of a distribution in the form in which equal names are equal."""
     return re.sub(r"[-_.]+", "_", name).lower()
 
 
 @functools.cache
-def _releases() -> dict[str, str]:
-    """Return the version of each installed distribution, read from the names of the folders of its metadata."""
-    found: dict[str, str] = {}
+def _releases() -> dict[str, tuple[str, str]]:
+    """Return version and folder of metadata of each installed distribution, from the names of these folders."""
+    found: dict[str, tuple[str, str]] = {}
     for folder in _metadata():
         name, _, version = os.path.basename(folder).removesuffix(".dist-info").partition("-")
-        found.setdefault(_plain(name), version)
+        found.setdefault(plain(name), (version, folder))
     return found
 
 

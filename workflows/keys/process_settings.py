@@ -8,8 +8,11 @@ from __future__ import annotations
 import functools
 import hashlib
 import sys
+import time
+from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from neusee.nodes.exact_convolution import tf32_setting
@@ -17,6 +20,13 @@ from neusee.workflows.keys.usual_settings import USUAL
 
 _KINDS, _is_cast = ("cpu", "cuda"), torch.is_autocast_enabled
 _HALF = float("0.5")
+#: how NumPy prints numbers in a new process
+_PRINTED = {"precision": 8, "threshold": 1000, "edgeitems": 3, "linewidth": 75, "suppress": False, "nanstr": "nan"} | {
+    "infstr": "inf",
+    "formatter": None,
+    "sign": "-",
+    "floatmode": "maxprec",
+}
 _SMALLEST = sys.float_info.min  #: its half is 0 where a process flushes small numbers to 0
 
 torch.get_default_device()  # imports what it needs now, because a process may lose the right to read files later
@@ -34,6 +44,42 @@ def settings() -> dict[str, str]:
         "assert statements": f"left out by -{'O' * sys.flags.optimize}" if sys.flags.optimize else "run",
     }
     return {name: value for name, value in now.items() if value != USUAL[name]}
+
+
+def own_settings(reads_time: bool) -> dict[str, str]:
+    """Return the settings that code of a user may read, and neusee does not, where they are not the usual ones.
+
+    With ``reads_time`` the code may read the time zone.
+    """
+    now = {"floating-point errors": _errors(), "printed numbers": _printing()}
+    if reads_time:
+        now["time zone"] = _time_zone()
+    return {name: value for name, value in now.items() if value != USUAL[name]}
+
+
+def _errors() -> str:
+    """Return which floating-point errors of NumPy end a calculation or call a function; warnings decide nothing."""
+    kinds = [f"{name} {does}" for name, does in np.geterr().items() if does in ("raise", "call", "log")]
+    return ", ".join(kinds) or USUAL["floating-point errors"]
+
+
+def _printing() -> str:
+    """Return how NumPy prints numbers, where it was told to.
+
+    The option ``legacy`` does not count: colour-science sets it, and whether it is loaded decides no result.
+    """
+    now: Mapping[str, object] = {**np.get_printoptions()}
+    other = [f"{name}={now[name]}" for name, value in _PRINTED.items() if now.get(name, value) != value]
+    return ", ".join(other) or USUAL["printed numbers"]
+
+
+def _time_zone() -> str:
+    """Return the names of the time zone and a digest of its offsets from UTC in each week from 1970 to 2040."""
+    weeks = range(0, 2_208_988_800, 7 * 86_400)
+    offsets = [time.localtime(week).tm_gmtoff for week in weeks]
+    if not any(offsets):
+        return USUAL["time zone"]
+    return f"{'/'.join(time.tzname)} {hashlib.blake2b(repr(offsets).encode(), digest_size=4).hexdigest()}"
 
 
 @functools.cache

@@ -11,7 +11,9 @@ from typing import NamedTuple
 
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_objects import functions_of
+from neusee.workflows.keys.hash_order import orders
 from neusee.workflows.keys.module_origin import module_file
+from neusee.workflows.keys.outward_code import NOWHERE, Reach, reach_of
 from neusee.workflows.keys.reachable_code import Statement, statements
 from neusee.workflows.keys.syntax_pass import Kinds, Syntax, each
 from neusee.workflows.keys.unfollowed_constructs import Construct, constructs, literal_import
@@ -42,10 +44,14 @@ class Summary(NamedTuple):
     constructs: list[Construct]
     statements: list[Statement]
     depends: list[str]  #: the entries of ``__depends__``
+    reach: Reach  #: of the code of a user
 
 
-def summarise(source: bytes) -> Summary:
-    """Return the summary of a source file; comments, layout and docstrings do not affect the digests."""
+def summarise(source: bytes, own: bool = False) -> Summary:
+    """Return the summary of a source file; comments, layout and docstrings do not affect the digests.
+
+    What only matters in code of a user is looked for if the file is the user's ``own``.
+    """
     with _parsing:
         parsed = ast.parse(source)
         functions = functions_of(source)
@@ -67,9 +73,10 @@ def summarise(source: bytes) -> Summary:
         _uses(tree.all, {name: {way for way in ways if _chained(way)} for name, ways in bound.items()}),
         _definitions(tree.texts),
         functions,
-        constructs(tree, names),
+        sorted({*constructs(tree, names), *(orders(parsed) if own else ())}, key=lambda item: (item.line, item)),
         statements(tree.blocks),
         depends,
+        reach_of(parsed, {name: _full(ways) for name, ways in bound.items()}) if own else NOWHERE,
     )
 
 
@@ -132,6 +139,12 @@ def _declared(item: ast.stmt) -> list[str]:
             f"line {item.lineno}: __depends__ must be a tuple of texts, not {ast.unparse(item.value)[:60]}"
         )
     return list(entries)
+
+
+def _full(ways: set[Import]) -> str:
+    """Return the full name of what an import binds, with the dots of a relative import."""
+    level, *names = min(ways)
+    return "." * level + ".".join(filter(None, names))
 
 
 def _chained(way: Import) -> bool:

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from neusee.nodes import Node
     from neusee.workflows.graph.recipe_graph import Step
     from neusee.workflows.keys.code_digest import Code
+    from neusee.workflows.keys.module_look import Look
 
+_TIMED = frozenset({"datetime", "time", "calendar", "email", "zoneinfo", "sqlite3", "logging"})
 PROVEN = ("neusee.",)  #: packages whose nodes are not observed
 
 
@@ -56,3 +58,10 @@ def own_code_of(node: Node, params: Mapping[str, Any], networks: Sequence[str], 
 def is_own(module: str) -> bool:
     """Return True for a module outside of neusee, whose nodes are proven by its own tests."""
     return not f"{module}.".startswith(PROVEN)
+
+
+def reads_time(looks: Mapping[str, Look]) -> bool:
+    """Return True if code of a user may read the time zone: by the standard library, or by a package of its own."""
+    own = [look for name, look in looks.items() if is_own(name)]
+    names = {imported.partition(".")[0] for look in own for imported in look.imports}
+    return not _TIMED.isdisjoint(names) or any("content" in part for look in own for part in look.parts.values())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+#: settings that only code of a user reads
+OWN_USUAL = {"floating-point errors": "told", "printed numbers": "as NumPy prints", "time zone": "UTC"}
 #: settings of a new process
 USUAL = {
     "default dtype": "torch.float32",
@@ -11,4 +13,5 @@ USUAL = {
     "autocast": "off",
     "numbers below 1e-308": "kept",
     "assert statements": "run",
+    **OWN_USUAL,
 }

@@ -23,7 +23,7 @@ from typing import Any
 import neusee.nodes
 from neusee.nodes import Node
 from neusee.nodes.network_classes import FAMILY, network_classes
-from neusee.nodes.own_modules import import_file
+from neusee.nodes.own_modules import import_file, note_module
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.recipe.text.renamed_keys import instead
 
@@ -155,7 +155,9 @@ def import_own(where: str, folder: Path) -> ModuleType:
     try:
         if is_path:
             return import_file(path.absolute() if where not in (".", "..") else path.resolve(), import_observed)
-        return import_observed(where)
+        module = import_observed(where)
+        note_module(where)
+        return module
     except ModuleNotFoundError as error:
         if not is_path and error.name and f"{where}.".startswith(f"{error.name}."):
             beside = f"; write ./{where} for the folder" if path.is_dir() else ""
@@ -235,7 +237,9 @@ def _load(family: str) -> ModuleType:
         raise LookupError(f"{names} both install a family of nodes {family}: uninstall one")
     module, place = points[0].value, points[0].dist.name if points[0].dist else points[0].value
     try:
-        return importlib.import_module(module)
+        loaded = importlib.import_module(module)
+        note_module(module)
+        return loaded
     except (Exception, SystemExit) as error:
         raise LookupError(f"{family} of the installed package {place} fails: {_failure(module, error)}") from None
 
