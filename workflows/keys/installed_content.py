@@ -9,6 +9,7 @@ the packages that it requires. Byte code, scripts and metadata do not count, so 
 from __future__ import annotations
 
 import functools
+import hashlib
 import os
 import re
 import sys
@@ -21,6 +22,7 @@ import xxhash
 from neusee.nodes.import_times import import_time
 from neusee.workflows.keys import module_origin
 from neusee.workflows.keys.code_memo import Parts, known_contents
+from neusee.workflows.keys.regular_file import opened
 
 #: distributions that neusee declares for its users, in pyproject.toml, in the form of `plain`
 BY_VERSION = frozenset(
@@ -169,10 +171,7 @@ def _stamp(file: str) -> tuple[int, ...]:
 
 def _digest_of(file: str) -> bytes:
     try:
-        with open(file, "rb") as opened:
-            text = xxhash.xxh3_128()
-            while block := opened.read(1 << 20):
-                text.update(block)
+        with opened(file) as content:
+            return hashlib.file_digest(content, xxhash.xxh3_128).digest()
     except OSError:
         return b"missing"
-    return text.digest()

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from neusee.nodes.exact_convolution import tf32_setting
-from neusee.workflows.keys.usual_settings import USUAL
+from neusee.workflows.keys.usual_settings import OWN_USUAL, USUAL
 
 _KINDS, _is_cast = ("cpu", "cuda"), torch.is_autocast_enabled
 _HALF = float("0.5")
@@ -60,7 +60,7 @@ def own_settings(reads_time: bool) -> dict[str, str]:
 def _errors() -> str:
     """Return which floating-point errors of NumPy end a calculation or call a function; warnings decide nothing."""
     kinds = [f"{name} {does}" for name, does in np.geterr().items() if does in ("raise", "call", "log")]
-    return ", ".join(kinds) or USUAL["floating-point errors"]
+    return ", ".join(kinds) or OWN_USUAL["floating-point errors"]
 
 
 def _printing() -> str:
@@ -70,7 +70,7 @@ def _printing() -> str:
     """
     now: Mapping[str, object] = {**np.get_printoptions()}
     other = [f"{name}={now[name]}" for name, value in _PRINTED.items() if now.get(name, value) != value]
-    return ", ".join(other) or USUAL["printed numbers"]
+    return ", ".join(other) or OWN_USUAL["printed numbers"]
 
 
 def _time_zone() -> str:
@@ -78,7 +78,7 @@ def _time_zone() -> str:
     weeks = range(0, 2_208_988_800, 7 * 86_400)
     offsets = [time.localtime(week).tm_gmtoff for week in weeks]
     if not any(offsets):
-        return USUAL["time zone"]
+        return OWN_USUAL["time zone"]
     return f"{'/'.join(time.tzname)} {hashlib.blake2b(repr(offsets).encode(), digest_size=4).hexdigest()}"
 
 

@@ -8,6 +8,7 @@ import torch
 
 import neusee.nodes
 from neusee.workflows.engine.runner import run
+from neusee.workflows.explain import code_changes
 from neusee.workflows.explain.why_rerun import why_lines
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -91,7 +92,8 @@ def test_autocast(lab):
 def test_every_setting_has_a_usual_value(monkeypatch):
     assert process_settings.settings() == {}
     monkeypatch.setattr(process_settings, "USUAL", dict.fromkeys(process_settings.USUAL, ""))
-    assert process_settings.settings().keys() == process_settings.USUAL.keys()
+    found = process_settings.settings() | process_settings.own_settings(reads_time=True)
+    assert found.keys() == process_settings.USUAL.keys()
 
 
 def test_the_version_of_python(lab, monkeypatch):
@@ -159,3 +161,9 @@ def test_code_that_was_edited_after_its_import(lab):
     with pytest.warns(UserWarning, match=r"_part.py was edited after its import"):
         found = why_lines(recipe, lab.store, "s")
     assert found[1].strip() == "s: the loaded code of beside.value is not that of its file any more: restart Python"
+
+
+def test_a_package_with_other_files_under_its_version_is_told():
+    old, new = ({"version": "thing 1.0", "content": digest} for digest in ("1" * 32, "2" * 32))
+    told = code_changes._beside("package thing", old, new)
+    assert told == ["package thing has other files, under the same version: thing 1.0"]
