@@ -12,10 +12,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from multiprocessing.connection import Pipe
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neusee.workflows.contract.surroundings import FOLDER, Others, Surrounding, others
+from neusee.workflows.contract.surroundings import FRESH, Others, Surrounding, others
 
 if TYPE_CHECKING:  # they import torch
     from neusee.workflows.contract.elsewhere_process import Asked
@@ -38,72 +37,78 @@ class NotStartedError(RuntimeError):
 class Elsewhere:
     """A process with some of the other surroundings; it imports torch while the caller does other things."""
 
-    def __init__(self, others: Others, changes: frozenset[Surrounding] = frozenset()) -> None:
-        self.others, self.changes = others, changes
-        self._folder = tempfile.TemporaryDirectory(prefix="neusee-check-")
+    def __init__(self, others: Others, changes: frozenset[Surrounding]) -> None:
+        self.others, self._fresh = others, changes & FRESH
+        self.folder = tempfile.TemporaryDirectory(prefix="neusee-check-")
         try:
             self._start()
         except OSError as error:
-            self._folder.cleanup()
+            self.folder.cleanup()
             raise NotStartedError(f"a process of Python does not start: {error}") from None
 
     def outcomes(self, asked: Asked) -> list[Outcome]:
-        """Return the outcome of each call; a call that ends the process, or has no end, costs another process.
+        """Return the outcome of each call, made in a fork of the process; raise `NotStartedError`.
 
-        Raises `NotStartedError`.
+        After a call that ends its fork, or that does not end, the other calls are made in another one.
         """
-        found = self._up_to_an_end(asked)
+        found: list[Outcome] = []
         while len(found) < len(asked.calls):
-            self._end()
-            self._start()
             found += self._up_to_an_end(replace(asked, calls=asked.calls[len(found) :]))
         return found
 
     def close(self) -> None:
         """End the process and remove its folder."""
         self._end()
-        self._folder.cleanup()
+        self.folder.cleanup()
 
     def _start(self) -> None:
-        """Start the process, beside this one: in its group, so that the end of a terminal ends it too."""
-        folder = Path(self._folder.name)
+        """Start the process in a group of its own, with which its forks end."""
         self._pipe, theirs = Pipe()
+        self._is_ready = False
         path = [os.path.abspath(entry) for entry in sys.path]
-        optimized = ["-O"] * sys.flags.optimize
         quiet = subprocess.DEVNULL
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", *optimized, "-c", _SCRIPT, str(theirs.fileno()), *path],
+                [sys.executable, "-P", *["-O"] * sys.flags.optimize, "-c", _SCRIPT, str(theirs.fileno()), *path],
                 stdin=quiet,
                 stdout=quiet,
                 stderr=quiet,
-                cwd=folder if FOLDER in self.changes else None,
-                env=self.others.environment(self.changes, folder, os.environ),
+                env=self.others.environment(self._fresh, os.environ),
                 pass_fds=[theirs.fileno()],
+                process_group=0,
             )
 
     def _end(self) -> None:
-        """End the process if it runs still."""
-        self._process.kill()
+        """End the process and its forks, if they run still."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
         self._pipe.close()
 
     def _up_to_an_end(self, asked: Asked) -> list[Outcome]:
-        """Return the outcomes of the calls up to the first that ends the process or has no end."""
-        found: list[Outcome] = []
+        """Return the outcomes of the calls up to the first that ends its process or has no end."""
         try:
-            self._pipe.recv_bytes()  # it is ready
-        except EOFError:
-            raise NotStartedError(f"a process of Python ended at its start, {_words(self._process.wait())}") from None
-        try:
-            self._pipe.send_bytes(pickle.dumps(asked))  # a tensor of `send` would share its memory
-            for _ in asked.calls:
-                if not self._pipe.poll(LONGEST):
-                    return [*found, _ended(f"does not end within {LONGEST:.0f} s")]
-                found.append(pickle.loads(self._pipe.recv_bytes()))
+            if not self._is_ready:
+                self._pipe.recv_bytes()
+                self._is_ready = True
+            self._pipe.send_bytes(pickle.dumps(asked))  # `send` would share the memory of a tensor
+            return self._received(asked)
         except (EOFError, OSError):
-            return [*found, _ended(f"ends the process, {_words(self._process.wait())}")]
-        return found
+            code = self._process.wait()
+            raise NotStartedError(f"a process of Python ended, {_words(code)}") from None
+
+    def _received(self, asked: Asked) -> list[Outcome]:
+        found: list[Outcome] = []
+        while True:
+            if not self._pipe.poll(LONGEST):
+                self._end()
+                self._start()
+                return [*found, _ended(f"does not end within {LONGEST:.0f} s")]
+            answer = pickle.loads(self._pipe.recv_bytes())
+            if isinstance(answer, int):
+                has_all = len(found) == len(asked.calls)
+                return found if has_all else [*found, _ended(f"ends the process, {_words(answer)}")]
+            found.append(answer)
 
 
 @contextmanager

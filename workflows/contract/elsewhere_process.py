@@ -1,13 +1,15 @@
-"""What runs in a process with other surroundings: it imports the modules of the calls, and sends their outcomes."""
+"""What runs in a process with other surroundings: its forks import the modules of the calls, and send the outcomes."""
 
 from __future__ import annotations
 
 import decimal
 import faulthandler
 import locale
+import multiprocessing
 import os
 import pickle
 import random
+import time
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
@@ -16,41 +18,44 @@ import torch
 
 from neusee.nodes.own_modules import import_missing
 from neusee.workflows.contract.outcomes import Outcome, failed, outcome_of
-from neusee.workflows.contract.surroundings import ERRORS, LOCALE, RANDOM, THREADS, WORK
+from neusee.workflows.contract.surroundings import Settings
 
-_LONGEST = 600  #: s of a call after which the process ends: its parent, which waits less, has died
+_LONGEST = 600  #: s of a call after which its process ends: the one that asked, which waits less, has died
 _SIDE = 64  #: of the matrices of unrelated work
+_errors: list[object] = [None]  #: what NumPy does at an error, as this process has set it last
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
     """The calls that a process makes, each pickled as a function without arguments, with the module of its code."""
 
-    changes: tuple[str, ...]  #: names of surroundings
-    threads: int
+    settings: Settings
     files: tuple[str, ...]  #: files and folders of the user to import
-    declared: dict[str, str]  #: variables of the environment that a key covers
     calls: tuple[tuple[str, bytes], ...]
 
 
 def serve(pipe: int) -> None:
-    """Answer what is asked through a pipe, given by its number, until its other end is closed."""
+    """Answer what is asked through a pipe, given by its number, until its other end is closed.
+
+    Each answer comes from a fork, which has imported no code of the user before, and ends with its exit code.
+    """
+    fork = multiprocessing.get_context("fork")
     with Connection(pipe) as connection:
         connection.send_bytes(b"ready")
         try:
             while True:
-                _answer(connection, pickle.loads(connection.recv_bytes()))
-        except (EOFError, BrokenPipeError):
+                asked: Asked = pickle.loads(connection.recv_bytes())
+                process = fork.Process(target=_answer, args=(connection, asked))
+                process.start()
+                process.join()
+                connection.send_bytes(pickle.dumps(process.exitcode))
+        except (EOFError, OSError):
             return
 
 
 def _answer(connection: Connection, asked: Asked) -> None:
     """Send the outcome of each call, in the order that was asked for."""
-    os.environ |= asked.declared
-    if LOCALE.name in asked.changes:
-        locale.setlocale(locale.LC_ALL, "")  # as a program does that shows numbers to its user
-    if THREADS.name in asked.changes:
-        torch.set_num_threads(asked.threads)
+    _settle(asked.settings)
     for module, pickled in asked.calls:
         faulthandler.dump_traceback_later(_LONGEST, exit=True)
         connection.send_bytes(pickle.dumps(_called(asked, module, pickled)))
@@ -58,28 +63,44 @@ def _answer(connection: Connection, asked: Asked) -> None:
 
 
 def _called(asked: Asked, module: str, pickled: bytes) -> Outcome:
-    _change(asked.changes)
+    _disturb(asked.settings)
     try:
         import_missing(asked.files)
         function = pickle.loads(pickled)
     except (Exception, SystemExit) as error:
         found = failed(error, module)
         return Outcome(failure=f"cannot be imported: it {found.failure}", place=found.place)
-    _change(asked.changes)  # again, as the import may have changed it back
+    _disturb(asked.settings)  # again, as the import may have changed it back
     return outcome_of(function, module)
 
 
-def _change(changes: tuple[str, ...]) -> None:
-    """Change what belongs to the process: states of generators, what NumPy does at an error, other work."""
-    if WORK.name in changes:
+def _settle(settings: Settings) -> None:
+    """Change what is set once: the folder, variables, the zone, the locale, the threads of torch."""
+    for name, value in settings.variables.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
+    time.tzset()
+    if settings.folder:
+        os.chdir(settings.folder)
+    if settings.has_locale:
+        locale.setlocale(locale.LC_ALL, "")
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+
+
+def _disturb(settings: Settings) -> None:
+    """Change what other code changes between two calls: other work, states of generators, errors of NumPy."""
+    if settings.has_other_work:
         _work()
-    if RANDOM.name in changes:
+    if settings.has_other_states:
         torch.manual_seed(4711)
         np.random.seed(4711)
         random.seed(4711)
-    if ERRORS.name in changes:
-        raising = {name: what == "raise" for name, what in np.geterr().items()}
-        np.seterr(**{name: "ignore" if is_raised else "raise" for name, is_raised in raising.items()})
+    if settings.has_other_errors and np.geterr() != _errors[0]:  # so that a second time does not change it back
+        np.seterr(**{name: "ignore" if what == "raise" else "raise" for name, what in np.geterr().items()})
+        _errors[0] = np.geterr()
 
 
 def _work() -> None:

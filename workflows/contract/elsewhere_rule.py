@@ -6,6 +6,7 @@ import pickle
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from neusee.nodes.own_modules import own_files
@@ -13,13 +14,11 @@ from neusee.workflows.contract.elsewhere_client import Elsewhere, NotStartedErro
 from neusee.workflows.contract.elsewhere_process import Asked
 from neusee.workflows.contract.finding import Finding
 from neusee.workflows.contract.outcomes import Difference, Outcome, difference, outcome_of
-from neusee.workflows.contract.surroundings import HASH, THREADS, WORK, Others, Surrounding
-from neusee.workflows.engine.processors import free_processors
+from neusee.workflows.contract.surroundings import FRESH, HASH, THREADS, WORK, Others, Surrounding
 
 RULE = "elsewhere"
 _MORE_SEEDS = 3  #: hash seeds that are tried where two gave the same order: a set of two words has only two orders
 _UNSTEADY = "two processes in the same surroundings differ, so draw from the argument rng and read no clock:"
-_MOST_PROCESSES = 4  #: at a time
 
 Changes = frozenset[Surrounding]
 Found = dict[str, Outcome]  #: by the name of the call
@@ -53,10 +52,15 @@ class Trial:
                 self.findings[each.name] = Finding(RULE, None, text)
         self._tried = {each.name: each for each in tried if each.name in self._pickled}
         self._here: Found = {}
+        self._processes = dict[Changes, Elsewhere]()  # by what only a new process can have
 
     def compare(self, first: Elsewhere) -> None:
         """Find what differs in the process ``first``, in which all is changed, and then what decides it."""
-        away = self._outcomes(first)
+        with ExitStack() as self._stack:
+            self._compare(first)
+
+    def _compare(self, first: Elsewhere) -> None:
+        away = self._outcomes(first, frozenset(self.others.changed()))
         self._leave_out_ends([name for name, outcome in away.items() if outcome.is_end])
         self._here = {name: outcome_of(each.function, each.module) for name, each in self._tried.items()}
         open_names = list[str]()
@@ -76,31 +80,23 @@ class Trial:
 
     # --- processes ----------------------------------------------------------------------------------------------------
 
-    def _outcomes(self, process: Elsewhere) -> Found:
+    def _outcomes(self, process: Elsewhere, changes: Changes) -> Found:
         """Return the outcome of each call in a process, in the other order where other work is changed."""
         names = [*self._tried]
-        if WORK in process.changes:
+        if WORK in changes:
             names.reverse()
-        asked = Asked(
-            tuple(each.name for each in process.changes),
-            self.others.threads,
-            own_files(),
-            {name: value for each in self._tried.values() for name, value in each.declared.items()},
-            tuple((self._tried[name].module, self._pickled[name]) for name in names),
-        )
-        return dict(zip(names, process.outcomes(asked), strict=True))
+        declared = {name: value for each in self._tried.values() for name, value in each.declared.items()}
+        settings = self.others.settings(changes, Path(process.folder.name), declared)
+        calls = tuple((self._tried[name].module, self._pickled[name]) for name in names)
+        return dict(zip(names, process.outcomes(Asked(settings, own_files(), calls)), strict=True))
 
-    def _each(self, *sets: Iterable[Surrounding], others: Others | None = None) -> list[Found]:
-        """Return the outcomes in a new process for each set of changes; a few processes start at a time."""
-        most = max(1, min(_MOST_PROCESSES, free_processors() or 1))
-        found = list[Found]()
-        for few in (sets[start : start + most] for start in range(0, len(sets), most)):
-            with ExitStack() as stack:
-                begun = [
-                    stack.enter_context(closing(Elsewhere(others or self.others, frozenset(each)))) for each in few
-                ]
-                found += [self._outcomes(process) for process in begun]
-        return found
+    def _each(self, *sets: Iterable[Surrounding]) -> list[Found]:
+        """Return the outcomes for each set of changes; the processes that they need start at the same time."""
+        changes = [frozenset(each) for each in sets]
+        for each in changes:
+            if each & FRESH not in self._processes:
+                self._processes[each & FRESH] = self._stack.enter_context(closing(Elsewhere(self.others, each)))
+        return [self._outcomes(self._processes[each & FRESH], each) for each in changes]
 
     # --- what decides -------------------------------------------------------------------------------------------------
 
@@ -150,9 +146,10 @@ class Trial:
         """Say what decides where no surrounding that was changed alone does."""
         if not names:
             return
-        seeds = [self.others.hash_seed + 1 + number for number in range(_MORE_SEEDS)]
-        for seed in seeds:
-            [found] = self._each([HASH], others=replace(self.others, hash_seed=seed))
+        for seed in range(_MORE_SEEDS):
+            others = replace(self.others, hash_seed=self.others.hash_seed + 1 + seed)
+            with closing(Elsewhere(others, frozenset({HASH}))) as process:
+                found = self._outcomes(process, frozenset({HASH}))
             for name in names:
                 one = self._difference(name, found[name], same[name])
                 if one and name not in self.findings:

@@ -76,6 +76,8 @@ MEMORY = Surrounding(
     "where new memory has other bits",
     "fill all that torch.empty or np.empty gives, or write zeros",
 )
+#: those of a new process of Python; the others change in a fork of one, before it imports code of the user
+FRESH = frozenset({LOCALE, HASH, THREADS, MEMORY})
 ALL = (FOLDER, LOCALE, HASH, THREADS, ZONE, RANDOM, WORK, ERRORS, HOME, VARIABLES, MEMORY)
 
 ZONE_ELSEWHERE = "NSC-13:45"  #: a zone that needs no table: UTC and 13 h 45 min
@@ -109,6 +111,19 @@ _LANGUAGES = ("tr_", "de_", "fr_", "es_", "it_", "nl_", "pt_", "pl_", "sv_", "da
 
 
 @dataclass(frozen=True, slots=True)
+class Settings:
+    """What a fork of a process changes before it makes the calls."""
+
+    folder: str  #: the working folder; empty if it stays
+    variables: dict[str, str | None]  #: of the environment; None for one that is left out
+    threads: int  #: of torch; 0 if they stay
+    has_locale: bool  #: whether the locale of the environment is set, as by a program with a window
+    has_other_states: bool
+    has_other_work: bool
+    has_other_errors: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Others:
     """What a process gets in place of the surroundings of this one."""
 
@@ -124,7 +139,7 @@ class Others:
 
     def differs(self, surrounding: Surrounding, source: str = "") -> str:
         """Return in which surrounding a result differs; ``source`` may name one of the variables that are left out."""
-        named = [name for name in self.variables if name in source]
+        named = [name for name in self.variables if f'"{name}"' in source or f"'{name}'" in source]
         return surrounding.differs.format(
             locale=self.locale,
             threads=self.in_threads(),
@@ -147,24 +162,37 @@ class Others:
         text = ", ".join(words.get(each, each.name) for each in changed)
         return text if self.locale else f"{text}; locale not changed: no other is installed"
 
-    def environment(self, changes: frozenset[Surrounding], folder: Path, environ: Mapping[str, str]) -> dict[str, str]:
-        """Return the environment of a process with ``changes``, whose home is in ``folder``."""
-        left_out = {*self.variables} if VARIABLES in changes else set[str]()
-        given = {name: value for name, value in environ.items() if name not in left_out}
-        given["PYTHONHASHSEED"] = str(self.hash_seed + 1 if HASH in changes else self.hash_seed)
+    def environment(self, changes: frozenset[Surrounding], environ: Mapping[str, str]) -> dict[str, str]:
+        """Return the environment of a new process of Python with those of ``changes`` that only a new one can have."""
+        given = {**environ, "PYTHONHASHSEED": str(self.hash_seed + 1 if HASH in changes else self.hash_seed)}
         given.setdefault("XDG_CACHE_HOME", os.path.join(os.path.expanduser("~"), ".cache"))  # of compiled programs
         if LOCALE in changes:
             given = {name: value for name, value in given.items() if name not in _LOCALE}
             given |= {"LC_ALL": self.locale, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
         if THREADS in changes:
             given |= dict.fromkeys(_THREADS, str(self.threads))
-        if ZONE in changes:
-            given["TZ"] = ZONE_ELSEWHERE
-        if HOME in changes:
-            given |= {"HOME": str(folder), "USER": "somebody", "LOGNAME": "somebody", "USERNAME": "somebody"}
         if MEMORY in changes:
             given["MALLOC_PERTURB_"] = "165"  # the library of C fills what it gives and takes
         return given
+
+    def settings(self, changes: frozenset[Surrounding], folder: Path, declared: Mapping[str, str]) -> Settings:
+        """Return what a fork changes; ``folder`` is empty, and variables that are ``declared`` stay."""
+        variables = dict[str, str | None]()
+        if VARIABLES in changes:
+            variables |= dict.fromkeys(name for name in self.variables if name not in declared)
+        if ZONE in changes:
+            variables["TZ"] = ZONE_ELSEWHERE
+        if HOME in changes:
+            variables |= {"HOME": str(folder), **dict.fromkeys(("USER", "LOGNAME", "USERNAME"), "somebody")}
+        return Settings(
+            folder=str(folder) if FOLDER in changes else "",
+            variables={name: value for name, value in variables.items() if name not in declared},
+            threads=self.threads if THREADS in changes else 0,
+            has_locale=LOCALE in changes,
+            has_other_states=RANDOM in changes,
+            has_other_work=WORK in changes,
+            has_other_errors=ERRORS in changes,
+        )
 
     def _can_change(self, each: Surrounding) -> bool:
         return bool(self.locale) if each is LOCALE else bool(self.variables) if each is VARIABLES else True
