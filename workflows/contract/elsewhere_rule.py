@@ -14,7 +14,7 @@ from neusee.workflows.contract.elsewhere_client import Elsewhere, NotStartedErro
 from neusee.workflows.contract.elsewhere_process import Asked
 from neusee.workflows.contract.finding import Finding
 from neusee.workflows.contract.outcomes import Difference, Outcome, difference, outcome_of
-from neusee.workflows.contract.surroundings import FRESH, HASH, THREADS, WORK, Others, Surrounding
+from neusee.workflows.contract.surroundings import FRESH, HASH, THREADS, VARIABLES, WORK, Others, Surrounding
 
 RULE = "elsewhere"
 _MORE_SEEDS = 3  #: hash seeds that are tried where two gave the same order: a set of two words has only two orders
@@ -31,7 +31,6 @@ class Tried:
     name: str
     module: str  #: of its code
     place: str  #: file and line of its code
-    source: str  #: of its module
     rtol: float
     function: Callable[[], Any]  #: which another process imports
     declared: Mapping[str, str]  #: variables of the environment that its key covers
@@ -80,13 +79,13 @@ class Trial:
 
     # --- processes ----------------------------------------------------------------------------------------------------
 
-    def _outcomes(self, process: Elsewhere, changes: Changes) -> Found:
+    def _outcomes(self, process: Elsewhere, changes: Changes, others: Others | None = None) -> Found:
         """Return the outcome of each call in a process, in the other order where other work is changed."""
         names = [*self._tried]
         if WORK in changes:
             names.reverse()
         declared = {name: value for each in self._tried.values() for name, value in each.declared.items()}
-        settings = self.others.settings(changes, Path(process.folder.name), declared)
+        settings = (others or self.others).settings(changes, Path(process.folder.name), declared)
         calls = tuple((self._tried[name].module, self._pickled[name]) for name in names)
         return dict(zip(names, process.outcomes(Asked(settings, own_files(), calls)), strict=True))
 
@@ -139,8 +138,24 @@ class Trial:
             for surrounding, outcomes in zip(changed, singles, strict=True):
                 found = self._difference(name, outcomes[name], same[name])
                 if found and not (surrounding is THREADS and found.is_rounding):
-                    self._fail_in(name, surrounding, found)
+                    variables = self._deciding(name, same) if surrounding is VARIABLES else []
+                    self._fail_in(name, surrounding, found, variables)
         self._settle_hidden([name for name in names if name not in self.findings], same, unsteady)
+
+    def _deciding(self, name: str, same: Found) -> list[str]:
+        """Return the variables of the environment without any of which a result differs, by halving."""
+        process = self._processes[frozenset()]
+        todo, deciding = [self.others.variables], list[str]()
+        while todo:
+            few = todo.pop()
+            found = self._outcomes(process, frozenset({VARIABLES}), replace(self.others, variables=few))
+            if not few or not self._difference(name, found[name], same[name]):
+                continue
+            if len(few) == 1:
+                deciding += few
+            else:
+                todo += [few[: len(few) // 2], few[len(few) // 2 :]]
+        return sorted(deciding)
 
     def _settle_hidden(self, names: list[str], same: Found, unsteady: Mapping[str, Difference]) -> None:
         """Say what decides where no surrounding that was changed alone does."""
@@ -175,9 +190,10 @@ class Trial:
             text += f"; equal to rounding with {self.others.in_threads()} ({rounding:.1g} of the largest value)"
         self.findings[name] = Finding(RULE, True, f"{text}; the clock was not changed")
 
-    def _fail_in(self, name: str, surrounding: Surrounding, found: Difference) -> None:
-        differs = self.others.differs(surrounding, self._tried[name].source)
-        self._fail(name, f"{differs} {found.text}: {surrounding.fix}", found.place)
+    def _fail_in(self, name: str, surrounding: Surrounding, found: Difference, variables: Sequence[str] = ()) -> None:
+        differs = self.others.differs(surrounding, variables)
+        fix = surrounding.fix.replace("NAME", variables[0]) if variables else surrounding.fix
+        self._fail(name, f"{differs} {found.text}: {fix}", found.place)
 
     def _fail(self, name: str, text: str, place: str = "") -> None:
         """Add a sentence on a call; several surroundings make several sentences."""

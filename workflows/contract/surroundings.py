@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import subprocess
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,7 +68,7 @@ HOME = Surrounding(
 )
 VARIABLES = Surrounding(
     "environment variables",
-    "without the variables of the environment{named}",
+    "without the {names} of the environment",
     'make the value a parameter, or write depends=["env:NAME"]',
 )
 MEMORY = Surrounding(
@@ -137,14 +137,13 @@ class Others:
         """Return the surroundings that can be changed here."""
         return tuple(each for each in ALL if self._can_change(each))
 
-    def differs(self, surrounding: Surrounding, source: str = "") -> str:
-        """Return in which surrounding a result differs; ``source`` may name one of the variables that are left out."""
-        named = [name for name in self.variables if f'"{name}"' in source or f"'{name}'" in source]
+    def differs(self, surrounding: Surrounding, variables: Sequence[str] = ()) -> str:
+        """Return in which surrounding a result differs; ``variables`` of the environment decide it."""
         return surrounding.differs.format(
             locale=self.locale,
             threads=self.in_threads(),
             threads_here=self.threads_here,
-            named=f", of which the module names {', '.join(named)}" if named else "",
+            names=f"variable{'s' * (len(variables) > 1)} {', '.join(variables)}" if variables else "variables",
         )
 
     def in_threads(self) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import os
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -41,7 +40,7 @@ def _tried(name: str, code: Any, rtol: float, function: Callable[[], Any], depen
     variables = [*depends, *_declarations(module)]
     names = {entry.removeprefix(_VARIABLE) for entry in variables if entry.startswith(_VARIABLE)}
     declared = {each: os.environ[each] for each in sorted(names) if each in os.environ}
-    return Tried(name, module, _place(code), _source(module), rtol, function, declared)
+    return Tried(name, module, _place(code), rtol, function, declared)
 
 
 def _declarations(module: str) -> Iterator[str]:
@@ -75,10 +74,3 @@ def _place(code: Any) -> str:
         return f"{Path(inspect.getfile(inspect.unwrap(code))).name}:{lines}"
     except (OSError, TypeError):
         return str(code.__module__)
-
-
-def _source(module: str) -> str:
-    try:
-        return inspect.getsource(sys.modules[module])
-    except (OSError, TypeError):
-        return ""

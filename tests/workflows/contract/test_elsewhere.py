@@ -1,17 +1,23 @@
 """A node whose result depends on what is around the call is told on what, where, and what to write."""
 
+import os
 import re
+import shutil
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from neusee.workflows.contract import surroundings
+from neusee.workflows.contract import elsewhere_client, surroundings
 from neusee.workflows.contract.elsewhere_client import elsewhere
 from neusee.workflows.contract.whole_contract import check_all
 from neusee.workflows.recipe.node_families import import_own, own_nodes
 
+INSTALLED = surroundings.installed_locales
 HEAD = '''"""Nodes of a test."""
 import datetime
+import locale
 import os
 import random
 import time
@@ -54,7 +60,8 @@ KINDS = {
     "imported": ("x * HOME_AT_IMPORT", "with another HOME the result differs by "),
     "variable": (
         'x * float(os.environ.get("GAIN_OF_A_TEST", "1"))',
-        "without the variables of the environment, of which the module names GAIN_OF_A_TEST the result differs by ",
+        "without the variable GAIN_OF_A_TEST of the environment the result differs by 0.6 of its largest value: make the "
+        'value a parameter, or write depends=["env:GAIN_OF_A_TEST"]',
     ),
     "unset": ("x + torch.empty(10_000_000)[:3]", "where new memory has other bits the result "),
     "clock": (
@@ -155,7 +162,9 @@ def test_rounding_by_threads_is_no_fault_and_its_size_is_said(kinds):
     found = said(kinds["many_threads"])
     assert found.ok is True
     assert found.text.startswith("the same bits in 10 changed surroundings: folder, locale (C), hash seed, time zone, ")
-    assert re.search(r"; equal to rounding with 3 threads \(\d(\.\d)?e-07 of the largest value\); the clock", found.text)
+    assert re.search(
+        r"; equal to rounding with 3 threads \(\d(\.\d)?e-07 of the largest value\); the clock", found.text
+    )
 
 
 ENDS = """
@@ -181,7 +190,7 @@ def _():
 
 @node()
 def crashes_elsewhere(x: Tensor) -> Tensor:
-    if os.getcwd() != HERE:
+    if os.environ.get("TZ") == "NSC-13:45":
         os.abort()
     return x
 
@@ -196,10 +205,83 @@ def _():
 
 @pytest.mark.slow
 def test_a_call_that_ends_its_process_ends_no_check(checked):
-    found = checked("ends_of_elsewhere", ENDS.replace("os.getcwd() != HERE", 'os.environ["TZ"] == "NSC-13:45"'))
+    found = checked("ends_of_elsewhere", ENDS)
     assert said(found["ends"]).text.endswith(
         ": the call ends the process, with exit code 0; the rules on values were not tried"
     )
     assert said(found["crashes"]).text.endswith(
         ": the call ends the process, with SIGABRT; the rules on values were not tried"
     )
+    assert ": in another time zone (TZ) it ends the process, with SIGABRT: " in said(found["crashes_elsewhere"]).text
+    assert {one.rule for one in found["ends"]} == {"docstring", "signature", "hooks", "key", "elsewhere"}
+    assert "finite" in {one.rule for one in found["crashes_elsewhere"]}
+
+
+@pytest.mark.slow
+def test_a_call_without_an_end_is_given_up(checked, monkeypatch):
+    monkeypatch.setattr(elsewhere_client, "LONGEST", 3)
+    text = source_of("hangs", "time.sleep(1e6)") + source_of("plain", "x * 2")
+    found = checked("hangs_elsewhere", text)
+    assert said(found["hangs"]).text.endswith(": the call does not end within 3 s; the rules on values were not tried")
+
+
+@pytest.mark.slow
+def test_a_locale_with_a_decimal_comma_is_taken_where_there_is_one(place, checked, monkeypatch):
+    if shutil.which("localedef") is None or not Path("/usr/share/i18n/locales/de_DE").exists():
+        pytest.skip("no locale can be made here")
+    made = place / "locales" / "de_DE.utf8"
+    made.parent.mkdir()
+    subprocess.run(["localedef", "-i", "de_DE", "-f", "UTF-8", str(made)], check=False, capture_output=True)
+    monkeypatch.setenv("LOCPATH", str(made.parent))
+    monkeypatch.setattr(surroundings, "installed_locales", INSTALLED)
+    assert "de_DE.utf8" in INSTALLED(os.environ)
+    found = said(checked("comma_of_elsewhere", source_of("comma", "x * ord(locale.str(1.5)[1])"))["comma"])
+    assert found.ok is False
+    assert ": in the locale de_DE.utf8 the result differs by " in found.text
+
+
+@pytest.mark.parametrize(
+    ("now", "names", "other"),
+    [
+        ("en_GB.UTF-8", ["C", "C.utf8", "POSIX", "en_GB.utf8", "fr_FR.utf8", "tr_TR.utf8"], "tr_TR.utf8"),
+        ("tr_TR.UTF-8", ["C", "de_DE", "de_DE.utf8", "tr_TR.utf8"], "de_DE"),
+        ("de_DE.UTF-8", ["C", "POSIX", "de_DE.utf8", "en_GB.utf8"], "en_GB.utf8"),
+        ("C.UTF-8", ["C", "C.utf8", "POSIX"], "C"),
+        ("C", ["C", "C.utf8", "POSIX"], "C"),  # Python takes UTF-8 there
+        ("C.UTF-8", [], ""),
+    ],
+)
+def test_the_other_locale_is_one_of_those_that_are_installed(now, names, other):
+    assert surroundings.other_locale(now, names, {}) == other
+    ascii_already = {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    assert surroundings.other_locale("C", ["C", "C.utf8", "POSIX"], ascii_already) == ""
+
+
+def test_a_locale_that_cannot_be_changed_is_said(monkeypatch):
+    monkeypatch.setattr(surroundings, "installed_locales", lambda environ: [])
+    others = surroundings.others({"PATH": "/bin", "OMP_NUM_THREADS": "4"})
+    assert others.said() == (
+        "folder, hash seed, 1 thread, time zone, random states, order of work, np.seterr, HOME, unset memory; "
+        "locale not changed: no other is installed"
+    )
+
+
+def test_variables_that_find_libraries_stay_and_others_go():
+    environ = {
+        "PATH": "/bin",
+        "LD_LIBRARY_PATH": "/lib",
+        "NEUSEE_CACHE": "c",
+        "GAIN": "2",
+        "DECLARED": "3",
+        "HOME": "/h",
+    }
+    others = surroundings.others(environ)
+    assert others.variables == ("DECLARED", "GAIN")
+    settings = others.settings(frozenset(surroundings.ALL), Path("/empty"), {"DECLARED": "3"})
+    assert {name: settings.variables[name] for name in ("GAIN", "HOME", "TZ")} == {
+        "GAIN": None,
+        "HOME": "/empty",
+        "TZ": "NSC-13:45",
+    }
+    assert "DECLARED" not in settings.variables
+    assert "PATH" not in settings.variables
