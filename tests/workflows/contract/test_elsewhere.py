@@ -60,8 +60,8 @@ KINDS = {
     "imported": ("x * HOME_AT_IMPORT", "with another HOME the result differs by "),
     "variable": (
         'x * float(os.environ.get("GAIN_OF_A_TEST", "1"))',
-        "without the variable GAIN_OF_A_TEST of the environment the result differs by 0.6 of its largest value: make the "
-        'value a parameter, or write depends=["env:GAIN_OF_A_TEST"]',
+        "without the variable GAIN_OF_A_TEST of the environment the result differs by 0.6 of its largest value: make "
+        'the value a parameter, or write depends=["env:GAIN_OF_A_TEST"]',
     ),
     "unset": ("x + torch.empty(10_000_000)[:3]", "where new memory has other bits the result "),
     "clock": (
