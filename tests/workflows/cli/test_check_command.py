@@ -45,8 +45,8 @@ def test_a_result_that_depends_on_the_time_zone_ends_a_check_with_three(here):
     assert found.exit_code == 3
     [line] = [line for line in found.output.splitlines() if "elsewhere" in line]
     assert line == (
-        "  FAIL  elsewhere    zoned_check.py:10: in another time zone (TZ) the result differs by 13 of its largest value: "
-        "compute in UTC: calendar.timegm and time.gmtime, or datetime with tzinfo=timezone.utc"
+        "  FAIL  elsewhere    zoned_check.py:10: in another time zone (TZ) the result differs by 13 of its largest "
+        "value: compute in UTC: calendar.timegm and time.gmtime, or datetime with tzinfo=timezone.utc"
     )
 
 
