@@ -91,20 +91,25 @@ def _parts(name: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield name, torch.from_numpy(np.ascontiguousarray(value).copy())
     elif isinstance(value, _PLAIN):
         yield name, value
-    elif isinstance(value, dict):
-        for key, item in value.items():
-            yield from _parts(f"{name}[{key!r}]", item)
-    elif isinstance(value, tuple | list):
-        fields = getattr(value, "_fields", None)
-        for number, item in enumerate(value):
-            yield from _parts(f"{name}.{fields[number]}" if fields else f"{name}[{number}]", item)
     elif isinstance(value, set | frozenset):
         yield name, str(sorted(map(repr, value)))
-    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        for field in dataclasses.fields(value):
-            yield from _parts(f"{name}.{field.name}", getattr(value, field.name))
+    elif (items := _items(value)) is not None:
+        for place, item in items:
+            yield from _parts(name + place, item)
     else:
         yield name, f"{type(value).__module__}.{type(value).__qualname__}"
+
+
+def _items(value: Any) -> list[tuple[str, Any]] | None:
+    """Return what a value holds, each with its place in it; None for a value that holds nothing that is known."""
+    if isinstance(value, dict):
+        return [(f"[{key!r}]", item) for key, item in value.items()]
+    if isinstance(value, tuple | list):
+        fields = getattr(value, "_fields", None)
+        return [(f".{fields[number]}" if fields else f"[{number}]", item) for number, item in enumerate(value)]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return [(f".{field.name}", getattr(value, field.name)) for field in dataclasses.fields(value)]
+    return None
 
 
 def _place(error: BaseException, module: str) -> str:
