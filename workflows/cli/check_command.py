@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -32,16 +33,16 @@ def check(
     """Check whether nodes keep what the nodes of neusee keep.
 
     Docstring, annotations, hooks, what a cache key covers; on the example of each node: the reference, gradients
-    against finite differences, bands, bounds and shapes. A network class of yours is called on small pictures. The exit
-    code is 3 if a rule fails. Runs the code.
+    against finite differences, bands, bounds and shapes, and the same call in a process with other surroundings. A
+    network class of yours is called on small pictures. The exit code is 3 if a rule fails. Runs the code.
     """
-    from neusee.workflows.contract.network_contract import check_network
-    from neusee.workflows.contract.node_contract import check_node
+    from neusee.workflows.contract.elsewhere_client import elsewhere
 
-    with failing(LookupError):
+    with failing(LookupError), elsewhere(early=not _is_of_neusee(place)) as process:
         nodes, networks = _found(place)
-        found = {name: check_node(node) for name, node in nodes.items()}
-        found |= {name: check_network(name, network) for name, network in networks.items()}
+        from neusee.workflows.contract.whole_contract import check_all
+
+        found = check_all(nodes, networks, process)
     if as_json:
         say([json.dumps({name: [asdict(f) for f in findings] for name, findings in found.items()}, indent=1)])
     for name, findings in found.items() if not as_json else ():
@@ -51,6 +52,11 @@ def check(
         end = f"{failed} rule{'s fail' if failed > 1 else ' fails'}" if failed else "every rule holds"
         say([f"{_count(len(nodes), len(networks))}: {end}"])
     raise typer.Exit(MISSED if failed else DONE)
+
+
+def _is_of_neusee(place: str) -> bool:
+    """Return True for a node or a family of neusee, without an import of them."""
+    return (files("neusee") / "nodes" / place.partition(".")[0]).is_dir() and not place.endswith(".py")
 
 
 def _installed(family: str) -> ModuleType | None:

@@ -59,11 +59,13 @@ def check_node(node: Node, example: Mapping[str, Any] | None = None) -> list[Fin
     ``example`` has the inputs and parameters of one call by name, parameters as a recipe writes them or in SI; by
     default it is what the node's hook ``example`` returns.
     """
-    found = [*check_docstring(node), *check_signature(node), *check_hooks(node), *_check_key(node)]
-    call = _call(node, example)
-    if isinstance(call, Finding):
-        return [*found, call]
-    return [*found, *check_values(call)]
+    call = example_call(node, example)
+    return [*check_words(node), *([call] if isinstance(call, Finding) else check_values(call))]
+
+
+def check_words(node: Node) -> list[Finding]:
+    """Return what each rule found on what a node says of itself, and on its key."""
+    return [*check_docstring(node), *check_signature(node), *check_hooks(node), *_check_key(node)]
 
 
 def check_values(call: Call) -> list[Finding]:
@@ -82,8 +84,8 @@ def _check_key(node: Node) -> Iterator[Finding]:
             yield Finding("key", True, "follows the code and all that it names")
 
 
-def _call(node: Node, example: Mapping[str, Any] | None) -> Call | Finding:
-    """Return the call of the example, or the finding that there is none."""
+def example_call(node: Node, example: Mapping[str, Any] | None = None) -> Call | Finding:
+    """Return the call of the example, or the finding that there is none or that it is wrong."""
     if example is None and node.hooks.example is None:
         name = node.fn.__name__
         return Finding("example", False, f"none: attach a function with @{name}.example that returns its arguments")

@@ -75,7 +75,7 @@ def check_reference(call: Call) -> Iterator[Finding]:
         shapes = [_shapes(tensors) or "no tensor" for tensors in (found, slow)]
         yield Finding("reference", False, f"the result is {shapes[0]}, the reference {shapes[1]}")
         return
-    error = max(map(_off, found, slow), default=0.0)
+    error = max(map(off_by, found, slow), default=0.0)
     ok = error <= node.rtol
     yield Finding("reference", ok, f"off by {error:.2g} of the largest value; rtol = {node.rtol:.2g}")
 
@@ -216,7 +216,7 @@ def _first_band(value: Any, axis: int) -> Any:
     return value._replace(**cut) if cut else value
 
 
-def _off(found: Tensor, wanted: Tensor) -> float:
+def off_by(found: Tensor, wanted: Tensor) -> float:
     """Return the largest difference of two tensors relative to the largest wanted value."""
     if found.numel() == 0:
         return 0.0

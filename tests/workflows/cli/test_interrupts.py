@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -181,3 +183,49 @@ def test_a_program_that_ignores_the_signal_goes_on(here):
     (here / "pressing.py").write_text(NODES.replace("time.sleep(30)", "pass"))
     done = command(here, "-c", ignoring, "run", "pressing.yaml", "--quiet")
     assert done.returncode == 0, done.stderr
+
+
+HANGING = '''"""Nodes of a test."""
+import os
+import time
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import node
+
+
+@node()
+def hangs(x: Tensor) -> Tensor:
+    """Hang, and say in which process."""
+    Path(__file__).with_suffix(".new").write_text(str(os.getpid()))
+    Path(__file__).with_suffix(".new").replace(Path(__file__).with_suffix(".pid"))
+    time.sleep(1e6)
+    return x
+
+
+@hangs.example
+def _():
+    return {"x": torch.ones(3)}
+'''
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_a_check_whose_node_hangs_and_its_processes(tmp_path):
+    (tmp_path / "hanging.py").write_text(HANGING)
+    words = [sys.executable, "-c", LISTENING, "check", "hanging.py"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, cwd=tmp_path, stdout=pipe, stderr=pipe, text=True, start_new_session=True) as checking:
+        called = tmp_path / "hanging.pid"
+        until = time.monotonic() + LONGEST
+        while not called.exists() and checking.poll() is None and time.monotonic() < until:
+            time.sleep(0.05)
+        elsewhere = int(called.read_text())
+        assert elsewhere != checking.pid  # a node that would end or stop the check is called in another process first
+        os.killpg(checking.pid, signal.SIGINT)
+        out, err = checking.communicate(timeout=LONGEST)
+    stopped(subprocess.CompletedProcess(words, checking.returncode, out, err))
+    while Path(f"/proc/{elsewhere}").exists() and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{elsewhere}").exists()

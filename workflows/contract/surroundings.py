@@ -1,0 +1,253 @@
+"""The surroundings of a call that a result must not depend on, and how a new process gets others.
+
+Nothing here imports torch: a process with other surroundings starts before it does.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class Surrounding:
+    """One thing around a call that can be changed."""
+
+    name: str
+    differs: str  #: where the result differs, such as "in another time zone"
+    fix: str  #: what its author writes
+
+
+FOLDER = Surrounding(
+    "folder",
+    "in another working folder",
+    'take the file as a parameter of type DataFile, or write depends=["table.csv"] for a file beside the module',
+)
+LOCALE = Surrounding(
+    "locale",
+    "in the locale {locale}",
+    'write encoding="utf-8" where a text is opened, and format and sort without the module locale',
+)
+HASH = Surrounding(
+    "hash seed",
+    "with another hash seed (PYTHONHASHSEED)",
+    "write sorted(...) around a set whose order counts, and hashlib in place of hash()",
+)
+THREADS = Surrounding(
+    "threads",
+    "with {threads} in place of {threads_here}",
+    "compute the same for any number of threads, and sum in float64",
+)
+ZONE = Surrounding(
+    "time zone",
+    "in another time zone (TZ)",
+    "compute in UTC: calendar.timegm and time.gmtime, or datetime with tzinfo=timezone.utc",
+)
+RANDOM = Surrounding(
+    "random states",
+    "with other states of the generators of torch, numpy and random",
+    "draw from the argument rng, or from a generator that the node makes with a seed",
+)
+WORK = Surrounding(
+    "order of work",
+    "after other work in the process",
+    "keep nothing in the module from one call to the next, and set in the node what a library remembers",
+)
+ERRORS = Surrounding(
+    "np.seterr",
+    "after another np.seterr",
+    'compute within `with np.errstate(all="ignore"):`, or "raise", whichever the node means',
+)
+HOME = Surrounding(
+    "HOME",
+    "with another HOME",
+    'take the file as a parameter of type DataFile, or write depends=["env:HOME"]',
+)
+VARIABLES = Surrounding(
+    "environment variables",
+    "without the {names} of the environment",
+    'make the value a parameter, or write depends=["env:NAME"]',
+)
+MEMORY = Surrounding(
+    "unset memory",
+    "where new memory has other bits",
+    "fill all that torch.empty or np.empty gives, or write zeros",
+)
+#: those of a new process of Python; the others change in a fork of one, before it imports code of the user
+FRESH = frozenset({LOCALE, HASH, THREADS, MEMORY})
+ALL = (FOLDER, LOCALE, HASH, THREADS, ZONE, RANDOM, WORK, ERRORS, HOME, VARIABLES, MEMORY)
+
+ZONE_ELSEWHERE = "NSC-13:45"  #: a zone that needs no table: UTC and 13 h 45 min
+_THREADS = (
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+)
+_LOCALE = (
+    "LC_ALL",
+    "LANG",
+    "LANGUAGE",
+    "LC_CTYPE",
+    "LC_NUMERIC",
+    "LC_TIME",
+    "LC_COLLATE",
+    "LC_MESSAGES",
+    "LC_MONETARY",
+)
+_WHO = ("HOME", "USER", "LOGNAME", "USERNAME")
+_FEW = ("PATH", "VIRTUAL_ENV", "TMPDIR", "TZ", "TZDIR", "LOCPATH", *_THREADS, *_LOCALE, *_WHO)
+#: beginnings of the names of variables that find libraries and devices, and those that neusee reads
+_KEPT = (
+    *("LD_", "DYLD_", "PYTHON", "CONDA", "XDG_", "NEUSEE_", "GLIBC_", "MALLOC_", "CUDA", "NVIDIA", "HIP", "ROCM"),
+    *("OMP_", "GOMP_", "KMP_", "MKL_", "OPENBLAS_", "TORCH", "PYTORCH"),
+)
+#: languages that write 1,5; Turkish first, whose i is another letter
+_LANGUAGES = ("tr_", "de_", "fr_", "es_", "it_", "nl_", "pt_", "pl_", "sv_", "da_", "fi_", "nb_", "cs_", "ru_", "uk_")
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What a fork of a process changes before it makes the calls."""
+
+    folder: str  #: the working folder; empty if it stays
+    variables: dict[str, str | None]  #: of the environment; None for one that is left out
+    threads: int  #: of torch; 0 if they stay
+    has_locale: bool  #: whether the locale of the environment is set, as by a program with a window
+    has_other_states: bool
+    has_other_work: bool
+    has_other_errors: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Others:
+    """What a process gets in place of the surroundings of this one."""
+
+    hash_seed: int
+    threads: int
+    threads_here: int
+    locale: str  #: empty if no other is installed
+    variables: tuple[str, ...]  #: that are left out
+
+    def changed(self) -> tuple[Surrounding, ...]:
+        """Return the surroundings that can be changed here."""
+        return tuple(each for each in ALL if self._can_change(each))
+
+    def differs(self, surrounding: Surrounding, variables: Sequence[str] = ()) -> str:
+        """Return in which surrounding a result differs; ``variables`` of the environment decide it."""
+        return surrounding.differs.format(
+            locale=self.locale,
+            threads=self.in_threads(),
+            threads_here=self.threads_here,
+            names=f"variable{'s' * (len(variables) > 1)} {', '.join(variables)}" if variables else "variables",
+        )
+
+    def in_threads(self) -> str:
+        """Return the number of threads in words."""
+        return f"{self.threads} thread{'s' * (self.threads > 1)}"
+
+    def said(self, without_threads: bool = False) -> str:
+        """Return all that is changed, and what is not, as one text."""
+        words = {
+            LOCALE: f"locale ({self.locale})",
+            THREADS: self.in_threads(),
+            VARIABLES: f"{len(self.variables)} environment variable{'s' * (len(self.variables) != 1)} left out",
+        }
+        changed = [each for each in self.changed() if not (without_threads and each is THREADS)]
+        text = ", ".join(words.get(each, each.name) for each in changed)
+        return text if self.locale else f"{text}; locale not changed: no other is installed"
+
+    def environment(self, changes: frozenset[Surrounding], environ: Mapping[str, str]) -> dict[str, str]:
+        """Return the environment of a new process of Python with those of ``changes`` that only a new one can have."""
+        given = {**environ, "PYTHONHASHSEED": str(self.hash_seed + 1 if HASH in changes else self.hash_seed)}
+        given.setdefault("XDG_CACHE_HOME", os.path.join(os.path.expanduser("~"), ".cache"))  # of compiled programs
+        if LOCALE in changes:
+            given = {name: value for name, value in given.items() if name not in _LOCALE}
+            given |= {"LC_ALL": self.locale, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+        if THREADS in changes:
+            given |= dict.fromkeys(_THREADS, str(self.threads))
+        if MEMORY in changes:
+            given["MALLOC_PERTURB_"] = "165"  # the library of C fills what it gives and takes
+        return given
+
+    def settings(self, changes: frozenset[Surrounding], folder: Path, declared: Mapping[str, str]) -> Settings:
+        """Return what a fork changes; ``folder`` is empty, and variables that are ``declared`` stay."""
+        variables = dict[str, str | None]()
+        if VARIABLES in changes:
+            variables |= dict.fromkeys(name for name in self.variables if name not in declared)
+        if ZONE in changes:
+            variables["TZ"] = ZONE_ELSEWHERE
+        if HOME in changes:
+            variables |= {"HOME": str(folder), **dict.fromkeys(("USER", "LOGNAME", "USERNAME"), "somebody")}
+        return Settings(
+            folder=str(folder) if FOLDER in changes else "",
+            variables={name: value for name, value in variables.items() if name not in declared},
+            threads=self.threads if THREADS in changes else 0,
+            has_locale=LOCALE in changes,
+            has_other_states=RANDOM in changes,
+            has_other_work=WORK in changes,
+            has_other_errors=ERRORS in changes,
+        )
+
+    def _can_change(self, each: Surrounding) -> bool:
+        return bool(self.locale) if each is LOCALE else bool(self.variables) if each is VARIABLES else True
+
+
+def others(environ: Mapping[str, str]) -> Others:
+    """Return other surroundings than those of a process with the environment ``environ``."""
+    seed = environ.get("PYTHONHASHSEED", "")
+    threads = environ.get("OMP_NUM_THREADS", "")
+    here = int(threads) if threads.isdecimal() else _processors()
+    now = next((environ[name] for name in ("LC_ALL", "LC_CTYPE", "LANG") if environ.get(name)), "C")
+    return Others(
+        hash_seed=int(seed) if seed.isdecimal() else 0,
+        threads=3 if here == 1 else 1,
+        threads_here=here,
+        locale=other_locale(now, installed_locales(environ), environ),
+        variables=tuple(sorted(name for name in environ if name not in _FEW and not name.startswith(_KEPT))),
+    )
+
+
+def installed_locales(environ: Mapping[str, str]) -> list[str]:
+    """Return the names of the locales of this machine; none where it cannot say them."""
+    try:
+        done = subprocess.run(["locale", "-a"], capture_output=True, text=True, check=False, errors="replace")
+        names = done.stdout.split()
+    except OSError:
+        names = []
+    own = [Path(folder) for folder in environ.get("LOCPATH", "").split(":") if folder]
+    return names + [path.name for folder in own if folder.is_dir() for path in sorted(folder.iterdir())]
+
+
+def other_locale(now: str, names: Iterable[str], environ: Mapping[str, str]) -> str:
+    """Return a locale that is not ``now``: one with a decimal comma and other letters than UTF-8 if there is one.
+
+    The locale C, in which a text is ASCII, is the last choice. No text if there is no other.
+    """
+
+    def rank(name: str) -> tuple[int, bool, str]:
+        language = next((number for number, each in enumerate(_LANGUAGES) if name.startswith(each)), len(_LANGUAGES))
+        return language, _is_utf8(name), name
+
+    plain = ("C", "POSIX")
+    found = sorted((n for n in names if n.split(".")[0] not in plain and _same(n) != _same(now)), key=rank)
+    if found:
+        return found[0]
+    is_ascii = now in plain and environ.get("PYTHONUTF8") == "0" and environ.get("PYTHONCOERCECLOCALE") == "0"
+    return "C" if "C" in names and not is_ascii else ""
+
+
+def _processors() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _same(name: str) -> str:
+    return name.lower().replace("-", "")
+
+
+def _is_utf8(name: str) -> bool:
+    return "utf8" in _same(name)
