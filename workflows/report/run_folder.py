@@ -71,6 +71,8 @@ def writable_folder(out: str | os.PathLike[str]) -> Path:
     root = existing = Path(out)
     try:
         existing = next(path for path in (root, *root.absolute().parents) if path.exists() or path.is_symlink())
+        if root.is_symlink() and os.environ.get("NEUSEE_NO_CODE"):  # a stranger's folder may have put it there
+            raise ValueError(f"{root} is a link, which --no-code does not follow: {_OTHER_FOLDER}")
         if existing.is_dir():
             os.rmdir(tempfile.mkdtemp(prefix=".neusee.", dir=existing))
             return root
