@@ -14,6 +14,7 @@ from neusee.nodes import Node, ParameterError
 from neusee.nodes.file_parameters import is_file, texts_of
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.graph.recipe_graph import Step, Wire
+from neusee.workflows.keys.input_file_digest import files_in
 from neusee.workflows.recipe.node_families import Own, class_context
 from neusee.workflows.recipe.text.field_errors import message_of
 from neusee.workflows.recipe.text.named_files import refuse_outside
@@ -80,8 +81,11 @@ class Checker:
                 self.diagnostics.append(Diagnostic(step.key, f"{step.name}.with.{error.parameter}", str(error)))
             else:
                 self.diagnostics.append(Diagnostic(value.mark, _said(value), str(error)))
-        except (ValueError, OSError) as error:
+        except ValueError as error:
             self.diagnostics.append(Diagnostic(step.key, step.name, str(error)))
+        except OSError as error:  # a read that fails does not say of which file
+            names = ", ".join(path.name for path in files_in(bound.params))
+            self.diagnostics.append(Diagnostic(step.key, step.name, f"{names} cannot be read ({error})"))
         return None
 
     def _plain(self, node: Node, name: str, value: Value) -> Any:

@@ -118,10 +118,24 @@ def _sweep(root: Path) -> None:
     """Remove the unfinished folders of killed runs, in which no file has changed for an hour."""
     for part in root.glob(".*.part"):
         try:
+            if _is_being_written(part):
+                continue
             if time.time() - max(p.stat().st_mtime for p in (part, *part.rglob("*"))) > _ABANDONED:
                 shutil.rmtree(part, ignore_errors=True)
         except OSError:  # another process has already removed the folder
             continue
+
+
+def _is_being_written(part: Path) -> bool:
+    """Return True if the process that made an unfinished folder runs on this machine, whatever the clock says."""
+    number = part.suffixes[-2].removeprefix(".") if len(part.suffixes) > 1 else ""
+    try:
+        os.kill(int(number), 0)
+    except (ValueError, OverflowError, ProcessLookupError):
+        return False
+    except OSError:  # of another user
+        return True
+    return True
 
 
 def _rename(part: Path, target: Path) -> Path:
