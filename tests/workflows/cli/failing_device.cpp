@@ -1,6 +1,6 @@
 // A device that fails in the middle of a command, put before the C library by LD_PRELOAD.
 //
-// DEVICE_FOLDER: files below it are on the device. DEVICE_CALLS: calls that fail, as "read,write". DEVICE_AFTER: how
+// DEVICE_FOLDER: files below it are on the device, with DEVICE_NAME only those with it in their path. DEVICE_CALLS: calls that fail, as "read,write". DEVICE_AFTER: how
 // many of them succeed first. DEVICE_ERROR: the number of the error. "mmap" among the calls gives a map without bytes,
 // as of a device whose pages cannot be read: a look into it ends the process by SIGBUS.
 // DEVICE_CLOCK: s by which the clock is set back once that many calls were made on the device.
@@ -21,7 +21,8 @@ static std::atomic<long> calls{0};
 
 static bool on_device(const char *path) {
     const char *folder = getenv("DEVICE_FOLDER");
-    return folder && path && !strncmp(path, folder, strlen(folder));
+    const char *name = getenv("DEVICE_NAME");
+    return folder && path && !strncmp(path, folder, strlen(folder)) && (!name || strstr(path, name));
 }
 
 static bool on_device(int file) {

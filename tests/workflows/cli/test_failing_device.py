@@ -82,8 +82,8 @@ def run(library, first, tmp_path):
     """Run the recipe with a cache that has its results and a device that fails; the process that has ended."""
     shutil.copytree(first[0], tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("runs"))
 
-    def run(folder=None, calls="", after=0, error=errno.EIO):
-        device = {"FOLDER": folder, "CALLS": calls, "AFTER": after, "ERROR": error}
+    def run(folder=None, calls="", after=0, error=errno.EIO, name=""):
+        device = {"FOLDER": folder, "CALLS": calls, "AFTER": after, "ERROR": error, "NAME": name}
         variables = {f"DEVICE_{name}": str(value) for name, value in device.items()} if folder else {}
         variables |= {"LD_PRELOAD": str(library)} if folder else {}
         return neusee(tmp_path, "run", "mine.yaml", "--json", "--out", str(tmp_path / "runs"), **variables)
@@ -109,13 +109,13 @@ def test_a_cache_whose_device_fails_in_the_middle_costs_one_warning(name, run, f
     assert again.stderr == ""
 
 
-@pytest.mark.parametrize("after", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_map_of_a_device_that_fails_is_not_looked_into(run, first, tmp_path, after):
+def test_a_map_of_a_device_that_fails_is_not_looked_into(run, first, tmp_path):
     """A look into a map without pages ends the process by SIGBUS: the read before it fails as an error instead."""
-    results = next(path for path in (tmp_path / "cache").glob("[0-9a-f][0-9a-f]/*.safetensors"))
-    done = run(results.parent, "read,mmap", after)
+    shutil.rmtree(tmp_path / "cache" / "files")  # so that the results are loaded, to be written again
+    done = run(tmp_path / "cache", "read,mmap", name=".safetensors")
     assert outputs(done) == first[1]
-    assert done.stderr.count("\n") <= 1
+    assert done.stderr.startswith("warning: the cache ")
+    assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(("calls", "after"), [("read", 0), pytest.param("read", 3, marks=pytest.mark.slow)])
