@@ -10,8 +10,23 @@ import time
 from collections.abc import Sequence
 from types import ModuleType
 
-_began: dict[str, int] = {}
-_FIRST = time.time_ns()
+_SLACK = 1_000_000_000  #: ns by which a clock that is corrected slowly may differ from the steady one
+
+
+class Moment:
+    """The moment at which it was made, as a time that what happens later has not, even if the clock is set back."""
+
+    def __init__(self) -> None:
+        self._clock, self._steady = time.time_ns(), time.monotonic_ns()
+
+    def time(self) -> int:
+        """Return the time (ns) of the moment by the clock as it is set now, or as it was then if that is earlier."""
+        by_now = time.time_ns() - (time.monotonic_ns() - self._steady)
+        return by_now if by_now < self._clock - _SLACK else self._clock
+
+
+_began: dict[str, Moment] = {}
+_FIRST = Moment()
 
 
 class _Clock:
@@ -19,7 +34,7 @@ class _Clock:
 
     @staticmethod
     def find_spec(name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> None:
-        _began[name] = time.time_ns()
+        _began[name] = Moment()
 
 
 def import_time(module: str) -> int:
@@ -27,7 +42,7 @@ def import_time(module: str) -> int:
 
     For a module that was imported before this one, return the time of the import of this module.
     """
-    return _began.get(module, _FIRST)
+    return _began.get(module, _FIRST).time()
 
 
 sys.meta_path.insert(0, _Clock)

@@ -258,7 +258,11 @@ class IsFile:
 
 
 def _existing(path: Path) -> Path:
-    if path.is_dir():
+    try:
+        is_folder = path.is_dir()
+    except OSError as error:  # such as a path that is too long
+        raise ValueError(f"{str(path)[:40]}… cannot be read: {error.strerror}") from None
+    if is_folder:
         raise ValueError(f"{path} is a folder, not a file: give a file in this folder")
     if not path.is_file():
         other = "is not a regular file but a pipe, a device or a socket: give the path of a file"
@@ -277,8 +281,11 @@ def files_of(written: Any) -> list[Path]:
     if isinstance(written, list | tuple):
         return [path for each in written for path in files_of(each)]
     path = Path(written)
-    if path.is_file():
-        return [path]
+    try:
+        if path.is_file():
+            return [path]
+    except OSError as error:
+        raise ValueError(f"{str(path)[:40]}… cannot be read: {error.strerror}") from None
     inside = path.iterdir() if path.is_dir() else map(Path, glob(str(written)))
     files = sorted(each for each in inside if each.is_file() and not each.name.startswith("."))
     if not files:

@@ -98,7 +98,7 @@ NO_SIZE = {
     "workflows/store/band_files.py:_fill": STORE,
     "workflows/store/band_files.py:about": STORE,
     "workflows/store/derived_files.py:_digest": DIGEST,
-    "workflows/store/environment.py:default_root": SOURCE,
+    "workflows/store/environment.py:_is_checkout": SOURCE,
     "workflows/store/journal.py:_newest_lines": STORE,
     "workflows/store/journal.py:_opened": OPENS,
     "workflows/store/journal.py:_read_new_lines": STORE,

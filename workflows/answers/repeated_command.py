@@ -16,6 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from neusee.nodes.import_times import Moment
 from neusee.workflows.answers.answer_upkeep import make_room
 from neusee.workflows.answers.installed_program import ROOT, SITES, SOURCES, program_state, standard_library
 from neusee.workflows.answers.opened_files import Folders, Opened
@@ -92,7 +93,7 @@ class Command:
     """A command whose answer may be stored, from its begin."""
 
     def __init__(self, words: Sequence[str], terminal: Sequence[object], disk: Disk) -> None:
-        self._began, self._started = time.perf_counter(), time.time_ns()
+        self._began, self._started = time.perf_counter(), Moment()
         self._words, self._disk = list(words), disk
         self.name, self._state = command_name(words, terminal), program_state()
         self._opened, self._doubtful = Opened(), False
@@ -182,7 +183,7 @@ class Command:
         return (
             self._doubtful
             or state != self._state
-            or state.changed > self._started - _IMPORTED
+            or state.changed > self._started.time() - _IMPORTED
             or any(name in sys.modules for name in _NATIVE)
             or any(_own_code())
         )
@@ -198,7 +199,7 @@ class Command:
             raise Unsettled("a recipe is in the folder of the cache or of results")
         folders = [path for path in self._opened.folders if path not in ignored and not _PART.search(path)]
         listed = {path: self._opened.folders[path] for path in folders if path != written}
-        return witnesses_of([*files, *inputs], recipes, listed, self._started - _TICK, written)
+        return witnesses_of([*files, *inputs], recipes, listed, self._started.time() - _TICK, written)
 
     def _of_cache(self) -> list[str]:
         """Return the files of the cache that were read and decide what a forecast or an explanation says."""

@@ -92,7 +92,9 @@ def _explained(error: Exception) -> int:
     if message is not None:
         print(f"{message()} (try `neusee --help`)", file=sys.stderr)
         return BAD
+    from neusee.workflows.graph.diagnostics import visible
+
     cause = type(error).__name__
     text = str(error) if cause == "RunError" else f"{cause}: {error}"
-    print(f"{text}   (--debug shows where)", file=sys.stderr)
+    print(visible(f"{text}   (--debug shows where)"), file=sys.stderr)
     return FAILED

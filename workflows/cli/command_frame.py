@@ -130,7 +130,9 @@ def say_line(line: str) -> None:
 
 def fail(message: str, code: int = BAD) -> NoReturn:
     """Print a message to stderr and end the command."""
-    print(message, file=sys.stderr)
+    from neusee.workflows.graph.diagnostics import visible
+
+    print(visible(message), file=sys.stderr)
     raise typer.Exit(code)
 
 

@@ -85,6 +85,7 @@ def say_folder(folder: Path, as_json: bool, *more: str) -> None:
 def print_warning(message: Warning | str, *where: object, **more: object) -> None:
     """Print a warning as one line on stderr, in place of Python's form, which shows a line of source code."""
     from neusee.workflows.cli.repetition import doubt_answer
+    from neusee.workflows.graph.diagnostics import visible
 
     doubt_answer()
-    print(f"warning: {message}", file=sys.stderr, flush=True)
+    print(f"warning: {visible(str(message))}", file=sys.stderr, flush=True)

@@ -10,11 +10,12 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.protection.equal_shade import EqualShade
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.composition import compose
+from neusee.workflows.recipe.text.named_files import refuse_outside
 from neusee.workflows.recipe.text.overrides import Override
 
 NONE = "none"  #: name of the restorer that restores nothing, and of the case without a laser
@@ -108,8 +109,11 @@ class PipelineRecipes:
         return self.pipeline.name + (f", {self.told}" if self.told else "")
 
 
-def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
-    """Parse pipelines such as ``flat+none, five_half_rings+wiener``; raise `EvaluationRefused` with all mistakes."""
+def read_pipelines(text: str, folder: Path, mark: Location | None = None) -> list[Pipeline]:
+    """Parse pipelines such as ``flat+none, five_half_rings+wiener``; raise `EvaluationRefused` with all mistakes.
+
+    ``mark`` is the place of the text, if it stands in a recipe.
+    """
     found: list[Pipeline] = []
     wrong: list[str] = []
     for word in filter(None, (part.strip() for part in text.split(","))):
@@ -119,7 +123,7 @@ def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
             continue
         height, weights = (folder / Path(x).expanduser() if (x := match[k]) else None for k in ("height", "weights"))
         found.append(Pipeline(match["mask"], match["restorer"], height, weights))
-        wrong += [f"{word}: no such file: {path}" for path in (height, weights) if path and not path.is_file()]
+        wrong += [f"{word}: {why}" for path in (height, weights) if path and (why := _fault(path, mark))]
     found = named_apart(found)
     twice = {p.name for p in found if [q.name for q in found].count(p.name) > 1}
     wrong += [f"{name} is listed twice: remove one" for name in sorted(twice)]
@@ -128,6 +132,16 @@ def read_pipelines(text: str, folder: Path) -> list[Pipeline]:
     if wrong:
         raise EvaluationRefused("\n".join(wrong))
     return found
+
+
+def _fault(path: Path, mark: Location | None) -> str:
+    """Return why a file of a pipeline cannot be used, or an empty text."""
+    try:
+        if mark is not None:
+            refuse_outside(path, mark)
+    except ValueError as error:
+        return f"{path.name} {error}"
+    return "" if path.is_file() else f"no such file: {path}"
 
 
 def named_apart(pipelines: Sequence[Pipeline]) -> list[Pipeline]:

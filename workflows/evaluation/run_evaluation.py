@@ -44,6 +44,7 @@ from neusee.workflows.evaluation.pipelines import (
     refuse_fixed_laser,
 )
 from neusee.workflows.evaluation.point_commands import PointCommands
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.protection.equal_shade import EqualProtection
@@ -133,9 +134,10 @@ def options_of(
 ) -> dict[str, Any]:
     """Return arguments of `evaluate`: those that are given, and else those of the settings of the recipe."""
     lines = settings.pipelines if pipelines is None else pipelines
+    mark = Location("evaluate.pipelines", 1, folder=str(folder)) if pipelines is None else None
     level = settings.equal_protection if equal_protection is None else equal_protection
     return {
-        "pipelines": read_pipelines(lines, folder) if isinstance(lines, str) else lines,
+        "pipelines": read_pipelines(lines, folder, mark) if isinstance(lines, str) else lines,
         "count": scenes or (None if settings.scenes == "all" else settings.scenes),
         "reference": reference or (settings.reference if pipelines is None else ""),
         "equal": read_protection(level, by or settings.by),

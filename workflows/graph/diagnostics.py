@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 UNREAD = "unread"  #: code of a value to which no step refers
 _KNOWN = "there are: "  #: text before a list of known names
+
+
+#: characters that no reader sees and a terminal obeys: they move the cursor, clear the screen, or turn text around
+CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+
+
+def visible(text: str) -> str:
+    """Return a text with escapes such as ``\\x1b`` in place of characters that a terminal obeys."""
+    return CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -38,7 +48,7 @@ class RecipeError(ValueError):
 
     def __init__(self, diagnostics: Iterable[Diagnostic]) -> None:
         self.diagnostics = tuple(sorted(_of_values_once(set(diagnostics))))
-        super().__init__(_table(self.diagnostics))
+        super().__init__(visible(_table(self.diagnostics)))
 
 
 def _of_values_once(diagnostics: set[Diagnostic]) -> Iterator[Diagnostic]:

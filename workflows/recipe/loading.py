@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
+from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError, visible
 from neusee.workflows.graph.final_values import Config
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys.regular_file import head_of
@@ -276,4 +276,4 @@ _TITLE = 4096  #: bytes of the first line of a recipe, at most
 
 def _titled(path: Path) -> Titled:
     first = head_of(path, _TITLE).decode("utf-8", "replace").partition("\n")[0].strip()
-    return Titled(path.stem, first.lstrip("# ") if first.startswith("#") else "")
+    return Titled(path.stem, visible(first.lstrip("# ")) if first.startswith("#") else "")

@@ -10,10 +10,10 @@ from typing import Any
 
 from neusee.workflows.graph.diagnostics import Diagnostic
 from neusee.workflows.recipe.node_families import import_own, is_known, own_nodes
+from neusee.workflows.recipe.text.no_code import VARIABLE, is_strange
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 
 KEY = "nodes"
-VARIABLE = "NEUSEE_NO_CODE"  #: any text but an empty one refuses recipes that name code
 _FORM = "must be a file, a folder or a module, such as bloom.py, or `family: module`"
 
 
@@ -46,7 +46,7 @@ def read_own_families(root: Value, diagnostics: list[Diagnostic]) -> OwnFamilies
         if pair is None:
             diagnostics.append(Diagnostic(entry.mark, entry.name, _FORM))
             continue
-        if os.environ.get(VARIABLE):
+        if is_strange():
             message = f"names code, which {VARIABLE} or --no-code refuses to run"
             diagnostics.append(Diagnostic(entry.mark, f"{entry.name} = {pair[1].data}", message))
             continue

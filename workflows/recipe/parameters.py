@@ -14,9 +14,11 @@ from neusee.nodes import Node, ParameterError
 from neusee.nodes.file_parameters import is_file, texts_of
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.graph.recipe_graph import Step, Wire
+from neusee.workflows.keys.input_file_digest import files_in
 from neusee.workflows.recipe.node_families import Own, class_context
-from neusee.workflows.recipe.own_families import VARIABLE as NO_CODE
 from neusee.workflows.recipe.text.field_errors import message_of
+from neusee.workflows.recipe.text.named_files import refuse_outside
+from neusee.workflows.recipe.text.no_code import VARIABLE, is_strange
 from neusee.workflows.recipe.text.references import broken
 from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, kind
@@ -50,12 +52,9 @@ class Checker:
             self.diagnostics += _problems(error, node, values, given, step)
             return None
         params = {name: getattr(model, name) for name in node.params.model_fields}
-        for name, value in values.items():
-            if isinstance(params[name], Path) and params[name].suffix == ".pt2" and os.environ.get(NO_CODE):
-                message = f"a file of torch.export holds code, which {NO_CODE} or --no-code refuses to run"
-                self.diagnostics.append(Diagnostic(value.mark, _said(value), message))
-                return None
-        return params
+        strange = [(value, why) for name, value in values.items() if (why := _strange(params[name], value))]
+        self.diagnostics += [Diagnostic(value.mark, _said(value), why) for value, why in strange]
+        return None if strange else params
 
     def preflight(
         self,
@@ -82,8 +81,11 @@ class Checker:
                 self.diagnostics.append(Diagnostic(step.key, f"{step.name}.with.{error.parameter}", str(error)))
             else:
                 self.diagnostics.append(Diagnostic(value.mark, _said(value), str(error)))
-        except (ValueError, OSError) as error:
+        except ValueError as error:
             self.diagnostics.append(Diagnostic(step.key, step.name, str(error)))
+        except OSError as error:  # a read that fails does not say of which file
+            names = ", ".join(path.name for path in files_in(bound.params))
+            self.diagnostics.append(Diagnostic(step.key, step.name, f"{names} cannot be read ({error})"))
         return None
 
     def _plain(self, node: Node, name: str, value: Value) -> Any:
@@ -96,6 +98,21 @@ class Checker:
         full = [os.path.abspath(path) for path in paths]
         self.files[value.path] = full if isinstance(value.data, list) else full[0]
         return paths if isinstance(value.data, list) else paths[0]
+
+
+def _strange(found: Any, value: Value) -> str:
+    """Return why a recipe of a stranger may not name the files that a value led to, or an empty text."""
+    files = [part for part in (found if isinstance(found, tuple | list) else [found]) if isinstance(part, Path)]
+    if not files or not is_strange():
+        return ""
+    if any(file.suffix == ".pt2" for file in files):
+        return f"a file of torch.export holds code, which {VARIABLE} or --no-code refuses to run"
+    try:
+        for file in files:
+            refuse_outside(file, value.mark)
+    except ValueError as error:
+        return str(error)
+    return ""
 
 
 def _problems(

@@ -71,6 +71,8 @@ def writable_folder(out: str | os.PathLike[str]) -> Path:
     root = existing = Path(out)
     try:
         existing = next(path for path in (root, *root.absolute().parents) if path.exists() or path.is_symlink())
+        if root.is_symlink() and os.environ.get("NEUSEE_NO_CODE"):  # a stranger's folder may have put it there
+            raise ValueError(f"{root} is a link, which --no-code does not follow: {_OTHER_FOLDER}")
         if existing.is_dir():
             os.rmdir(tempfile.mkdtemp(prefix=".neusee.", dir=existing))
             return root
@@ -116,10 +118,24 @@ def _sweep(root: Path) -> None:
     """Remove the unfinished folders of killed runs, in which no file has changed for an hour."""
     for part in root.glob(".*.part"):
         try:
+            if _is_being_written(part):
+                continue
             if time.time() - max(p.stat().st_mtime for p in (part, *part.rglob("*"))) > _ABANDONED:
                 shutil.rmtree(part, ignore_errors=True)
         except OSError:  # another process has already removed the folder
             continue
+
+
+def _is_being_written(part: Path) -> bool:
+    """Return True if the process that made an unfinished folder runs on this machine, whatever the clock says."""
+    number = part.suffixes[-2].removeprefix(".") if len(part.suffixes) > 1 else ""
+    try:
+        os.kill(int(number), 0)
+    except (ValueError, OverflowError, ProcessLookupError):
+        return False
+    except OSError:  # of another user
+        return True
+    return True
 
 
 def _rename(part: Path, target: Path) -> Path:

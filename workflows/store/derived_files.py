@@ -60,10 +60,11 @@ class DerivedFiles:
     def keep(self, key: str, suffix: str, what: str, write: Callable[[Path], None]) -> Path:
         """Let ``write`` write a file beside its final path, rename the file, and store its checksum; return its path.
 
-        The file is read-only. If the folder cannot be written, it is written into a temporary folder.
+        The file is read-only. If the folder cannot be written, or the file not be read again, it is written into a
+        temporary folder.
         """
         try:
-            path = self._written(key, suffix, write)
+            path, found = self._compared(key, suffix, write)
         except OSError as error:
             self.store.report_failure(error)
             with self._failing:
@@ -71,7 +72,7 @@ class DerivedFiles:
                     self._spare = mkdtemp(prefix="neusee-")
                     weakref.finalize(self, _remove, self._spare, os.getpid())
                 self.folder = Path(self._spare)
-            path = self._written(key, suffix, write)
+            path, found = self._compared(key, suffix, write)
         about = {
             "step": what,
             "seconds": 0.0,
@@ -79,12 +80,17 @@ class DerivedFiles:
             "file": path.name,
             "file_bytes": path.stat().st_size,
         }
-        self.store.put(key, _digest(path, "sha256" if secrets() else _FAST), about)
+        self.store.put(key, found, about)
         self._fresh[path] = _state(path)
         return path
 
     def _path(self, key: str, suffix: str) -> Path:
         return self.folder / key[:2] / f"{key}{suffix}"
+
+    def _compared(self, key: str, suffix: str, write: Callable[[Path], None]) -> tuple[Path, Tensor]:
+        """Return the path of a file that is written now, and the digest of what the device gives back of it."""
+        path = self._written(key, suffix, write)
+        return path, _digest(path, "sha256" if secrets() else _FAST)
 
     def _written(self, key: str, suffix: str, write: Callable[[Path], None]) -> Path:
         path = self._path(key, suffix)

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import Literal, cast, get_args
 
+import neusee
 from neusee.workflows.store.byte_sizes import parse_size
 
 Verify = Literal["always", "sampled", "never"]
@@ -22,10 +23,17 @@ def default_root() -> Path:
         return Path(value)
     here = Path.cwd()
     for folder in (here, *here.parents):
-        project = folder / "pyproject.toml"
-        if (folder / "cache").is_dir() and project.is_file() and 'name = "neusee"' in project.read_text("utf-8"):
+        if (folder / "cache").is_dir() and _is_checkout(folder):
             return folder / "cache"
     return Path.home() / ".cache" / "neusee"
+
+
+def _is_checkout(folder: Path) -> bool:
+    """Return True for a checkout of neusee; with ``--no-code``, a stranger's folder that looks like one is none."""
+    project = folder / "pyproject.toml"
+    if not project.is_file() or 'name = "neusee"' not in project.read_text("utf-8"):
+        return False
+    return not os.environ.get("NEUSEE_NO_CODE") or folder in Path(neusee.__file__).resolve().parents
 
 
 def verify_mode(mode: str | None) -> Verify:

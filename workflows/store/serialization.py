@@ -24,6 +24,7 @@ from neusee.workflows.store.layout_check import checked_layout, is_count, is_sha
 from neusee.workflows.store.shared_folder import open_now
 from neusee.workflows.store.stored_types import is_registered, made, stored_type, type_name
 
+_PIECE = 1 << 18  #: bytes of a file that are read at once
 _ALIGN = 64
 _FILLER = "_"  #: first letter of the names of padding entries, which fill up to the next multiple of `_ALIGN`
 _DTYPES = {
@@ -242,11 +243,13 @@ def read(path: str, expected: str | None, sha256: str | None = None) -> list[Ten
     Compare the file with the checksum ``expected`` and the digest ``sha256`` if given. Raises `ValueError` for a file
     that differs, or that `write` did not write.
     """
-    with open(path, "rb", opener=open_now) as file:
+    with open(path, "rb", buffering=0, opener=open_now) as file:
+        # read and not mapped: where a device fails, a read raises an error, and a look into a map ends the process
+        found = digests_of(file, *([xxhash.xxh3_128()] if expected else []), *([hashlib.sha256()] if sha256 else []))
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
-    if expected is not None and xxhash.xxh3_128_hexdigest(data) != expected:
+    if expected is not None and found[0] != expected:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
-    if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
+    if sha256 is not None and found[-1:] != [sha256]:
         raise ValueError("the stored bytes are not those that were signed")
     start = 8 + int.from_bytes(data[:8], "little")
     header = json.loads(data[8:start]) if start <= len(data) else None
@@ -254,6 +257,15 @@ def read(path: str, expected: str | None, sha256: str | None = None) -> list[Ten
         raise ValueError("the header of the file of tensors is missing or cut short")
     numbers = sorted(int(name) for name in header if name.isdecimal())
     return [_entry(data, start, header.get(str(i)), kinds.get(str(i))) for i in numbers]
+
+
+def digests_of(file: IO[bytes], *digests: Any) -> list[str]:
+    """Return the digests of a file as texts, each of all its bytes, read piece by piece."""
+    piece = memoryview(bytearray(_PIECE if digests else 0))
+    while digests and (count := file.readinto(piece)):  # type: ignore[attr-defined]
+        for each in digests:
+            each.update(piece[:count])
+    return [each.hexdigest() for each in digests]
 
 
 def _entry(data: Any, start: int, entry: Any, kind: Any) -> Tensor:

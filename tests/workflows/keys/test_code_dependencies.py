@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import sys
+import time
 import types
 import zipfile
 
@@ -585,6 +586,21 @@ def test_an_edit_between_import_and_first_run_is_not_stored_without_byte_code(la
         assert lab.run(again=False)[:2] == (1.5, 1.5)
     assert entries(lab.store) == before
     assert in_a_new_process(lab, monkeypatch) == 2.5
+
+
+def test_an_edit_after_the_clock_was_set_back_is_noticed(lab, monkeypatch):
+    """The import was at a time that has not come yet, as the clock is set now."""
+    lab.write(ONE, source("part(k)", FROM))
+    lab.write(TWO, "def part(x):\n    return 1.5 * x\n")
+    now = time.time_ns
+    with monkeypatch.context() as ahead:
+        ahead.setattr(time, "time_ns", lambda: now() + 3600 * 10**9)
+        lab.node()
+    lab.edit(TWO, "1.5", "2.5")
+    before = entries(lab.store) if lab.store.exists() else set()
+    with pytest.warns(UserWarning, match=r"_two.py was edited after its import: restart Python"):
+        assert lab.run(again=False)[:2] == (1.5, 1.5)
+    assert entries(lab.store) == before
 
 
 def test_equal_size_and_time_after_an_edit_are_noticed(lab, monkeypatch):

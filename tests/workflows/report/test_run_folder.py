@@ -1,6 +1,8 @@
 """The folder of a run: what a killed one leaves behind is swept, what another writes is not."""
 
 import os
+import subprocess
+import sys
 import time
 
 import pytest
@@ -9,7 +11,9 @@ from neusee.workflows.report.run_folder import new_run
 
 
 def test_an_abandoned_folder_is_swept_and_a_young_one_is_not(tmp_path):
-    old, young = tmp_path / ".2026-01-01_a_0.1.part", tmp_path / ".2026-01-01_b_0.2.part"
+    ended = subprocess.Popen([sys.executable, "-S", "-c", ""])
+    ended.wait()
+    old, young = tmp_path / f".2026-01-01_a_0.{ended.pid}.part", tmp_path / f".2026-01-01_b_0.{ended.pid}.part"
     for part in (old, young):
         (part / "figures").mkdir(parents=True)
         (part / "figures" / "x.png").write_bytes(b"x")
@@ -21,6 +25,16 @@ def test_an_abandoned_folder_is_swept_and_a_young_one_is_not(tmp_path):
     assert not old.exists()
     assert young.exists()
     assert (tmp_path / "latest" / "a.txt").read_text() == "a"
+
+
+def test_a_folder_that_a_process_writes_stays_whatever_the_clock_says(tmp_path):
+    with new_run(tmp_path, "r", "k" * 8) as folder:
+        folder.write("a.txt", "a")
+        for path in (folder.path / "a.txt", folder.path):
+            os.utime(path, (0, 0))  # as if written before the clock was set
+        with new_run(tmp_path, "other", "k" * 8) as other:
+            other.write("b.txt", "b")
+    assert sorted(path.name[11:] for path in tmp_path.glob("2*")) == ["other_kkkkkkkk", "r_kkkkkkkk"]
 
 
 def failing(root):

@@ -35,6 +35,7 @@ from neusee.nodes.units import (
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.recipe.blocks.sensor_facts import LaserChannels, Passing, SensorFacts
 from neusee.workflows.recipe.blocks.settings_block import SettingsBlock, located
+from neusee.workflows.recipe.text.named_files import refuse_outside
 from neusee.workflows.recipe.text.references import References, Scope, broken
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted, kind
 
@@ -286,6 +287,7 @@ def _laws(block: Value, diagnostics: list[Diagnostic], files: dict[Where, str]) 
     path = (Path(given.mark.folder) / Path(given.data).expanduser()).resolve()
     files[given.path] = str(path)
     try:
+        refuse_outside(path, given.mark)
         if not path.is_file():
             raise ValueError(f"no such file: {path}")
         return read_damage_laws(path)

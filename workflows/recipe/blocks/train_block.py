@@ -24,6 +24,8 @@ from neusee.workflows.recipe.blocks.settings_block import (
     read_block,
 )
 from neusee.workflows.recipe.text.composition import Composed
+from neusee.workflows.recipe.text.named_files import refuse_outside
+from neusee.workflows.recipe.text.no_code import is_strange
 from neusee.workflows.recipe.text.option_groups import packaged
 from neusee.workflows.recipe.text.yaml_values import Value
 
@@ -229,6 +231,24 @@ def _missing(block: Value, training: Training) -> Iterator[Diagnostic]:
     if training.start is not None and not training.start.exists():
         value = block.items["start"]
         yield Diagnostic(value.mark, value.name, f"there is neither a file nor a folder {training.start}")
+    for outer, path, key in (
+        (block, training.photographs, "photographs"),
+        (block, training.start, "start"),
+        (block.items.get("mask"), training.mask.start, "start"),
+    ):
+        given = outer.child(key) if outer else None
+        if given is not None and path is not None:
+            yield from _outside(path, given)
+
+
+def _outside(path: Path, value: Value) -> Iterator[Diagnostic]:
+    """Yield a diagnostic for a file that is not the stranger's whose recipe names it, also for a link in a folder."""
+    links = (each for each in path.rglob("*") if each.is_symlink()) if is_strange() and path.is_dir() else ()
+    try:
+        for each in (path, *links):
+            refuse_outside(each, value.mark)
+    except ValueError as error:
+        yield Diagnostic(value.mark, value.name, str(error))
 
 
 def _wrong_network(given: Value, training: Training) -> Iterator[Diagnostic]:

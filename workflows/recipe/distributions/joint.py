@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from neusee.nodes.units import read_any, read_written
+from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.keys.regular_file import NotRegular, refuse_other_than_file, text_of
 from neusee.workflows.recipe.distributions.sample_table import read_columns, require_samples, with_units
 from neusee.workflows.recipe.distributions.shapes import FloatArray, scores_between
+from neusee.workflows.recipe.text.named_files import refuse_outside
 from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
 
 GAIN_UNIT = "DN/e-"  #: unit of the system gain K of EMVA 1288
@@ -134,12 +136,17 @@ class Posterior:
     untold: tuple[str, ...] = ()  #: names that the file has without draws, because no frame tells them
 
 
-def read_posterior(path: Path) -> Posterior:
-    """Return the posterior in a file or in the newest file of a glob pattern; raise ValueError for an invalid file."""
+def read_posterior(path: Path, mark: Location | None = None) -> Posterior:
+    """Return the posterior in a file or in the newest file of a glob pattern; raise ValueError for an invalid file.
+
+    ``mark`` is the place at which a recipe names the file.
+    """
     if any(sign in str(path) for sign in "*?["):
         path = max(map(Path, glob(str(path))), key=lambda each: (each.stat().st_mtime, each), default=path)
     if path.is_dir():
         path = path / "posterior.json"
+    if mark is not None:
+        refuse_outside(path, mark)
     refuse_other_than_file(path)
     if not path.is_file():
         raise ValueError(f"there is no posterior file {path}: give {_FILES}")
@@ -147,7 +154,7 @@ def read_posterior(path: Path) -> Posterior:
         if path.suffix in (".npz", ".csv"):
             return _drawn(*with_units(read_columns(path)))
         if path.suffix in (".json", ".yaml", ".yml"):
-            return _document(path)
+            return _document(path, mark)
     except NotRegular:
         raise
     except (OSError, KeyError, TypeError, UnicodeDecodeError) as error:
@@ -155,7 +162,7 @@ def read_posterior(path: Path) -> Posterior:
     raise ValueError(f"{path.name} is not a posterior file: give {_FILES}")
 
 
-def _document(path: Path) -> Posterior:
+def _document(path: Path, mark: Location | None) -> Posterior:
     """Return the posterior in a file of `neusee calibrate`, or in a file with means and standard deviations."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
@@ -172,7 +179,7 @@ def _document(path: Path) -> Posterior:
         failed = [check["name"] for check in doc.get("checks", ()) if check["mark"] == "fail"]
         checks = "1 check fails" if doc["failed"] == 1 else f"{doc['failed']} checks fail"
         raise ValueError(f"the calibration cannot be used: {checks} ({'; '.join(failed)})")
-    joint = read_posterior(path.with_name("draws.npz")).joint
+    joint = read_posterior(path.with_name("draws.npz"), mark).joint
     assert joint.draws is not None
     rows = {POSTERIOR_NAMES.get(name, name): row for name, row in doc["parameters"].items()}
     columns = {POSTERIOR_NAMES.get(name, name): x for name, x in zip(joint.names, joint.draws.T, strict=True)}

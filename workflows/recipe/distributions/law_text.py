@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from neusee.nodes.units import read_written
-from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.diagnostics import Location, nearest
 from neusee.workflows.recipe.distributions.sample_table import read_columns, require_samples, si_unit, with_units
 from neusee.workflows.recipe.distributions.scalar import Law
 from neusee.workflows.recipe.distributions.shapes import (
@@ -28,6 +28,7 @@ from neusee.workflows.recipe.distributions.shapes import (
     Triangular,
     Uniform,
 )
+from neusee.workflows.recipe.text.named_files import refuse_outside
 
 #: each kind of distribution with its form and the meaning of its arguments
 KINDS = {
@@ -73,10 +74,10 @@ def is_law(text: Any) -> bool:
     return isinstance(text, str) and _BEGIN.match(text) is not None
 
 
-def read_law(text: str, folder: Path = Path()) -> Law:
+def read_law(text: str, folder: Path = Path(), mark: Location | None = None) -> Law:
     """Return the probability distribution in a text; raise ValueError with the correct form for an invalid text.
 
-    Args: folder: folder of the recipe, to which the path of a file of samples is relative.
+    Args: folder: folder of the recipe, to which the path of a file of samples is relative. mark: place of the text.
     """
     text = text.strip()
     match = _CALL.fullmatch(text)
@@ -86,9 +87,9 @@ def read_law(text: str, folder: Path = Path()) -> Law:
     if not all(arguments):
         raise ValueError(_form(kind))
     if kind == "truncated":
-        return _truncated(text, arguments, folder)
+        return _truncated(text, arguments, folder, mark)
     if kind == "empirical":
-        return _empirical(text, arguments, folder)
+        return _empirical(text, arguments, folder, mark)
     return _READERS[kind](kind, text, arguments)
 
 
@@ -219,11 +220,11 @@ def _weights(written: Sequence[str], count: int) -> list[float]:
     return weights
 
 
-def _truncated(text: str, arguments: Sequence[str], folder: Path) -> Law:
+def _truncated(text: str, arguments: Sequence[str], folder: Path, mark: Location | None) -> Law:
     """Return a distribution with bounds; a bound of infinity has no unit."""
     if len(arguments) != 3 or not is_law(arguments[0]):
         raise ValueError(_form("truncated"))
-    law = read_law(arguments[0], folder)
+    law = read_law(arguments[0], folder, mark)
     if law.kind == "truncated":
         raise ValueError("a truncated distribution cannot be truncated again: write one distribution with both bounds")
     low, high = (_bound(argument, law) for argument in arguments[1:])
@@ -242,7 +243,7 @@ def _bound(argument: str, law: Law) -> float:
     return number
 
 
-def _empirical(text: str, arguments: Sequence[str], folder: Path) -> Law:
+def _empirical(text: str, arguments: Sequence[str], folder: Path, mark: Location | None) -> Law:
     """Return the distribution of the samples in a file, each with the same probability."""
     options = {}
     for argument in arguments[1:]:
@@ -251,6 +252,8 @@ def _empirical(text: str, arguments: Sequence[str], folder: Path) -> Law:
             raise ValueError(_form("empirical"))
         options[match[1]] = match[2].strip().strip("\"'")
     path = folder / Path(arguments[0].strip("\"'")).expanduser()
+    if mark is not None:
+        refuse_outside(path, mark)
     columns, units = with_units(read_columns(path))
     name = _column(path, list(columns), options.get("column"))
     samples, unit = columns[name], units.get(name, "")

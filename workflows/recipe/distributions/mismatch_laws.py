@@ -69,7 +69,7 @@ def _difference(path: str, leaf: Value, root: Value) -> Difference:
     if own is None:
         raise ValueError(f"the recipe has no value {path}; {nearest(path, [each.name for each in root.leaves()])}")
     value, unit = _own(path, own)
-    law = read_law(leaf.data, Path(leaf.mark.folder)) if is_law(leaf.data) else _single(leaf)
+    law = read_law(leaf.data, Path(leaf.mark.folder), leaf.mark) if is_law(leaf.data) else _single(leaf)
     if law.reciprocal:
         raise ValueError(f"a gain in e-/DN has no difference that is added: write lognormal(1, …), not {law.text}")
     if law.multiplies:

@@ -94,7 +94,7 @@ def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
     diagnostics = list(composed.diagnostics)
     for path, leaf in _laws(root):
         try:
-            laws[dotted(path)] = law = read_law(leaf.data, Path(leaf.mark.folder))
+            laws[dotted(path)] = law = read_law(leaf.data, Path(leaf.mark.folder), leaf.mark)
         except ValueError as error:
             diagnostics.append(Diagnostic(leaf.mark, f"{dotted(path)} = {leaf.data}", str(error)))
             root = put(root, path, BROKEN)
@@ -178,7 +178,7 @@ class _Reader:
         if file is None or not isinstance(file.data, str):
             raise ValueError("the posterior has no file: write posterior: PATH, or posterior: {file: PATH, use: mean}")
         self.source = file.data
-        return read_posterior(Path(file.mark.folder) / Path(file.data).expanduser())
+        return read_posterior(Path(file.mark.folder) / Path(file.data).expanduser(), file.mark)
 
     def _use(self, given: Value | None, posterior: Posterior) -> str | int:
         use = "mean" if given is None else given.data

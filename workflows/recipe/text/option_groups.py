@@ -16,6 +16,8 @@ from importlib.resources import files
 from pathlib import Path
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, nearest
+from neusee.workflows.recipe.text.no_code import VARIABLE as NO_CODE
+from neusee.workflows.recipe.text.no_code import is_inside, is_strange
 from neusee.workflows.recipe.text.yaml_values import Value, kind, read
 
 NAME = re.compile(r"[\w-]+")
@@ -116,6 +118,10 @@ class Groups:
         file = option_file(group, name, folders)
         if file is None:
             self._report(choice, self._absent(choice, open_))
+            return None
+        if is_strange() and file.parent.parent not in shared_folders() and not is_inside(file, file.parent.parent):
+            message = f"{shown(file, self.folder)} is a link to another folder, which {NO_CODE} or --no-code refuses"
+            self._report(choice, message)
             return None
         if not open_ and file.parent.parent != packaged():
             self._say_hidden(group, name, file)

@@ -15,7 +15,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError, YAMLStreamError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 
-from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
+from neusee.workflows.graph.diagnostics import CONTROL, Diagnostic, Location, RecipeError, visible
 from neusee.workflows.keys.regular_file import NotRegular, opened
 from neusee.workflows.recipe.text.yaml_mistakes import YamlMistake, directive_mistake, explained
 
@@ -27,6 +27,7 @@ _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
 _LACKS_SPACE = re.compile(r"[\w.-]+:\S.*")
 _MOST = 1_000_000  #: largest number of values in one file
 _LARGEST = 4_000_000  #: bytes of one file; 20 000 steps take about half of them
+_DIGITS = 400  #: of a whole number, at most
 _MOST_ALIASED = 100_000  #: largest number of values from aliases in one file
 
 
@@ -135,7 +136,7 @@ def _document(text: str, shown: str, folder: str) -> Document:
         what = "the file is empty" if root.data is None else f"the file contains {kind(root)}"
         raise RecipeError([Diagnostic(Location(shown, 1, 1), "", f"{what}: write a mapping, `key: value`")])
     first = text.lstrip().partition("\n")[0].strip()
-    return Document(root, first.lstrip("# ") if first.startswith("#") else "")
+    return Document(root, visible(first.lstrip("# ")) if first.startswith("#") else "")
 
 
 def parse(text: str, start: Location, path: Where = ()) -> Value:
@@ -183,7 +184,8 @@ class _Builder:
         if tag not in _KNOWN:
             return self._refuse(mark, path, f"unknown YAML tag {tag}: remove the tag")
         if isinstance(node, ScalarNode):
-            return Value(_scalar(node), mark, key, path)
+            fault = _fault(str(node.value))
+            return self._refuse(mark, path, fault) if fault else Value(_scalar(node), mark, key, path)
         if id(node) in self.built:
             self.aliased += self.size[id(node)]
             self._refuse_many(self.aliased, _MOST_ALIASED, mark, path)
@@ -200,7 +202,11 @@ class _Builder:
     def _mapping(self, node: MappingNode, path: Where) -> dict[str | int, Value]:
         data: dict[str | int, Value] = {}
         for key_node, value_node in node.value:
-            mark, key = self._mark(key_node), _key(key_node)
+            mark = self._mark(key_node)
+            if isinstance(key_node, ScalarNode) and (fault := _fault(str(key_node.value))):
+                self._refuse(mark, path, f"a key {fault}")
+                continue
+            key = _key(key_node)
             if key == "<<":
                 self._refuse(mark, path, "merge keys (<<) are not part of YAML 1.2: refer to values with ${…}")
             elif key is None:
@@ -249,6 +255,15 @@ def _moved(value: Value, path: Where) -> Value:
 
 
 _KNOWN = {f"!!{name}" for name in ("str", "int", "float", "bool", "null", "map", "seq", "timestamp", "merge", "value")}
+
+
+def _fault(text: str) -> str:
+    """Return what is wrong with the text of a scalar that would harm a reader or the program, or an empty text."""
+    if found := CONTROL.search(text):
+        return f"has the control character {visible(found[0])}: remove it"
+    if len(text) > _DIGITS and _INT.fullmatch(text):
+        return f"has {len(text)} digits, more than the limit of {_DIGITS}"
+    return ""
 
 
 def _scalar(node: ScalarNode) -> Any:

@@ -1,0 +1,23 @@
+"""What ships with neusee is not observed, and pays nothing."""
+
+from ruamel.yaml import YAML
+
+from neusee.workflows.keys import user_code
+from neusee.workflows.recipe.node_families import all_nodes
+from neusee.workflows.recipe.text.option_groups import packaged
+
+
+def test_no_node_that_ships_is_one_of_the_user(monkeypatch):
+    monkeypatch.setattr(user_code, "PROVEN", ("neusee.",))
+    modules = {name: node.fn.__module__ for name, node in all_nodes() if node.fn.__module__.startswith("neusee")}
+    assert len(modules) > 100
+    assert [name for name, module in modules.items() if user_code.is_own(module)] == []
+    assert user_code.is_own("neusee_of_another")
+    assert user_code.is_own("bloom")
+
+
+def test_no_recipe_that_ships_names_code():
+    files = list(packaged().rglob("*.yaml"))
+    assert len(files) > 50
+    read = YAML(typ="safe", pure=True)
+    assert [path.name for path in files if "nodes" in (read.load(path) or {})] == []
