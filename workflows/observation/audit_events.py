@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from neusee.workflows.observation.python_watch import Watch, watch_here
@@ -60,11 +61,23 @@ def _called_by_program() -> bool:
     return False
 
 
+@contextmanager
+def _unwatched(watch: Watch) -> Iterator[None]:
+    """Trust the current thread while this hook itself looks at folders."""
+    before = watch.trust(True)
+    try:
+        yield
+    finally:
+        watch.trust(before)
+
+
 def _source(watch: Watch, arguments: tuple[Any, ...]) -> None:
     """Take note of a source file that is opened, and of whether a message or a compiler asked for it."""
     path = arguments[0]
     if isinstance(path, str | bytes | os.PathLike) and os.fsdecode(path).endswith(SOURCES):
-        watch.heard(os.path.realpath(os.fsdecode(path)), quotes_source(sys._getframe(2)))
+        frame = sys._getframe(2)
+        with _unwatched(watch):
+            watch.heard(os.path.realpath(os.fsdecode(path)), quotes_source(frame))
 
 
 def _copied(watch: Watch, arguments: tuple[Any, ...]) -> None:
@@ -72,13 +85,15 @@ def _copied(watch: Watch, arguments: tuple[Any, ...]) -> None:
     path = arguments[0]
     if not isinstance(path, int):
         copies = sys._getframe(2).f_globals.get("__name__") == "shutil"
-        watch.heard(os.path.realpath(os.fsdecode(path)), copies)
+        with _unwatched(watch):
+            watch.heard(os.path.realpath(os.fsdecode(path)), copies)
 
 
 def _named_by_chance(watch: Watch, arguments: tuple[Any, ...]) -> None:
     """Take note of a temporary file, whose name no other process expects."""
     above, name = os.path.split(os.path.abspath(os.fsdecode(arguments[0])))
-    watch.temporary.add(os.path.join(os.path.realpath(above), name))
+    with _unwatched(watch):
+        watch.temporary.add(os.path.join(os.path.realpath(above), name))
 
 
 def _file(watch: Watch, arguments: tuple[Any, ...]) -> None:
