@@ -88,7 +88,8 @@ def changing_refusal(name: str, kind: str, source: Path) -> str:
 def _covers(entry: str, item: Construct) -> bool:
     if entry.startswith(FREE):
         free = entry.removeprefix(FREE)
-        return free in (item.kind, item.name, item.text) or item.text.startswith((f"{free}.", f"{free}("))
+        named = (item.kind, item.name, PurePath(item.name).name, item.text)
+        return free in named or item.text.startswith((f"{free}.", f"{free}("))
     if entry.startswith(_ENV):
         return item.kind == "env" and item.name in ("", entry.removeprefix(_ENV))
     if item.kind == "file":

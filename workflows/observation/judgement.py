@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Set
 
 from neusee.workflows.observation.covered_paths import (
     caches,
@@ -28,7 +28,7 @@ class Judgement:
     """The taints of one call, from its records in their order."""
 
     def __init__(
-        self, covered: Covered, bodies: dict[str, str], quiet: Collection[str] = (), temporary: Collection[str] = ()
+        self, covered: Covered, bodies: dict[str, str], quiet: Set[str] = frozenset(), temporary: Set[str] = frozenset()
     ) -> None:
         """Judge by what the key covers, and by what the process knows: see `python_watch.Watch`."""
         self._covered, self._bodies = covered, bodies
@@ -95,7 +95,7 @@ class Judgement:
 
     def _meet(self, record: Record) -> None:
         """Judge a path where the success of a call depends on what was there before."""
-        path, named_by_chance = record.path, not self._temporary.isdisjoint(_with_parents(record.path))
+        path, named_by_chance = record.path, any(above in self._temporary for above in _with_parents(record.path))
         free = record.trusted or named_by_chance or path in self._folders
         if not (free or self._is_covered(path) or is_searched_program(path)):
             self.add("write", path)
