@@ -24,6 +24,8 @@ _FIX = {
     "import": 'write the import as a statement, or declare each module: depends=["package.module"]',
     "run": 'declare the file or the module that it runs: depends=["kernel.cpp"]',
     "state": "make it a parameter",
+    "stamp": "make it a parameter",
+    "source": 'declare the file of the code, with its comments and lines: depends=["helper.py"]',
     "hash": "write sorted(...) around the set, or a digest of hashlib",
 }
 _NAME = {"file": "table.csv", "env": "NAME"}
@@ -86,11 +88,14 @@ def changing_refusal(name: str, kind: str, source: Path) -> str:
 def _covers(entry: str, item: Construct) -> bool:
     if entry.startswith(FREE):
         free = entry.removeprefix(FREE)
-        return free in (item.kind, item.name, item.text) or item.text.startswith((f"{free}.", f"{free}("))
+        named = (item.kind, item.name, PurePath(item.name).name, item.text)
+        return free in named or item.text.startswith((f"{free}.", f"{free}("))
     if entry.startswith(_ENV):
         return item.kind == "env" and item.name in ("", entry.removeprefix(_ENV))
     if item.kind == "file":
         return not item.name or not PurePath(entry).suffix or PurePath(entry).name == PurePath(item.name).name
+    if item.kind == "source":
+        return PurePath(entry).suffix == ".py"
     return item.kind in ("run", "import")
 
 

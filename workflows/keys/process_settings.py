@@ -5,8 +5,10 @@ The number of threads and deterministic algorithms change results only within ro
 
 from __future__ import annotations
 
+import codecs
 import functools
 import hashlib
+import locale
 import sys
 import time
 from collections.abc import Mapping
@@ -51,7 +53,7 @@ def own_settings(reads_time: bool) -> dict[str, str]:
 
     With ``reads_time`` the code may read the time zone.
     """
-    now = {"floating-point errors": _errors(), "printed numbers": _printing()}
+    now = {"floating-point errors": _errors(), "printed numbers": _printing(), "encoding of texts": _encoding()}
     if reads_time:
         now["time zone"] = _time_zone()
     return {name: value for name, value in now.items() if value != USUAL[name]}
@@ -71,6 +73,11 @@ def _printing() -> str:
     now: Mapping[str, object] = {**np.get_printoptions()}
     other = [f"{name}={now[name]}" for name, value in _PRINTED.items() if now.get(name, value) != value]
     return ", ".join(other) or OWN_USUAL["printed numbers"]
+
+
+def _encoding() -> str:
+    """Return the encoding of a text file that is opened without one."""
+    return codecs.lookup(locale.getpreferredencoding(False)).name
 
 
 def _time_zone() -> str:

@@ -11,7 +11,9 @@ from typing import NamedTuple
 
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_objects import functions_of
+from neusee.workflows.keys.facts_beside_content import facts
 from neusee.workflows.keys.hash_order import orders
+from neusee.workflows.keys.literal_texts import reads_attributes_unnamed, texts
 from neusee.workflows.keys.module_origin import module_file
 from neusee.workflows.keys.outward_code import NOWHERE, Reach, reach_of
 from neusee.workflows.keys.reachable_code import Statement, statements
@@ -67,13 +69,13 @@ def summarise(source: bytes, own: bool = False) -> Summary:
     return Summary(
         text,
         digest(text, tree.documents),
-        any(map(_reads_docstrings, (tree.all, tree.not_run))),
+        any(_reads_docstrings(kinds, own) for kinds in (tree.all, tree.not_run)),
         imports,
         binds,
         _uses(tree.all, {name: {way for way in ways if _chained(way)} for name, ways in bound.items()}),
         _definitions(tree.texts),
         functions,
-        sorted({*constructs(tree, names), *(orders(parsed) if own else ())}, key=lambda item: (item.line, item)),
+        _all_constructs(parsed, tree, names) if own else constructs(tree, names),
         statements(tree.blocks),
         depends,
         reach_of(parsed, {name: _full(ways) for name, ways in bound.items()}) if own else NOWHERE,
@@ -119,8 +121,18 @@ def _by_literal(call: ast.Call, names: Mapping[str, str]) -> Import | None:
     return (module and (len(module) - len(module.lstrip(".")), module.lstrip("."), "")) or None
 
 
-def _reads_docstrings(kinds: Kinds) -> bool:
-    """Return True for code that reads a docstring as data."""
+def _all_constructs(parsed: ast.Module, tree: Syntax, names: Mapping[str, str]) -> list[Construct]:
+    """Return what is not followed, with what only matters in code of a user."""
+    usual = constructs(tree, names)
+    known = {(item.line, item.text.rpartition(".")[2]) for item in usual}
+    beside = [item for item in facts(tree.all, names) if (item.line, item.text.rpartition(".")[2]) not in known]
+    return sorted({*usual, *orders(parsed), *beside}, key=lambda item: (item.line, item))
+
+
+def _reads_docstrings(kinds: Kinds, own: bool) -> bool:
+    """Return True for code that reads a docstring as data, or attributes that it does not name in code of a user."""
+    if own and (reads_attributes_unnamed(kinds) or any("__doc__" in text for text, _ in texts(kinds))):
+        return True
     by_attribute = any(item.attr in _READS for item in each(kinds, ast.Attribute))
     by_name = any(item.id in _READS[:2] and isinstance(item.ctx, ast.Load) for item in each(kinds, ast.Name))
     return by_attribute or by_name or any(item.value == "__doc__" for item in each(kinds, ast.Constant))

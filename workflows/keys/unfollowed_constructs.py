@@ -89,7 +89,7 @@ _FILE_NAME = re.compile(
 class Construct(NamedTuple):
     """A construct that is not followed: its kind, what it names (or nothing), its text, the reason, and the line."""
 
-    kind: str  #: file, env, import, run, state or hash
+    kind: str  #: file, env, import, run, state, hash, stamp or source
     name: str
     text: str
     why: str

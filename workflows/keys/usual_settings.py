@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 #: settings that only code of a user reads
-OWN_USUAL = {"floating-point errors": "told", "printed numbers": "as NumPy prints", "time zone": "UTC"}
+OWN_USUAL = {
+    "floating-point errors": "told",
+    "printed numbers": "as NumPy prints",
+    "encoding of texts": "utf-8",
+    "time zone": "UTC",
+}
 #: settings of a new process
 USUAL = {
     "default dtype": "torch.float32",

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from neusee.workflows.observation.python_watch import Watch, watch_here
+from neusee.workflows.observation.quoted_source import SOURCES, quotes_source
 from neusee.workflows.observation.recorded_call import Record
 from neusee.workflows.observation.system_calls import Does
 
@@ -28,9 +30,11 @@ def listen() -> None:
 def _heard(event: str, arguments: tuple[Any, ...]) -> None:
     if event not in _EVENTS or (watch := watch_here()) is None:
         return
+    if event in _FOR_BOTH and not watch.trusted():
+        _FOR_BOTH[event](watch, arguments)
     if event == "subprocess.Popen":
         _program(watch, arguments)
-    elif not watch.kernel and not watch.trusted():
+    elif event in _HANDLERS and not watch.kernel and not watch.trusted():
         _HANDLERS[event](watch, arguments)
 
 
@@ -57,6 +61,41 @@ def _called_by_program() -> bool:
     return False
 
 
+@contextmanager
+def _unwatched(watch: Watch) -> Iterator[None]:
+    """Trust the current thread while this hook itself looks at folders."""
+    before = watch.trust(True)
+    try:
+        yield
+    finally:
+        watch.trust(before)
+
+
+def _source(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    """Take note of a source file that is opened, and of whether a message or a compiler asked for it."""
+    path = arguments[0]
+    if isinstance(path, str | bytes | os.PathLike) and os.fsdecode(path).endswith(SOURCES):
+        frame = sys._getframe(2)
+        with _unwatched(watch):
+            watch.heard(os.path.realpath(os.fsdecode(path)), quotes_source(frame))
+
+
+def _copied(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    """Take note of whether the attributes of a file are asked for in order to copy it."""
+    path = arguments[0]
+    if not isinstance(path, int):
+        copies = sys._getframe(2).f_globals.get("__name__") == "shutil"
+        with _unwatched(watch):
+            watch.heard(os.path.realpath(os.fsdecode(path)), copies)
+
+
+def _named_by_chance(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    """Take note of a temporary file, whose name no other process expects."""
+    above, name = os.path.split(os.path.abspath(os.fsdecode(arguments[0])))
+    with _unwatched(watch):
+        watch.temporary.add(os.path.join(os.path.realpath(above), name))
+
+
 def _file(watch: Watch, arguments: tuple[Any, ...]) -> None:
     path, mode, flags = arguments
     if isinstance(path, int):
@@ -76,6 +115,20 @@ def _of_path(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
         if not isinstance(path, int):
             real = os.path.realpath(os.fsdecode(path))
             watch.records.append(Record(does, real, there=os.path.lexists(real)))
+
+    return note
+
+
+def _of_named_path(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
+    """Return what takes note of an event whose first argument is a path, where a link at its end is meant itself."""
+
+    def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
+        text, folder = os.fsdecode(arguments[0]), arguments[-1]
+        if not os.path.isabs(text) and folder != -1:
+            return  # below an open folder that the event does not name
+        above, name = os.path.split(os.path.abspath(text))
+        path = os.path.join(os.path.realpath(above), name)
+        watch.records.append(Record(does, path, there=os.path.lexists(path)))
 
     return note
 
@@ -127,11 +180,17 @@ _HANDLERS: dict[str, _Handler] = {
     "open": _file,
     "os.listdir": _of_path("list"),
     "os.scandir": _of_path("list"),
-    "os.mkdir": _of_path("make"),
+    "os.mkdir": _of_named_path("make"),
+    "os.remove": _of_named_path("remove"),
+    "os.rmdir": _of_named_path("remove"),
+    "os.symlink": lambda watch, arguments: _of_named_path("make")(watch, (arguments[1], arguments[2])),
     "os.rename": _of_two_paths("move"),
     "os.link": _of_two_paths("link"),
-    "os.getxattr": _of_path("check"),
-    "os.listxattr": _of_path("check"),
+    "os.truncate": _of_path("check"),
+    "os.chmod": _of_path("check"),
+    "os.utime": _of_path("check"),
+    "os.getxattr": _of_path("xattr"),
+    "os.listxattr": _of_path("xattr"),
     "os.system": _command,
     "os.posix_spawn": _command,
     "os.exec": _command,
@@ -150,4 +209,11 @@ _HANDLERS: dict[str, _Handler] = {
     "ctypes.dlopen": _library,
     "builtins.input": _named("input", "the terminal"),
 }
-_EVENTS = frozenset({"subprocess.Popen", *_HANDLERS})
+_FOR_BOTH: dict[str, _Handler] = {
+    "open": _source,
+    "os.getxattr": _copied,
+    "os.listxattr": _copied,
+    "tempfile.mkstemp": _named_by_chance,
+    "tempfile.mkdtemp": _named_by_chance,
+}  #: what only the interpreter knows of a call: who makes it
+_EVENTS = frozenset({"subprocess.Popen", *_HANDLERS, *_FOR_BOTH})

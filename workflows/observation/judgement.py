@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Set
 
 from neusee.workflows.observation.covered_paths import (
     caches,
@@ -27,8 +27,12 @@ _GRND_NONBLOCK, _GRND_INSECURE = 1, 4
 class Judgement:
     """The taints of one call, from its records in their order."""
 
-    def __init__(self, covered: Covered, bodies: dict[str, str]) -> None:
+    def __init__(
+        self, covered: Covered, bodies: dict[str, str], quiet: Set[str] = frozenset(), temporary: Set[str] = frozenset()
+    ) -> None:
+        """Judge by what the key covers, and by what the process knows: see `python_watch.Watch`."""
         self._covered, self._bodies = covered, bodies
+        self._quiet, self._temporary = quiet, temporary
         self._files = {str(path) for path in covered.files}
         self._made: set[str] = set()  #: files and folders that the call itself made
         self._caches = set(caches())
@@ -53,7 +57,7 @@ class Judgement:
 
     def taints(self) -> tuple[Taint, ...]:
         """Return the taints, each once; a look at a folder on the way to another one is none."""
-        reached = [each.what for each in self._taints if each.kind in ("file", "folder")]
+        reached = [each.what for each in self._taints if each.kind in ("file", "folder", "write")]
         on_the_way = {above for path in (*reached, *self._looks) for above in _with_parents(path)[1:]}
         for path in self._looks:
             if path not in on_the_way:
@@ -63,32 +67,57 @@ class Judgement:
     # --- what was done ------------------------------------------------------------------------------------------------
 
     def _open(self, record: Record) -> None:
+        """Judge a file that was opened: whoever does not empty it may learn its length, or that it was there."""
         flags = record.flags
-        if flags & os.O_CREAT and flags & os.O_EXCL and record.there:
-            return  # it failed, as a search for a free name does
         if _TMPFILE and flags & _TMPFILE == _TMPFILE:
             return  # a new file without a name
-        writes = flags & _ACCESS in (os.O_WRONLY, os.O_RDWR)
-        if (flags & os.O_CREAT and not record.there) or (writes and flags & os.O_TRUNC):
+        if flags & os.O_CREAT and (flags & os.O_EXCL or not (record.there or flags & os.O_TRUNC)):
             self._make(record)
+        elif flags & os.O_TRUNC and flags & _ACCESS != os.O_RDONLY:
+            self._add_made(record.path)
         elif flags & _PATH or os.path.isdir(record.path):
             self._check(record)
-        elif flags & _ACCESS != os.O_WRONLY:
+        elif flags & _ACCESS == os.O_WRONLY:
+            self._meet(record)
+        else:
             self._read(record.path)
+            self._read_source(record.path)
 
     def _make(self, record: Record) -> None:
-        if record.does != "make" or not record.there:
+        """Judge what is made if it is not there: that it could be made says that it was not there before."""
+        if record.there or os.path.lexists(record.path):  # the next run finds it
+            self._meet(record)
+        if not record.there:
             self._add_made(record.path)
+
+    def _remove(self, record: Record) -> None:
+        self._meet(record)
+
+    def _meet(self, record: Record) -> None:
+        """Judge a path where the success of a call depends on what was there before."""
+        path, named_by_chance = record.path, any(above in self._temporary for above in _with_parents(record.path))
+        free = record.trusted or named_by_chance or path in self._folders
+        if not (free or self._is_covered(path) or is_searched_program(path)):
+            self.add("write", path)
 
     def _move(self, record: Record) -> None:
         """Follow a file of the step to its new name; any other file is read there, perhaps in a folder of the step."""
+        if os.path.isdir(record.second):  # one that is there stops a move
+            self._meet(record._replace(path=record.second))
         if self._is_made(record.path):
             self._add_made(record.second)
-        elif record.there:
+        elif record.there or not record.trusted:
             self._read(record.path)
 
     def _link(self, record: Record) -> None:
+        if os.path.lexists(record.second):
+            self._meet(record._replace(path=record.second))
         self._move(record)
+
+    def _xattr(self, record: Record) -> None:
+        """Judge marks beside a file: no key has them, also of a file that is covered."""
+        if record.path not in self._quiet and not (self._is_made(record.path) or self._is_of_machine(record.path)):
+            self.add("attribute", record.path)
 
     def _check(self, record: Record) -> None:
         if not (record.path in self._folders or self._is_covered(record.path) or is_searched_program(record.path)):
@@ -136,10 +165,21 @@ class Judgement:
         elif not self._is_covered(path):
             self.add("folder" if os.path.isdir(path) else "file", path)
 
+    def _read_source(self, path: str) -> None:
+        """Judge source of a module that the key follows, which has neither its comments nor its lines."""
+        if path not in self._quiet and not self._is_covered_as_a_whole(path) and self._is_source(path):
+            self.add("file", path)
+
     def _is_covered(self, path: str) -> bool:
+        return self._is_covered_as_a_whole(path) or self._is_source(path)
+
+    def _is_covered_as_a_whole(self, path: str) -> bool:
         if self._is_made(path) or not self._files.isdisjoint(_with_parents(path)):
             return True
-        return is_installed(path) or is_of_system(path) or self._is_cache(path) or self._is_source(path)
+        return self._is_of_machine(path)
+
+    def _is_of_machine(self, path: str) -> bool:
+        return is_installed(path) or is_of_system(path) or self._is_cache(path)
 
     def _is_cache(self, path: str) -> bool:
         return not self._caches.isdisjoint(_with_parents(path))

@@ -89,7 +89,8 @@ def _judged(watch: Watch, covered: Covered, records: list[Record]) -> tuple[Tain
     chance = watch.chance()
     if not (records or watch.bodies or chance):
         return ()
-    judgement = Judgement(covered, watch.bodies)
+    quiet = {path for path, is_quiet in watch.quiet.items() if is_quiet}
+    judgement = Judgement(covered, watch.bodies, quiet, watch.temporary)
     # where Python knows which source of chance was asked, what the kernel says of it is the same once more
     judgement.judge(record for record in records if record.does != "entropy" or not chance)
     judgement.judge_modules()

@@ -15,6 +15,8 @@ T = TypeVar("T")
 WORDS = {
     "file": "reads",
     "folder": "lists",
+    "write": "makes, removes or adds to",
+    "attribute": "reads extended attributes of",
     "process": "starts",
     "network": "asks",
     "random": "draws from",

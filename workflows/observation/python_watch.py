@@ -26,6 +26,8 @@ class Watch:
         self.draws: set[str] = set()  #: sources of chance that were asked
         self.generators: list[Seedable] = []  #: that were made before their seed, if any, was known
         self.bodies: dict[str, str] = {}  #: file of each module of the user that was executed, by name
+        self.quiet: dict[str, bool] = {}  #: files, and whether all who asked for their source or marks need no record
+        self.temporary: set[str] = set()  #: files and folders with names that chance gave
         self._threads: set[threading.Thread] = set()
         self._local = threading.local()
 
@@ -53,6 +55,10 @@ class Watch:
             self._local.trusted = trusted
             self._mark(TRUSTED if trusted else UNTRUSTED)
         return before
+
+    def heard(self, path: str, quiet: bool) -> None:
+        """Take note of who asks for the source or the marks of a file."""
+        self.quiet[path] = quiet and self.quiet.get(path, True)
 
     def trust_child(self) -> None:
         """Trust the next child process that this process starts."""

@@ -20,6 +20,7 @@ class Record(NamedTuple):
     second: str = ""  #: the other path of a call with two, or the family of an address
     flags: int = 0  #: of ``open``
     there: bool = True  #: the path existed before the call
+    trusted: bool = False  #: an import of an installed package, or the program, did it
 
 
 def recorded(task: Task, call: Call, arguments: Sequence[int]) -> Record:
@@ -30,8 +31,8 @@ def recorded(task: Task, call: Call, arguments: Sequence[int]) -> Record:
 def without_reading(record: Record) -> Record | None:
     """Return what remains of a call of a trusted task: the step may read what was made, and nothing else counts."""
     if record.does == "open" and record.flags & (os.O_CREAT | os.O_TRUNC):
-        return record._replace(flags=(record.flags & ~os.O_ACCMODE) | os.O_WRONLY)
-    return record if record.does in ("make", "move") else None
+        return record._replace(flags=(record.flags & ~os.O_ACCMODE) | os.O_WRONLY, trusted=True)
+    return record._replace(trusted=True) if record.does in ("make", "move") else None
 
 
 def _number(call: Call, arguments: Sequence[int]) -> int:
@@ -62,7 +63,8 @@ def _opened(task: Task, call: Call, arguments: Sequence[int]) -> Record:
 
 
 def _at_path(task: Task, call: Call, arguments: Sequence[int]) -> Record:
-    path = _path(task, call.path, arguments)
+    itself = call.does in ("make", "remove")  # a link at the end of the path is meant itself
+    path = _path(task, call.path, arguments, follow=not itself)
     return Record(call.does, path, there=os.path.lexists(path))
 
 
@@ -72,7 +74,8 @@ def _two_paths(task: Task, call: Call, arguments: Sequence[int]) -> Record:
 
 
 def _descriptor(task: Task, call: Call, arguments: Sequence[int]) -> Record:
-    return Record(call.does, task.link(f"fd/{_number(call, arguments)}"))
+    does: Does = "xattr" if call.does == "xattr_open" else call.does
+    return Record(does, task.link(f"fd/{_number(call, arguments)}"))
 
 
 def _address(task: Task, call: Call, arguments: Sequence[int]) -> Record:
@@ -103,9 +106,9 @@ def _entropy(task: Task, call: Call, arguments: Sequence[int]) -> Record:
 _SMALL = 32
 _READ: dict[Does, Callable[[Task, Call, Sequence[int]], Record]] = {
     **dict.fromkeys(("open", "openat2", "creat"), _opened),
-    **dict.fromkeys(("check", "make", "exec"), _at_path),
+    **dict.fromkeys(("check", "xattr", "make", "remove", "exec"), _at_path),
     **dict.fromkeys(("move", "link"), _two_paths),
-    **dict.fromkeys(("list", "input"), _descriptor),
+    **dict.fromkeys(("list", "input", "xattr_open"), _descriptor),
     **dict.fromkeys(("connect", "bind"), _address),
     **dict.fromkeys(("fork", "unseen"), _named),
     "entropy": _entropy,

@@ -12,8 +12,8 @@ from typing import Literal, NamedTuple
 
 #: what a call does, for the process that records it and for the judgement of the records
 Does = Literal[
-    "open", "openat2", "creat", "check", "list", "input", "make", "move", "link", "exec", "fork", "connect",
-    "bind", "entropy", "unseen",
+    "open", "openat2", "creat", "check", "xattr", "xattr_open", "list", "input", "make", "remove", "move", "link",
+    "exec", "fork", "connect", "bind", "entropy", "unseen",
 ]  # fmt: skip
 Test = Literal["without", "nonzero", "zero"]
 
@@ -74,13 +74,27 @@ CALLS = (
     Call("faccessat2", "check", 439, 439, Path(1, 0), when=_about_path(3)),
     Call("readlink", "check", 89, -1, Path(0)),
     Call("readlinkat", "check", 267, 78, Path(1, 0)),
-    Call("getxattr", "check", 191, 8, Path(0)),
-    Call("lgetxattr", "check", 192, 9, Path(0)),
-    Call("listxattr", "check", 194, 11, Path(0)),
-    Call("llistxattr", "check", 195, 12, Path(0)),
-    # what the step makes itself, and may therefore read
+    Call("getxattr", "xattr", 191, 8, Path(0)),
+    Call("lgetxattr", "xattr", 192, 9, Path(0)),
+    Call("fgetxattr", "xattr_open", 193, 10, number=0),
+    Call("listxattr", "xattr", 194, 11, Path(0)),
+    Call("llistxattr", "xattr", 195, 12, Path(0)),
+    Call("flistxattr", "xattr_open", 196, 13, number=0),
+    # these fail where it is not there
+    Call("truncate", "check", 76, 45, Path(0)),
+    Call("chmod", "check", 90, -1, Path(0)),
+    Call("fchmodat", "check", 268, 53, Path(1, 0)),
+    Call("utimensat", "check", 280, 88, Path(1, 0), when=Condition(1, "nonzero")),
+    # what the step makes itself, and may therefore read; whether it could be made or removed says what was there before
     Call("mkdir", "make", 83, -1, Path(0)),
     Call("mkdirat", "make", 258, 34, Path(1, 0)),
+    Call("mknod", "make", 133, -1, Path(0)),
+    Call("mknodat", "make", 259, 33, Path(1, 0)),
+    Call("symlink", "make", 88, -1, Path(1)),
+    Call("symlinkat", "make", 266, 36, Path(2, 1)),
+    Call("unlink", "remove", 87, -1, Path(0)),
+    Call("unlinkat", "remove", 263, 35, Path(1, 0)),
+    Call("rmdir", "remove", 84, -1, Path(0)),
     Call("rename", "move", 82, -1, Path(0), Path(1)),
     Call("renameat", "move", 264, 38, Path(1, 0), Path(3, 2)),
     Call("renameat2", "move", 316, 276, Path(1, 0), Path(3, 2)),

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-Kind = Literal["file", "folder", "process", "network", "random", "import", "unknown"]
+Kind = Literal["file", "folder", "write", "attribute", "process", "network", "random", "import", "unknown"]
 
 
 class Covered(NamedTuple):
@@ -24,10 +24,14 @@ class Taint(NamedTuple):
     fix: str  #: what to write
 
 
+_OF_PATHS = ("file", "folder", "write", "attribute")
 _FIX: dict[Kind, str] = {
     "file": 'declare it, depends=["{name}"], or make it a parameter of type DataFile; or write cache: false',
     "folder": 'declare the folder, depends=["{name}"], or make its files a parameter of type DataFiles; or write '
     "cache: false",
+    "write": 'empty the file where it is opened, mode "w", or write to a temporary one; or, if no result depends on '
+    'what was there before, depends=["unaffected:{name}"]; or write cache: false',
+    "attribute": "give it as a parameter; or write cache: false",
     "process": "compute it in the node, or run it before and give its output as a DataFile; or write cache: false",
     "network": "fetch it before and give the file as a DataFile; or write cache: false",
     "random": "draw from an argument rng of the node, a generator that the engine seeds; or write cache: false",
@@ -38,4 +42,4 @@ _FIX: dict[Kind, str] = {
 
 def taint(kind: Kind, what: str) -> Taint:
     """Return a taint with what to write against it."""
-    return Taint(kind, what, _FIX[kind].format(name=Path(what).name if kind in ("file", "folder") else what))
+    return Taint(kind, what, _FIX[kind].format(name=Path(what).name if kind in _OF_PATHS else what))

@@ -154,3 +154,24 @@ def test_a_step_that_a_worker_taints_is_computed_by_the_caller(lab):
     assert result["last"].tolist() == [40.0] * 3
     assert [is_private(result.keys[name]) for name in ("first", "read", "last")] == [False, True, True]
     assert {key for key, _ in store.entries()} == {result.keys["first"]}
+
+
+LOG = """
+    with open("{folder}/log.txt", "a") as file:
+        file.write("read")
+    with open(f"{{name}}.txt")"""
+
+
+@pytest.mark.filterwarnings("ignore:.*which its cache key does not cover")
+@pytest.mark.parametrize("declared", [True, False])
+def test_a_step_that_adds_to_a_log_is_stored_if_it_states_that_its_result_does_not_depend_on_it(lab, declared):
+    (file,) = lab.glob("reader_*.py")
+    free = 'depends=["dark.txt", "unaffected:log.txt"]' if declared else 'depends=["dark.txt", "unaffected:file"]'
+    text = file.read_text().replace('\n    with open(f"{name}.txt")', LOG.format(folder=lab))
+    file.write_text(text.replace("@node()\ndef table", f"@node({free})\ndef table"))
+    result = run(load("lab.yaml", [], lab), Store(lab / "cache"))
+    assert result["last"].tolist() == [40.0] * 3
+    assert (lab / "log.txt").read_text() == "read"
+    assert is_private(result.keys["read"]) is not declared
+    again = run(load("lab.yaml", [], lab), Store(lab / "cache"))
+    assert (again.done["read"].state == "cached") is declared

@@ -1,6 +1,7 @@
 """Settings of a process that own code may read: they count for own nodes, where they are not the usual ones."""
 
 import json
+import locale
 import os
 import subprocess
 import sys
@@ -68,6 +69,14 @@ def test_how_numbers_are_printed_counts(own):
         assert own() != usual
     with np.printoptions(legacy="1.13"):
         assert "legacy" not in str(own_settings(False))
+
+
+def test_the_encoding_of_texts_counts(own, monkeypatch):
+    usual = own()
+    assert "encoding of texts" not in own_settings(False)
+    monkeypatch.setattr(locale, "getpreferredencoding", lambda do_setlocale=True: "ANSI_X3.4-1968")
+    assert own_settings(False) == {"encoding of texts": "ascii"}
+    assert own() != usual
 
 
 def test_the_time_zone_counts_where_code_may_read_it(own, zone):

@@ -73,9 +73,10 @@ def of_a_relative_path(folder):
 
 
 def of_a_link(folder):
-    link = folder.parent / "link"
-    link.symlink_to(folder / "gain.csv")
-    return link.read_text()
+    with tempfile.TemporaryDirectory() as other:
+        link = Path(other) / "link"
+        link.symlink_to(folder / "gain.csv")
+        return link.read_text()
 
 
 def of_an_open_folder(folder):
@@ -171,8 +172,7 @@ READERS = {
 
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.__name__)
 def test_a_file_that_is_read_is_found(reader, data, taints, layer):
-    known = [data / "link"] if reader is of_a_link else []
-    found = taints(lambda: reader(data), *known)
+    found = taints(lambda: reader(data))
     if layer == "python" and reader is of_an_open_folder:  # which folder it was is not known
         assert ("file", "gain.csv") in found
     else:
@@ -272,13 +272,12 @@ def test_a_file_that_the_step_writes_anew_may_be_read_back_and_one_that_it_appen
         return (data / "gain.json").read_text()
 
     assert taints(anew) == []
-    assert taints(appended) == [("file", "data/gain.json")]
+    assert taints(appended) == [("write", "data/gain.json"), ("file", "data/gain.json")]
 
 
-def test_a_file_that_is_only_written_is_none(data, taints, layer):
+def test_a_file_that_is_only_written_anew_is_none(data, taints, layer):
     def step():
-        with open(data / "log.txt", "a") as file:
-            file.write("done")
+        (data / "log.txt").write_text("done")
 
     assert taints(step) == []
     assert taints(step) == []

@@ -18,7 +18,7 @@ HEADERS = {
     "x86_64": Path("/usr/include/x86_64-linux-gnu/asm/unistd_64.h"),
     "aarch64": Path("/usr/include/asm-generic/unistd.h"),
 }
-OTHER_NAMES = {"newfstatat": "__NR3264_fstatat"}  #: in the header of aarch64
+OTHER_NAMES = {"newfstatat": "__NR3264_fstatat", "truncate": "__NR3264_truncate"}  #: in the header of aarch64
 
 
 @pytest.mark.parametrize("name", HEADERS)
