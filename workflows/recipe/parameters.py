@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,6 +15,7 @@ from neusee.nodes import Node, ParameterError
 from neusee.nodes.file_parameters import is_file, texts_of
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.graph.recipe_graph import Step, Wire
+from neusee.workflows.keys.module_owner import is_own
 from neusee.workflows.recipe.node_families import Own, class_context
 from neusee.workflows.recipe.own_families import VARIABLE as NO_CODE
 from neusee.workflows.recipe.text.field_errors import message_of
@@ -72,9 +74,8 @@ class Checker:
         if bound.node.hooks.preflight is None:
             return ()
         try:
-            return bound.node.hooks.preflight(
-                **bound.params, **{name: inputs.get(name) for name in bound.node.preflight_inputs}
-            )
+            known = {name: inputs.get(name) for name in bound.node.preflight_inputs}
+            return _checked(bound, functools.partial(bound.node.hooks.preflight, **bound.params, **known))
         except ParameterError as error:
             fed, _, name = error.parameter.rpartition(".")
             value = (source(bound.wires.get(fed)) if fed else given.items).get(name)
@@ -96,6 +97,15 @@ class Checker:
         full = [os.path.abspath(path) for path in paths]
         self.files[value.path] = full if isinstance(value.data, list) else full[0]
         return paths if isinstance(value.data, list) else paths[0]
+
+
+def _checked(bound: Step, hook: Callable[[], Sequence[str]]) -> Sequence[str]:
+    """Return the notes of a node's own check, which is observed where the node is one of the user."""
+    if not is_own(bound.node.fn.__module__):
+        return hook()
+    from neusee.workflows.observation.own_hook import call_hook  # imports torch
+
+    return call_hook(bound.node, hook, bound.params)
 
 
 def _problems(
