@@ -26,7 +26,7 @@ class _Place(NamedTuple):
 def is_lazy_constant(tree: ast.Module, name: str) -> bool:
     """Return True if functions of a module set a name, and no argument of a function decides the value."""
     places = list(_places(tree, [], set(), set()))
-    stores = [place for place in places if name in place.shared and name in _stored(place.item)]
+    stores = [place for place in places if name in place.shared and name in _targets(place.item)]
     return bool(stores) and all(_is_free(store, places) for store in stores)
 
 
@@ -59,6 +59,15 @@ def _locals(function: ast.AST) -> set[str]:
     """Return the arguments of a function and the names that it sets."""
     arguments = {each.arg for each in ast.walk(function) if isinstance(each, ast.arg)}
     return arguments | _stored(function)
+
+
+def _targets(item: ast.AST) -> set[str]:
+    """Return the names that a statement itself sets, not those that statements in it set."""
+    if isinstance(item, ast.For | ast.AsyncFor):
+        return _stored(item.target)
+    if isinstance(item, ast.With | ast.AsyncWith):
+        return {name for part in item.items if part.optional_vars for name in _stored(part.optional_vars)}
+    return set() if isinstance(item, ast.ClassDef) or hasattr(item, "body") or hasattr(item, "cases") else _stored(item)
 
 
 def _stored(item: ast.AST) -> set[str]:

@@ -97,15 +97,22 @@ def _is_lazy(module: str, name: str) -> bool:
 
 def _of_others(own: OwnCode) -> dict[str, dict[str, Any]]:
     """Return the attributes of the modules, classes and objects of libraries that own code may change."""
-    found = {name: _found(name) for name in own.changed if "()" not in name and not name.startswith(".")}
-    return {name: _attributes(value) for name, value in found.items() if value is not None}
+    names = [name for name in own.changed if "()" not in name and not name.startswith(".")]
+    found = {name: _attributes(value) for name in names if (value := _found(name)) is not None}
+    for name in names:
+        place, _, last = name.rpartition(".")
+        parts = getattr(_found(place), "__dict__", {}) if place else {}
+        found.setdefault(place, {last: parts[last]} if last in parts else {})
+    return found
 
 
 def _found(name: str) -> Any:
     """Return what has a full name, or None for a name that nothing has."""
     parts = name.split(".")
     most = next((n for n in range(len(parts), 0, -1) if ".".join(parts[:n]) in sys.modules), 0)
-    found: Any = sys.modules[".".join(parts[:most])] if most and parts[0] != _SYSTEM else None
+    if not most or parts[0] == _SYSTEM:
+        return None
+    found: Any = sys.modules[".".join(parts[:most])]
     for part in parts[most:]:
         found = getattr(found, "__dict__", {}).get(part)
     return found
