@@ -58,12 +58,17 @@ TOLD = {
         "float(NORM.running_mean)",
     ),
     "an attribute of torch": ("", "torch.told_gain = by", "getattr(torch, 'told_gain', 0.0)"),
-    "a setting": ("", "np.set_printoptions(precision=int(by))", "float(len(np.array2string(np.array([0.123456789]))) - 4)"),
+    "a setting of torch": (
+        "",
+        "torch.set_float32_matmul_precision('high' if by > 2 else 'medium')",
+        "{'highest': 1.0, 'medium': 2.0, 'high': 3.0}[torch.get_float32_matmul_precision()]",
+    ),
 }  # fmt: skip
 HONEST = {
     "a memo of a function": ("@lru_cache\ndef memo(x):\n    return 2 * x", "memo(by)", "memo(1.0)"),
     "a constant that is made at the first call": (
-        "TABLE = None\n\n\ndef table():\n    global TABLE\n    if TABLE is None:\n        TABLE = np.ones(3)\n    return TABLE",
+        "TABLE = None\n\n\ndef table():\n    global TABLE\n    if TABLE is None:\n        TABLE = np.ones(3)\n"
+        "    return TABLE",
         "table()",
         "float(table()[0])",
     ),
@@ -87,7 +92,7 @@ def lab(tmp_path, request, monkeypatch):
     """Write two nodes of their own module, and run them as a new process would."""
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    files, printed = dict(own_modules._files), __import__("numpy").get_printoptions()
+    files = dict(own_modules._files)
     name = f"told_{abs(hash(request.node.nodeid)) % 10**9}"
     names = (name, f"{name}_helper")
 
@@ -99,7 +104,7 @@ def lab(tmp_path, request, monkeypatch):
         own_modules._files.clear()
         own_modules._files.update(files)
         vars(torch).pop("told_gain", None)
-        __import__("numpy").set_printoptions(precision=printed["precision"])
+        torch.set_float32_matmul_precision("highest")
 
     def compute(parts, by=2.0, declared=""):
         forget()
