@@ -57,7 +57,7 @@ def note_module(name: str) -> None:
 
 def own_modules() -> tuple[str, ...]:
     """Return the names of the modules with nodes of a user that this process has imported, in their order."""
-    return tuple(_files)
+    return tuple(name for name in _files if name in sys.modules)
 
 
 def own_files() -> tuple[str, ...]:

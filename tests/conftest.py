@@ -48,6 +48,6 @@ def pytest_collection_finish() -> None:
 @pytest.fixture(autouse=True, scope="session")
 def nodes_of_tests_are_not_observed():
     """Let nodes that stand in a test itself run as those of neusee do: side by side, in the thread of their lane."""
-    from neusee.workflows.keys import user_code
+    from neusee.workflows.keys import module_owner
 
-    user_code.PROVEN = ("neusee.", "tests.")
+    module_owner.PROVEN = ("neusee.", "tests.")

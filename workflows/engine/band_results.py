@@ -20,6 +20,7 @@ from neusee.nodes import Node
 from neusee.nodes.values import BAND_FIELDS, band_names
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.keys.cache_key import digest, plain
+from neusee.workflows.keys.written_params import written
 from neusee.workflows.store.band_files import Blobs, Damaged, Stacked, bytes_of
 from neusee.workflows.store.serialization import pack
 
@@ -81,7 +82,7 @@ def bands_in(node: Node, inputs: Sequence[Any]) -> int:
 def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
     """Return the cache key of each wavelength band: a digest of node, code, parameters and this band of the inputs."""
     params = {name: plain(value) for name, value in step.params.items()}
-    same: list[Any] = ["band", step.node.path, code, params]
+    same: list[Any] = ["band", step.node.path, code, params, *([said] if (said := written(step)) else [])]
     each: list[list[str]] = []
     for name, value in zip(step.node.inputs, inputs, strict=False):
         axis = _axis(step, name, value)

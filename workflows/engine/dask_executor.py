@@ -27,6 +27,7 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.seal import Unsigned, check_signature, secrets, signature
 from neusee.workflows.keys.tainted_code import taint_code, taints_of
 from neusee.workflows.keys.user_code import own_code
+from neusee.workflows.observation.own_call import tainted_modules
 from neusee.workflows.recipe.node_families import all_nodes
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
@@ -214,7 +215,7 @@ def _one_here(work: StepJob, here: _Here) -> Outcome:
         return Outcome(work, taints=known)
     outcome = carry_out(work, partial(here.fetch, kinds=kinds_of(work)), here.store)
     if work.own and outcome.taints:
-        taint_code(work.own.modules, outcome.taints)
+        taint_code(tainted_modules(work.own, outcome.taints), outcome.taints)
         outcome.value = None
     if outcome.value is not None:
         here.keep(work.key, outcome.value)

@@ -11,7 +11,7 @@ from neusee.nodes import Check
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import device_kind, stream_seed
-from neusee.workflows.store.serialization import each_tensor, settle, tensors_in
+from neusee.workflows.store.serialization import each_tensor, forget_attributes, settle, tensors_in
 from neusee.workflows.store.stored_types import fits as fits_type
 
 
@@ -27,6 +27,8 @@ def call(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int
         raise RunError(step, inputs, error) from error
     if before != [x._version for x in tensors]:
         raise RunError(step, inputs, ValueError("the node changed its input in place: let the node clone the input"))
+    for x in tensors:
+        forget_attributes(x)
     kind = step.node.hints.get("return", Any)
     if not fits_type(value, kind):  # stored, such a value would count as damaged
         name = getattr(kind, "__name__", kind)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from neusee.workflows.engine.step_job import Outcome
 from neusee.workflows.keys.loaded_source import say_once
 from neusee.workflows.keys.tainted_code import taint_code
-from neusee.workflows.observation.own_call import WORDS
+from neusee.workflows.observation.own_call import WORDS, tainted_modules
 
 
 class TaintedRun(Exception):
@@ -33,5 +33,5 @@ def refuse_taints(outcome: Outcome) -> None:
             step.node.fn.__module__,
             f"{text}: its result, and all that follow, are not stored. {taint.fix[0].upper()}{taint.fix[1:]}",
         )
-    if taint_code(outcome.work.own.modules, outcome.taints):
+    if taint_code(tainted_modules(outcome.work.own, outcome.taints), outcome.taints):
         raise TaintedRun(outcome)

@@ -26,8 +26,9 @@ from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, device_kind, is_private, plain
 from neusee.workflows.keys.input_file_digest import file_stamps
+from neusee.workflows.keys.tainted_code import hold_back, may_be_stored
 from neusee.workflows.keys.user_code import OwnCode
-from neusee.workflows.observation.own_call import call_observed
+from neusee.workflows.observation.own_call import call_observed, tainted_modules
 from neusee.workflows.observation.taints import Taint
 from neusee.workflows.store.lease import Lease
 from neusee.workflows.store.metadata import INLINE
@@ -201,6 +202,8 @@ def _observing(function: Callable[..., T], own: OwnCode | None, taints: list[Tai
     def watched(*args: Any, **more: Any) -> T:
         value, found = call_observed(partial(function, *args, **more), own)
         taints.extend(found)
+        if found:
+            hold_back(tainted_modules(own, found))
         return value
 
     return watched
@@ -208,7 +211,8 @@ def _observing(function: Callable[..., T], own: OwnCode | None, taints: list[Tai
 
 def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:
     """Store the metadata of a result, and also its value if reading is faster than computing the result again."""
-    if is_private(outcome.work.key) or outcome.taints:
+    own = outcome.work.own
+    if is_private(outcome.work.key) or outcome.taints or (own and not may_be_stored(own.modules)):
         outcome.value = plain_of(outcome.value)
         return outcome
     work, value, about = outcome.work, outcome.value, _about(outcome)

@@ -90,6 +90,8 @@ class Comparison:
             where = self.wording.source("steps", label.partition("[")[0], "node")
             return [f"{old['node']} -> {new['node']}{where}"]
         found = self.wording.params(label, old["params"], new["params"])
+        if not found and old.get("written") != new.get("written"):
+            found = ["a file of a parameter has another name, or a mapping another order"]
         if old["code"] != new["code"]:
             private = [f"the loaded code of {new['node']} is not that of its file any more: restart Python"]
             found += (

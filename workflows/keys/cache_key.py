@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.keys.input_file_digest import file_digest
+from neusee.workflows.keys.written_params import written
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Step, Wire
@@ -44,6 +45,8 @@ def key_of(
         "params": {name: plain(value) for name, value in step.params.items()},
         "inputs": [_keys_of(step.wires.get(name), keys) for name in node.inputs],
     }
+    if said := written(step):
+        parts["written"] = said
     if node.random:
         parts["stream"] = [seed, step.name, device_kind(device)]
     private = not step.cached or any(map(is_private, [parts["code"], *(keys[name] for name in step.sources)]))

@@ -28,12 +28,13 @@ from neusee.workflows.keys.loaded_source import compiled_as_written, imported, s
 from neusee.workflows.keys.loaded_state import LoadedState, counted_values
 from neusee.workflows.keys.module_look import OURS, Look, Names, Whole, digest_of, installed_look, parts_of
 from neusee.workflows.keys.module_origin import Origin, look_again, module_path, origin_of
+from neusee.workflows.keys.module_owner import is_own
 from neusee.workflows.keys.process_settings import own_settings, settings, workflows_digest
 from neusee.workflows.keys.reachable_code import reached, read_names
 from neusee.workflows.keys.sibling_modules import Siblings
 from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
 from neusee.workflows.keys.tainted_code import holds_here_alone
-from neusee.workflows.keys.user_code import is_own, reads_time
+from neusee.workflows.keys.user_code import reads_time
 
 #: modules that decide no result
 _LEFT_OUT = frozenset({"neusee", ROOT} | {f"{ROOT}.{n}" for n in ("_hooks", "_node", "import_times", "own_modules")})

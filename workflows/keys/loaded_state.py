@@ -28,6 +28,7 @@ from torch import nn
 
 from neusee.nodes import Node
 from neusee.workflows.keys.code_objects import function_code
+from neusee.workflows.keys.module_owner import is_own
 from neusee.workflows.keys.reachable_code import read_names, written_only
 from neusee.workflows.keys.source_summary import Summary
 
@@ -75,7 +76,10 @@ _HOW = _Hows()
 class LoadedState:
     """The state of a loaded module, as a digest, with the modules of the functions and classes that it names."""
 
-    def __init__(self, module: ModuleType, functions: Collection[str], followed: Callable[[str], bool]) -> None:
+    def __init__(
+        self, module: ModuleType, functions: Collection[str], followed: Callable[[str], bool], lazy: bool = True
+    ) -> None:
+        """Describe a module; without ``lazy`` not what a ``cached_property`` holds, which the rest decides."""
         self.modules: dict[str, set[str]] = {}  #: names of functions and classes that the module holds, by module
         self.replaced: list[str] = []  #: functions of the module's own file whose code is not that of the file
         self.changing: dict[str, str] = {}  #: types of objects such as generators, by the name that is or holds them
@@ -83,7 +87,7 @@ class LoadedState:
         self._holds: dict[int, list[str]] = {}  # changes in repeated objects, by id
         self._name, self._file = module.__name__, getattr(module, "__file__", "") or ""
         self._folder = self._file.rpartition("/")[0] or "."
-        self._functions, self._followed = frozenset(functions), followed
+        self._functions, self._followed, self._lazy = frozenset(functions), followed, lazy
         self._seen: dict[int, int] = {}
         self._kept: list[Any] = []  # objects whose id is in _seen, so that no other object gets the same id
 
@@ -165,7 +169,8 @@ class LoadedState:
         """
         kind = type(value)
         if kind is SimpleNamespace or isinstance(value, nn.Module) or self._followed(kind.__module__):
-            return self._typed(value), [(name, self._of(part)) for name, part in _attributes(value)]
+            parts = [(name, part) for name, part in _attributes(value) if self._lazy or not _is_lazy(kind, name)]
+            return self._typed(value), [(name, self._of(part)) for name, part in parts]
         inner = getattr(value, "__wrapped__", None) if kind.__module__ != "typing" else None
         return self._typed(value), self._of(inner) if callable(inner) else ""
 
@@ -184,7 +189,10 @@ class LoadedState:
         local = own or not _found(home, function)
         held = (function.__defaults__, function.__kwdefaults__, function.__closure__) if local else ()
         exact = function_code(code) if local and not own and self._followed(home) else ""
-        return "function", home, code.co_qualname, exact, [part and self._of(part) for part in held]
+        told = [part and self._of(part) for part in held]
+        if own and is_own(home):  # an attribute of a function may hold what a call left in it
+            told += [(name, self._of(part)) for name, part in vars(function).items() if name != "__wrapped__"]
+        return "function", home, code.co_qualname, exact, told
 
     def _class(self, kind: type) -> Any:
         name = ("class", self._noted(kind.__module__, kind.__qualname__), kind.__qualname__)
@@ -244,7 +252,9 @@ def _array(value: Any) -> tuple[Any, ...]:
         if value.device.type == "meta" or value.layout != torch.strided:
             return str(value.dtype), tuple(value.shape)
         flat = value.detach().cpu().contiguous().reshape(-1)
-        raw = flat.resolve_conj().resolve_neg().view(torch.uint8).numpy().tobytes() if flat.numel() else b""
+        raw: Any = flat.resolve_conj().resolve_neg().view(torch.uint8).numpy().data if flat.numel() else b""
+    elif value.flags.c_contiguous and value.dtype.kind in "biufc":
+        raw = value.data  # without a copy
     else:
         raw = repr(value.tolist()).encode() if value.dtype.hasobject else value.tobytes()
     return str(value.dtype), tuple(value.shape), xxhash.xxh3_128_hexdigest(raw)
@@ -255,6 +265,11 @@ def _attributes(value: Any) -> list[tuple[str, Any]]:
     slots = {slot for base in type(value).__mro__ for slot in _named(vars(base).get("__slots__", ()))}
     found = {slot: getattr(value, slot) for slot in sorted(slots) if not slot.startswith("__") and hasattr(value, slot)}
     return list({**found, **getattr(value, "__dict__", {})}.items())
+
+
+def _is_lazy(kind: type, name: str) -> bool:
+    """Return True for an attribute that a ``cached_property`` of its class fills."""
+    return isinstance(getattr(kind, name, None), functools.cached_property)
 
 
 def _named(slots: Any) -> Iterator[str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 from neusee.workflows.keys.scopes_of_names import Scope, last_name, roots
@@ -73,6 +73,13 @@ def reach_of(tree: ast.Module, bound: Mapping[str, str]) -> Reach:
     return Reach(
         sorted(found.outward), sorted(found.passed), sorted(unused), found.inward, found.changes_arguments, found.seeks
     )
+
+
+def outward_names(reaches: Collection[Reach]) -> set[str]:
+    """Return the full names of what code may change in other modules, also by functions that it calls."""
+    names = {name for reach in reaches for name in reach.outward}
+    passed = any(reach.changes_arguments for reach in reaches)
+    return names | {name for reach in reaches for name in reach.passed if passed}
 
 
 class _Pass:

@@ -14,8 +14,8 @@ from typing import Literal
 from neusee.nodes.own_modules import own_modules
 from neusee.workflows.keys.module_look import Look, Whole
 from neusee.workflows.keys.module_origin import origin_of
-from neusee.workflows.keys.outward_code import Reach
-from neusee.workflows.keys.user_code import is_own
+from neusee.workflows.keys.module_owner import is_own
+from neusee.workflows.keys.outward_code import Reach, outward_names
 
 Scope = Literal["nothing", "own", "all"]  #: nodes whose results a module may change
 _GETTER = re.compile(r"get|current|default|instance|global|regist|shared|root", re.IGNORECASE)
@@ -59,9 +59,7 @@ class Siblings:
 def _scope(looks: Mapping[str, Look]) -> Scope:
     """Return whose results the code of a module and of its helpers may change."""
     reaches = _own(looks).values()
-    names = {name for reach in reaches for name in reach.outward}
-    if any(reach.changes_arguments for reach in reaches):
-        names |= {name for reach in reaches for name in reach.passed}
+    names = outward_names(reaches)
     names |= {name for reach in reaches for name in reach.unused if _kind(name) == "distribution"}
     summaries = [look.summary for name, look in looks.items() if is_own(name) and look.summary]
     unseen = any(each.kind in _UNSEEN for summary in summaries for each in summary.constructs)

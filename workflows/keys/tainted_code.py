@@ -12,6 +12,17 @@ from typing import Any
 from neusee.workflows.keys.loaded_source import edited_since
 
 _taints: dict[str, tuple[Any, ...]] = {}  #: by module, what it reached: `observation.taints.Taint`
+_held_back: set[str] = set()  #: modules whose taint the run may not know yet, since it looks at results one by one
+
+
+def hold_back(modules: Iterable[str]) -> None:
+    """Let no result of own modules be stored from now on: one of their steps was just seen to reach too much."""
+    _held_back.update(modules)
+
+
+def may_be_stored(modules: Iterable[str]) -> bool:
+    """Return True if no step that was seen to reach too much has ended while one of these modules computed."""
+    return _held_back.isdisjoint(modules)
 
 
 def taint_code(modules: Iterable[str], taints: tuple[Any, ...]) -> bool:

@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 from neusee.workflows.keys.cache_key import networks_of
 from neusee.workflows.keys.declared_dependencies import FREE
 from neusee.workflows.keys.input_file_digest import files_in
+from neusee.workflows.keys.module_owner import is_own
+from neusee.workflows.keys.outward_code import outward_names
+from neusee.workflows.keys.reachable_code import written_only
 
 if TYPE_CHECKING:
     from neusee.nodes import Node
@@ -18,7 +21,6 @@ if TYPE_CHECKING:
     from neusee.workflows.keys.module_look import Look
 
 _TIMED = frozenset({"datetime", "time", "calendar", "email", "zoneinfo", "sqlite3", "logging"})
-PROVEN = ("neusee.",)  #: packages whose nodes are not observed
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +31,10 @@ class OwnCode:
     followed: frozenset[str]  #: all modules whose source counts
     files: frozenset[str]  #: real paths of parameter files, and of declared files and folders
     free: frozenset[str]  #: what the author states to decide no result: a kind, a name or a path
+    changed: frozenset[str] = frozenset()  #: full names of what the code may change in modules of others
+    unread: frozenset[str] = (
+        frozenset()
+    )  #: full names of lists and dicts that their modules only write to, such as logs
 
 
 def own_code(step: Step, code: Code) -> OwnCode | None:
@@ -52,12 +58,10 @@ def own_code_of(node: Node, params: Mapping[str, Any], networks: Sequence[str], 
         free.update(entry.removeprefix(FREE) for entry in entries if entry.startswith(FREE))
         beside = [source.parent / entry for entry in entries] if source else []
         files.update(os.path.realpath(path) for path in beside if path.exists())
-    return OwnCode(modules, frozenset(looks), frozenset(files), frozenset(free))
-
-
-def is_own(module: str) -> bool:
-    """Return True for a module outside of neusee, whose nodes are proven by its own tests."""
-    return not f"{module}.".startswith(PROVEN)
+    summaries = {name: followed[name].summary for name in modules}
+    changed = outward_names([each.reach for each in summaries.values() if each])
+    unread = {f"{name}.{log}" for name, each in summaries.items() if each for log in written_only(each.statements)}
+    return OwnCode(modules, frozenset(looks), frozenset(files), frozenset(free), frozenset(changed), frozenset(unread))
 
 
 def reads_time(looks: Mapping[str, Look]) -> bool:

@@ -24,8 +24,12 @@ _turn = [threading.Lock()]  #: one observed call at a time: hooks and generators
 _LOOK = 0.05  #: s after which a caller that waits for its turn sees an exception that another thread raises in it
 
 
-def observed(function: Callable[[], T], covered: Covered) -> tuple[T, tuple[Taint, ...]]:
+def observed(
+    function: Callable[[], T], covered: Covered, state: Callable[[], Callable[[], list[Taint]]] | None = None
+) -> tuple[T, tuple[Taint, ...]]:
     """Return the value of a function, and what the function reached that is not covered.
+
+    ``state`` notes what modules hold, before the call, and returns what tells the changes after it.
 
     The function runs in a thread of its own, as its caller would run it, and its exceptions pass unchanged. If the
     process that watches it dies meanwhile, calls of the function fail, so the function is called again: what it uses
@@ -37,7 +41,9 @@ def observed(function: Callable[[], T], covered: Covered) -> tuple[T, tuple[Tain
     while not turn.acquire(timeout=_LOOK):
         pass
     try:
+        told = state() if state is not None else list[Taint]
         step, taints = _observed(function, covered)
+        taints += tuple(told())
     finally:
         turn.release()
     return step.value(), taints

@@ -29,7 +29,7 @@ def import_observed(name: str) -> ModuleType:
     load = functools.partial(importlib.import_module, name)
     module, found = observed_import(load, Covered(frozenset(), lambda _: True))
     new = [each for each in sys.modules if each not in before and origin_of(each, frozenset()).kind == "source"]
-    taints = tuple(taint for taint in found if not any(_declares(each, taint) for each in new))
+    taints = tuple(taint for taint in found if not any(declares(each, taint) for each in new))
     if taints:
         taint_code(new, taints)
         for taint in taints:
@@ -40,7 +40,7 @@ def import_observed(name: str) -> ModuleType:
     return module
 
 
-def _declares(module: str, taint: Taint) -> bool:
+def declares(module: str, taint: Taint) -> bool:
     """Return True if the ``__depends__`` of a module has what was reached."""
     loaded = sys.modules[module]
     entries = [entry for entry in getattr(loaded, "__depends__", ()) if isinstance(entry, str)]

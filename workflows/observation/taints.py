@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-Kind = Literal["file", "folder", "write", "attribute", "process", "network", "random", "import", "unknown"]
+Kind = Literal["file", "folder", "write", "attribute", "process", "network", "random", "import", "memory", "unknown"]
 
 
 class Covered(NamedTuple):
@@ -36,10 +36,19 @@ _FIX: dict[Kind, str] = {
     "network": "fetch it before and give the file as a DataFile; or write cache: false",
     "random": "draw from an argument rng of the node, a generator that the engine seeds; or write cache: false",
     "import": 'write the import as a statement, or declare the module: depends=["{name}"]; or write cache: false',
+    "memory": "return it as a value to the steps that read it, or, if no result depends on it, declare "
+    'depends=["unaffected:{name}"]; or write cache: false',
     "unknown": "write cache: false",
 }
 
 
 def taint(kind: Kind, what: str) -> Taint:
     """Return a taint with what to write against it."""
-    return Taint(kind, what, _FIX[kind].format(name=Path(what).name if kind in _OF_PATHS else what))
+    return Taint(kind, what, _FIX[kind].format(name=_short(kind, what)))
+
+
+def _short(kind: Kind, what: str) -> str:
+    """Return the last name of a file or of something in a module, by which it is declared."""
+    if kind == "memory":
+        return what.rpartition(".")[2]
+    return Path(what).name if kind in _OF_PATHS else what

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from neusee.nodes.file_parameters import is_file, texts_of
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
 from neusee.workflows.graph.recipe_graph import Step, Wire
 from neusee.workflows.keys.input_file_digest import files_in
+from neusee.workflows.keys.module_owner import is_own
 from neusee.workflows.recipe.node_families import Own, class_context
 from neusee.workflows.recipe.text.field_errors import message_of
 from neusee.workflows.recipe.text.named_files import refuse_outside
@@ -71,9 +73,8 @@ class Checker:
         if bound.node.hooks.preflight is None:
             return ()
         try:
-            return bound.node.hooks.preflight(
-                **bound.params, **{name: inputs.get(name) for name in bound.node.preflight_inputs}
-            )
+            known = {name: inputs.get(name) for name in bound.node.preflight_inputs}
+            return _checked(bound, functools.partial(bound.node.hooks.preflight, **bound.params, **known))
         except ParameterError as error:
             fed, _, name = error.parameter.rpartition(".")
             value = (source(bound.wires.get(fed)) if fed else given.items).get(name)
@@ -113,6 +114,15 @@ def _strange(found: Any, value: Value) -> str:
     except ValueError as error:
         return str(error)
     return ""
+
+
+def _checked(bound: Step, hook: Callable[[], Sequence[str]]) -> Sequence[str]:
+    """Return the notes of a node's own check, which is observed where the node is one of the user."""
+    if not is_own(bound.node.fn.__module__):
+        return hook()
+    from neusee.workflows.observation.own_hook import call_hook  # imports torch
+
+    return call_hook(bound.node, hook, bound.params)
 
 
 def _problems(

@@ -77,17 +77,37 @@ def tensors_in(value: Any) -> list[Tensor]:
 
 
 def settle(value: Any) -> Any:
-    """Return ``value`` as if read from the store: contiguous tensors that hold no memory beyond their own elements."""
+    """Return ``value`` as if read from the store: contiguous tensors that hold no memory beyond their own elements.
+
+    They have no attributes and no class of a user, and want a gradient only where gradients are recorded.
+    """
     return each_tensor(_settled, value)
 
 
 def _settled(x: Tensor) -> Tensor:
-    x = x.resolve_conj().resolve_neg().contiguous()
+    x = _bare(x).resolve_conj().resolve_neg().contiguous()
     try:
         spare = x.untyped_storage().nbytes() > x.nbytes
     except NotImplementedError:  # a tensor inside a transform of torch.func has no memory of its own
         spare = False
     return x.clone(memory_format=torch.contiguous_format) if spare else x
+
+
+def forget_attributes(x: Tensor) -> None:
+    """Take from a tensor what was attached to it: a step that reads it from the store does not see that either."""
+    if type(x) is Tensor and vars(x):
+        vars(x).clear()
+
+
+def _bare(x: Tensor) -> Tensor:
+    """Return a tensor without what the store does not keep."""
+    if x.requires_grad and not torch.is_grad_enabled():
+        x = x.detach()
+    kind = type(x)
+    if vars(x) if kind is Tensor else kind.__module__.partition(".")[0] != "torch":
+        with torch._C.DisableTorchFunctionSubclass():
+            return x.as_subclass(Tensor)
+    return x
 
 
 class _Listed:

@@ -21,6 +21,7 @@ from neusee.workflows.keys.cache_key import code_of, digest, plain
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.input_file_digest import file_digest
 from neusee.workflows.keys.regular_file import text_of
+from neusee.workflows.keys.written_params import written
 from neusee.workflows.training.loop.checkpoint import write_whole
 
 FILE = "inputs.json"  #: in the folder of a training
@@ -153,6 +154,8 @@ def _origin(step: Step, seed: int, code: Code) -> dict[str, Any]:
         "params": {name: plain(value) for name, value in step.params.items()},
         "inputs": [plain(step.wires.get(name)) for name in step.node.inputs],
     }
+    if said := written(step):
+        origin["written"] = said
     return {**origin, "stream": [seed, step.name, _ANY_DEVICE]} if step.node.random else origin
 
 
