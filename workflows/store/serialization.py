@@ -19,6 +19,7 @@ import torch
 import xxhash
 from torch import Tensor
 
+from neusee.workflows.keys.seal import may_change
 from neusee.workflows.store.band_files import Blobs, Stacked, bytes_of, dtype_of
 from neusee.workflows.store.layout_check import checked_layout, is_count, is_shape
 from neusee.workflows.store.shared_folder import open_now
@@ -237,13 +238,16 @@ def _parts(tensors: list[Tensor]) -> Iterator[bytes | memoryview]:
 
 
 def read(path: str, expected: str | None, sha256: str | None = None) -> list[Tensor]:
-    """Map the tensors in a safetensors file into memory.
+    """Map the tensors in a safetensors file into memory, or copy them if another user could change them.
 
     Compare the file with the checksum ``expected`` and the digest ``sha256`` if given. Raises `ValueError` for a file
     that differs, or that `write` did not write.
     """
     with open(path, "rb", opener=open_now) as file:
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+        if may_change(file.fileno()):
+            data = mmap.mmap(-1, len(data))
+            file.readinto(data)
     if expected is not None and xxhash.xxh3_128_hexdigest(data) != expected:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
     if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
