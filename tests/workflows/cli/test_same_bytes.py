@@ -75,12 +75,12 @@ COMMANDS = {
     "init": "init {out}",
     "new": "new node mine --in {out}",
     "handbook": "handbook --no-pictures --no-open --quiet --out {out}/book",
-    "study accuracy": "study accuracy mine.yaml --quick --seeds 1",
+    "study accuracy": f"study accuracy first_light {SMALL} ~expect laser=none outputs=[raw,lsr] --quick --seeds 1",
     "study stability": "study stability mine.yaml",
     "study leave-out": "study leave-out mine.yaml",
     "study calibration": "study calibration calibrate 'flats.shape=[32,32]' 'sensor.gain=0.37 DN/e-' --simulations 20",
-    "study uncertainty": "study uncertainty mine.yaml 'sensor.gain=normal(0.5 e-/DN, 0.01 e-/DN)' --error 0.5 "
-    "--most 64 outputs=[saturated]",
+    "study uncertainty": f"study uncertainty first_light {SMALL} ~expect 'sensor.read_noise=normal(10.5 e-, 0.5 e-)' "
+    "--error 0.5 --most 64 outputs=[restored_quality]",
     "study protection": f"study protection axicon doe.waves=5 {PROTECTION}",
 }
 #: commands that print, or that write into the cache alone
@@ -143,8 +143,9 @@ def command(words, project, cache):
     return done
 
 
-def written(words, out, project, cache):
-    """The contents of the files that a command writes, by name without the date."""
+def written(words, kept, project, cache):
+    """The contents of the files that a command writes, by name without the date; they end in the folder ``kept``."""
+    out = kept.parent / "out"  # always the same, because documents state the command
     out.mkdir()
     if words.startswith("report"):
         command(f"run mine.yaml --out {out}", project, cache)
@@ -154,11 +155,13 @@ def written(words, out, project, cache):
     beside = {path for path in below(project) if before.get(path) != path.stat().st_mtime_ns}
     files |= {f"beside {path.relative_to(project)}": path for path in beside if "runs" not in path.parts}
     if words.startswith("compare"):  # its page is all that it writes
-        (page,) = files.values()
-        return {"page": TIME.sub(b"", page.read_bytes().replace(bytes(out), b""))}
+        pages = {name: TIME.sub(b"", path.read_bytes()) for name, path in files.items() if path.name == "report.html"}
+        out.rename(kept)
+        return pages
     found = {name: content(path) for name, path in files.items() if path.name not in DIFFERENT_FILES}
     for path in beside:
         path.unlink()
+    out.rename(kept)
     return found
 
 
@@ -174,7 +177,7 @@ def content(path):
             head, *rows = csv.reader(file)
         kept = [at for at, name in enumerate(head) if name not in MEASURED]
         return [[row[at] for at in kept] for row in (head, *rows)]
-    if path.name == "provenance.json":
+    if path.suffix == ".json":
         return said(json.loads(path.read_bytes(), parse_constant=str))  # NaN is not NaN
     if path.name == "sweep.yaml":  # its first line, a comment, counts the points that were computed
         return said(YAML(typ="safe").load(path.read_text(encoding="utf-8")))
