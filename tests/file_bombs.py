@@ -158,7 +158,7 @@ def chain(path):
         group.create_dataset("accepted", (64,), "f8")
         group.attrs.update({"iteration": 1_000_000, "nwalkers": 64, "ndim": 8, "has_blobs": False})
     content = part.read_bytes()[emcee_sampler._SEAL :]
-    seal = emcee_sampler.seal_file(path.stem, content).ljust(emcee_sampler._SEAL, b"\0")
+    seal = emcee_sampler.seal_file("draws", path.stem, content).ljust(emcee_sampler._SEAL, b"\0")
     path.write_bytes(seal + content)
 
 

@@ -44,6 +44,8 @@ OTHER_LINES = {
     'export NEUSEE_CACHE_SECRET="a long text that only your group knows"': "a shell",
     "export NEUSEE_CACHE=/shared/neusee": "a shell",
     "export NEUSEE_CACHE=s3://my-bucket/neusee": "a shell",
+    "export NEUSEE_CACHE=file:///shared/neusee": "a shell",
+    "export NEUSEE_CACHE_LOCAL=$HOME/neusee-cache": "a shell",
     SYNTAX: "nobody: it is the grammar of a command",
 }
 

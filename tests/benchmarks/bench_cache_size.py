@@ -74,8 +74,8 @@ def fill(root: Path, count: int) -> None:
             about = about_of(i, key, rng)
             if about["payload"]:
                 (root / key[:2] / f"{key}.safetensors").write_bytes(bytes(1024))
-            (root / key[:2] / f"{key}.json").write_bytes(seal_record(about))
-            journal.write(b"\n" + seal_record(row_of(key, about)))
+            (root / key[:2] / f"{key}.json").write_bytes(seal_record("result", about))
+            journal.write(b"\n" + seal_record("journal", row_of(key, about)))
 
 
 def measured(root: Path, words: list[str]) -> tuple[float, float, str]:

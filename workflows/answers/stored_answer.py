@@ -92,7 +92,7 @@ def packed(name: str, answer: Answer) -> bytes:
     rests = {"witnesses": answer.witnesses._asdict(), "stored": answer.stored._asdict()}
     head = json.dumps({**fields, **rests, "files": sizes}).encode()
     content = b"".join([head, b"\n", *answer.files.values()])
-    return seal_file(f"{FOLDER}/{name}", content) + b"\n" + content
+    return seal_file("answer", f"{FOLDER}/{name}", content) + b"\n" + content
 
 
 def unpacked(name: str, raw: bytes) -> Answer:
@@ -102,7 +102,7 @@ def unpacked(name: str, raw: bytes) -> Answer:
     `AttributeError` for any other content.
     """
     seal, _, content = raw.partition(b"\n")
-    head, _, rest = unseal_file(f"{FOLDER}/{name}", seal, content).partition(b"\n")
+    head, _, rest = unseal_file("answer", f"{FOLDER}/{name}", seal, content).partition(b"\n")
     fields: dict[str, Any] = json.loads(head)
     files, at = {}, 0
     for file, size in fields.pop("files"):

@@ -186,23 +186,33 @@ def _gathered(runs: Sequence[Walk], tau: float, steps: int, long: bool) -> Chain
 
 
 def _read(file: Path, index: int) -> Any:
-    """Read the draws of an ensemble into a backend in memory; return None if the file cannot be read or trusted."""
+    """Read the draws of an ensemble into a backend in memory; return None if the file cannot be read or trusted.
+
+    A copy is read, because the file may be replaced after its signature was compared.
+    """
     try:
         content = bytes_of(file)
-        unseal_file(file.stem, content[:_SEAL].rstrip(b"\0"), content[_SEAL:])
-        del content
-        kept = emcee.backends.HDFBackend(str(file), name=f"ensemble{index}", read_only=True)
-        memory = emcee.backends.Backend()
-        with kept.open() as opened:
-            hdf5_needs(file, [opened[kept.name]])
-        memory.reset(*kept.shape)
-        memory.chain, memory.log_prob = kept.get_chain(), kept.get_log_prob()
-        memory.accepted, memory.iteration = kept.accepted, kept.iteration
-        memory.random_state = kept.random_state
-        np.random.RandomState().set_state(memory.random_state)
+        unseal_file("draws", file.stem, content[:_SEAL].rstrip(b"\0"), content[_SEAL:])
+        with TemporaryDirectory(prefix="neusee-") as folder:
+            copy = Path(folder) / "draws.h5"
+            copy.write_bytes(content)
+            memory = _unpacked(copy, index)
     except (OSError, LookupError, AttributeError, ValueError, TypeError, RuntimeError):
         return None
     return memory if _is_whole(memory) else None
+
+
+def _unpacked(file: Path, index: int) -> Any:
+    kept = emcee.backends.HDFBackend(str(file), name=f"ensemble{index}", read_only=True)
+    memory = emcee.backends.Backend()
+    with kept.open() as opened:
+        hdf5_needs(file, [opened[kept.name]])
+    memory.reset(*kept.shape)
+    memory.chain, memory.log_prob = kept.get_chain(), kept.get_log_prob()
+    memory.accepted, memory.iteration = kept.accepted, kept.iteration
+    memory.random_state = kept.random_state
+    np.random.RandomState().set_state(memory.random_state)
+    return memory
 
 
 def _is_whole(memory: Any) -> bool:
@@ -235,7 +245,7 @@ def _write(file: Path, backends: Sequence[Any]) -> None:
             _write_draws(whole, backends)
             content = whole.read_bytes()[_SEAL:]
         with open(part, "wb") as written:
-            written.write(seal_file(file.stem, content).ljust(_SEAL, b"\0") + content)
+            written.write(seal_file("draws", file.stem, content).ljust(_SEAL, b"\0") + content)
             written.flush()
             os.fsync(written.fileno())
         os.replace(part, file)

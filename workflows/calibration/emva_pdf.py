@@ -25,7 +25,8 @@ def pdf(sheet: EmvaSheet, title: str, lines: list[str], budgets: Sequence[Budget
     from matplotlib.backends.backend_pdf import PdfPages
 
     out = io.BytesIO()
-    with styled(), PdfPages(out, metadata={"Title": title, "Creator": "neusee"}) as pages:
+    about = {"Title": title, "Creator": "neusee", "CreationDate": None}  # equal frames give equal bytes
+    with styled(), PdfPages(out, metadata=about) as pages:
         pages.savefig(_summary(sheet, title, lines, {b.key: b for b in budgets}))
         for draw in emva_figures.PICTURES.values():
             if (figure := draw(sheet)) is not None:

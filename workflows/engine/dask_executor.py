@@ -68,7 +68,7 @@ class Dask:
             self.where,
             self.threads,
             _SHARE * min((lane.memory for lane in self._lanes.values()), default=0.0),
-            signature("worker", b""),
+            signature("worker", "", b""),
             key=f"neusee-{work[0].key}-{work[-1].key}-{self._tries[work[0].key]}",
             workers=[work[0].lane] if work[0].lane in self._lanes else None,
             allow_other_workers=True,
@@ -194,7 +194,7 @@ def work_here(chain: tuple[StepJob, ...], where: str, threads: int, room: float,
 
 def _same_secret(signed: str) -> bool:
     try:
-        check_signature(signed, "worker", b"")
+        check_signature(signed, "worker", "", b"")
     except Unsigned:
         return False
     return bool(secrets()) == bool(signed)

@@ -20,6 +20,11 @@ def error_in(about: Mapping[str, Any] | None) -> tuple[float, float] | None:
     return (float(found[0]), float(found[1])) if found else None
 
 
+def checks_in(about: Mapping[str, Any] | None) -> tuple[Check, ...]:
+    """Return the checks in the metadata of a stored result, as they were when it was computed."""
+    return tuple(Check(text, ok) for text, ok in (about or {}).get("checks") or ())
+
+
 def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
     """Return the statistics in the metadata of a stored result, or None if the metadata contain none."""
     found = (about or {}).get("facts")
@@ -30,16 +35,18 @@ def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
 
 
 def unneeded(name: str, key: Key, about: Mapping[str, Any] | None, bound: float | None) -> StepRecord:
-    """Return the record of a step whose value no other step needed."""
-    return StepRecord(name, "not needed", "nothing needed it", 0.0, key, bound=bound, error=error_in(about))
+    """Return the record of a step whose value no other step needed; its checks are those of the stored result."""
+    why, checks, error = "nothing needed it", checks_in(about), error_in(about)
+    return StepRecord(name, "not needed", why, 0.0, key, checks=checks, bound=bound, error=error)
 
 
 def loaded(name: str, key: Key, about: Mapping[str, Any], bound: float | None, why: str, seconds: float) -> StepRecord:
     """Return the record of a step whose stored result was read in ``seconds``."""
     why = why or f"computed {about.get('date')} in {about.get('seconds') or 0.0:.3g} s"
-    checks = tuple(Check(text, ok) for text, ok in about.get("checks") or ())
     size, error = about.get("bytes") or 0, error_in(about)
-    return StepRecord(name, "cached", why, seconds, key, facts_in(about), checks, "cpu", size, bound, error=error)
+    return StepRecord(
+        name, "cached", why, seconds, key, facts_in(about), checks_in(about), "cpu", size, bound, error=error
+    )
 
 
 def ran(outcome: Outcome, why: str, bound: float | None, began: float, expected: Estimate | None) -> StepRecord:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -58,4 +59,5 @@ def _signature(value: Any) -> str:
         found = inspect.signature(value)
     except (TypeError, ValueError):
         return "()"
-    return str(found.replace(parameters=[each for name, each in found.parameters.items() if name != "self"]))
+    shown = str(found.replace(parameters=[each for name, each in found.parameters.items() if name != "self"]))
+    return re.sub(r"<(?:function|class) '?([\w.]*\.)?(\w+)'?(?: at 0x[0-9a-f]+)?>", r"\2", shown)  # no address

@@ -81,7 +81,7 @@ def read_memo(memo: Path) -> dict[str, Summary]:
 def _read(name: str, raw: bytes, signed_by: tuple[bytes, ...]) -> tuple[_Known, dict[str, Summary]]:
     """Return what a memo says; the same bytes are read once in a process, for each list of secrets."""
     seal, _, content = raw.partition(b"\n")
-    known, text = unseal_file(name, seal, content).split(b"\n", 1)
+    known, text = unseal_file("sources", name, seal, content).split(b"\n", 1)
     return _KNOWN.validate_json(known), _SUMMARIES.validate_json(text)
 
 
@@ -98,13 +98,13 @@ def write_memo(memo: Path, summaries: Mapping[str, Summary]) -> None:
     known = _KNOWN.dump_json(_Known(distributions_of, newest, packages))
     text = json.dumps(dict(list(summaries.items())[-_KEPT:])).encode()
     content = b"\n".join([known, text])
-    _write(memo, b"\n".join([seal_file(memo.name, content), content]), memo.parent / "tmp")
+    _write(memo, b"\n".join([seal_file("sources", memo.name, content), content]), memo.parent / "tmp")
 
 
 def read_parts(root: Path, code: str) -> Parts:
     """Return the digest of each definition that the digest ``code`` covers; {} if the record is missing or damaged."""
     try:
-        record = unseal_record(bytes_of(root / "code" / f"{code}.json"))
+        record = unseal_record("definitions", bytes_of(root / "code" / f"{code}.json"))
         return _PARTS.validate_python(record) if record.pop("key", "") == f"code/{code}" else {}
     except (OSError, ValueError):
         return {}
@@ -118,7 +118,7 @@ def write_parts(root: Path, code: str, parts: Parts) -> None:
         if _right.get(path) == stamp or read_parts(root, code):
             _right[path] = stamp
             return
-    _write(path, seal_record({**parts, "key": f"code/{code}"}), root / "tmp")
+    _write(path, seal_record("definitions", {**parts, "key": f"code/{code}"}), root / "tmp")
 
 
 def _stamp(path: Path) -> tuple[int, ...]:

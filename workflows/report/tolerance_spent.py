@@ -131,12 +131,11 @@ def _left_out(result: Result) -> list[StepRecord]:
 
 def _economy(result: Result, costs: Costs, each: Substitution, estimated: bool) -> dict[str, Any]:
     done = result.done.get(each.instead) if each.instead else None
-    about = result.store.about(done.key) if done else None
     return {
         "step": each.step,
         "instead": each.instead,
         "why": each.why,
-        "seconds": _spent_on(result, each) if done and done.state == "run" else about["seconds"] if about else None,
+        "seconds": _spent_on(result, each) if done else None,
         "estimated": estimated,
         "full_seconds": _seconds(result, costs, each.step),
         "bound": done.error[0] if done and done.error else None,
@@ -144,9 +143,21 @@ def _economy(result: Result, costs: Costs, each: Substitution, estimated: bool) 
     }
 
 
-def _spent_on(result: Result, each: Substitution) -> float:
-    """Return the time in s of all steps that replace a step: the cheaper one, and those that choose and check it."""
-    return sum(done.seconds for name, done in result.done.items() if name.startswith(f"{each.step}."))
+def _spent_on(result: Result, each: Substitution) -> float | None:
+    """Return the time in s of all steps that replace a step: the cheaper one, and those that choose and check it.
+
+    A stored result counts with the time in which it was computed; None if the store no longer knows that.
+    """
+    seconds = [_made_in(result, done) for name, done in result.done.items() if name.startswith(f"{each.step}.")]
+    known = [each for each in seconds if each is not None]
+    return sum(known) if len(known) == len(seconds) else None
+
+
+def _made_in(result: Result, done: StepRecord) -> float | None:
+    if done.state == "run":
+        return done.seconds
+    about = result.store.about(done.key)
+    return about["seconds"] if about else None
 
 
 def _seconds(result: Result, costs: Costs, step: str) -> float | None:

@@ -28,7 +28,7 @@ import torch
 import xxhash
 from torch import Tensor
 
-from neusee.workflows.keys.seal import FORMAT, NotRead, OtherFormat, check_signature, secrets, signature
+from neusee.workflows.keys.seal import FORMAT, NotRead, OtherFormat, check_signature, may_change, secrets, signature
 from neusee.workflows.store.layout_check import is_band, is_checksum, is_shape
 from neusee.workflows.store.shared_folder import Disk, open_now
 
@@ -106,7 +106,7 @@ class Blobs:
                     self.read([name], (1, *blob.shape), blob.dtype)
                 return blob.xxh3
         data, kind = bytes_of(x), _kind(x.dtype, tuple(x.shape), name)
-        kind = _signed(kind, signature(name, _sha256(data, kind)) if secrets() else "")
+        kind = _signed(kind, signature("band", name, _sha256(data, kind)) if secrets() else "")
         xxh3 = _checksum(data, kind)
         with self._disk.temporary(name) as (part, file):
             for piece in (data, kind, xxh3.encode(), len(kind).to_bytes(4, "little")):
@@ -263,23 +263,27 @@ def _trailer(file: int, name: str) -> tuple[Blob, bytes]:
 
 
 def _load(file: BufferedReader, expected: Blob, into: memoryview, address: int | None, verify: bool) -> None:
-    """Load a band file into memory; raise `ValueError` if the file holds another band or damaged bytes."""
+    """Load a band file into memory; raise `ValueError` if the file holds another band or damaged bytes.
+
+    It is mapped to ``address``, if that is given and nobody else could change the file after its check.
+    """
     blob, kind = _trailer(file.fileno(), expected.name)
     if blob[:2] != expected[:2]:
         raise ValueError(f"the band file holds {blob.dtype} {blob.shape}, not {expected.dtype} {expected.shape}")
     if expected.xxh3 and blob.xxh3 != expected.xxh3:
         raise ValueError("the band file holds a different band than the band that was written with this result")
+    copied = address is None or may_change(file.fileno())
     # a map is looked into once the file was read: where a device fails, a read raises an error and ends no process
-    found = _checksum_read(file, blob.nbytes, kind) if verify and address is not None else ""
+    found = "" if copied or not verify else _checksum_read(file, blob.nbytes, kind)
     if address is not None:
-        _map(file.fileno(), address, blob.nbytes)
-    elif file.readinto(into) != len(into):
+        _map(None if copied else file.fileno(), address, blob.nbytes)
+    if copied and file.readinto(into) != len(into):
         raise ValueError("the band file was truncated while it was read")
     if verify and (found or _checksum(into, kind)) != blob.xxh3:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
     if secrets():
         plain = _kind(blob.dtype, blob.shape, blob.name)
-        check_signature(blob.sign, blob.name, _sha256(into, plain))
+        check_signature(blob.sign, "band", blob.name, _sha256(into, plain))
 
 
 def _reserve(size: int) -> Any:
@@ -294,8 +298,9 @@ def _reserve(size: int) -> Any:
     return space
 
 
-def _map(file: int, address: int, size: int) -> None:
+def _map(file: int | None, address: int, size: int) -> None:
+    """Map a file, or empty memory if it is None, to an address."""
     assert _LIBC is not None
-    access = mmap.PROT_READ | mmap.PROT_WRITE
-    if _LIBC.mmap(address, size, access, mmap.MAP_PRIVATE | _FIXED, file, 0) != address:
+    access, kind = mmap.PROT_READ | mmap.PROT_WRITE, mmap.MAP_PRIVATE | _FIXED | (mmap.MAP_ANON if file is None else 0)
+    if _LIBC.mmap(address, size, access, kind, -1 if file is None else file, 0) != address:
         raise OSError(ctypes.get_errno(), "the band file cannot be mapped into memory")

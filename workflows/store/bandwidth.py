@@ -42,7 +42,7 @@ class Speeds:
         if not written / _NEWS < self._now[way] < written * _NEWS:
             self._written = dict(self._now)
             with suppress(OSError):
-                self._disk.replace(_FILE, seal_record({str(way): speed for way, speed in self._now.items()}))
+                self._disk.replace(_FILE, seal_record("speeds", {str(way): speed for way, speed in self._now.items()}))
 
     def _speed(self, way: Direction) -> float:
         if not self._now:
@@ -52,7 +52,7 @@ class Speeds:
 
     def _stored(self) -> dict[Direction, float]:
         try:
-            speeds = unseal_record(read_file(f"{self._disk.folder}/{_FILE}"))
+            speeds = unseal_record("speeds", read_file(f"{self._disk.folder}/{_FILE}"))
             return {way: float(speeds[way]) for way in _USUAL if 1e3 < speeds[way] < 1e13}
         except (OSError, ValueError, LookupError, TypeError):
             return {}

@@ -21,6 +21,7 @@ import xxhash
 
 from neusee.workflows.keys.inherited_modes import make_folders
 from neusee.workflows.keys.seal import secrets
+from neusee.workflows.store.metadata import is_kept
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.shared_folder import open_now
 
@@ -42,7 +43,7 @@ class DerivedFiles:
         self._fresh: dict[Path, tuple[int, ...]] = {}  # what the system said of each file when it was right
 
     def find(self, key: str, suffix: str) -> Path | None:
-        """Return the path of the derived file ``key``, or None if the file is missing or has a wrong checksum.
+        """Return the path of the derived file ``key``, or None if it is missing, or has a wrong name or checksum.
 
         A file that this object has written or compared is not compared again while it is the same to the system.
         """
@@ -52,7 +53,9 @@ class DerivedFiles:
         with suppress(KeyError, OSError):
             if path in self._fresh and self._fresh[path] == _state(path):
                 return path
-            if path.is_file() and self.store.has(key) and _is_right(path, self.store.get(key, Tensor)):
+            about = self.store.about(key) if path.is_file() else None
+            named = is_kept(about) and about.get("file") == path.name
+            if named and _is_right(path, self.store.get(key, Tensor)):
                 self._fresh[path] = _state(path)
                 return path
         return None

@@ -53,7 +53,7 @@ class Journal:
         """Append the line of a result to the journal; ignore a failure, because no result depends on the journal."""
         with suppress(OSError):
             try:
-                append(self._path, b"\n" + seal_record(row_of(key, about)))
+                append(self._path, b"\n" + seal_record("journal", row_of(key, about)))
             except FileNotFoundError:
                 with self._guard:
                     self._rebuild()
@@ -116,7 +116,7 @@ class Journal:
                     kept = NO_VALUE not in read_file(self._disk.path(key, "json"))
                     lines.append((place.get(key, -1), *self._line(key, newest.get(key), kept)))
             for key, about in self._others():
-                raw = newest.get(key) or seal_record(row_of(key, about))
+                raw = newest.get(key) or seal_record("journal", row_of(key, about))
                 lines.append((place.get(key, -1), str(about.get("date")), raw))
             lines.sort(key=lambda line: line[:2])
             self._forget()
@@ -141,8 +141,8 @@ class Journal:
         """Return the date and the line of a result, which is ``line`` if that is right."""
         if line is not None and kept == (NO_VALUE not in line):
             return "", line
-        row = row_of(key, metadata.read(self._disk, key)) if line is None else unseal_record(line)
-        return str(row["date"]), seal_record({**row, "kept": kept})
+        row = row_of(key, metadata.read(self._disk, key)) if line is None else unseal_record("journal", line)
+        return str(row["date"]), seal_record("journal", {**row, "kept": kept})
 
     def _forget(self) -> None:
         self._rows = []
@@ -199,7 +199,7 @@ class Journal:
     def _replace(self, rows: list[Row]) -> None:
         """Replace the journal file by the lines ``rows``; a line that another process adds meanwhile may be lost."""
         self._forget()
-        self._replace_lines([seal_record(row) for row in rows])
+        self._replace_lines([seal_record("journal", row) for row in rows])
         self._rows = rows
 
     def _replace_lines(self, lines: list[bytes]) -> None:
@@ -218,7 +218,7 @@ def _parsed(raw: bytes) -> Iterator[Row]:
     for line in raw.split(b"\n"):
         if line:
             with suppress(ValueError):
-                row = unseal_record(line)
+                row = unseal_record("journal", line)
                 if _is_row(row):
                     yield row
 

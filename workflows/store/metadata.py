@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any, TypeGuard
 
-from neusee.workflows.keys.seal import NotRead, seal_record, unseal_record
+from neusee.workflows.keys.seal import Kind, NotRead, seal_record, unseal_record
 from neusee.workflows.store.metadata_fields import checked_fields
 from neusee.workflows.store.shared_folder import Disk, entries, read_file
 
@@ -26,19 +26,19 @@ def read(disk: Disk, key: str) -> Metadata:
 
     Raises `NotRead` for the metadata of another format version, or without the signature that is asked for.
     """
-    return unseal_of(key, read_file(disk.path(key, "json")))
+    return unseal_of("result", key, read_file(disk.path(key, "json")))
 
 
-def unseal_of(key: str, raw: bytes) -> Metadata:
+def unseal_of(kind: Kind, key: str, raw: bytes) -> Metadata:
     """Return the metadata that `seal_record` wrote for ``key``; raise `ValueError` for the metadata of another key."""
-    return checked_fields(unseal_record(raw), key)
+    return checked_fields(unseal_record(kind, raw), key)
 
 
 def write(disk: Disk, key: str, about: Metadata, over: bool) -> bool:
     """Write the metadata of ``key``; if ``over`` is False, keep an existing file and return False."""
     path = disk.path(key, "json")
     with disk.temporary(key) as (part, file):
-        file.write(seal_record(about))
+        file.write(seal_record("result", about))
         file.flush()  # without a sync to disk, because torn metadata fail their checksum
         linked = disk.link(part, path)
         if over and not linked:

@@ -6,6 +6,7 @@ steps with an empty cache sends 256 requests in parallel instead of a thousand i
 
 from __future__ import annotations
 
+import errno
 import os
 import threading
 import time
@@ -17,6 +18,7 @@ from contextlib import suppress
 from typing import Any, Literal, TypeVar
 
 from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.keys.regular_file import NotRegular
 
 T = TypeVar("T")
 Direction = Literal["down", "up"]
@@ -29,6 +31,7 @@ _ORPHAN = 86400.0  #: s after which a half-written file counts as abandoned
 _FOLDERS = tuple(f"{i:02x}" for i in range(256))
 _RENAMES = frozenset({"file", "local", "sftp", "ssh"})  #: show half-written files, but can rename files
 _NEAR = frozenset({"file", "local", "memory"})
+_NO_FILE = (errno.ELOOP, errno.ENXIO, errno.EISDIR, errno.ENOTDIR)  #: what is there is a link in a circle or a folder
 
 
 class RemoteFiles:
@@ -173,13 +176,13 @@ class RemoteFiles:
 
     def _attempt(self, direction: Direction, do: Callable[[], T], size: Callable[[T], int] | None = None) -> T | None:
         """Return the result of the function ``do``, or None if ``do`` fails or the URL is disabled after a failure."""
-        if time.monotonic() < self._resume[direction]:
+        if time.monotonic() < self._resume[direction] or (direction == "up" and self._is_read_only()):
             return None
         began = time.perf_counter()
         try:
             result = do()
         except Exception as error:  # file systems raise different errors, which have no other common base class
-            if not (direction == "down" and isinstance(error, FileNotFoundError)):
+            if not (direction == "down" and _counts_as_missing(error)):
                 self._failed(direction, error)
             return None
         self._pause[direction] = _PAUSE
@@ -187,7 +190,13 @@ class RemoteFiles:
             self._update_speed(direction, size(result), time.perf_counter() - began)
         return result
 
+    def _is_read_only(self) -> bool:
+        """Return True for a folder that this user may only read, in which case nobody expects results there."""
+        return hasattr(self._fs, "is_read_only") and bool(self._fs.is_read_only())
+
     def _failed(self, direction: Direction, error: Exception) -> None:
+        if direction == "up" and isinstance(error, IsADirectoryError):
+            return  # a folder in the place of one file
         alone = isinstance(error, PermissionError | FileNotFoundError)  # a file that cannot be written may be readable
         for each in (direction,) if alone else _DIRECTIONS:
             self._resume[each] = time.monotonic() + self._pause[each]
@@ -202,6 +211,13 @@ class RemoteFiles:
         else:
             rate = size / max(seconds - self._latency[direction], 1e-6)
             self._rate[direction] += (rate - self._rate[direction]) / 3
+
+
+def _counts_as_missing(error: Exception) -> bool:
+    """Return True for the error of one name at a URL, which says nothing of the others."""
+    if isinstance(error, FileNotFoundError | NotRegular):
+        return True
+    return isinstance(error, OSError) and error.errno in _NO_FILE
 
 
 def _file_system(url: str) -> tuple[Any, str]:
@@ -220,4 +236,9 @@ def _file_system(url: str) -> tuple[Any, str]:
         if scheme in known:
             raise
         raise ValueError(f"no file system has the scheme {scheme}:// of {url}; {nearest(scheme, known)}") from error
-    return file_system, str(path).rstrip("/")
+    path = str(path).rstrip("/")
+    if file_system.protocol in ("file", "local", ("file", "local")):
+        from neusee.workflows.store.folder_at_url import FolderAtUrl
+
+        file_system = FolderAtUrl(path)
+    return file_system, path

@@ -23,7 +23,7 @@ from typing import Any
 import xxhash
 
 from neusee.workflows.keys.cache_key import Key, digest
-from neusee.workflows.keys.seal import NotRead, seal_record, secrets
+from neusee.workflows.keys.seal import Kind, NotRead, seal_record, secrets
 from neusee.workflows.store.environment import Verify
 from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept, read, receipt, unseal_of
 from neusee.workflows.store.payload import newest, stamp_of
@@ -93,7 +93,7 @@ class RemoteStore(Store):
         """Store the metadata of a result without its value, locally and at the URL."""
         stored = super().put_receipt(key, about)
         if stored and not self._remote.exists(_receipt_name(key)) and not self._remote.exists(f"{key}.json"):
-            self._remote.write(_receipt_name(key), seal_record(receipt({"key": key, **about})))
+            self._remote.write(_receipt_name(key), seal_record("receipt at a URL", receipt({"key": key, **about})))
         return stored
 
     def entries(self) -> Iterator[tuple[Key, Metadata]]:
@@ -121,17 +121,17 @@ class RemoteStore(Store):
         """Return the metadata of a result at the URL; if ``look`` is True, request an unlisted file too."""
         value, note = f"{key}.json", _receipt_name(key)
         if key not in self._broken and (look or self._remote.exists(value)) and not is_kept(self._seen.get(key)):
-            self._read_metadata(key, value)
+            self._read_metadata(key, value, "result at a URL")
         if key not in self._seen and self._remote.exists(note):
-            self._read_metadata(key, note)
+            self._read_metadata(key, note, "receipt at a URL")
         return self._seen.get(key)
 
-    def _read_metadata(self, key: Key, name: str) -> None:
+    def _read_metadata(self, key: Key, name: str, kind: Kind) -> None:
         """Read the metadata file ``name`` at the URL; damaged metadata count as missing, after a warning."""
         raw = self._remote.read(name)
         if raw is not None:
             try:
-                self._seen[key] = unseal_of(key, raw)
+                self._seen[key] = unseal_of(kind, key, raw)
             except NotRead as error:
                 self._give_up(key)
                 self.leave(error)
@@ -228,7 +228,7 @@ class RemoteStore(Store):
             )
             if not all(sent):
                 return
-        if self._remote.write(name, seal_record(about), over):
+        if self._remote.write(name, seal_record("result at a URL", about), over):
             self._broken.discard(key)
 
     def _files(self, key: Key, about: Metadata) -> dict[str, str]:

@@ -12,6 +12,7 @@ import hashlib
 import json
 import math
 import mmap
+import os
 from collections.abc import Callable, Iterator
 from typing import IO, Any
 
@@ -19,6 +20,7 @@ import torch
 import xxhash
 from torch import Tensor
 
+from neusee.workflows.keys.seal import may_change
 from neusee.workflows.store.band_files import Blobs, Stacked, bytes_of, dtype_of
 from neusee.workflows.store.layout_check import checked_layout, is_count, is_shape
 from neusee.workflows.store.shared_folder import open_now
@@ -258,15 +260,23 @@ def _parts(tensors: list[Tensor]) -> Iterator[bytes | memoryview]:
 
 
 def read(path: str, expected: str | None, sha256: str | None = None) -> list[Tensor]:
-    """Map the tensors in a safetensors file into memory.
+    """Map the tensors in a safetensors file into memory, or copy them if another user could change them.
 
     Compare the file with the checksum ``expected`` and the digest ``sha256`` if given. Raises `ValueError` for a file
     that differs, or that `write` did not write.
     """
+    wanted: list[tuple[Any, str | None]] = [(xxhash.xxh3_128, expected), (hashlib.sha256, sha256)]
+    digests = [function() for function, text in wanted if text is not None]
     with open(path, "rb", buffering=0, opener=open_now) as file:
-        # read and not mapped: where a device fails, a read raises an error, and a look into a map ends the process
-        found = digests_of(file, *([xxhash.xxh3_128()] if expected else []), *([hashlib.sha256()] if sha256 else []))
-        data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+        if may_change(file.fileno()):
+            data = _copied(file)
+            for digest in digests:
+                digest.update(data)
+        else:
+            # read and not mapped: where a device fails, a read raises an error, and a look into a map ends the process
+            digests_of(file, *digests)
+            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+    found = [digest.hexdigest() for digest in digests]
     if expected is not None and found[0] != expected:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
     if sha256 is not None and found[-1:] != [sha256]:
@@ -277,6 +287,15 @@ def read(path: str, expected: str | None, sha256: str | None = None) -> list[Ten
         raise ValueError("the header of the file of tensors is missing or cut short")
     numbers = sorted(int(name) for name in header if name.isdecimal())
     return [_entry(data, start, header.get(str(i)), kinds.get(str(i))) for i in numbers]
+
+
+def _copied(file: IO[bytes]) -> mmap.mmap:
+    """Return the bytes of a file in memory of this process."""
+    size = os.fstat(file.fileno()).st_size
+    data, done = mmap.mmap(-1, size), 0
+    while done < size and (count := file.readinto(memoryview(data)[done:])):  # type: ignore[attr-defined]
+        done += count
+    return data
 
 
 def digests_of(file: IO[bytes], *digests: Any) -> list[str]:

@@ -128,17 +128,19 @@ class Disk:
             os.close(file)
 
     def _lock_file(self) -> int:
-        path = f"{self.folder}/tmp/.lock"
-        if os.path.islink(path):
-            os.unlink(path)
+        """Open the file of the lock without waiting; what is no file is removed first, if this user may."""
+        path, careful = f"{self.folder}/tmp/.lock", os.O_NOFOLLOW | os.O_NONBLOCK
+        with suppress(OSError):
+            if not stat.S_ISREG(os.lstat(path).st_mode):
+                os.unlink(path)
         try:
-            return os.open(path, os.O_RDWR | os.O_TRUNC | os.O_NOFOLLOW)
+            return os.open(path, os.O_RDWR | os.O_TRUNC | careful)
         except FileNotFoundError:
-            file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+            file = os.open(path, os.O_RDWR | os.O_CREAT | careful, 0o666)
             self.share(path)
             return file
         except (PermissionError, IsADirectoryError):
-            return os.open(path, os.O_RDONLY)
+            return os.open(path, os.O_RDONLY | careful)
 
     def sweep(self, dry: bool = False, patience: float = math.inf) -> list[tuple[str, int]]:
         """Remove the temporary files of dead processes; return the path and the bytes of each file.

@@ -40,7 +40,7 @@ class SmallResults:
         with suppress(*UNREADABLE):  # also a KeyError if the key has no line
             raw = self._lines[key]
             if key not in self._read or self._read[key][0] is not raw:
-                self._read[key] = raw, metadata.unseal_of(key, raw)
+                self._read[key] = raw, metadata.unseal_of("small result", key, raw)
             return self._read[key][1]
         return None
 
@@ -49,7 +49,7 @@ class SmallResults:
 
         Raises `OSError` if the line cannot be written.
         """
-        raw = seal_record(about)
+        raw = seal_record("small result", about)
         try:
             self._write(raw)
         except (FileNotFoundError, IsADirectoryError):

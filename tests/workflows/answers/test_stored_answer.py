@@ -42,7 +42,7 @@ def sealed(name=NAME, **changed):
     """The bytes of an answer with another field, under a seal that is right."""
     head, _, rest = packed(NAME, ANSWER).partition(b"\n")[2].partition(b"\n")
     content = json.dumps(json.loads(head) | changed).encode() + b"\n" + rest
-    return seal_file(f"answers/{name}", content) + b"\n" + content
+    return seal_file("answer", f"answers/{name}", content) + b"\n" + content
 
 
 def test_an_answer_is_read_as_it_was_written(disk, stored):

@@ -47,7 +47,7 @@ def forged(change):
         with h5py.File(path, "a") as file:
             change(file["ensemble0"])
         content = path.read_bytes()[512:]
-        path.write_bytes(seal_file(path.stem, content).ljust(512, b"\0") + content)
+        path.write_bytes(seal_file("draws", path.stem, content).ljust(512, b"\0") + content)
 
     return forge
 
@@ -121,3 +121,29 @@ def test_a_sealed_file_of_draws_is_a_file_of_emcee(tmp_path, sampled):
     sampled(tmp_path / "draws.h5")
     kept = emcee.backends.HDFBackend(str(tmp_path / "draws.h5"), name="ensemble3", read_only=True)
     assert kept.get_chain().shape == (20, WALKERS, 2)
+
+
+def test_signed_draws_of_another_key_or_kind_of_file_are_not_read(tmp_path, sampled, monkeypatch):
+    monkeypatch.setenv("NEUSEE_CACHE_SECRET", "ours")
+    path, other = tmp_path / "draws.h5", tmp_path / "other.h5"
+    sampled(path)
+    other.write_bytes(path.read_bytes())
+    assert sampled(other)[1] > 0, "signed for another key"
+    content = path.read_bytes()[512:]
+    path.write_bytes(seal_file("answer", path.stem, content).ljust(512, b"\0") + content)
+    assert sampled(path)[1] > 0, "signed as another kind of file"
+
+
+def test_draws_that_are_exchanged_after_their_check_are_not_read(tmp_path, sampled, monkeypatch):
+    path, other = tmp_path / "draws.h5", tmp_path / "other.h5"
+    right, _ = sampled(path)
+    sampled(other)
+    forged(lambda group: group["chain"].write_direct(np.ones(group["chain"].shape)))(other)
+    whole, check = other.read_bytes(), emcee_sampler.unseal_file
+
+    def exchanged(*words):
+        check(*words)
+        path.write_bytes(whole)
+
+    monkeypatch.setattr(emcee_sampler, "unseal_file", exchanged)
+    assert np.array_equal(sampled(path)[0], right)

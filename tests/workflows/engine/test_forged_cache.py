@@ -99,8 +99,8 @@ def result(root):
 def test_a_run_on_forged_entries_computes_them_and_the_next_one_finds_them(tmp_path, how):
     result(tmp_path)
     for path in tmp_path.glob("??/*.json"):
-        about = unseal_record(path.read_bytes())
-        path.write_bytes(seal_record(about | FORGERIES[how](about)))
+        about = unseal_record("result", path.read_bytes())
+        path.write_bytes(seal_record("result", about | FORGERIES[how](about)))
     result(tmp_path)
     result(tmp_path)
     CALLS.clear()
@@ -117,7 +117,7 @@ def test_a_run_on_a_forged_journal_plans_as_if_it_were_not_there(tmp_path):
         for row in rows:
             for _ in range(20):
                 bad = {rng.choice(["peak", "bytes", "seconds"]): rng.choice([1e30, "x", -5, None, [], float("nan")])}
-                file.write(b"\n" + seal_record({**row, **bad}))
+                file.write(b"\n" + seal_record("journal", {**row, **bad}))
     for path in tmp_path.glob("??/*.json"):
         path.unlink()
     result(tmp_path)
@@ -148,7 +148,7 @@ def test_a_worker_knows_the_type_of_each_input():
 @pytest.mark.parametrize(("caller", "worker", "same"), [("", "one", False), ("one", "", False), ("one", "two", False)])
 def test_a_worker_with_another_secret_says_so(tmp_path, monkeypatch, caller, worker, same):
     monkeypatch.setenv("NEUSEE_CACHE_SECRET", caller)
-    signed = signature("worker", b"")
+    signed = signature("worker", "", b"")
     monkeypatch.setenv("NEUSEE_CACHE_SECRET", worker)
     work = StepJob(recipe().steps["light"], "k", {"code": ""}, (), 1, "r", "cpu", "l")
     (outcome,) = work_here((work,), str(tmp_path), torch.get_num_threads(), 1e9, signed)

@@ -47,7 +47,7 @@ def with_the_tree_of(first, second, raw):
     own = [name for name, summary in summaries.items() if "value()" in summary[6]]
     summaries[own[second]][:2] = summaries[own[first]][:2]
     content = names + b"\n" + json.dumps(summaries).encode()
-    return seal_file("code.json", content) + b"\n" + content
+    return seal_file("sources", "code.json", content) + b"\n" + content
 
 
 @pytest.mark.parametrize("secret", ["", "ours"])
@@ -80,11 +80,11 @@ def test_a_record_of_definitions_of_another_writer_is_not_read_and_written_anew(
     assert read_parts(root, found) == right
     other = {"neusee.nodes.sealed_trial": {"value()": "0"}}
     for content in (
-        seal_record({"key": "code/0123", **other}),
+        seal_record("definitions", {"key": "code/0123", **other}),
         path.read_bytes().replace(b"value()", b"other()"),
         b"",
         b"\xff\x00\n{",
-        seal_record({"key": f"code/{found}", "module": [1]}),
+        seal_record("definitions", {"key": f"code/{found}", "module": [1]}),
         b"[" * 100_000,
     ):
         path.write_bytes(content)
@@ -94,14 +94,14 @@ def test_a_record_of_definitions_of_another_writer_is_not_read_and_written_anew(
 
 
 def test_the_seal_of_a_file_covers_its_name_and_its_content():
-    seal = seal_file("a", b"content")
-    assert unseal_file("a", seal, b"content") == b"content"
+    seal = seal_file("answer", "a", b"content")
+    assert unseal_file("answer", "a", seal, b"content") == b"content"
     for name, content in (("b", b"content"), ("a", b"Content")):
         with pytest.raises(ValueError, match="not what was sealed"):
-            unseal_file(name, seal, content)
-    record = unseal_record(seal)
+            unseal_file("answer", name, seal, content)
+    record = unseal_record("answer", seal)
     with pytest.raises(ValueError, match="not what was sealed"):
-        unseal_file("a", seal_record({**record, "more": 1}), b"content")
+        unseal_file("answer", "a", seal_record("answer", {**record, "more": 1}), b"content")
 
 
 def test_flipped_bits_of_a_record_of_definitions_give_no_definitions(package):

@@ -110,6 +110,15 @@ def test_a_large_tolerance_spoils_no_figure_of_merit(recipe, warm):
     assert run(wide, warm, ["raw[plain]"]).recipe.limit("raw[plain]") == 0.1
 
 
+def test_what_a_cheaper_step_says_and_took_is_said_again_from_the_cache(recipe, tmp_path):
+    first = spent(run(recipe, Store(tmp_path)))["economies"]
+    again = run(recipe, Store(tmp_path))
+    assert {record.state for record in again.done.values()} <= {"cached", "not needed", "left out"}
+    assert all(each["what"] and each["seconds"] for each in first if each["instead"])
+    for name in ("what", "seconds", "bound", "instead", "why"):
+        assert [each[name] for each in spent(again)["economies"]] == [each[name] for each in first], name
+
+
 def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
     result = run(recipe, store)
     before = spent(result)

@@ -62,11 +62,11 @@ def sidecar(root, key=KEY):
     return root / key[:2] / f"{key}.json"
 
 
-def forge(root, change, key=KEY):
+def forge(root, change, key=KEY, kind="result"):
     """Change the metadata of an entry, and seal what came out, as anybody can who knows the format."""
     path = sidecar(root, key)
-    about = unseal_record(path.read_bytes())
-    path.write_bytes(seal_record(change(about) or about))
+    about = unseal_record(kind, path.read_bytes())
+    path.write_bytes(seal_record(kind, change(about) or about))
 
 
 def found(root, kind=Stop | torch.Tensor):
@@ -215,7 +215,7 @@ def test_a_named_tuple_with_wrong_fields_is_a_miss(tmp_path, items):
 
 def as_format(raw, version):
     """The same entry as another version of the program would write it."""
-    about = unseal_record(raw)
+    about = unseal_record("result", raw)
     if version is not None:
         about["format"] = version
     body = json.dumps(about, separators=(",", ":"))[:-1].encode()
@@ -475,10 +475,10 @@ def test_forged_lines_of_the_journal_do_no_harm(tmp_path):
     with (tmp_path / "journal.jsonl").open("ab") as file:
         for field in ("peak", "seconds", "bytes"):
             for bad in (1e30, -1.0, "much", float("nan"), float("inf"), [], True, 10**400):
-                file.write(b"\n" + seal_record({**rows[0], field: bad}))
+                file.write(b"\n" + seal_record("journal", {**rows[0], field: bad}))
         for _ in range(300):
             line = mutated(rng, rows[0])
-            file.write(b"\n" + seal_record(line if isinstance(line, dict) else {}))
+            file.write(b"\n" + seal_record("journal", line if isinstance(line, dict) else {}))
         file.write(b"\n" + json.dumps({**rows[0], "peak": 10**11}).encode())  # in range, without a seal
     found = Store(tmp_path).journal.rows()
     assert found[:5] == rows
@@ -497,7 +497,7 @@ def test_forged_small_results_do_no_harm(tmp_path):
         store.put_small(KEY, torch.zeros(3), ABOUT)
         about = mutated(rng, SmallResults(store.disk).find(KEY))
         with (root / "brief.jsonl").open("ab") as file:
-            file.write(b"\n" + seal_record({"key": KEY, **(about if isinstance(about, dict) else {})}))
+            file.write(b"\n" + seal_record("small result", {"key": KEY, **(about if isinstance(about, dict) else {})}))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             for _ in range(2):
@@ -523,7 +523,7 @@ def test_a_forged_entry_at_a_url_does_no_harm(tmp_path, monkeypatch, secret):
         RemoteStore(url, tmp_path / f"one{i}").put(KEY, STOP, ABOUT)
         fs, root = fsspec.core.url_to_fs(url)
         (path,) = fs.find(root)
-        forge(Path(path).parents[1], lambda about, layout=layout: {**about, "layout": layout})
+        forge(Path(path).parents[1], lambda about, layout=layout: {**about, "layout": layout}, kind="result at a URL")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             two = RemoteStore(url, tmp_path / f"two{i}")

@@ -502,9 +502,9 @@ def test_a_result_that_takes_its_name_while_one_looks_is_not_damaged(tmp_path, m
 
 def test_entries_from_before_there_were_receipts_are_values(tmp_path):
     keep(tmp_path, BIG)
-    about = unseal_record(sidecar(tmp_path).read_bytes())
+    about = unseal_record("result", sidecar(tmp_path).read_bytes())
     del about["kept"], about["payload"]["stamp"]
-    sidecar(tmp_path).write_bytes(seal_record(about))
+    sidecar(tmp_path).write_bytes(seal_record("result", about))
     assert Store(tmp_path).has(KEY)
     for verify in ("always", "sampled", "never"):
         same(Store(tmp_path, verify=verify).get(KEY), BIG)
@@ -538,10 +538,10 @@ def quietly_flipped(root):
     """A bit that changes without the file being touched, as a disk may do it; the file's stamp is put back."""
     stamp, path = payload(root).stat(), payload(root)
     flip(path, 0.9)
-    about = unseal_record(sidecar(root).read_bytes())
+    about = unseal_record("result", sidecar(root).read_bytes())
     os.utime(path, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
     about["payload"]["stamp"] = payload_module.stamp_of(str(path))
-    sidecar(root).write_bytes(seal_record(about))
+    sidecar(root).write_bytes(seal_record("result", about))
 
 
 def test_sampled_finds_what_was_written_to_at_once(tmp_path, monkeypatch):

@@ -2,16 +2,11 @@
 
 import json
 import os
-import shutil
 import subprocess
-import sys
-import tempfile
-from pathlib import Path
 
 import pytest
 
-GROUP = 60_001
-FIRST, SECOND, STRANGER = 60_011, 60_012, 60_013  #: numbers of users; no account is needed
+from tests.workflows.store.other_users import FIRST, GROUP, SECOND, STRANGER, command_of
 
 RUN = """
 import json, sys, warnings
@@ -35,51 +30,6 @@ print(json.dumps({"states": states, "kept": [r.kept for r in result.done.values(
 """
 
 
-#: what a user must read, and what the home folder of root may hide
-NEEDED = tuple(dict.fromkeys(map(os.path.realpath, (sys.base_prefix, sys.prefix, Path(__file__).parents[3]))))
-
-
-def hidden_above(path):
-    """The highest folder above a path that other users may not enter, or None."""
-    above = [path, *map(str, Path(path).parents)]
-    return next((folder for folder in reversed(above) if not os.stat(folder).st_mode & 0o001), None)
-
-
-def opened(place):
-    """Lines of a shell that, in a mount namespace of their own, let every user enter what Python needs."""
-    lines, known = ["set -e", "mount --make-rprivate /"], {}
-    for path in NEEDED:
-        top = hidden_above(path)
-        if top is None:
-            continue
-        if top not in known:
-            known[top] = f"{place}/real-{len(known)}"
-            lines += [
-                f"mkdir {known[top]}",
-                f"mount --bind {top} {known[top]}",
-                f"mount -t tmpfs -o mode=755 none {top}",
-            ]
-        inside = os.path.relpath(path, top)
-        lines += [f"mkdir -p {path}", f"mount --bind {known[top]}/{inside} {path}"]
-    return lines
-
-
-@pytest.fixture
-def place():
-    """A folder that every user may enter."""
-    folder = Path(tempfile.mkdtemp(prefix="neusee-users-"))
-    folder.chmod(0o755)
-    yield folder
-    shutil.rmtree(folder)
-
-
-def command_of(place, user, groups, umask, *words):
-    """The command that runs Python as a user; in a test, ``words`` are its arguments."""
-    who = ["setpriv", f"--reuid={user}", f"--regid={user}", f"--groups={groups}" if groups else "--clear-groups"]
-    script = "; ".join([*opened(tempfile.mkdtemp(dir=place)), f"umask {umask:04o}", 'exec "$@"'])
-    return ["unshare", "--mount", "sh", "-c", script, "sh", *who, sys.executable, "-c", *words]
-
-
 def as_user(user, cache, *words, groups=str(GROUP), umask=0o022):
     """What a user's process says of a run with a cache; its own group is not that of the cache."""
     home = cache.parent / f"home-{user}"
@@ -93,23 +43,6 @@ def as_user(user, cache, *words, groups=str(GROUP), umask=0o022):
     done = subprocess.run(command, env=environment, cwd=home, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
-
-
-@pytest.fixture
-def cache(place):
-    if not hasattr(os, "geteuid") or os.geteuid() != 0:
-        pytest.skip("only root can start processes of other users")
-    if not (shutil.which("unshare") and shutil.which("setpriv")):
-        pytest.skip("there is no unshare and setpriv of util-linux")
-    tried = subprocess.run(
-        command_of(place, STRANGER, "", 0o022, "import neusee"), capture_output=True, text=True, cwd="/"
-    )
-    if tried.returncode:
-        pytest.skip(f"other users cannot read this Python, and mounts are not allowed: {tried.stderr[-200:]}")
-    folder = place / "cache"
-    folder.mkdir()
-    os.chown(folder, FIRST, GROUP)
-    return folder
 
 
 def owners(cache):

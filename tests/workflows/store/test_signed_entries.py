@@ -101,27 +101,28 @@ def test_what_is_unsigned_is_told_of_once_and_left_alone(tmp_path, secret):
     assert {path: path.read_bytes() for path in tmp_path.glob("??/*")} == files
 
 
-def test_a_signature_is_that_of_format_key_and_content(secret):
+def test_a_signature_is_that_of_format_kind_key_and_content(secret):
     """By the definition, with nothing of the program."""
     secret("one,two")
-    raw = seal_record({"key": KEY, "x": 1})
+    raw = seal_record("result", {"key": KEY, "x": 1})
     about = json.loads(raw)
     body = raw[: raw.index(b',"seal"')]
-    text = b"neusee cache 2\n" + KEY.encode() + b"\n" + hashlib.sha256(body).digest()
+    text = b"neusee cache 2\nresult\n" + KEY.encode() + b"\n" + hashlib.sha256(body).digest()
     assert about["sign"] == hmac.new(b"one", text, "sha256").hexdigest()
-    assert unseal_record(raw) == {"key": KEY, "x": 1}
+    assert unseal_record("result", raw) == {"key": KEY, "x": 1}
     for forged in (raw.replace(about["sign"].encode(), b"0" * 64), raw[:-76] + b'"}', raw[:-1] + b" "):
         with pytest.raises(ValueError, match=r"signature|checksum"):
-            unseal_record(forged)
+            unseal_record("result", forged)
     secret("two")
     with pytest.raises(Unsigned):
-        unseal_record(raw)
+        unseal_record("result", raw)
 
 
 def test_a_record_says_its_version():
-    assert json.loads(seal_record({"key": KEY}))["format"] == 2
+    assert json.loads(seal_record("result", {"key": KEY}))["format"] == 2
+    other = seal_record("result", {"key": KEY}).replace(b'"format":2', b'"format":3')
     with pytest.raises(OtherFormat, match="version 3, not version 2"):
-        unseal_record(seal_record({"key": KEY}).replace(b'"format":2', b'"format":3')[:-43] + seal_of(KEY, 3))
+        unseal_record("result", other[:-43] + seal_of(KEY, 3))
 
 
 def seal_of(key, version):
@@ -188,6 +189,6 @@ def test_a_store_of_a_forged_value_type_is_no_file(tmp_path):
     store = Store(tmp_path)
     files = DerivedFiles(store)
     files.keep(KEY, ".png", "picture", lambda path: path.write_bytes(b"picture"))
-    store.put(KEY, ["text"], ABOUT)
+    store.put(KEY, ["text"], ABOUT | {"file": f"{KEY}.png"})
     with pytest.warns(UserWarning, match="is damaged"):
         assert DerivedFiles(Store(tmp_path)).find(KEY, ".png") is None

@@ -1,0 +1,45 @@
+"""Processes of other real users, who need no account; a test that starts them needs root."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+GROUP = 60_001
+FIRST, SECOND, STRANGER = 60_011, 60_012, 60_013  #: numbers of users; no account is needed
+#: what a user must read, and what the home folder of root may hide
+NEEDED = tuple(dict.fromkeys(map(os.path.realpath, (sys.base_prefix, sys.prefix, Path(__file__).parents[3]))))
+
+
+def hidden_above(path):
+    """The highest folder above a path that other users may not enter, or None."""
+    above = [path, *map(str, Path(path).parents)]
+    return next((folder for folder in reversed(above) if not os.stat(folder).st_mode & 0o001), None)
+
+
+def opened(place):
+    """Lines of a shell that, in a mount namespace of their own, let every user enter what Python needs."""
+    lines, known = ["set -e", "mount --make-rprivate /"], {}
+    for path in NEEDED:
+        top = hidden_above(path)
+        if top is None:
+            continue
+        if top not in known:
+            known[top] = f"{place}/real-{len(known)}"
+            lines += [
+                f"mkdir {known[top]}",
+                f"mount --bind {top} {known[top]}",
+                f"mount -t tmpfs -o mode=755 none {top}",
+            ]
+        inside = os.path.relpath(path, top)
+        lines += [f"mkdir -p {path}", f"mount --bind {known[top]}/{inside} {path}"]
+    return lines
+
+
+def command_of(place, user, groups, umask, *words):
+    """The command that runs Python as a user; in a test, ``words`` are its arguments."""
+    who = ["setpriv", f"--reuid={user}", f"--regid={user}", f"--groups={groups}" if groups else "--clear-groups"]
+    script = "; ".join([*opened(tempfile.mkdtemp(dir=place)), f"umask {umask:04o}", 'exec "$@"'])
+    return ["unshare", "--mount", "sh", "-c", script, "sh", *who, sys.executable, "-c", *words]
