@@ -10,7 +10,7 @@ import ast
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import MappingProxyType, ModuleType
+from types import FunctionType, MappingProxyType, ModuleType
 from typing import Any
 
 from neusee.nodes.own_modules import own_modules
@@ -62,6 +62,11 @@ def _digest(module: ModuleType, name: str, value: Any, own: OwnCode) -> str:
         return ""
     if isinstance(value, ModuleType):
         return "module"
+    if isinstance(value, _UNLIKE):
+        return f"{type(value).__name__} {value!r}"
+    if isinstance(value, FunctionType) and not (value.__kwdefaults__ or value.__closure__ or vars(value)):
+        if all(isinstance(part, _UNLIKE) for part in value.__defaults__ or ()):
+            return f"function {id(value.__code__)} {value.__defaults__!r}"  # the usual one, in little time
     return LoadedState(module, (), own.modules.__contains__, lazy=False).digest({name: value})
 
 
