@@ -64,10 +64,16 @@ def _digest(module: ModuleType, name: str, value: Any, own: OwnCode) -> str:
         return "module"
     if isinstance(value, _UNLIKE):
         return f"{type(value).__name__} {value!r}"
-    if isinstance(value, FunctionType) and not (value.__kwdefaults__ or value.__closure__ or vars(value)):
-        if all(isinstance(part, _UNLIKE) for part in value.__defaults__ or ()):
-            return f"function {id(value.__code__)} {value.__defaults__!r}"  # the usual one, in little time
+    if isinstance(value, FunctionType) and _is_usual(value):
+        return f"function {id(value.__code__)} {value.__defaults__!r}"
     return LoadedState(module, (), own.modules.__contains__, lazy=False).digest({name: value})
+
+
+def _is_usual(function: FunctionType) -> bool:
+    """Return True for a function that holds numbers and words alone, and is compared in little time."""
+    if function.__kwdefaults__ or function.__closure__ or vars(function):
+        return False
+    return all(isinstance(part, _UNLIKE) for part in function.__defaults__ or ())
 
 
 def _changed_modules(own: OwnCode, before: dict[str, dict[str, str]]) -> Iterator[str]:
