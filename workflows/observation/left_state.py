@@ -10,7 +10,7 @@ import ast
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import MappingProxyType, ModuleType
+from types import FunctionType, MappingProxyType, ModuleType
 from typing import Any
 
 from neusee.nodes.own_modules import own_modules
@@ -62,7 +62,18 @@ def _digest(module: ModuleType, name: str, value: Any, own: OwnCode) -> str:
         return ""
     if isinstance(value, ModuleType):
         return "module"
+    if isinstance(value, _UNLIKE):
+        return f"{type(value).__name__} {value!r}"
+    if isinstance(value, FunctionType) and _is_usual(value):
+        return f"function {id(value.__code__)} {value.__defaults__!r}"
     return LoadedState(module, (), own.modules.__contains__, lazy=False).digest({name: value})
+
+
+def _is_usual(function: FunctionType) -> bool:
+    """Return True for a function that holds numbers and words alone, and is compared in little time."""
+    if function.__kwdefaults__ or function.__closure__ or vars(function):
+        return False
+    return all(isinstance(part, _UNLIKE) for part in function.__defaults__ or ())
 
 
 def _changed_modules(own: OwnCode, before: dict[str, dict[str, str]]) -> Iterator[str]:
