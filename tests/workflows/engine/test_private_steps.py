@@ -5,6 +5,7 @@ import textwrap
 
 import pytest
 
+from neusee.nodes import own_modules
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.keys import tainted_code
@@ -61,7 +62,10 @@ steps:
   last: {{node: {names["follower"]}.twice, from: read}}
 """
     )
+    files = dict(own_modules._files)
     yield tmp_path
+    own_modules._files.clear()
+    own_modules._files.update(files)
     for name in names.values():
         sys.modules.pop(name, None)
         tainted_code._taints.pop(name, None)
