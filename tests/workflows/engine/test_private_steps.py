@@ -178,4 +178,4 @@ def test_a_step_that_adds_to_a_log_is_stored_if_it_states_that_its_result_does_n
     assert (lab / "log.txt").read_text() == "read"
     assert is_private(result.keys["read"]) is not declared
     again = run(load("lab.yaml", [], lab), Store(lab / "cache"))
-    assert (again.done["read"].state == "cached") is declared
+    assert (again.done["last"].state == "cached") is declared
