@@ -5,6 +5,7 @@ import textwrap
 
 import pytest
 
+from neusee.nodes import own_modules
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.keys import tainted_code
@@ -61,7 +62,10 @@ steps:
   last: {{node: {names["follower"]}.twice, from: read}}
 """
     )
+    files = dict(own_modules._files)
     yield tmp_path
+    own_modules._files.clear()
+    own_modules._files.update(files)
     for name in names.values():
         sys.modules.pop(name, None)
         tainted_code._taints.pop(name, None)
@@ -174,4 +178,4 @@ def test_a_step_that_adds_to_a_log_is_stored_if_it_states_that_its_result_does_n
     assert (lab / "log.txt").read_text() == "read"
     assert is_private(result.keys["read"]) is not declared
     again = run(load("lab.yaml", [], lab), Store(lab / "cache"))
-    assert (again.done["read"].state == "cached") is declared
+    assert (again.done["last"].state == "cached") is declared
