@@ -2,18 +2,18 @@
 
 from ruamel.yaml import YAML
 
-from neusee.workflows.keys import user_code
+from neusee.workflows.keys import module_owner
 from neusee.workflows.recipe.node_families import all_nodes
 from neusee.workflows.recipe.text.option_groups import packaged
 
 
 def test_no_node_that_ships_is_one_of_the_user(monkeypatch):
-    monkeypatch.setattr(user_code, "PROVEN", ("neusee.",))
+    monkeypatch.setattr(module_owner, "PROVEN", ("neusee.",))
     modules = {name: node.fn.__module__ for name, node in all_nodes() if node.fn.__module__.startswith("neusee")}
     assert len(modules) > 100
-    assert [name for name, module in modules.items() if user_code.is_own(module)] == []
-    assert user_code.is_own("neusee_of_another")
-    assert user_code.is_own("bloom")
+    assert [name for name, module in modules.items() if module_owner.is_own(module)] == []
+    assert module_owner.is_own("neusee_of_another")
+    assert module_owner.is_own("bloom")
 
 
 def test_no_recipe_that_ships_names_code():
