@@ -159,7 +159,7 @@ def executor_of(place: str, store: Store) -> Iterator[Executor | None]:
     try:
         import distributed  # noqa: F401
 
-        from neusee.workflows.engine.dask_executor import cluster
+        from neusee.workflows.engine.dask_cluster import cluster
     except ModuleNotFoundError as error:
         fail(f'--executor {place}: {error.name} is not installed: pip install "neusee[distributed]"')
     with cluster(place, store) as executor:
