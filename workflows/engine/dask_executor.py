@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import CancelledError
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import torch
 
 from neusee.workflows.engine.dask_worker import lane_here, work_here
+from neusee.workflows.engine.scheduler_link import SchedulerLink
 from neusee.workflows.engine.step_job import Lane, Outcome, StepJob
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key
@@ -24,6 +27,7 @@ from neusee.workflows.store.result_store import Store
 
 _SHARE = 0.4  #: fraction of the planned memory for values that the next tasks of a worker may read
 _LOOK = 1.0  #: s between two queries for the connected workers
+_AGAIN = 0.1  #: s between two looks at a link that is cut
 _TRIES = 3  #: number of workers that may die during one chain before the run fails
 
 
@@ -32,9 +36,10 @@ class Dask:
 
     shares = False
 
-    def __init__(self, client: Any, store: Store) -> None:
+    def __init__(self, client: Any, store: Store, threads: int = 0) -> None:
         self.client, self.where = client, getattr(store, "url", None) or str(store.root.absolute())
-        self.threads = torch.get_num_threads()  # the same thread count gives the same round-off as in this process
+        self.link = SchedulerLink(client)
+        self.threads = threads or torch.get_num_threads()  # as many as here give the same round-off as here
         self._lanes: dict[str, Lane] = {}
         self._looked = -_LOOK
         self._running: dict[Any, tuple[StepJob, ...]] = {}
@@ -66,46 +71,71 @@ class Dask:
         self._running[future] = tuple(work)
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
-        """Return the outcomes of jobs that have arrived since the last call."""
-        from distributed import wait
+        """Return the outcomes of jobs that have arrived since the last call.
 
-        if not self._running:
-            return []
-        try:
-            with self.client.as_current():
-                done = wait(list(self._running), seconds, return_when="FIRST_COMPLETED").done
-        except TimeoutError:
-            return []
-        return [outcome for future in done for outcome in self._taken(future)]
+        Raises `ClusterLost` if the scheduler or all its workers are gone, and do not come back.
+        """
+        end = time.monotonic() + (float("inf") if seconds is None else seconds)
+        while self._running:
+            left = end - time.monotonic()
+            self._rest(max(0.0, min(left, _LOOK)))
+            self.link.check()
+            ended = [future for future in self._running if future.status != "pending"] if self.link.is_up else []
+            found = [outcome for future in ended for outcome in self._taken(future)]
+            if found or left <= 0:
+                return found
+        return []
 
     def cancel(self) -> None:
-        """Cancel the tasks that have not begun; running tasks continue, and their results are stored."""
-        if self._running:
-            self.client.cancel(list(self._running))
-            self._running = {}
+        """Drop the tasks that have not begun; running tasks continue, and their results are stored."""
+        for future in self._running:
+            future.release()  # waits for no answer, which a lost scheduler does not give
+        self._running = {}
+
+    def _rest(self, seconds: float) -> None:
+        """Wait until a task ends, or for a time."""
+        from distributed import wait
+
+        if not self.link.is_up:
+            time.sleep(min(seconds, _AGAIN))
+            return
+        with suppress(TimeoutError, CancelledError), self.client.as_current():
+            wait(list(self._running), seconds, return_when="FIRST_COMPLETED")
 
     def _taken(self, future: Any) -> list[Outcome]:
         """Return the outcomes of a chain of jobs, or one outcome with a `RunError` if the workers died."""
         chain = self._running.pop(future)
         if future.status == "finished":
-            outcomes: list[Outcome] = future.result()
-            for outcome in outcomes:  # another worker may have computed the chain
-                outcome.work = replace(outcome.work, lane=chain[0].lane)
-            return outcomes
+            with suppress(CancelledError, OSError):  # the link was lost before the outcomes came
+                outcomes: list[Outcome] = future.result()
+                for outcome in outcomes:  # another worker may have computed the chain
+                    outcome.work = replace(outcome.work, lane=chain[0].lane)
+                return outcomes
         cause = future.exception() if future.status == "error" else None
         if cause is None and self._tries[chain[0].key] < _TRIES:  # the task was lost with its worker or its scheduler
             self.submit(chain)
             return []
-        text = f"no worker could carry out the step ({cause or future.status})"
-        return [Outcome(chain[0], error=RunError(chain[0].step, [], OSError(text)))]
+        return [Outcome(chain[0], error=RunError(chain[0].step, [], OSError(_why_not(cause))))]
 
     def _look(self) -> None:
         """Update the list of connected workers and their devices; wait until a worker is connected."""
-        if not self.client.nthreads():
-            self.client.wait_for_workers(1, timeout=60)
-        there = self.client.nthreads()
+        there = self.link.workers()
+        if there is None and self._lanes:  # a cut, which may end
+            return
+        there = there or self.link.wait_for_workers()
         new = [address for address in there if address not in self._lanes]
-        found = self.client.run(lane_here, workers=new) if new else {}
+        found: dict[str, Any] = {}
+        with suppress(OSError):
+            found = self.client.run(lane_here, workers=new, on_error="ignore") if new else {}
         known = {**self._lanes, **{address: Lane(*about) for address, about in found.items()}}
         self._lanes = {address: known[address] for address in sorted(there) if address in known}
         self._looked = time.monotonic()
+
+
+def _why_not(cause: BaseException | None) -> str:
+    """Return why no worker computed a step, without the advice of dask."""
+    if cause is None:
+        return "the link to the cluster was lost again and again while a worker computed the step"
+    if type(cause).__name__ == "KilledWorker":
+        return "every worker that computed the step died: too little memory, or killed; the log of a worker says more"
+    return f"no worker could carry out the step: {type(cause).__name__}: {cause}"

@@ -6,6 +6,8 @@ of the chain to the store.
 
 from __future__ import annotations
 
+import random
+import sys
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import replace
@@ -35,7 +37,7 @@ class _Here:
 
     def __init__(self, where: str, room: float) -> None:
         self.store = open_store(where)
-        self._codes = {None: Code(self.store.code_memo)}
+        self._codes: dict[frozenset[str] | None, Code] = {None: Code(self.store.code_memo)}
         self.values: OrderedDict[Key, Any] = OrderedDict()
         self.room, self.held = room, 0
 
@@ -45,7 +47,7 @@ class _Here:
         What a package of the user holds depends on which of its modules were imported. The caller's count: this worker
         imports those that it lacks, and leaves out those that steps of other recipes imported here.
         """
-        for loaded in (None, work.own and work.own.followed):
+        for loaded in (None, work.own.followed if work.own else frozenset[str]()):
             for module in sorted(loaded or ()):
                 imported(module)
             code = self._codes.get(loaded) or self._codes.setdefault(loaded, Code(self.store.code_memo, loaded))
@@ -74,6 +76,13 @@ class _Here:
 _here: dict[str, _Here] = {}
 
 
+def _chance_of_its_own() -> None:
+    """Give dask a generator of its own: its threads draw beside a step, which would be taken for draws of the step."""
+    for name, module in list(sys.modules.items()):
+        if name.startswith("distributed.") and getattr(module, "random", None) is random:
+            module.random = random.Random()  # type: ignore[attr-defined]
+
+
 def lane_here(dask_worker: Any) -> tuple[str, float]:
     """Return the device of a worker, and the memory (bytes) that a schedule may use on this device."""
     if torch.cuda.is_available():
@@ -92,6 +101,7 @@ def work_here(chain: tuple[StepJob, ...], where: str, threads: int, room: float,
         return [Outcome(chain[0], error=RunError(chain[0].step, [], OSError(text)))]
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
+    _chance_of_its_own()
     here = _here.get(where) or _here.setdefault(where, _Here(where, room))
     outcomes: list[Outcome] = []
     refetch = chain[0].refetch_seconds
