@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from neusee.workflows.cli.command_frame import fail, failing
+from neusee.workflows.cli.interruption import print_warning
 from neusee.workflows.report.text_table import lasts
 from neusee.workflows.store.byte_sizes import parse_size
 
@@ -165,7 +166,7 @@ def executor_of(
         from neusee.workflows.engine.dask_cluster import cluster
     except ModuleNotFoundError as error:
         fail(f'--executor {place}: {error.name} is not installed: pip install "neusee[distributed]"')
-    with cluster(place, store, job, say) as executor:
+    with cluster(place, store, job, say, print_warning) as executor:
         yield executor
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -17,13 +18,17 @@ _QUIET = {"DASK_LOGGING__DISTRIBUTED": "critical"}  #: in the environment of wor
 
 @contextmanager
 def cluster(
-    where: str, store: Store, job: Sequence[str] = (), say: Callable[[str], None] = lambda line: None
+    where: str,
+    store: Store,
+    job: Sequence[str] = (),
+    say: Callable[[str], None] = lambda line: None,
+    warn: Callable[[str], None] = warnings.warn,
 ) -> Iterator[Dask]:
     """Yield an executor for workers that the text ``where`` names.
 
     ``dask:4`` are four local workers, ``dask:here`` is this process, ``slurm:4`` are four jobs of SLURM with the
     options ``job``, such as ``queue=gpu``; anything else is the address of a scheduler. ``say`` is told what is waited
-    for.
+    for, and ``warn`` of a scheduler that is silent.
     Raises `ClusterLost` if no scheduler or no worker comes.
     """
     silence_logs()
@@ -40,7 +45,7 @@ def cluster(
         open_now.callback(close_client, client)
         if kind == "slurm":
             wait_for_job(jobs, client, options, say)
-        yield Dask(client, store, threads)
+        yield Dask(client, store, threads, warn)
 
 
 @contextmanager

@@ -9,7 +9,8 @@ are in the store, and a second worker may write a result again without harm.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import replace
@@ -36,9 +37,12 @@ class Dask:
 
     shares = False
 
-    def __init__(self, client: Any, store: Store, threads: int = 0) -> None:
+    def __init__(
+        self, client: Any, store: Store, threads: int = 0, warn: Callable[[str], None] = warnings.warn
+    ) -> None:
+        """Use ``threads`` threads on a worker, by default as many as here; ``warn`` is told at once of a lost link."""
         self.client, self.where = client, getattr(store, "url", None) or str(store.root.absolute())
-        self.link = SchedulerLink(client)
+        self.link = SchedulerLink(client, warn)
         self.threads = threads or torch.get_num_threads()  # as many as here give the same round-off as here
         self._lanes: dict[str, Lane] = {}
         self._looked = -_LOOK

@@ -79,7 +79,7 @@ _here: dict[str, _Here] = {}
 def _chance_of_its_own() -> None:
     """Give dask a generator of its own: its threads draw beside a step, which would be taken for draws of the step."""
     for name, module in list(sys.modules.items()):
-        if name.startswith("distributed.") and getattr(module, "random", None) is random:
+        if name.startswith(("distributed.", "dask.")) and getattr(module, "random", None) is random:
             module.random = random.Random()  # type: ignore[attr-defined]
 
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -28,8 +27,8 @@ class ClusterLost(OSError):
 class SchedulerLink:
     """What is known of a scheduler through a `distributed.Client`."""
 
-    def __init__(self, client: Any) -> None:
-        self.client = client
+    def __init__(self, client: Any, warn: Callable[[str], None]) -> None:
+        self.client, self._warn = client, warn
         self.address = str(client.scheduler.address)
         now = time.monotonic()
         self._asked = self._workers_seen = now
@@ -78,8 +77,7 @@ class SchedulerLink:
     def _say_silent(self) -> None:
         if not self._silent:
             self._silent = True
-            text = f"the scheduler {self.address} does not answer: waiting up to {PATIENCE:.0f} s for it to return"
-            warnings.warn(text, stacklevel=4)
+            self._warn(f"the scheduler {self.address} does not answer: waiting up to {PATIENCE:.0f} s for it to return")
 
 
 def connected(address: Any) -> Any:
@@ -101,7 +99,10 @@ def close_client(client: Any) -> None:
 
 def silence_logs() -> None:
     """Let dask and its network print nothing in this process: what a user needs to know is said in a sentence."""
-    for name in _LOGGERS:
+    import distributed  # noqa: F401  makes its loggers, each with a handler of its own
+
+    known = [name for name in logging.root.manager.loggerDict if name.startswith(f"{_LOGGERS[0]}.")]
+    for name in (*_LOGGERS, *known):
         logger = logging.getLogger(name)
         logger.handlers[:] = [logging.NullHandler()]
         logger.propagate = False

@@ -59,7 +59,8 @@ def write_lab(folder: Path, steps: int = 4, rounds: int = 300) -> None:
             values = f"{{rounds: {rounds}, add: {number + (chain == 'b')}}}"
             lines.append(f"  {chain}{number}: {{node: slow_lab.work, from: {{x: {above}}}, with: {values}}}")
     lines.append(f"  last: {{node: slow_lab.both, from: {{x: a{steps - 1}, y: b{steps - 1}}}}}")
-    head = "# Long steps beside each other.\nnodes: [slow_lab.py]\nseed: 1\ntolerance: 0\noutputs: [last]\nsteps:\n"
+    all_steps = ", ".join(f"{chain}{number}" for chain in "ab" for number in range(steps))  # each a task of its own
+    head = f"# Long steps.\nnodes: [slow_lab.py]\nseed: 1\ntolerance: 0\noutputs: [last, {all_steps}]\nsteps:\n"
     (folder / "lab.yaml").write_text(head + "\n".join(lines) + "\n")
 
 

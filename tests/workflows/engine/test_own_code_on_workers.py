@@ -106,3 +106,18 @@ def test_a_changed_helper_is_refused(lab, tmp_path):
     job = job_of(load("mine.yaml", (), tmp_path), tmp_path)
     (tmp_path / lab / "helper.py").write_text("def half(x):\n    return x / 3\n")
     assert on_a_worker(job) == "differs"
+
+
+def test_what_dask_draws_beside_a_step_is_no_draw_of_the_step():
+    sizeof = pytest.importorskip("dask.sizeof")
+    from neusee.workflows.engine.dask_worker import _chance_of_its_own
+    from neusee.workflows.observation.random_states import RandomStates
+
+    many = {number: number for number in range(1000)}
+    before = RandomStates()
+    sizeof.sizeof(many)
+    assert before.changed() == ["random"]  # dask asks the generator of the process
+    _chance_of_its_own()
+    before = RandomStates()
+    sizeof.sizeof(many)
+    assert before.changed() == []
