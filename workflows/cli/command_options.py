@@ -36,12 +36,8 @@ OneDevice = Annotated[str, typer.Option("--device", help="Where to compute: cpu 
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print only the path of the page.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object, and nothing else.")]
 Exact = Annotated[bool, typer.Option("--exact", help="Compute every step in full; omit nothing.")]
-Memory = Annotated[
-    str,
-    typer.Option(
-        "--memory", help="Limit of the memory of the program, and of each GPU: 6 GB. Soft for one call of a library."
-    ),
-]
+_MEMORY = "Limit of the memory of the program, and of each GPU: 6 GB. One call of a library may pass it a little."
+Memory = Annotated[str, typer.Option("--memory", help=_MEMORY)]
 
 
 def _writable(out: Path) -> Path:

@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from neusee.workflows.engine.dask_executor import Dask
-from neusee.workflows.engine.scheduler_link import close_client, connected, silence_logs
+from neusee.workflows.engine.scheduler_link import connected, silence_logs
 from neusee.workflows.engine.slurm_jobs import slurm_cluster, wait_for_job
 from neusee.workflows.engine.slurm_options import SlurmOptions
 from neusee.workflows.store.result_store import Store
@@ -42,10 +42,11 @@ def cluster(
             jobs = open_now.enter_context(slurm_cluster(int(count or 1), options))
             address, threads = jobs.cluster, options.cores or 0
         client = connected(address)
-        open_now.callback(close_client, client)
+        executor = Dask(client, store, threads, warn)
+        open_now.callback(executor.link.close)
         if kind == "slurm":
             wait_for_job(jobs, client, options, say)
-        yield Dask(client, store, threads, warn)
+        yield executor
 
 
 @contextmanager

@@ -28,7 +28,6 @@ from neusee.workflows.store.result_store import Store
 
 _SHARE = 0.4  #: fraction of the planned memory for values that the next tasks of a worker may read
 _LOOK = 1.0  #: s between two queries for the connected workers
-_AGAIN = 0.1  #: s between two looks at a link that is cut
 _TRIES = 3  #: number of workers that may die during one chain before the run fails
 
 
@@ -41,13 +40,18 @@ class Dask:
         self, client: Any, store: Store, threads: int = 0, warn: Callable[[str], None] = warnings.warn
     ) -> None:
         """Use ``threads`` threads on a worker, by default as many as here; ``warn`` is told at once of a lost link."""
-        self.client, self.where = client, getattr(store, "url", None) or str(store.root.absolute())
+        self.where = getattr(store, "url", None) or str(store.root.absolute())
         self.link = SchedulerLink(client, warn)
         self.threads = threads or torch.get_num_threads()  # as many as here give the same round-off as here
         self._lanes: dict[str, Lane] = {}
         self._looked = -_LOOK
         self._running: dict[Any, tuple[StepJob, ...]] = {}
         self._tries: dict[Key, int] = {}
+
+    @property
+    def client(self) -> Any:
+        """Return the `distributed.Client` that is connected now."""
+        return self.link.client
 
     @property
     def lanes(self) -> Mapping[str, Lane]:
@@ -83,8 +87,9 @@ class Dask:
         while self._running:
             left = end - time.monotonic()
             self._rest(max(0.0, min(left, _LOOK)))
-            self.link.check()
-            ended = [future for future in self._running if future.status != "pending"] if self.link.is_up else []
+            if self.link.renewed():
+                self._submit_again()
+            ended = [future for future in self._running if future.status != "pending"]
             found = [outcome for future in ended for outcome in self._taken(future)]
             if found or left <= 0:
                 return found
@@ -96,13 +101,16 @@ class Dask:
             future.release()  # waits for no answer, which a lost scheduler does not give
         self._running = {}
 
+    def _submit_again(self) -> None:
+        """Send all chains once more, whose results a worker may have stored meanwhile."""
+        lost, self._running = self._running, {}
+        for chain in lost.values():
+            self.submit(chain)
+
     def _rest(self, seconds: float) -> None:
         """Wait until a task ends, or for a time."""
         from distributed import wait
 
-        if not self.link.is_up:
-            time.sleep(min(seconds, _AGAIN))
-            return
         with suppress(TimeoutError, CancelledError), self.client.as_current():
             wait(list(self._running), seconds, return_when="FIRST_COMPLETED")
 

@@ -16,6 +16,7 @@ from neusee.workflows.engine.memory_use import FRESH
 
 PATIENCE = 60.0  #: s without a scheduler, or without any worker, after which a run gives up
 _ANSWER = 10.0  #: s in which a scheduler answers a question
+_ATTEMPT = 5.0  #: s of one attempt to connect again
 _BETWEEN = 5.0  #: s between two questions while steps are computed
 _LOGGERS = ("distributed", "tornado", "tornado.application", "asyncio")
 
@@ -25,30 +26,26 @@ class ClusterLost(OSError):
 
 
 class SchedulerLink:
-    """What is known of a scheduler through a `distributed.Client`."""
+    """The connection to a scheduler through a `distributed.Client`, made anew where it was lost."""
 
     def __init__(self, client: Any, warn: Callable[[str], None]) -> None:
         self.client, self._warn = client, warn
         self.address = str(client.scheduler.address)
-        now = time.monotonic()
-        self._asked = self._workers_seen = now
-        self._silent = False
+        self._asked = self._workers_seen = time.monotonic()
+        self._lost: list[Any] = []  # clients before, which futures of lost tasks still name
 
-    @property
-    def is_up(self) -> bool:
-        """Return True while the client is connected."""
-        return bool(self.client.status == "running")
+    def renewed(self) -> bool:
+        """Return True if the connection was lost and is made anew, so that all tasks are lost.
 
-    def check(self) -> None:
-        """Raise `ClusterLost` if the scheduler has ended, or had no worker for too long; say if it is silent."""
+        Raises `ClusterLost` if the scheduler does not return, or had no worker for too long.
+        """
         client = self.client
-        left = client.status == "running" and (client.scheduler_comm is None or client.scheduler_comm.closed())
-        if client.status in ("closing", "closed") or left:
-            raise ClusterLost(f"the scheduler {self.address} has ended, or the network to it is cut")
-        if client.status == "connecting":
-            self._say_silent()
-        elif time.monotonic() - self._asked > _BETWEEN:
+        if client.status != "running" or client.scheduler_comm is None or client.scheduler_comm.closed():
+            self._connect_again()
+            return True
+        if time.monotonic() - self._asked > _BETWEEN:
             self.workers()
+        return False
 
     def workers(self) -> Mapping[str, int] | None:
         """Return the number of threads by address of the connected workers, or None if the scheduler does not answer.
@@ -63,38 +60,43 @@ class SchedulerLink:
             self._workers_seen = now
         elif now - self._workers_seen > PATIENCE:
             raise ClusterLost(f"the scheduler {self.address} has had no worker for {PATIENCE:.0f} s")
-        if found is not None:
-            self._silent = False
         return found
 
     def wait_for_workers(self) -> Mapping[str, int]:
         """Return the connected workers as soon as there is one."""
         while not (found := self.workers()):
-            self.check()
+            self.renewed()
             time.sleep(10 * FRESH)
         return found
 
-    def _say_silent(self) -> None:
-        if not self._silent:
-            self._silent = True
-            self._warn(f"the scheduler {self.address} does not answer: waiting up to {PATIENCE:.0f} s for it to return")
+    def close(self) -> None:
+        """Close the connection, and those before it."""
+        for client in (self.client, *self._lost):
+            with suppress(Exception):
+                client.close(timeout=_ANSWER)
+
+    def _connect_again(self) -> None:
+        """Connect to the scheduler with a new client, because one that waits for a lost packet misses the return."""
+        self._warn(f"the scheduler {self.address} does not answer: waiting up to {PATIENCE:.0f} s for it to return")
+        self._lost.append(self.client)
+        end = time.monotonic() + PATIENCE
+        while time.monotonic() < end:
+            with suppress(ClusterLost):
+                self.client = connected(self.address, _ATTEMPT)
+                self._workers_seen = time.monotonic()
+                return
+            time.sleep(10 * FRESH)
+        raise ClusterLost(f"the scheduler {self.address} has ended, or the network to it is cut")
 
 
-def connected(address: Any) -> Any:
+def connected(address: Any, seconds: float = PATIENCE) -> Any:
     """Return a `distributed.Client` of a scheduler; raise `ClusterLost` if none answers there."""
     from distributed import Client
 
     try:
-        return Client(address, timeout=PATIENCE, set_as_default=False)
+        return Client(address, timeout=seconds, set_as_default=False)
     except (OSError, ValueError) as error:
-        cause = str(error.__cause__ or error).splitlines()[0]
-        raise ClusterLost(f"no scheduler of dask answers at {address} within {PATIENCE:.0f} s: {cause}") from error
-
-
-def close_client(client: Any) -> None:
-    """Close a client, also if its scheduler is gone."""
-    with suppress(Exception):
-        client.close(timeout=_ANSWER)
+        raise ClusterLost(f"no scheduler of dask answers at {address} within {seconds:.0f} s") from error
 
 
 def silence_logs() -> None:

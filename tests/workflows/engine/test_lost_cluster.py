@@ -155,6 +155,7 @@ def test_a_scheduler_that_is_started_again(lab, machine, begin):
     kill(scheduler)
     command.waits_for("does not answer")
     machine.scheduler()
+    machine.worker()  # a worker of dask ends with its scheduler
     code, text = command.end()
     assert code == 0, text
     no_page_of_errors(text)
