@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import replace
@@ -47,6 +47,7 @@ class Dask:
         self._looked = -_LOOK
         self._running: dict[Any, tuple[StepJob, ...]] = {}
         self._tries: dict[Key, int] = {}
+        self._bound = set[Any]()  # futures of chains that are meant for one worker
 
     @property
     def client(self) -> Any:
@@ -62,6 +63,8 @@ class Dask:
 
     def submit(self, work: Sequence[StepJob]) -> None:
         """Send a chain of jobs to the assigned worker, or to another worker if the assigned worker is gone."""
+        lane = work[0].lane
+        there = {"workers": [lane], "allow_other_workers": True} if lane in self.link.newest else {}
         self._tries[work[0].key] = self._tries.get(work[0].key, 0) + 1
         future = self.client.submit(
             work_here,
@@ -71,12 +74,13 @@ class Dask:
             _SHARE * min((lane.memory for lane in self._lanes.values()), default=0.0),
             signature("worker", b""),
             key=f"neusee-{work[0].key}-{work[-1].key}-{self._tries[work[0].key]}",
-            workers=[work[0].lane] if work[0].lane in self._lanes else None,
-            allow_other_workers=True,
             pure=False,
             retries=_TRIES,
+            **there,
         )
         self._running[future] = tuple(work)
+        if there:
+            self._bound.add(future)
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
         """Return the outcomes of jobs that have arrived since the last call.
@@ -88,7 +92,9 @@ class Dask:
             left = end - time.monotonic()
             self._rest(max(0.0, min(left, _LOOK)))
             if self.link.renewed():
-                self._submit_again()
+                self.link.workers()
+                self._submit_again(self._running)
+            self._free_of_lost_workers()
             ended = [future for future in self._running if future.status != "pending"]
             found = [outcome for future in ended for outcome in self._taken(future)]
             if found or left <= 0:
@@ -100,12 +106,20 @@ class Dask:
         for future in self._running:
             future.release()  # waits for no answer, which a lost scheduler does not give
         self._running = {}
+        self._bound.clear()
 
-    def _submit_again(self) -> None:
-        """Send all chains once more, whose results a worker may have stored meanwhile."""
-        lost, self._running = self._running, {}
-        for chain in lost.values():
+    def _submit_again(self, futures: Iterable[Any]) -> None:
+        """Send chains once more; a worker may have stored their results meanwhile."""
+        for future in list(futures):
+            chain = self._running.pop(future)
+            self._bound.discard(future)
             self.submit(chain)
+            future.release()
+
+    def _free_of_lost_workers(self) -> None:
+        """Send again what was meant for a worker that is gone: dask would keep it for that worker if none was left."""
+        if there := self.link.newest:
+            self._submit_again([f for f in self._bound if self._running[f][0].lane not in there])
 
     def _rest(self, seconds: float) -> None:
         """Wait until a task ends, or for a time."""
@@ -117,6 +131,7 @@ class Dask:
     def _taken(self, future: Any) -> list[Outcome]:
         """Return the outcomes of a chain of jobs, or one outcome with a `RunError` if the workers died."""
         chain = self._running.pop(future)
+        self._bound.discard(future)
         if future.status == "finished":
             with suppress(CancelledError, OSError):  # the link was lost before the outcomes came
                 outcomes: list[Outcome] = future.result()

@@ -32,6 +32,7 @@ class SchedulerLink:
         self.client, self._warn = client, warn
         self.address = str(client.scheduler.address)
         self._asked = self._workers_seen = time.monotonic()
+        self.newest: Mapping[str, int] = {}  #: the workers that the scheduler told last
         self._lost: list[Any] = []  # clients before, which futures of lost tasks still name
 
     def renewed(self) -> bool:
@@ -56,6 +57,7 @@ class SchedulerLink:
         with suppress(OSError, AttributeError):  # the latter while the client closes
             found = self.client.sync(self.client.scheduler.ncores, workers=None, callback_timeout=_ANSWER)
         self._asked = now = time.monotonic()
+        self.newest = found or {}
         if found or found is None:
             self._workers_seen = now
         elif now - self._workers_seen > PATIENCE:

@@ -155,7 +155,7 @@ def test_a_scheduler_that_is_started_again(lab, machine, begin):
     kill(scheduler)
     command.waits_for("does not answer")
     machine.scheduler()
-    machine.worker()  # a worker of dask ends with its scheduler
+    machine.worker()  # a worker of dask ends with its scheduler, and comes after the tasks
     code, text = command.end()
     assert code == 0, text
     no_page_of_errors(text)
@@ -173,6 +173,19 @@ def test_the_only_worker_is_killed(lab, machine, begin):
     assert f"the scheduler {machine.address} has had no worker for 60 s\nfailed: " in text
     no_page_of_errors(text)
     goes_on(lab, text)
+
+
+def test_the_only_worker_is_killed_and_another_one_comes(lab, machine, begin):
+    machine.scheduler()
+    worker = machine.worker("--no-nanny")
+    command = begin(machine.address)
+    command.waits_for(r"a1 +cpu")
+    kill(worker)
+    machine.worker("--no-nanny")
+    code, text = command.end()
+    assert code == 0, text
+    no_page_of_errors(text)
+    assert output_of(lab) == expected(STEPS)
 
 
 def test_one_of_two_workers_is_killed(lab, machine, begin):
