@@ -58,6 +58,6 @@ def _local(count: str) -> Iterator[Any]:
     workers = 1 if here or not count else int(count)
     quiet = {} if here else {"env": _QUIET}
     with LocalCluster(
-        n_workers=workers, threads_per_worker=1, processes=not here, dashboard_address=None, silence_logs=50, **quiet
+        n_workers=workers, threads_per_worker=1, processes=not here, dashboard_address=":0", silence_logs=50, **quiet
     ) as local:
         yield local

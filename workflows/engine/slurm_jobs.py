@@ -132,7 +132,7 @@ def _settings(options: SlurmOptions) -> dict[str, Any]:
         "log_directory": options.logs,
         "job_extra_directives": list(options.directive),
         "job_script_prologue": list(options.prologue),
-        "scheduler_options": {"dashboard_address": None, "dashboard": False},
+        "scheduler_options": {"dashboard_address": ":0", "dashboard": False},
         "silence_logs": False,
         **{name: value for name, value in stated.items() if value},
     }
