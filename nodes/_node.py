@@ -132,9 +132,10 @@ class Node:
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle a node as module and name, so that the process that unpickles the node imports the code.
 
-        Files of the user that this process has imported are named too: a result of their nodes may be an input.
+        Files of the user that this process has imported are named too: a result of their nodes may be an input. So is
+        the name in a recipe, whose family a recipe may choose.
         """
-        return _imported, (self.fn.__module__, self.fn.__name__, own_files())
+        return _imported, (self.fn.__module__, self.fn.__name__, own_files(), self.path)
 
     @functools.cached_property
     def path(self) -> str:
@@ -196,9 +197,11 @@ def _variables(depends: Sequence[str]) -> list[str]:
     return [entry.removeprefix("env:") for entry in depends if entry.startswith("env:")]
 
 
-def _imported(module: str, name: str, files: tuple[str, ...] = ()) -> Node:
+def _imported(module: str, name: str, files: tuple[str, ...] = (), path: str = "") -> Node:
     import_missing(files)
     imported: Node = getattr(importlib.import_module(module), name)
+    if path:
+        imported.path = path
     return imported
 
 

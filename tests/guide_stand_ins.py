@@ -154,6 +154,9 @@ STAND_INS = {
         "a frame of 24 x 24", instead={"points.window=[33,33]": "points.window=[5,5]"},
         more=("restore.most=1", "restore.lamps=0")),
     "run six_lasers": StandIn("two of the six lasers", more=TWO_LASERS),
+    "run six_lasers --executor slurm:8": StandIn(
+        "two lasers, other noise, and one process in the place of jobs", more=(*TWO_LASERS, "seed=10"),
+        instead={"slurm:8": "dask:1"}),
     "run six_lasers --executor dask:2": StandIn(
         "two lasers, other noise, and one process", more=(*TWO_LASERS, "seed=8"), instead={"dask:2": "dask:1"}),
     f"run six_lasers --executor {CLUSTER}": StandIn(

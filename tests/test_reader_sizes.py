@@ -72,7 +72,7 @@ NO_SIZE = {
     "workflows/engine/cost_laws.py:_file": PACKAGED,
     "workflows/engine/memory_use.py:_free_memory": SYSTEM,
     "workflows/engine/memory_use.py:_reclaimable": SYSTEM,
-    "workflows/engine/memory_use.py:_resident": SYSTEM,
+    "workflows/engine/memory_use.py:resident": SYSTEM,
     "workflows/engine/memory_use.py:process_memory": SYSTEM,
     "workflows/engine/memory_use.py:there_is": SYSTEM,
     "workflows/engine/processors.py:free_processors": SYSTEM,

@@ -5,14 +5,16 @@ from __future__ import annotations
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from neusee.workflows.cli.command_frame import fail, failing
+from neusee.workflows.cli.interruption import print_warning
 from neusee.workflows.report.text_table import lasts
 from neusee.workflows.store.byte_sizes import parse_size
 
@@ -34,7 +36,8 @@ OneDevice = Annotated[str, typer.Option("--device", help="Where to compute: cpu 
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print only the path of the page.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object, and nothing else.")]
 Exact = Annotated[bool, typer.Option("--exact", help="Compute every step in full; omit nothing.")]
-Memory = Annotated[str, typer.Option("--memory", help="Limit of the memory of the program, and of each GPU: 6 GB.")]
+_MEMORY = "Limit of the memory of the program, and of each GPU: 6 GB. One call of a library may pass it a little."
+Memory = Annotated[str, typer.Option("--memory", help=_MEMORY)]
 
 
 def _writable(out: Path) -> Path:
@@ -148,19 +151,43 @@ def within_memory(text: str) -> Iterator[int | None]:
 
 
 @contextmanager
-def executor_of(place: str, store: Store) -> Iterator[Executor | None]:
-    """Yield None for ``local``, or an executor on the cluster ``place``, and close it after the ``with`` block."""
+def executor_of(
+    place: str, store: Store, job: Sequence[str] = (), say: Callable[[str], None] = lambda line: None
+) -> Iterator[Executor | None]:
+    """Yield None for ``local``, or an executor on the cluster ``place``, and close it after the ``with`` block.
+
+    ``job`` are the options of jobs of SLURM. ``say`` is told what is waited for.
+    """
     if place == "local":
         yield None
         return
-    kind, _, count = place.partition(":")
-    if not (kind == "dask" and (not count or count == "here" or count.isdecimal())) and "://" not in place:
-        fail(f"--executor {place}: write local, dask, dask:4, or a scheduler's address such as tcp://host:8786")
     try:
         import distributed  # noqa: F401
 
-        from neusee.workflows.engine.dask_executor import cluster
+        from neusee.workflows.engine.dask_cluster import cluster
     except ModuleNotFoundError as error:
         fail(f'--executor {place}: {error.name} is not installed: pip install "neusee[distributed]"')
-    with cluster(place, store) as executor:
+    with cluster(place, store, job, say, print_warning) as executor:
         yield executor
+
+
+def check_executor(place: str, job: Sequence[str]) -> None:
+    """End the command before any work for a place that is none, or for options of jobs that cannot be."""
+    kind, _, count = place.partition(":")
+    counted = not count or (count.isdecimal() and int(count) > 0)
+    known = place == "local" or (kind == "dask" and (counted or count == "here")) or (kind == "slurm" and counted)
+    if not known and "://" not in place:
+        forms = "local, dask, dask:4, slurm:4, or a scheduler's address such as tcp://host:8786"
+        fail(f"--executor {place}: write {forms}")
+    if job and kind != "slurm":
+        fail(f"--job is for jobs of SLURM: write --executor slurm:4, not {place}")
+    if kind != "slurm":
+        return
+    if find_spec("dask_jobqueue") is None:
+        fail(f'--executor {place}: dask_jobqueue is not installed: pip install "neusee[slurm]"')
+    from neusee.workflows.engine.slurm_options import SlurmOptions, missing_command
+
+    with failing(ValueError, before="--job "):
+        SlurmOptions.read(job)
+    if name := missing_command():
+        fail(f"--executor {place}: this machine has no command {name}: run it where jobs of SLURM are submitted")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, the_store
+from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, say_line, the_store
 from neusee.workflows.cli.command_list import FAILED, MISSED
 from neusee.workflows.cli.command_options import (
     AsJson,
@@ -21,6 +21,7 @@ from neusee.workflows.cli.command_options import (
     Out,
     Words,
     check_device,
+    check_executor,
     executor_of,
     within_memory,
 )
@@ -39,7 +40,12 @@ Rerun = Annotated[
     typer.Option("--rerun", metavar="STEP", help="Compute this step, and all that follow, though stored; repeatable."),
 ]
 Where = Annotated[
-    str, typer.Option("--executor", help="Who computes: local, dask, dask:4 (workers), or tcp://scheduler:8786.")
+    str,
+    typer.Option("--executor", help="Who computes: local, dask:4 (workers), slurm:4 (jobs), or tcp://scheduler:8786."),
+]
+Job = Annotated[
+    list[str] | None,
+    typer.Option("--job", metavar="NAME=VALUE", help="What a job of SLURM asks for: queue=gpu, cores=4; repeatable."),
 ]
 
 
@@ -50,6 +56,7 @@ def run(
     debug: Debug = False,
     device: Device = "cpu",
     executor: Where = "local",
+    job: Job = None,
     memory: Memory = "",
     exact: Exact = False,
     rerun: Rerun = None,
@@ -60,6 +67,7 @@ def run(
     Steps whose results are in the cache are not computed again. Without a name the recipe is first_light. The folder
     of results holds report.html, the numbers, the pictures and the recipe with every final value.
     """
+    check_executor(executor, job or [])
     with within_memory(memory) as limit:
         recipe, command = load(words, "run", exact=exact)
     _check_rerun(recipe, rerun or [])
@@ -78,7 +86,7 @@ def run(
     table = console.RunTable(cheaper, contents.steps_of(cheaper), console.mode_for(silent), predicted)
     with (
         resumable(lambda: kept_in(store, f"{table.finished} steps are finished, and results that take time are")),
-        executor_of(executor, store) as cluster,
+        executor_of(executor, store, job or [], lambda line: None if silent else say_line(line)) as cluster,
         table,
     ):
         done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit, rerun or [])

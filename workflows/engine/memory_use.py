@@ -40,13 +40,13 @@ class PeakMemory:
             torch.cuda.reset_peak_memory_stats(self.device)
             self._before = torch.cuda.memory_allocated(self.device)
         elif self.device.startswith("cpu"):
-            self._before = _resident("VmRSS:") if _peak_reset() else None
+            self._before = resident("VmRSS:") if _peak_reset() else None
         return self
 
     def __exit__(self, *error: object) -> None:
         if self._before is None:
             return
-        highest = _resident("VmHWM:") if self.device.startswith("cpu") else _highest_on(self.device)
+        highest = resident("VmHWM:") if self.device.startswith("cpu") else _highest_on(self.device)
         if highest is not None:
             self.bytes = max(0, highest - self._before)
 
@@ -65,7 +65,7 @@ def pool_of(device: str) -> str:
 def _peak_reset() -> bool:
     """Reset the peak memory of this process; return False if the system does not allow the reset."""
     global _highest
-    _highest = max(_highest, _resident("VmHWM:") or 0)
+    _highest = max(_highest, resident("VmHWM:") or 0)
     try:
         with open("/proc/self/clear_refs", "w") as file:
             file.write("5")
@@ -74,7 +74,8 @@ def _peak_reset() -> bool:
     return True
 
 
-def _resident(field: str) -> int | None:
+def resident(field: str) -> int | None:
+    """Return a number of bytes that the system tells of this process, such as ``VmRSS:``, or None."""
     with suppress(OSError), open("/proc/self/status") as file:
         for line in file:
             if line.startswith(field):
@@ -91,7 +92,7 @@ def process_memory() -> int:
 
 def process_peak() -> int:
     """Return the peak memory of this process in bytes since it started, whatever `PeakMemory` measured since then."""
-    return max(_highest, _resident("VmHWM:") or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+    return max(_highest, resident("VmHWM:") or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
 
 
 def give_back() -> None:

@@ -20,6 +20,10 @@ from neusee.workflows.store.byte_sizes import format_size
 
 _PAUSE = 0.02  #: s between two looks
 _NEAR = 0.9  #: share of the limit from which memory that was freed is given back to the system
+_ADVICE = (
+    "give more memory, or choose a smaller picture, pupil or number of bands; the steps that are finished stay in the "
+    "cache"
+)
 _raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
 
@@ -27,11 +31,10 @@ class MemoryLimit(Exception):
     """Error of a step or a report during which the memory of the process exceeded the limit of the run."""
 
     def __str__(self) -> str:
+        if self.args:
+            return f"{self.args[0]}: {_ADVICE}"
         limits = f", the limit is {format_size(int(_last[1]))}" if _last[1] else ""
-        return (
-            f"the process holds {format_size(int(_last[0]))}{limits}: give more memory, or choose a smaller "
-            "picture, pupil or number of bands; the steps that are finished stay in the cache"
-        )
+        return f"the process holds {format_size(int(_last[0]))}{limits}: {_ADVICE}"
 
 
 _last = [0.0, 0.0]  # bytes of the process and the limit when a step was last stopped
@@ -52,6 +55,11 @@ def limited(limit: float) -> Iterator[None]:
     finally:
         with _guard:
             _limits.remove(limit)
+
+
+def limit_now() -> float | None:
+    """Return the limit of the memory of this process in bytes, or None where none is set."""
+    return min(_limits, default=None)
 
 
 def _room() -> Room:

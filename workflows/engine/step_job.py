@@ -15,6 +15,7 @@ from typing import Any, Protocol, TypeVar
 import torch
 
 from neusee.nodes import Check, TensorStats
+from neusee.workflows.engine.allocation_limit import refusing_allocations
 from neusee.workflows.engine.band_results import call_by_band, plain_of
 from neusee.workflows.engine.cost_laws import measured_size
 from neusee.workflows.engine.memory_use import PeakMemory
@@ -175,7 +176,9 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     stamps = file_stamps(step.params)
     began, clock = time.time(), time.perf_counter()
     size = sum(t.nbytes for t in tensors_in(inputs))
-    with PeakMemory(work.device, size >= _WATCHED or not work.unlocked) as peak, torch.no_grad(), guarded():
+    watched = size >= _WATCHED or not work.unlocked
+    own = work.own is not None and work.device.startswith("cpu")
+    with PeakMemory(work.device, watched) as peak, torch.no_grad(), guarded(), refusing_allocations(own):
         if step.node.bands and (work.parts > 1 or work.device.startswith("cpu")):
             value = call_by_band(step, inputs, evaluate, work.origin["code"], store.blobs, work.parts)
         else:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 from neusee.nodes import Node
@@ -25,7 +25,7 @@ from neusee.workflows.keys.code_objects import PYTHON
 from neusee.workflows.keys.declared_dependencies import FREE, changing_refusal, refusal, resolve, uncovered
 from neusee.workflows.keys.followed_imports import Imports
 from neusee.workflows.keys.loaded_source import compiled_as_written, imported, say_once, source_of
-from neusee.workflows.keys.loaded_state import LoadedState, counted_values
+from neusee.workflows.keys.loaded_state import LoadedState, counted_values, without_modules
 from neusee.workflows.keys.module_look import OURS, Look, Names, Whole, digest_of, installed_look, parts_of
 from neusee.workflows.keys.module_origin import Origin, look_again, module_path, origin_of
 from neusee.workflows.keys.module_owner import is_own
@@ -46,9 +46,10 @@ _PYTHON = "Python {}.{}".format(*sys.version_info)
 class Code:
     """Digests of the source code of nodes, which stay the same during one run."""
 
-    def __init__(self, memo: Path) -> None:
+    def __init__(self, memo: Path, loaded: Collection[str] | None = None) -> None:
+        """Read the summaries in the file ``memo``; with ``loaded`` packages hold no followed modules but these."""
         look_again()
-        self._memo = memo
+        self._memo, self._loaded = memo, loaded
         self._summaries: dict[str, Summary] = read_memo(memo)
         self._new = False
         self._wholes: dict[str, Whole] = {}
@@ -219,7 +220,10 @@ class Code:
         changing: Mapping[str, str] = {}
         if known:
             loaded = LoadedState(sys.modules[module], summary.functions if compiled_as_written(module) else (), follows)
-            state = loaded.digest(counted_values(sys.modules[module], summary, free, root))
+            values = counted_values(sys.modules[module], summary, free, root)
+            if (only := self._loaded) is not None:
+                values = without_modules(module, values, lambda name: follows(name) and name not in only)
+            state = loaded.digest(values)
             parts[f"state of {module}"], changing = {"values": state}, loaded.changing
             for name in sorted(loaded.modules):
                 imports.setdefault(name, set()).update(loaded.modules[name])

@@ -145,7 +145,7 @@ class LoadedState:
         return self._typed(value), sorted((self._of(part) for part in value), key=repr)
 
     def _node(self, value: Any) -> Any:
-        return "node", value.path, self._of(value.fn), [self._of(hook) for hook in _hooks(value)]
+        return "node", self._of(value.fn), [self._of(hook) for hook in _hooks(value)]
 
     def _partial(self, value: Any) -> Any:
         return "partial", self._of(value.func), self._of(value.args), self._of(value.keywords)
@@ -237,6 +237,12 @@ def counted_values(module: ModuleType, summary: Summary, free: Collection[str], 
         return {name: value for name, value in values.items() if name in names}
     noted = written_only(summary.statements)
     return {name: value for name, value in values.items() if name not in noted}
+
+
+def without_modules(package: str, values: Mapping[str, Any], left_out: Callable[[str], bool]) -> dict[str, Any]:
+    """Return the values of a package without those of its own modules whose names are ``left_out``."""
+    inside = {name for name, value in values.items() if value is sys.modules.get(f"{package}.{name}")}
+    return {name: value for name, value in values.items() if name not in inside or not left_out(f"{package}.{name}")}
 
 
 def _hooks(node: Node) -> Iterator[Any]:

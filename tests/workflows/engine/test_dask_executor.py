@@ -72,7 +72,7 @@ def test_an_error_comes_back_as_what_it_was(small):
 
 
 def test_in_one_process(small, local, tmp_path):
-    from neusee.workflows.engine.dask_executor import cluster
+    from neusee.workflows.engine.dask_cluster import cluster
 
     store = Store(tmp_path)
     with cluster("dask:here", store) as executor:
@@ -89,7 +89,7 @@ def test_in_one_process(small, local, tmp_path):
 def test_on_a_cluster_of_two_workers_and_after_one_was_killed(small, local, tmp_path):
     from distributed import Client
 
-    from neusee.workflows.engine.dask_executor import cluster
+    from neusee.workflows.engine.dask_cluster import cluster
 
     store = Store(tmp_path / "a")
     with cluster("dask:2", store) as executor:
@@ -116,7 +116,7 @@ def test_on_a_cluster_of_two_workers_and_after_one_was_killed(small, local, tmp_
 
 @pytest.mark.slow
 def test_a_worker_with_other_code_is_refused(small, tmp_path, monkeypatch):
-    from neusee.workflows.engine.dask_executor import cluster
+    from neusee.workflows.engine.dask_cluster import cluster
     from neusee.workflows.keys import code_digest
 
     store = Store(tmp_path)

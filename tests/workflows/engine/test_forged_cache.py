@@ -9,7 +9,7 @@ import torch
 
 from neusee.nodes import node
 from neusee.nodes.values import Psf
-from neusee.workflows.engine.dask_executor import kinds_of, work_here
+from neusee.workflows.engine.dask_worker import kinds_of, work_here
 from neusee.workflows.engine.runner import run
 from neusee.workflows.engine.step_job import StepJob
 from neusee.workflows.graph.diagnostics import Location

@@ -150,7 +150,7 @@ def test_what_a_module_reads_when_it_is_imported_taints_its_nodes(lab):
 def test_a_step_that_a_worker_taints_is_computed_by_the_caller(lab):
     """The worker sees what the step reads, keeps nothing of it, and the caller computes the rest."""
     pytest.importorskip("distributed")
-    from neusee.workflows.engine.dask_executor import cluster
+    from neusee.workflows.engine.dask_cluster import cluster
 
     store = Store(lab / "cache")
     with cluster("dask:1", store) as executor:

@@ -243,7 +243,7 @@ def test_a_group_brings_its_node_and_the_recipe_its_own(mine, write, tmp_path):
 
 @pytest.mark.slow
 def test_a_worker_imports_the_files_of_the_recipe(mine, tmp_path):
-    from neusee.workflows.engine.dask_executor import cluster
+    from neusee.workflows.engine.dask_cluster import cluster
 
     recipe = load(mine("bloom_i"), (), tmp_path)
     here = run(recipe, store=Store(tmp_path / "here"))
