@@ -95,6 +95,6 @@ def _explained(error: Exception) -> int:
     from neusee.workflows.graph.diagnostics import visible
 
     cause = type(error).__name__
-    text = str(error) if cause == "RunError" else f"{cause}: {error}"
+    text = str(error) if cause in ("RunError", "UnfollowedCode") else f"{cause}: {error}"
     print(visible(f"{text}   (--debug shows where)"), file=sys.stderr)
-    return FAILED
+    return BAD if cause == "UnfollowedCode" else FAILED

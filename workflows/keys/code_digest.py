@@ -34,12 +34,14 @@ from neusee.workflows.keys.reachable_code import reached, read_names
 from neusee.workflows.keys.sibling_modules import Siblings
 from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
 from neusee.workflows.keys.tainted_code import holds_here_alone
+from neusee.workflows.keys.unfollowed_code import UnfollowedCode
 from neusee.workflows.keys.user_code import reads_time
 
 #: modules that decide no result
 _LEFT_OUT = frozenset({"neusee", ROOT} | {f"{ROOT}.{n}" for n in ("_hooks", "_node", "import_times", "own_modules")})
 _WORKFLOWS = "neusee.workflows"
 _THIS_PROCESS = os.urandom(8).hex()
+_NO_FILE = "{} has no source file, so its nodes have no cache key: save the module as a file"
 _PYTHON = "Python {}.{}".format(*sys.version_info)
 
 
@@ -130,7 +132,7 @@ class Code:
             state = LoadedState(sys.modules[module], (), self._follows(_packages(module)))
             parts["closure"] = {node.path: state.digest({"function": node.fn})}
             if state.changing and f"{FREE}function" not in node.depends:
-                raise LookupError(changing_refusal("function", state.changing["function"], source))
+                raise UnfollowedCode(changing_refusal("function", state.changing["function"], source))
             inner = [self._whole(name).code for name in sorted(state.modules.keys() - whole.looks.keys())]
             parts["closure"].update({f"module {n}": each for n, each in enumerate(inner)})
             private = private or any(map(is_private, inner))
@@ -152,7 +154,9 @@ class Code:
                     names.setdefault(other, set()).update(used)
                     todo.append(other)
         if module not in looks or looks[module].summary is None:
-            raise LookupError(f"{module} has no source file, so its nodes have no cache key: save the module as a file")
+            raise UnfollowedCode(
+                f"{module} has no source file, so its nodes have no cache key: save the module as a file"
+            )
         documents = any(look.summary.documents for look in looks.values() if look.summary)
         state = {name: digest_of(look, documents) for name, look in looks.items()}
         now = settings() | (own_settings(reads_time(looks)) if is_own(module) else {})
@@ -179,12 +183,12 @@ class Code:
             read = read_names(look.summary.statements, set() if used & {"", "*"} else used) if look.changing else set()
             for held, kind in look.changing.items():
                 if held in read and f"{FREE}{held}" not in free:
-                    raise LookupError(changing_refusal(held, kind, look.path))
+                    raise UnfollowedCode(changing_refusal(held, kind, look.path))
             lines = [r for r in reached(look.summary.statements, None if "" in used else used)]
             found = [item for item in look.summary.constructs if any(item.line in r for r in lines)]
             left = uncovered(found, free)
             if left is not None:
-                raise LookupError(refusal(left, look.path))
+                raise UnfollowedCode(refusal(left, look.path))
 
     def _look(self, module: str, packages: frozenset[str], root: bool) -> Look | None:
         key = (module, packages, root)
@@ -201,7 +205,9 @@ class Code:
         if origin.kind in ("distribution", "absent"):
             return installed_look(module, origin.version, packages)
         if origin.path is None:
-            raise LookupError(f"{module} has no source file, so its nodes have no cache key: save the module as a file")
+            raise UnfollowedCode(
+                f"{module} has no source file, so its nodes have no cache key: save the module as a file"
+            )
         if origin.kind == "binary":
             return Look({f"file {origin.path.name}": {"content": source_of(module, origin.path)[1]}}, {})
         return self._source(module, origin.path, packages, root)
@@ -271,7 +277,7 @@ class Code:
             try:
                 self._summaries[name] = _summarised(source, own)
             except (SyntaxError, ValueError) as error:
-                raise LookupError(f"{path}: {error}") from error
+                raise UnfollowedCode(f"{path}: {error}") from error
             self._new = True
         return self._summaries[name]
 

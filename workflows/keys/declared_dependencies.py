@@ -14,6 +14,7 @@ from typing import NamedTuple
 from neusee.nodes.import_times import import_time
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.input_file_digest import file_digest
+from neusee.workflows.keys.unfollowed_code import UnfollowedCode
 from neusee.workflows.keys.unfollowed_constructs import Construct
 
 FREE = "unaffected:"
@@ -61,7 +62,7 @@ def resolve(
                 found.modules.append(entry)
             else:
                 text = f"{source}: depends={entry!r} is no file in {source.parent} and no module: correct the name"
-                raise LookupError(text)
+                raise UnfollowedCode(text)
     return found
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from neusee.workflows.keys.module_origin import Kind, contents, module_path
 from neusee.workflows.keys.source_summary import ROOT, Import, Summary, Use
+from neusee.workflows.keys.unfollowed_code import UnfollowedCode
 
 Lookup = Callable[[str], tuple[Path, Summary] | None]
 
@@ -32,7 +33,7 @@ class Imports:
             used = self._used(use)
             if used is None and self._module.startswith(ROOT):
                 what = "the package of all nodes is used, so the modules that a result depends on are unknown"
-                raise LookupError(f"{self._path}:{use[-1]}: {what}: import each name from its own module")
+                raise UnfollowedCode(f"{self._path}:{use[-1]}: {what}: import each name from its own module")
             for module in used or ():
                 found.setdefault(module, set()).add("")
         return found

@@ -541,3 +541,27 @@ def test_the_guide_states_each_limit_as_the_program_has_it():
         step_declarations._MOST, yaml_values._LARGEST, references._MOST_VALUES, yaml_values._MOST_ALIASED,
         _bands._MOST, input_files.PIXELS, input_files.VALUES, input_files.ROWS,
     ]  # fmt: skip
+
+
+READS_A_VARIABLE = '''import os
+
+from neusee.nodes import node
+
+
+@node()
+def gain_of_day():
+    """Return the gain of the day."""
+    return float(os.environ.get("GAIN_OF_DAY", 2))
+'''
+
+
+def test_own_code_that_no_key_covers_ends_with_the_code_of_a_mistake(neusee, tmp_path):
+    (tmp_path / "reads_a_variable.py").write_text(READS_A_VARIABLE)
+    (tmp_path / "r.yaml").write_text(
+        "nodes: [reads_a_variable.py]\nsteps: {mine: {node: reads_a_variable.gain_of_day}}\n"
+    )
+    code, _, err = neusee("run", "r.yaml", "--out", "runs")
+    assert code == 2
+    assert re.search(
+        r"^\S*reads_a_variable.py:9: os.environ.get: .* depends=\[\"env:GAIN_OF_DAY\"\]", err, re.MULTILINE
+    )
