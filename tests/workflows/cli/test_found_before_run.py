@@ -558,7 +558,7 @@ def gain_of_day():
 def test_own_code_that_no_key_covers_ends_with_the_code_of_a_mistake(neusee, tmp_path):
     (tmp_path / "reads_a_variable.py").write_text(READS_A_VARIABLE)
     (tmp_path / "r.yaml").write_text(
-        "nodes: [reads_a_variable.py]\nsteps: {mine: {node: reads_a_variable.gain_of_day}}\n"
+        "nodes: [reads_a_variable.py]\nsteps: {mine: {node: reads_a_variable.gain_of_day}}\noutputs: [mine]\n"
     )
     code, _, err = neusee("run", "r.yaml", "--out", "runs")
     assert code == 2
