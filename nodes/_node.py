@@ -198,7 +198,7 @@ def _variables(depends: Sequence[str]) -> list[str]:
 
 
 def _imported(module: str, name: str, files: tuple[str, ...] = (), path: str = "") -> Node:
-    import_missing(files)
+    import_missing(files, module)
     imported: Node = getattr(importlib.import_module(module), name)
     if path:
         imported.path = path

@@ -108,7 +108,7 @@ def _nearest(name: str, known: Any) -> str:
 
 
 def _imported(name: str, module: str, qualname: str, files: tuple[str, ...]) -> Architecture:
-    import_missing(files)
+    import_missing(files, module)
     found: Any = importlib.import_module(module)
     for part in qualname.split("."):
         found = getattr(found, part)

@@ -65,14 +65,31 @@ def own_files() -> tuple[str, ...]:
     return tuple(str(file or name) for name, file in _files.items())
 
 
-def import_missing(files: tuple[str, ...]) -> None:
-    """Import the modules of another process that this process lacks; raise `ImportError` for a missing file."""
+def import_missing(files: tuple[str, ...], needed: str) -> None:
+    """Import the modules of another process that this process lacks.
+
+    The other process may have imported files that no longer exist, or that this process cannot import. Only what the
+    module ``needed`` raises is raised: `ImportError` for a missing file, and whatever its code raises.
+    """
     for each in files:
-        if not os.path.isabs(each):
-            importlib.import_module(each)
-            note_module(each)
-        elif _files.get(Path(each).stem) != Path(each):
-            import_file(Path(each))
+        try:
+            _import_if_missing(each)
+        except Exception:
+            if needed.partition(".")[0] == _top_name(each):
+                raise
+
+
+def _import_if_missing(file: str) -> None:
+    if not os.path.isabs(file):
+        importlib.import_module(file)
+        note_module(file)
+    elif _files.get(_top_name(file)) != Path(file):
+        import_file(Path(file))
+
+
+def _top_name(file: str) -> str:
+    """Return the first part of the name of the module in a file or folder, or of a module that is given by its name."""
+    return Path(file).stem if os.path.isabs(file) else file.partition(".")[0]
 
 
 def _refuse_taken(name: str, file: Path) -> None:

@@ -1051,8 +1051,8 @@ MUTANTS = (
         ),
         ("(4 * beam.wavelength * focal_length)) ** 2", "(4 * beam.wavelength * focal_length))"),
         (
-            "fill = diameter**2 / (4 * _radius_squared(beam, distance))\n    return axis",
-            "fill = diameter**2 / (2 * _radius_squared(beam, distance))\n    return axis",
+            "fill = diameter**2 / (4 * _radius_squared(beam, distance))\n    return even_density",
+            "fill = diameter**2 / (2 * _radius_squared(beam, distance))\n    return even_density",
         ),
         ("spot_peak(fill, waves, within)", "spot_peak(fill, 0 * waves, within)"),
     ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
 import shlex
 import shutil
@@ -270,7 +271,7 @@ def test_the_package_of_the_page_on_nodes_has_a_family(reader, tmp_path, monkeyp
 def test_a_shell_takes_the_variable_and_the_program_knows_it(line):
     name, _, value = line.removeprefix("export ").partition("=")
     done = subprocess.run(["sh", "-euc", f"{line}\nenv"], capture_output=True, text=True, check=True)
-    assert f"{name}={value.strip(chr(34))}" in done.stdout.splitlines()
+    assert f"{name}={os.path.expandvars(value.strip(chr(34)))}" in done.stdout.splitlines()
     assert f"| `{name}` |" in (ROOT / "recipes" / "guide" / "cache.md").read_text(encoding="utf-8")
 
 

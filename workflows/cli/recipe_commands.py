@@ -77,9 +77,7 @@ def run(
 
     check_device(device)
     silent = as_json or quiet
-    before = [] if silent else console.opening(recipe, shlex.join(command[1:]))
-    if not silent:
-        say(before)
+    before = _opening(recipe, command, silent)
     store = the_store()
     predicted = _predicted(recipe, store, device, limit, executor == "local", silent)
     cheaper = with_substitutions(recipe, contents.wanted(recipe))
@@ -96,6 +94,17 @@ def run(
         raise typer.Exit(MISSED)
     if executor == "local" and not rerun:
         keep_run(_text([*before, *table.printed()], done, hints), as_json, out, done, recipe, store)
+
+
+def _opening(recipe: Recipe, command: Sequence[str], silent: bool) -> list[str]:
+    """Say what is run, unless silent, and return what was said."""
+    from neusee.workflows.report import console
+
+    if silent:
+        return []
+    lines = console.opening(recipe, shlex.join(command[1:]))
+    say(lines)
+    return lines
 
 
 def _check_rerun(recipe: Recipe, names: Sequence[str]) -> None:

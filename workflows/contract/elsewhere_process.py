@@ -65,7 +65,7 @@ def _answer(connection: Connection, asked: Asked) -> None:
 def _called(asked: Asked, module: str, pickled: bytes) -> Outcome:
     _disturb(asked.settings)
     try:
-        import_missing(asked.files)
+        import_missing(asked.files, module)
         function = pickle.loads(pickled)
     except (Exception, SystemExit) as error:
         found = failed(error, module)

@@ -27,7 +27,7 @@ from neusee.workflows.keys.regular_file import opened
 #: distributions that neusee declares for its users, in pyproject.toml, in the form of `plain`
 BY_VERSION = frozenset(
     {
-        *("arviz", "astropy", "colour_science", "dask", "deepinv", "distributed", "emcee", "fsspec"),
+        *("arviz", "astropy", "colour_science", "dask", "dask_jobqueue", "deepinv", "distributed", "emcee", "fsspec"),
         *("h5netcdf", "h5py", "jinja2", "kornia", "kornia_rs", "matplotlib", "numpy", "onnx", "onnxscript"),
         *("openexr", "pillow", "pydantic", "rich", "ruamel_yaml", "safetensors", "scipy", "tensorboard"),
         *("torch", "typer", "xarray", "xxhash"),

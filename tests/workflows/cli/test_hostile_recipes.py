@@ -44,7 +44,7 @@ def told(tmp_path, monkeypatch, capfd):
     write_secrets(tmp_path / "secret")
     write_secrets(tmp_path / "home")
     monkeypatch.setenv("XDG_CACHE_HOME", os.path.expanduser("~/.cache"))  # of the compiled libraries
-    monkeypatch.delenv("NEUSEE_CACHE")  # it is below the home folder then
+    monkeypatch.delenv("NEUSEE_CACHE", raising=False)  # it is below the home folder then
     for name, value in {"HOME": "home", "STRANGER": "secret"}.items():
         monkeypatch.setenv(name, str(tmp_path / value))
     monkeypatch.setenv("NEUSEE_NO_CODE", "")

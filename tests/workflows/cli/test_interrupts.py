@@ -61,7 +61,7 @@ def light() -> Tensor:
     return torch.ones(64, 64)
 
 
-@node(depends=["unaffected:file"])
+@node(depends=["unaffected:file", "unaffected:pressed"])
 def pressed(image: Tensor, *, number: float = 0.0) -> Tensor:
     """Press Ctrl-C as a terminal does, once in a folder."""
     try:

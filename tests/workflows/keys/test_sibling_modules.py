@@ -238,6 +238,20 @@ def test_another_process_imports_files_and_modules_in_the_same_order(lab, monkey
     files = own_files()
     assert files == ("sib_b", str(lab.folder / "sib_a.py"))
     forget()
-    import_missing(files)
+    import_missing(files, "sib_a")
     assert own_files() == files
     assert {"sib_a", "sib_b"} <= sys.modules.keys()
+
+
+def test_another_process_needs_no_file_of_other_nodes(lab, monkeypatch):
+    """The caller may have imported files for other recipes, which are gone or fail elsewhere."""
+    lab.write("sib_a.py", source("k"))
+    lab.write("sib_b.py", source("k", name="other"))
+    files = (str(lab.folder / "sib_gone.py"), str(lab.folder / "sib_a.py"), "sib_of_no_folder")
+    forget()
+    import_missing(files, "sib_a")
+    assert own_files() == (str(lab.folder / "sib_a.py"),)
+    with pytest.raises(ImportError, match="there is no file .*sib_gone"):
+        import_missing(files, "sib_gone")
+    with pytest.raises(ImportError, match="sib_of_no_folder"):
+        import_missing(files, "sib_of_no_folder.part")
