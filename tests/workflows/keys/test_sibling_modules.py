@@ -251,7 +251,7 @@ def test_another_process_needs_no_file_of_other_nodes(lab, monkeypatch):
     forget()
     import_missing(files, "sib_a")
     assert own_files() == (str(lab.folder / "sib_a.py"),)
-    with pytest.raises(ImportError, match="there is no file .*sib_gone"):
+    with pytest.raises(ImportError, match=r"there is no file .*sib_gone"):
         import_missing(files, "sib_gone")
     with pytest.raises(ImportError, match="sib_of_no_folder"):
         import_missing(files, "sib_of_no_folder.part")
