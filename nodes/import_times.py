@@ -16,8 +16,10 @@ _SLACK = 1_000_000_000  #: ns by which a clock that is corrected slowly may diff
 class Moment:
     """The moment at which it was made, as a time that what happens later has not, even if the clock is set back."""
 
-    def __init__(self) -> None:
-        self._clock, self._steady = time.time_ns(), time.monotonic_ns()
+    def __init__(self, clock: int | None = None, steady: int | None = None) -> None:
+        """Take the times (ns) of both clocks at the moment, by default those of now."""
+        self._clock = time.time_ns() if clock is None else clock
+        self._steady = time.monotonic_ns() if steady is None else steady
 
     def time(self) -> int:
         """Return the time (ns) of the moment by the clock as it is set now, or as it was then if that is earlier."""

@@ -16,7 +16,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from neusee.nodes.import_times import Moment
 from neusee.workflows.answers.answer_upkeep import make_room
 from neusee.workflows.answers.installed_program import ROOT, SITES, SOURCES, program_state, standard_library
 from neusee.workflows.answers.opened_files import Folders, Opened
@@ -93,10 +92,16 @@ class Command:
     """A command whose answer may be stored, from its begin."""
 
     def __init__(self, words: Sequence[str], terminal: Sequence[object], disk: Disk) -> None:
-        self._began, self._started = time.perf_counter(), Moment()
+        self._began, self._clocks = time.perf_counter(), (time.time_ns(), time.monotonic_ns())
         self._words, self._disk = list(words), disk
         self.name, self._state = command_name(words, terminal), program_state()
         self._opened, self._doubtful = Opened(), False
+
+    def _started(self) -> int:
+        """Return the time (ns) of the begin by the clock as it is set now; the program is imported by then."""
+        from neusee.nodes.import_times import Moment
+
+        return Moment(*self._clocks).time()
 
     def answer(self) -> str | None:
         """Write the folder of the stored answer again and return the text to print, or None without a right answer.
@@ -183,7 +188,7 @@ class Command:
         return (
             self._doubtful
             or state != self._state
-            or state.changed > self._started.time() - _IMPORTED
+            or state.changed > self._started() - _IMPORTED
             or any(name in sys.modules for name in _NATIVE)
             or any(_own_code())
         )
@@ -199,7 +204,7 @@ class Command:
             raise Unsettled("a recipe is in the folder of the cache or of results")
         folders = [path for path in self._opened.folders if path not in ignored and not _PART.search(path)]
         listed = {path: self._opened.folders[path] for path in folders if path != written}
-        return witnesses_of([*files, *inputs], recipes, listed, self._started.time() - _TICK, written)
+        return witnesses_of([*files, *inputs], recipes, listed, self._started() - _TICK, written)
 
     def _of_cache(self) -> list[str]:
         """Return the files of the cache that were read and decide what a forecast or an explanation says."""

@@ -264,4 +264,7 @@ def _inference_data(result: CalibrationResult) -> Any:
     attributes = {"recipe": result.problem.recipe.name, "inference_library": "emcee"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # ArviZ warns of more walkers than steps
-        return arviz().from_dict(posterior, sample_stats={"lp": by_walker(chains.log)}, attrs=attributes)
+        data = arviz().from_dict(posterior, sample_stats={"lp": by_walker(chains.log)}, attrs=attributes)
+    for group in data.groups():
+        data[group].attrs.pop("created_at", None)  # the date is that of the command, in provenance.json
+    return data

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -13,6 +13,7 @@ from neusee.nodes.calibrate import LeastSquares, frame_divisor, hot_pixels, leas
 from neusee.workflows.engine.runner import run
 from neusee.workflows.frames.descriptor_file import descriptor_of, descriptors_in, quoted
 from neusee.workflows.frames.frame_folder import FolderLevel, FolderLevels, FolderRefused, find_levels
+from neusee.workflows.graph.final_values import Config
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.report.study_folder import Progress, silent
@@ -163,7 +164,11 @@ def _loaded(name: str, text: str, changes: Sequence[str] = ()) -> Recipe:
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"{name}.yaml"
         path.write_text(text, encoding="utf-8")
-        return load(path, changes)
+        recipe = load(path, changes)
+    settings = recipe.config.settings.items()
+    gone = f"{path.parent.name}/"  # the sources of values name no folder that is gone
+    named = {key: replace(each, source=each.source.rpartition(gone)[-1]) for key, each in settings}
+    return replace(recipe, config=Config(named))
 
 
 def _read(folder: Path, found: FolderLevels, scale: float, needs: _Corrections) -> str:

@@ -7,9 +7,11 @@ damaged is rebuilt from the metadata of the results.
 
 from __future__ import annotations
 
+import errno
 import itertools
 import os
 import re
+import stat
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
@@ -232,5 +234,12 @@ def _is_row(row: Row) -> bool:
 
 
 def _opened(path: str, flags: int) -> int:
-    """Open the journal without waiting for a pipe in its place, and without following a symbolic link."""
-    return os.open(path, flags | os.O_NONBLOCK | os.O_NOFOLLOW)
+    """Open the journal, which is a regular file, without following a symbolic link; never wait for a pipe.
+
+    Raises `OSError` for anything else, such as a device that never ends.
+    """
+    file = os.open(path, flags | os.O_NONBLOCK | os.O_NOFOLLOW)
+    if not stat.S_ISREG(os.fstat(file).st_mode):
+        os.close(file)
+        raise OSError(errno.EINVAL, "not a regular file", path)
+    return file

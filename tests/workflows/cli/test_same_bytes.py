@@ -63,8 +63,8 @@ COMMANDS = {
     "sweep, a camera": f"sweep first_light {SMALL} ~expect 'sensor.read_noise=5 e-,10 e-' outputs=[restored_quality]",
     "train, a lift": f"train train_lift {LIFT}",
     "train, a mask": f"train train_small --stage mask {CAMERA} train.mask.iterations=2",
-    "train": f"train train_small --stage 2 doe=half_ring {CAMERA} train.critics.width=4 train.pool=2 "
-    "train.stages.2.iterations=1 train.stages.2.batch=2",
+    "train": f"train train_small doe=half_ring {CAMERA} train.critics.width=4 train.pool=2 "
+    "train.stages.1.iterations=1 train.stages.2.iterations=1",
     "calibrate": "calibrate calibrate 'flats.shape=[32,32]' --draws 100 --walkers 16",
     "calibrate, a folder": "calibrate my/lab --sensor lab --draws 100 --walkers 16",
     "sheet": "sheet my/frames.yaml --relative",
@@ -100,6 +100,7 @@ DIFFERENT_FIELDS = {
     "date": "date of the command",
     "seconds": "time of the command or of a step",
     "seconds a point": "time of a point that was computed",
+    "seconds a draw": "time of a draw that was computed",
     "computed": "how many points were computed",
     "timing": "time, memory and bytes of the steps",
     "counts": "how many steps were computed",
