@@ -51,3 +51,14 @@ def nodes_of_tests_are_not_observed():
     from neusee.workflows.keys import module_owner
 
     module_owner.PROVEN = ("neusee.", "tests.", "engine_toys.")
+
+
+@pytest.fixture(autouse=True)
+def own_modules_of_a_test_are_forgotten():
+    """Let no own module of a test join the keys of the nodes of the next one, as in a process it would."""
+    from neusee.nodes import own_modules
+
+    known = dict(own_modules._files)
+    yield
+    own_modules._files.clear()
+    own_modules._files.update(known)
