@@ -85,7 +85,7 @@ def _run(function: Callable[[], T], client: NotificationClient | None) -> tuple[
             step.run()
         finally:
             python_watch.end()
-        watch.draws.update(states.changed())
+        watch.draws.update(states.changed(), watch.kept.changed())
     if step.unprepared is not None:
         raise step.unprepared
     return step, watch

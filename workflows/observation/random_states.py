@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from neusee.workflows.observation.drawn_names import draws_name
 from neusee.workflows.observation.python_watch import watch_here
 
 
@@ -65,14 +66,23 @@ class WatchedChance:
 
 def _note(source: str) -> None:
     watch = watch_here()
-    if watch is not None and not watch.trusted():
+    if watch is not None and watch.trusted():
+        watch.kept.drew = True
+    elif watch is not None:
         watch.draws.add(source)
 
 
 def _asking(function: Callable[[int], bytes]) -> Callable[[int], bytes]:
     def urandom(size: int, /) -> bytes:
-        _note("os.urandom")
-        return function(size)
+        watch = watch_here()
+        if watch is None or not draws_name(1):
+            _note("os.urandom")
+            return function(size)
+        before = watch.trust(True)
+        try:
+            return function(size)
+        finally:
+            watch.trust(before)
 
     return urandom
 
