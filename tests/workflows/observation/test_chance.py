@@ -7,6 +7,7 @@ import random
 import secrets
 import sys
 import tempfile
+import threading
 import uuid
 from pathlib import Path
 
@@ -15,11 +16,40 @@ import pytest
 import scipy.stats
 import torch
 
+from neusee.workflows.observation.observed_call import observed
+from neusee.workflows.observation.taints import Covered
+
+
+def seeded(size=3):
+    torch.manual_seed(3)
+    return torch.rand(size)
+
+
+def forked(draw):
+    with torch.random.fork_rng(devices=[]):
+        return draw(3)
+
+
+def put_back(*draws):
+    before = np.random.get_state()
+    for draw in draws:
+        draw()
+    np.random.set_state(before)
+    return np.random.normal() if len(draws) > 1 else None
+
+
 DRAWS = {
     "torch": (lambda: torch.poisson(torch.ones(3)), "torch"),
     "torch dropout": (lambda: torch.nn.functional.dropout(torch.ones(3)), "torch"),
     "numpy": (lambda: np.random.normal(), "numpy.random"),
-    "numpy seeded for all": (lambda: np.random.seed(1), "numpy.random"),
+    "numpy, then seeded": (lambda: [np.random.normal(), np.random.seed(3)], "numpy.random"),
+    "numpy, put back": (lambda: put_back(np.random.normal), "numpy.random"),
+    "numpy, seeded and put back": (lambda: put_back(lambda: np.random.seed(3), np.random.normal), "numpy.random"),
+    "weights of torch": (lambda: torch.nn.Linear(3, 2), "torch"),
+    "torch, then seeded": (lambda: [torch.rand(3), torch.manual_seed(3)], "torch"),
+    "torch in a fork": (lambda: forked(torch.rand), "torch"),
+    "torch after a fork": (lambda: [forked(seeded), torch.rand(3)], "torch"),
+    "torch seeded by itself": (lambda: torch.manual_seed(int(torch.randint(9, ()))), "torch"),
     "scipy": (lambda: scipy.stats.norm.rvs(size=2), "numpy.random"),
     "random": (random.random, "random"),
     "default_rng": (lambda: np.random.default_rng().normal(), "os.urandom"),
@@ -50,6 +80,12 @@ def test_chance_of_the_kernel_is_found_however_little_it_is(size, taints, watche
 
 
 SEEDED = {
+    "torch for all": lambda: [seeded(), torch.nn.Conv2d(1, 1, 3), torch.nn.functional.dropout(torch.ones(3))],
+    "torch for all, in a fork": lambda: forked(seeded),
+    "torch for all, a fork in it": lambda: [seeded(), forked(torch.rand), torch.rand(3)],
+    "layer without weights": lambda: torch.nn.utils.skip_init(torch.nn.Linear, 3, 2),
+    "numpy for all": lambda: [np.random.seed(3), scipy.stats.norm.rvs(size=2)],
+    "numpy for all, put back": lambda: [np.random.seed(3), put_back(np.random.normal), np.random.normal()],
     "torch": lambda: torch.rand(3, generator=torch.Generator().manual_seed(3)),
     "numpy": lambda: np.random.default_rng(3).normal(),
     "legacy numpy": lambda: np.random.RandomState(3).normal(),
@@ -163,3 +199,59 @@ def test_chance_that_dask_draws_and_a_name_that_a_step_draws_are_found(taints, l
     random = pytest.importorskip("dask.array").random
     assert [kind for kind, _ in taints(lambda: random.default_rng().normal(size=3).compute())] == ["random"]
     assert taints(lambda: [uuid.uuid4() for _ in range(2)]) == [("random", "os.urandom")]
+
+
+@pytest.mark.parametrize(("seed", "source"), [(np.random.seed, "numpy.random"), (torch.seed, "torch")])
+def test_a_seed_that_the_system_gives_is_none(seed, source, taints, layer):
+    assert ("random", source) in taints(seed)
+
+
+def test_a_seed_that_the_process_has_already_is_one(taints):
+    torch.manual_seed(3)
+    np.random.seed(3)
+    assert taints(lambda: [seeded(), np.random.seed(3), np.random.normal()]) == []
+
+
+def test_a_state_that_the_process_has_already_is_none(taints):
+    before = torch.get_rng_state()
+    assert taints(lambda: [torch.set_rng_state(before), torch.rand(3)]) == [("random", "torch")]
+
+
+def test_a_seed_that_another_thread_sets_is_none_of_the_step(taints):
+    started, ended = threading.Event(), threading.Event()
+
+    def disturb():
+        started.wait(60)
+        torch.manual_seed(5)
+        ended.set()
+
+    other = threading.Thread(target=disturb)
+    other.start()
+    assert taints(lambda: [seeded(), started.set(), ended.wait(60), torch.rand(3)]) == [("random", "torch")]
+    other.join()
+
+
+def test_the_functions_of_torch_and_numpy_are_what_they_were(taints):
+    def functions():
+        return [torch.random.default_generator, np.random.seed, np.random.mtrand.set_state, torch.cuda.manual_seed_all]
+
+    before = functions()
+    taints(lambda: torch.manual_seed(3))
+    assert functions() == before
+    assert torch.manual_seed(4) is torch.default_generator
+
+
+def test_a_draw_says_what_to_write_and_the_advice_works(taints):
+    found = observed(lambda: torch.nn.Linear(3, 2), Covered(frozenset(), lambda name: True))[1]
+    for word in ("torch.manual_seed(seed)", "torch.nn.utils.skip_init(torch.nn.Linear, 3, 2)", "rng", "cache: false"):
+        assert word in found[0].fix
+    numpy = observed(np.random.normal, Covered(frozenset(), lambda name: True))[1]
+    assert "np.random.seed(seed)" in numpy[0].fix
+
+    def advised(seed=3):
+        layer = torch.nn.utils.skip_init(torch.nn.Linear, 3, 2)
+        torch.nn.init.zeros_(layer.weight)
+        torch.manual_seed(seed)
+        return torch.nn.Linear(3, 2)(torch.ones(3)), layer
+
+    assert taints(advised) == []
