@@ -22,7 +22,7 @@ import torch
 
 from neusee.workflows.observation import kernel_layer
 from neusee.workflows.observation.observed_call import observed
-from neusee.workflows.observation.random_states import RandomStates
+from neusee.workflows.observation.shared_generators import SharedGenerators
 from neusee.workflows.observation.taints import Covered
 
 COVERED = Covered(frozenset(), lambda name: True)
@@ -85,7 +85,7 @@ def processor_time() -> float:
 PARTS: dict[str, Callable[[], object]] = {
     "a thread": threads,
     "a thread with filter, listener and records": filtered,
-    "states of generators, twice": lambda: RandomStates().changed(),
+    "states of generators, twice": lambda: SharedGenerators().drawn(),
     "all": lambda: observed(int, COVERED),
 }
 

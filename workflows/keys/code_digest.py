@@ -181,9 +181,9 @@ class Code:
             used = own if name == module else whole.names.get(name) or {""}
             free = [*look.summary.depends, *node.depends]
             read = read_names(look.summary.statements, set() if used & {"", "*"} else used) if look.changing else set()
-            for held, kind in look.changing.items():
+            for held, what in look.changing.items():
                 if held in read and f"{FREE}{held}" not in free:
-                    raise UnfollowedCode(changing_refusal(held, kind, look.path))
+                    raise UnfollowedCode(changing_refusal(held, what, look.path))
             lines = [r for r in reached(look.summary.statements, None if "" in used else used)]
             found = [item for item in look.summary.constructs if any(item.line in r for r in lines)]
             left = uncovered(found, free)

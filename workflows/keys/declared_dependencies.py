@@ -78,10 +78,10 @@ def refusal(item: Construct, source: Path) -> str:
     return f"{source}:{item.line}: {item.text}: {item.why}, and a cache key cannot see it: {fix}; {free}"
 
 
-def changing_refusal(name: str, kind: str, source: Path) -> str:
-    """Return the message that refuses a name of a module whose object changes while a process runs."""
+def changing_refusal(name: str, what: str, source: Path) -> str:
+    """Return the message that refuses a name of a module whose object changes while a process runs, or is not read."""
     return (
-        f"{source}: {name} is or holds a {kind}, which changes while a process runs, and a cache key cannot see it: "
+        f"{source}: {name} is or holds a {what}, and a cache key cannot see it: "
         f'make it inside of the function that uses it; or, if no result depends on it, depends=["{FREE}{name}"]'
     )
 

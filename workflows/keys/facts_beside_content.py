@@ -10,9 +10,10 @@ import ast
 from collections.abc import Iterator, Mapping
 
 from neusee.workflows.keys.literal_texts import texts
+from neusee.workflows.keys.local_names import dotted
 from neusee.workflows.keys.scopes_of_names import last_name
 from neusee.workflows.keys.syntax_pass import Kinds, each
-from neusee.workflows.keys.unfollowed_constructs import Construct, dotted
+from neusee.workflows.keys.unfollowed_constructs import Construct
 
 _STAMP = "times, rights and marks of a file are not its content"
 _SOURCE = "comments and numbers of lines of code are read"

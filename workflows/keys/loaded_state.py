@@ -2,12 +2,13 @@
 
 The source of a module says how its names get their values. What a process computes with are the values themselves: a
 table that another module filled, a constant or function that was replaced, a default that an import computed.
-Values of classes of other packages count by their type alone.
+Values of classes of other packages count by their type alone, also where their own methods fail.
 """
 
 from __future__ import annotations
 
 import functools
+import inspect
 import io
 import operator
 import random
@@ -82,7 +83,7 @@ class LoadedState:
         """Describe a module; without ``lazy`` not what a ``cached_property`` holds, which the rest decides."""
         self.modules: dict[str, set[str]] = {}  #: names of functions and classes that the module holds, by module
         self.replaced: list[str] = []  #: functions of the module's own file whose code is not that of the file
-        self.changing: dict[str, str] = {}  #: types of objects such as generators, by the name that is or holds them
+        self.changing: dict[str, str] = {}  #: objects such as generators, and why, by the name that is or holds them
         self._changes: list[str] = []
         self._holds: dict[int, list[str]] = {}  # changes in repeated objects, by id
         self._name, self._file = module.__name__, getattr(module, "__file__", "") or ""
@@ -96,43 +97,73 @@ class LoadedState:
         state: list[Any] = []
         for name in sorted(values):
             if name == "__getattr__" or not (name.startswith("__") and name.endswith("__")):
-                state.append((name, self._of(values[name])))
+                state.append((name, self._shallow(values[name])))
                 if self._changes:
                     self.changing[name] = self._changes[0]
                     self._changes = []
         return xxhash.xxh3_128_hexdigest(repr(state).encode(errors="surrogatepass"))
 
+    def _shallow(self, value: Any) -> Any:
+        """Return a value as text and tuples, or its type if it holds itself, or much, one in the other without end."""
+        try:
+            return self._of(value)
+        except RecursionError:
+            return self._unread(value, "is nested too deeply")
+
     def _of(self, value: Any) -> Any:
         """Return a value as text and tuples that are the same in each process; a repeated object is its number."""
         if value is None:
             return _NOTHING
-        kind: Any = type(value)
-        how = _HOW[kind]
-        if how == "plain":
-            return kind.__name__, repr(value)
-        if how == "text":
-            return kind.__name__, self._placed(str(value))
-        if how == "builtin":
-            return kind.__name__, value.__qualname__
-        if how == "module":
-            return kind.__name__, self._noted(value.__name__)
-        seen, name = self._seen, id(value)
-        if name in seen:
-            self._changes += self._holds.get(name, ())
-            return "again", seen[name]
-        seen[name], before = len(seen), len(self._changes)
-        self._kept.append(value)
-        told = _DESCRIBED[how](self, value)
+        how = _HOW[type(value)]
+        seen, name, before = self._seen, id(value), len(self._changes)
+        try:
+            if how in _ATOMS:
+                return _DESCRIBED[how](self, value)
+            if name in seen:
+                self._changes += self._holds.get(name, ())
+                return "again", seen[name]
+            seen[name] = len(seen)
+            self._kept.append(value)
+            told = _DESCRIBED[how](self, value)
+        except RecursionError:
+            raise  # where it ends depends on the calls around it
+        except Exception as error:  # the methods of a class may do anything
+            told = self._unread(value, f"could not be read ({type(error).__name__}: {error})")
         if len(self._changes) > before:
             self._holds[name] = self._changes[before:]
         return told
 
+    def _unread(self, value: Any, why: str) -> str:
+        """Return the type of a value whose parts cannot be told; note it if the parts of such a value count."""
+        kind = type(value)
+        if kind.__module__ == "builtins" or self._followed(_home(kind)):
+            self._changes.append(f"{kind.__name__}, which {why}")
+        return self._typed(value)
+
+    def _plain(self, value: Any) -> Any:
+        return type(value).__name__, repr(value)
+
+    def _text(self, value: Any) -> Any:
+        return type(value).__name__, self._placed(str(value))
+
+    def _builtin(self, value: Any) -> Any:
+        return type(value).__name__, value.__qualname__
+
+    def _module(self, value: Any) -> Any:
+        return type(value).__name__, self._noted(value.__name__)
+
     def _array(self, value: Any) -> Any:
-        return type(value).__name__, *_array(value)
+        if not isinstance(value, np.ndarray):
+            return type(value).__name__, *_array(value)
+        plain = np.ndarray.view(value, np.ndarray)  # a class of arrays may refuse to be read
+        if plain.dtype.hasobject:
+            return type(value).__name__, str(plain.dtype), plain.shape, self._of(plain.tolist())
+        mask = np.ma.getmask(value) if isinstance(value, np.ma.MaskedArray) else np.ma.nomask
+        return type(value).__name__, *_array(plain), *(_array(mask) if isinstance(mask, np.ndarray) else ())
 
     def _changing(self, value: Any) -> Any:
         """Note an object that changes while a process runs, such as a generator or a file, and return its type."""
-        self._changes.append(type(value).__name__)
+        self._changes.append(f"{type(value).__name__}, which changes while a process runs")
         return self._typed(value)
 
     def _table(self, value: Any) -> Any:
@@ -168,10 +199,12 @@ class LoadedState:
         A module of torch counts by its parts, whose weights others may have set.
         """
         kind = type(value)
-        if kind is SimpleNamespace or isinstance(value, nn.Module) or self._followed(kind.__module__):
+        if kind is SimpleNamespace or issubclass(kind, nn.Module) or self._followed(_home(kind)):
             parts = [(name, part) for name, part in _attributes(value) if self._lazy or not _is_lazy(kind, name)]
             return self._typed(value), [(name, self._of(part)) for name, part in parts]
-        inner = getattr(value, "__wrapped__", None) if kind.__module__ != "typing" else None
+        # a class that answers to each name answers to this one too
+        wraps = kind.__module__ != "typing" and inspect.getattr_static(value, "__wrapped__", None) is not None
+        inner = value.__wrapped__ if wraps else None
         return self._typed(value), self._of(inner) if callable(inner) else ""
 
     def _function(self, function: FunctionType) -> Any:
@@ -195,7 +228,7 @@ class LoadedState:
         return "function", home, code.co_qualname, exact, told
 
     def _class(self, kind: type) -> Any:
-        name = ("class", self._noted(kind.__module__, kind.__qualname__), kind.__qualname__)
+        name = ("class", self._noted(_home(kind), kind.__qualname__), kind.__qualname__)
         if kind.__module__ != self._name:
             return name
         bases = [(base.__module__, base.__qualname__) for base in kind.__mro__[1:]]
@@ -206,7 +239,7 @@ class LoadedState:
 
     def _typed(self, value: Any) -> str:
         kind = type(value)
-        return f"{self._noted(kind.__module__, kind.__qualname__)}.{kind.__qualname__}"
+        return f"{self._noted(_home(kind), kind.__qualname__)}.{kind.__qualname__}"
 
     def _noted(self, module: str, name: str = "") -> str:
         """Note a function or class that the state contains, or a whole module, if its source is followed."""
@@ -220,19 +253,19 @@ class LoadedState:
 
 
 _NOTHING = ("NoneType", "None")
-_ATOMS = ("plain", "text", "builtin", "module")
+_ATOMS = frozenset({"plain", "text", "builtin", "module"})
 #: the method that describes a value, by the kind of its type
 _DESCRIBED: dict[str, Callable[[LoadedState, Any], Any]] = {
-    how: getattr(LoadedState, f"_{how}") for how in ("object", *(how for how, _ in _KINDS)) if how not in _ATOMS
+    how: getattr(LoadedState, f"_{how}") for how in ("object", *(how for how, _ in _KINDS))
 }
 
 
 def counted_values(module: ModuleType, summary: Summary, free: Collection[str], root: bool) -> dict[str, Any]:
     """Return the values of a loaded module that count: of a node's own module, those that its nodes reach."""
     values = {name: value for name, value in vars(module).items() if name not in free}
-    nodes = [name for name, value in values.items() if root and isinstance(value, Node)]
+    nodes = [name for name, value in values.items() if root and issubclass(type(value), Node)]
     if nodes:
-        classes = [name for name, value in values.items() if isinstance(value, type) and issubclass(value, nn.Module)]
+        classes = [name for name, value in values.items() if _is_network(value)]
         names = read_names(summary.statements, [*nodes, *classes, "_"])
         return {name: value for name, value in values.items() if name in names}
     noted = written_only(summary.statements)
@@ -262,7 +295,7 @@ def _array(value: Any) -> tuple[Any, ...]:
     elif value.flags.c_contiguous and value.dtype.kind in "biufc":
         raw = value.data  # without a copy
     else:
-        raw = repr(value.tolist()).encode() if value.dtype.hasobject else value.tobytes()
+        raw = value.tobytes()
     return str(value.dtype), tuple(value.shape), xxhash.xxh3_128_hexdigest(raw)
 
 
@@ -271,6 +304,15 @@ def _attributes(value: Any) -> list[tuple[str, Any]]:
     slots = {slot for base in type(value).__mro__ for slot in _named(vars(base).get("__slots__", ()))}
     found = {slot: getattr(value, slot) for slot in sorted(slots) if not slot.startswith("__") and hasattr(value, slot)}
     return list({**found, **getattr(value, "__dict__", {})}.items())
+
+
+def _home(kind: type) -> str:
+    """Return the module of a class, or an empty text for a class that states something else."""
+    return kind.__module__ if isinstance(kind.__module__, str) else ""
+
+
+def _is_network(value: Any) -> bool:
+    return issubclass(type(value), type) and issubclass(value, nn.Module)
 
 
 def _is_lazy(kind: type, name: str) -> bool:

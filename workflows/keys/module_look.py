@@ -23,7 +23,7 @@ class Look(NamedTuple):
     summary: Summary | None = None  #: None for a module that counts by its version
     path: Path | None = None
     state: str = ""
-    changing: Mapping[str, str] = {}  #: types of loaded objects that no digest covers, such as generators, by name
+    changing: Mapping[str, str] = {}  #: loaded objects that no digest covers, such as generators, and why, by name
     private: bool = False  #: True if the loaded code is not that of the file
 
 

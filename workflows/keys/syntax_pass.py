@@ -40,6 +40,7 @@ class Syntax:
         self.texts: list[tuple[ast.stmt, str]] = []  #: statements at the top level with their texts
         self.documents: list[tuple[int, int, str]] = []  #: the place and the text of each docstring
         self.calls: list[tuple[Scope, ast.Call]] = []  #: calls that a process runs, with the functions around them
+        self.joins: list[tuple[Scope, ast.BinOp]] = []  #: sums, paths that are put together, and so on, likewise
         self.blocks: list[Block] = []
         self.all: Kinds = defaultdict(list)  #: the parts of every block
         self.not_run: Kinds = defaultdict(list)
@@ -81,6 +82,8 @@ class Syntax:
         self._kinds[kind].append(item)
         if kind is ast.Call:
             self.calls.append((scope, item))  # type: ignore[arg-type]
+        elif kind is ast.BinOp:
+            self.joins.append((scope, item))  # type: ignore[arg-type]
         elif kind in _FUNCTIONS:
             scope = (*scope, item)
         elif kind is ast.If and _is_not_run(item.test):  # type: ignore[attr-defined]
@@ -115,13 +118,13 @@ class Syntax:
 
     def _visit_quietly(self, *items: ast.AST) -> None:
         """Add the text of items that no process runs."""
-        kinds, calls = self._kinds, len(self.calls)
+        kinds, calls, joins = self._kinds, len(self.calls), len(self.joins)
         self._kinds = self.not_run
         self._words.append(f"[{len(items)}")
         for item in items:
             self._visit(item, ())
         self._kinds = kinds
-        del self.calls[calls:]
+        del self.calls[calls:], self.joins[joins:]
 
     def _without_docstring(self, item: Any) -> list[ast.stmt]:
         """Return the statements of a definition or a module without its docstring, which is noted."""

@@ -2,7 +2,8 @@
 
 A digest of code does not cover what these constructs read, so a node declares it with ``depends=``. Code below
 ``if __name__ == "__main__"`` and files that are written do not count. A file counts unless its path comes from an
-argument of the function that reads it, because the file of a parameter is part of the key.
+argument of the function that reads it, because the file of a parameter is part of the key, or is that of a temporary
+file or of an object in memory: what own code really opens is observed.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
+from neusee.workflows.keys.local_names import arguments, assigned, dotted, read_by
+from neusee.workflows.keys.scratch_files import Scratch
 from neusee.workflows.keys.syntax_pass import Kinds, Scope, Syntax, each
 
 _CLOCK = "a clock, a process or a machine decides"
@@ -99,19 +102,10 @@ class Construct(NamedTuple):
 def constructs(tree: Syntax, bound: Mapping[str, str]) -> list[Construct]:
     """Return each construct of a module that is not followed; ``bound`` has the full name of each imported name."""
     own = _bound_here(tree.all)
-    found = [*_named(tree.all, bound, own), *_read(tree.calls, bound, own), *_file_names(tree.all)]
+    scratch = Scratch(bound, lambda full: _READERS.fullmatch(full) is not None)
+    found = [*_named(tree.all, bound, own), *_read(tree.calls, bound, own, scratch)]
+    found += _file_names(tree.all, scratch.texts(tree) if scratch else set())
     return sorted(set(found), key=lambda item: (item.line, item))
-
-
-def dotted(item: ast.expr, bound: Mapping[str, str]) -> str:
-    """Return the full name of an expression such as ``np.random.rand``, or an empty text for any other expression."""
-    parts: list[str] = []
-    while isinstance(item, ast.Attribute):
-        parts.append(item.attr)
-        item = item.value
-    if not isinstance(item, ast.Name):
-        return ""
-    return ".".join([bound.get(item.id, item.id), *reversed(parts)]).removeprefix("builtins.")
 
 
 def literal_import(call: ast.expr, bound: Mapping[str, str]) -> str | None:
@@ -173,19 +167,23 @@ def _variables(kinds: Kinds, bound: Mapping[str, str]) -> Iterator[tuple[ast.exp
             yield use, name
 
 
-def _read(calls: Iterable[tuple[Scope, ast.Call]], bound: Mapping[str, str], own: set[str]) -> Iterator[Construct]:
+def _read(
+    calls: Iterable[tuple[Scope, ast.Call]], bound: Mapping[str, str], own: set[str], scratch: Scratch
+) -> Iterator[Construct]:
     """Yield each call that reads a file whose path does not come from an argument of the function around it."""
     for scope, item in calls:
         full = dotted(item.func, bound)
         method = isinstance(item.func, ast.Attribute) and item.func.attr in _METHODS
         known = _first_name(item.func) in bound or (full == "open" and full not in own)
         if known and _READERS.fullmatch(full):
-            path = item.args[0] if item.args else next((word.value for word in item.keywords), None)
+            path = read_by(item)
         elif method and isinstance(item.func, ast.Attribute) and _first_name(item.func) not in bound:
             path = item.func.value
         else:
             continue
-        if path is not None and not _writes(item) and not _given(path, scope, frozenset()):
+        if path is None or _writes(item) or _given(path, scope, frozenset()):
+            continue
+        if not scratch.holds(path, scope):
             yield Construct("file", _literal(path), ast.unparse(item)[:60], _FILE, item.lineno)
 
 
@@ -211,40 +209,20 @@ def _name_given(name: str, scope: Scope, seen: frozenset[str]) -> bool:
     if name in seen:
         return False
     for function in reversed(scope):
-        if name in _arguments(function):
+        if name in arguments(function):
             return True
-        values = [value for target, value in _assigned(function) if target == name]
+        values = [value for target, value in assigned(function) if target == name]
         if values:
             return any(_given(value, scope, seen | {name}) for value in values)
     return False
 
 
-def _arguments(function: ast.AST) -> set[str]:
-    inner = getattr(function, "args", None)
-    return {part.arg for part in ast.walk(inner) if isinstance(part, ast.arg)} if inner is not None else set()
+def _file_names(kinds: Kinds, scratch: set[int]) -> Iterator[Construct]:
+    """Yield each text that is the name of a file of data, where it may become a path: in a call or as a constant.
 
-
-def _assigned(function: ast.AST) -> Iterator[tuple[str, ast.expr]]:
-    """Yield each local name of a function with an expression that gives it its value."""
-    for item in ast.walk(function):
-        if isinstance(item, ast.Assign):
-            pairs: Iterable[tuple[ast.AST, ast.expr | None]] = [(target, item.value) for target in item.targets]
-        elif isinstance(item, ast.AnnAssign | ast.AugAssign | ast.NamedExpr):
-            pairs = [(item.target, item.value)]
-        elif isinstance(item, ast.For | ast.AsyncFor | ast.comprehension):
-            pairs = [(item.target, item.iter)]
-        elif isinstance(item, ast.withitem):
-            pairs = [(item.optional_vars, item.context_expr)] if item.optional_vars else []
-        else:
-            continue
-        for target, value in pairs:
-            if value is not None:
-                yield from ((part.id, value) for part in ast.walk(target) if isinstance(part, ast.Name))
-
-
-def _file_names(kinds: Kinds) -> Iterator[Construct]:
-    """Yield each text that is the name of a file of data, where it may become a path: in a call or as a constant."""
+    ``scratch`` are the texts, by id, that name a file in a temporary folder.
+    """
     spoken = {id(part) for item in each(kinds, ast.Raise, ast.JoinedStr) for part in ast.walk(item)}
     for item in each(kinds, ast.Constant):
-        if _FILE_NAME.fullmatch(text := _literal(item)) and id(item) not in spoken:
+        if _FILE_NAME.fullmatch(text := _literal(item)) and id(item) not in spoken | scratch:
             yield Construct("file", text, repr(text), _FILE, item.lineno)

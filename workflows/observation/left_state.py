@@ -60,11 +60,12 @@ def _digests(module: ModuleType, own: OwnCode) -> dict[str, str]:
 def _digest(module: ModuleType, name: str, value: Any, own: OwnCode) -> str:
     if value is None:
         return ""
-    if isinstance(value, ModuleType):
+    kind = type(value)  # an object may state another class, or raise if it is asked for it
+    if issubclass(kind, ModuleType):
         return "module"
-    if isinstance(value, _UNLIKE):
-        return f"{type(value).__name__} {value!r}"
-    if isinstance(value, FunctionType) and _is_usual(value):
+    if kind in _UNLIKE:
+        return f"{kind.__name__} {value!r}"
+    if kind is FunctionType and _is_usual(value):
         return f"function {id(value.__code__)} {value.__defaults__!r}"
     return LoadedState(module, (), own.modules.__contains__, lazy=False).digest({name: value})
 
@@ -73,7 +74,7 @@ def _is_usual(function: FunctionType) -> bool:
     """Return True for a function that holds numbers and words alone, and is compared in little time."""
     if function.__kwdefaults__ or function.__closure__ or vars(function):
         return False
-    return all(isinstance(part, _UNLIKE) for part in function.__defaults__ or ())
+    return all(type(part) in _UNLIKE for part in function.__defaults__ or ())
 
 
 def _changed_modules(own: OwnCode, before: dict[str, dict[str, str]]) -> Iterator[str]:
@@ -147,7 +148,7 @@ def _changed_others(own: OwnCode, before: dict[str, dict[str, Any]]) -> Iterator
 
 
 def _is_alike(one: Any, other: Any) -> bool:
-    return one is other or (type(one) is type(other) and isinstance(one, _UNLIKE) and one == other)
+    return one is other or (type(one) is type(other) and type(one) in _UNLIKE and one == other)
 
 
 def _settings() -> dict[str, str]:

@@ -6,6 +6,8 @@ So does all that takes ``random_state=3``. While a call is observed, such a gene
 from __future__ import annotations
 
 import abc
+import pickle
+import sys
 from typing import Any
 
 import numpy as np
@@ -28,15 +30,19 @@ class LegacyGenerator(np.random.MT19937, metaclass=_Replacement):
 
     def __init__(self, *seed: Any) -> None:
         """Make the generator; what it takes from the system counts at the end of the call, if no seed followed."""
-        self._seeded = bool(seed)
+        self._seeded, self._first = bool(seed), b""
         watch = watch_here()
         if watch is None or seed:
             super().__init__(*seed)
             return
-        watch.generators.append(self)
+        if watch.trusted():  # an import of a package, which keeps it for itself
+            watch.kept.keep(self, str(sys._getframe(1).f_globals.get("__name__")))
+        else:
+            watch.generators.append(self)
         before = watch.trust(True)
         try:
             super().__init__()
+            self._first = pickle.dumps(self.state)
         finally:
             watch.trust(before)
 
@@ -47,6 +53,10 @@ class LegacyGenerator(np.random.MT19937, metaclass=_Replacement):
     def is_seeded(self) -> bool:
         """Return True if a seed decides what the generator draws."""
         return self._seeded
+
+    def has_drawn_by_chance(self) -> bool:
+        """Return True if the generator has drawn without a seed."""
+        return not self._seeded and pickle.dumps(self.state) != self._first
 
     def __reduce__(self) -> Any:
         """Return what a file keeps: the generator of NumPy that this is."""

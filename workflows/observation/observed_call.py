@@ -8,12 +8,13 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from neusee.workflows.observation import audit_events, kernel_layer, python_watch
+from neusee.workflows.observation.asked_chance import WatchedChance
 from neusee.workflows.observation.judgement import Judgement
 from neusee.workflows.observation.legacy_numpy import WatchedLegacyGenerators
 from neusee.workflows.observation.notification_client import NoServer, NotificationClient
 from neusee.workflows.observation.python_watch import Watch
-from neusee.workflows.observation.random_states import RandomStates, WatchedChance
 from neusee.workflows.observation.recorded_call import Record
+from neusee.workflows.observation.shared_generators import SharedGenerators
 from neusee.workflows.observation.step_thread import StepThread
 from neusee.workflows.observation.taints import Covered, Taint
 from neusee.workflows.observation.watched_imports import WatchedImports
@@ -78,14 +79,13 @@ def _run(function: Callable[[], T], client: NotificationClient | None) -> tuple[
     step = StepThread(function, lambda: kernel_layer.stop_here(client) if client else None)
     watch.add(step.thread)
     audit_events.listen()
-    with WatchedChance(), WatchedLegacyGenerators(), WatchedImports(), WatchedThreads():
-        states = RandomStates()
+    with WatchedChance(), WatchedLegacyGenerators(), WatchedImports(), WatchedThreads(), SharedGenerators() as shared:
         python_watch.begin(watch)
         try:
             step.run()
         finally:
             python_watch.end()
-        watch.draws.update(states.changed())
+        watch.draws.update(shared.drawn(), watch.kept.changed())
     if step.unprepared is not None:
         raise step.unprepared
     return step, watch

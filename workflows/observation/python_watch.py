@@ -6,6 +6,7 @@ import os
 import threading
 from typing import Protocol
 
+from neusee.workflows.observation.kept_generators import KeptGenerators
 from neusee.workflows.observation.recorded_call import Record
 from neusee.workflows.observation.trusted_tasks import CHILD, TRUSTED, UNTRUSTED
 
@@ -24,6 +25,7 @@ class Watch:
         self.kernel = kernel  #: True if the kernel watches too: then it sees all that is opened, and more
         self.records: list[Record] = []
         self.draws: set[str] = set()  #: sources of chance that were asked
+        self.kept = KeptGenerators()  #: generators of installed packages
         self.generators: list[Seedable] = []  #: that were made before their seed, if any, was known
         self.bodies: dict[str, str] = {}  #: file of each module of the user that was executed, by name
         self.quiet: dict[str, bool] = {}  #: files, and whether all who asked for their source or marks need no record

@@ -40,11 +40,23 @@ _FIX: dict[Kind, str] = {
     'depends=["unaffected:{name}"]; or write cache: false',
     "unknown": "write cache: false",
 }
+_SEED = "set the seed in the node before it draws, {call}, from a parameter or a constant"
+_OF_LAYERS = (
+    "make a layer whose weights the node fills itself without drawing them, "
+    "torch.nn.utils.skip_init(torch.nn.Linear, 3, 2)"
+)
+#: what else to write against a draw, by what was drawn from
+_OF_CHANCE = {
+    "torch": f"{_SEED.format(call='torch.manual_seed(seed)')}; or {_OF_LAYERS}",
+    "torch.cuda": f"{_SEED.format(call='torch.manual_seed(seed)')}; or {_OF_LAYERS}",
+    "numpy.random": _SEED.format(call="np.random.seed(seed)"),
+}
 
 
 def taint(kind: Kind, what: str) -> Taint:
     """Return a taint with what to write against it."""
-    return Taint(kind, what, _FIX[kind].format(name=_short(kind, what)))
+    fix = _FIX[kind].format(name=_short(kind, what))
+    return Taint(kind, what, f"{_OF_CHANCE[what]}; or {fix}" if kind == "random" and what in _OF_CHANCE else fix)
 
 
 def _short(kind: Kind, what: str) -> str:

@@ -51,6 +51,8 @@ def _searching(function: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return function(name, import_)
         finally:
+            if not before:
+                watch.kept.note()
             watch.trust(before)
 
     return search

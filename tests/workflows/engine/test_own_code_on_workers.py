@@ -111,13 +111,13 @@ def test_a_changed_helper_is_refused(lab, tmp_path):
 def test_what_dask_draws_beside_a_step_is_no_draw_of_the_step():
     sizeof = pytest.importorskip("dask.sizeof")
     from neusee.workflows.engine.dask_worker import _chance_of_its_own
-    from neusee.workflows.observation.random_states import RandomStates
+    from neusee.workflows.observation.shared_generators import SharedGenerators
 
     many = {number: number for number in range(1000)}
-    before = RandomStates()
+    before = SharedGenerators()
     sizeof.sizeof(many)
-    assert before.changed() == ["random"]  # dask asks the generator of the process
+    assert before.drawn() == ["random"]  # dask asks the generator of the process
     _chance_of_its_own()
-    before = RandomStates()
+    before = SharedGenerators()
     sizeof.sizeof(many)
-    assert before.changed() == []
+    assert before.drawn() == []

@@ -1,4 +1,4 @@
-"""Generators of the process, before and after a call, and the sources of chance that the call asks meanwhile."""
+"""The sources of chance that a call asks, such as the system, a process or a device."""
 
 from __future__ import annotations
 
@@ -8,38 +8,8 @@ import tempfile
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-import torch
-
+from neusee.workflows.observation.drawn_names import draws_name
 from neusee.workflows.observation.python_watch import watch_here
-
-
-class RandomStates:
-    """States of the generators that all code of a process shares."""
-
-    def __init__(self) -> None:
-        self._torch = torch.default_generator.get_state()
-        self._cuda = _of_cuda()
-        self._numpy = np.random.get_state()
-        self._python = random.getstate()
-
-    def changed(self) -> list[str]:
-        """Return the names of the generators whose states changed since."""
-        numpy: Any = np.random.get_state()
-        before: Any = self._numpy
-        changes = {
-            "torch": not torch.equal(self._torch, torch.default_generator.get_state()),
-            "torch.cuda": any(state != self._cuda.get(name, (state[0], 0)) for name, state in _of_cuda().items()),
-            "numpy.random": not np.array_equal(before[1], numpy[1]) or before[2:] != numpy[2:],
-            "random": self._python != random.getstate(),
-        }
-        return [name for name, is_changed in changes.items() if is_changed]
-
-
-def _of_cuda() -> dict[int, tuple[int, int]]:
-    """Return seed and count of the draws of each graphics processor in use; a new one has drawn nothing."""
-    generators = torch.cuda.default_generators if torch.cuda.is_initialized() else ()  # type: ignore[no-untyped-call]
-    return {number: (each.initial_seed(), each.get_offset()) for number, each in enumerate(generators)}
 
 
 class WatchedChance:
@@ -65,14 +35,23 @@ class WatchedChance:
 
 def _note(source: str) -> None:
     watch = watch_here()
-    if watch is not None and not watch.trusted():
+    if watch is not None and watch.trusted():
+        watch.kept.drew = True
+    elif watch is not None:
         watch.draws.add(source)
 
 
 def _asking(function: Callable[[int], bytes]) -> Callable[[int], bytes]:
     def urandom(size: int, /) -> bytes:
-        _note("os.urandom")
-        return function(size)
+        watch = watch_here()
+        if watch is None or not draws_name(1):
+            _note("os.urandom")
+            return function(size)
+        before = watch.trust(True)
+        try:
+            return function(size)
+        finally:
+            watch.trust(before)
 
     return urandom
 
