@@ -1057,6 +1057,16 @@ MUTANTS = (
         ("spot_peak(fill, waves, within)", "spot_peak(fill, 0 * waves, within)"),
     ),
     *faults(
+        "nodes/laser/_spot_heat.py",
+        within("nodes/laser", "spot_heat.py"),
+        ("/ _AIRY", "/ 1.0"),
+        ("+ (2 * math.pi * waves).square() + near", "+ (math.pi * waves).square() + near"),
+        ("irradiance = 4 * (parts", "irradiance = 2 * (parts"),
+        ("ring / (points + ring) * torch", "ring / (points + 2 * ring) * torch"),
+        ("hottest = (irradiance @ inverse.T).amax(1)", "hottest = (irradiance @ inverse.T)[:, 0]"),
+        ("torch.erf(root) / root", "torch.erf(root)"),
+    ),
+    *faults(
         "nodes/laser/_beam.py",
         within("nodes/laser", "beam.py::test_turbulence_multiplies_by_the_quantile_of_scipys_lognormal_law"),
         ("** (11 / 6)", "** (5 / 3)"),
