@@ -25,7 +25,8 @@ from neusee.workflows.keys.source_summary import Summary
 
 _SUMMARISING = (
     *("source_summary", "unfollowed_constructs", "reachable_code", "code_objects", "syntax_pass", "outward_code"),
-    *("scopes_of_names", "hash_order", "facts_beside_content", "literal_texts", "local_names", "scratch_files"),
+    *("scopes_of_names", "hash_order", "facts_beside_content", "facts_of_the_moment", "literal_texts", "local_names"),
+    "scratch_files",
 )
 #: digest of the code that summarises a source file, so that an older summary is not used
 EDITION = xxhash.xxh3_64_hexdigest(b"".join(Path(__file__).with_name(f"{n}.py").read_bytes() for n in _SUMMARISING))

@@ -25,6 +25,7 @@ _STAMPS = frozenset(
         *(f"st_{name}" for name in _FIELDS),
         *(f"ST_{name.upper()}" for name in (*_TIMES, *_FIELDS)),
         *("getmtime", "getctime", "getatime", "samefile", "sameopenfile", "samestat", "getxattr", "listxattr"),
+        *("mtime", "date_time", "gettarinfo"),
         *("is_symlink", "islink", "readlink", "is_mount", "ismount", "is_junction", "isjunction"),
     }
 )

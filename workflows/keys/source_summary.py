@@ -12,6 +12,7 @@ from typing import NamedTuple
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_objects import functions_of
 from neusee.workflows.keys.facts_beside_content import facts
+from neusee.workflows.keys.facts_of_the_moment import moments
 from neusee.workflows.keys.hash_order import orders
 from neusee.workflows.keys.literal_texts import reads_attributes_unnamed, texts
 from neusee.workflows.keys.module_origin import module_file
@@ -125,7 +126,8 @@ def _all_constructs(parsed: ast.Module, tree: Syntax, names: Mapping[str, str]) 
     """Return what is not followed, with what only matters in code of a user."""
     usual = constructs(tree, names)
     known = {(item.line, item.text.rpartition(".")[2]) for item in usual}
-    beside = [item for item in facts(tree.all, names) if (item.line, item.text.rpartition(".")[2]) not in known]
+    more = [*facts(tree.all, names), *moments(tree.all, names)]
+    beside = [item for item in more if (item.line, item.text.rpartition(".")[2]) not in known]
     return sorted({*usual, *orders(parsed), *beside}, key=lambda item: (item.line, item))
 
 

@@ -138,11 +138,11 @@ def _named(kinds: Kinds, bound: Mapping[str, str], own: set[str]) -> Iterator[Co
         if base not in bound and (base in own or base not in _BUILTINS):
             continue
         full = dotted(item, bound)
-        if entry := _entry(full):
+        if entry := entry_of(full):
             yield Construct(entry[0], names.get(id(_environ(item)), ""), full, entry[1], item.lineno)
 
 
-def _entry(full: str) -> tuple[str, str] | None:
+def entry_of(full: str) -> tuple[str, str] | None:
     """Return what a full name such as ``os.environ.get`` does, or None for any other name."""
     parts = full.split(".")
     return next((_NAMES[name] for n in range(len(parts), 0, -1) if (name := ".".join(parts[:n])) in _NAMES), None)
@@ -163,7 +163,7 @@ def _variables(kinds: Kinds, bound: Mapping[str, str]) -> Iterator[tuple[ast.exp
     pairs = [(item.value, item.slice) for item in each(kinds, ast.Subscript)]
     pairs += [(_environ(item.func), item.args[0]) for item in each(kinds, ast.Call) if item.args]
     for use, key in pairs:
-        if (name := _literal(key)) and (_entry(dotted(use, bound)) or " ")[0] == "env":
+        if (name := _literal(key)) and (entry_of(dotted(use, bound)) or " ")[0] == "env":
             yield use, name
 
 

@@ -23,6 +23,9 @@ STAMP = {
     "group": "from neusee.nodes import DataFile\ndef f(file: DataFile):\n    return file.group()",
     "attribute": "import os\ndef f(file):\n    return os.getxattr(file, 'user.gain')",
     "same": "def f(file, other):\n    return file.samefile(other)",
+    "member of an archive": "def f(info):\n    return info.date_time",
+    "another file system": "def f(system, file):\n    return system.info(file)['mtime']",
+    "header of an archive": "def f(archive, file):\n    return archive.gettarinfo(file).mode",
     "link": "def f(file):\n    return file.is_symlink()",
 }
 SOURCE = {
