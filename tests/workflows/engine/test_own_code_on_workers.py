@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import random
 import subprocess
 import sys
 import textwrap
@@ -108,8 +109,9 @@ def test_a_changed_helper_is_refused(lab, tmp_path):
     assert on_a_worker(job) == "differs"
 
 
-def test_what_dask_draws_beside_a_step_is_no_draw_of_the_step():
+def test_what_dask_draws_beside_a_step_is_no_draw_of_the_step(monkeypatch):
     sizeof = pytest.importorskip("dask.sizeof")
+    monkeypatch.setattr(sizeof, "random", random)  # a worker in this process may have changed it
     from neusee.workflows.engine.dask_worker import _chance_of_its_own
     from neusee.workflows.observation.shared_generators import SharedGenerators
 
