@@ -174,7 +174,7 @@ def judged(case: Case, place: Place) -> dict[str, object]:
 
 def _of_failure(case: Case, run: Run) -> str:
     """Return the verdict on a run that ended with an error."""
-    if run.code != 2:
+    if run.code != 2 or "nothing was run" in run.words:
         return "no case"
     return "refused" if case.honest else "told"
 

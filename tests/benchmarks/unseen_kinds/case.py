@@ -29,6 +29,16 @@ def picture(number) -> Tensor:
 
 
 """
+#: and each other file of nodes ends with a node that no step names
+OTHER = """
+
+from neusee.nodes import node
+
+
+@node()
+def idle(x: float) -> float:
+    return x
+"""
 STEP = "a: {node: own.value}"
 
 Text = str | bytes | None

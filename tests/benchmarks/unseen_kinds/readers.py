@@ -18,11 +18,11 @@ TWO = ("1\n", "2\n")
 TABLE = ("400, 1\n410, 1\n420, 1\n", "400, 2\n410, 2\n420, 2\n")
 
 
-def reads(name: str, about: str, lines: str, **words) -> Case:
-    """Return a case whose node runs a few lines that return a number; `place` is the folder of the lab."""
+def reads(name: str, about: str, table: str, lines: str, **words) -> Case:
+    """Return a case whose node runs a few lines that return a number; `table` is the name of a file, as a text."""
     indented = "\n".join("    " + line for line in lines.strip("\n").splitlines())
-    code = f'@node()\ndef value(*, place: str = ".") -> Tensor:\n{indented}\n'
-    return Case(name, about, code, **words)
+    steps = f"a: {{node: own.value, with: {{table: {table}}}}}"
+    return Case(name, about, f"@node()\ndef value(*, table: str) -> Tensor:\n{indented}\n", steps, **words)
 
 
 def _shelf(folder: Path, turn: int) -> None:
@@ -62,11 +62,12 @@ CASES = [
     reads(
         "configparser",
         "an INI file of the laboratory",
+        "lab.ini",
         """
 import configparser
 
 lab = configparser.ConfigParser()
-lab.read(place + "/lab.ini")
+lab.read(table)
 return picture(lab["camera"]["gain"])
 """,
         files={"lab.ini": ("[camera]\ngain = 1\n", "[camera]\ngain = 2\n")},
@@ -74,10 +75,11 @@ return picture(lab["camera"]["gain"])
     reads(
         "fsspec_local",
         "fsspec.open",
+        "gain.txt",
         """
 import fsspec
 
-with fsspec.open(f"file://{os.path.abspath(place)}/gain.txt", "r") as file:
+with fsspec.open(f"file://{os.path.abspath(table)}", "r") as file:
     return picture(file.read())
 """,
         files={"gain.txt": TWO},
@@ -85,8 +87,9 @@ with fsspec.open(f"file://{os.path.abspath(place)}/gain.txt", "r") as file:
     reads(
         "fromregex",
         "np.fromregex over a log of the instrument",
+        "lab.log",
         """
-found = np.fromregex(place + "/lab.log", r"gain=(\\d+)", [("gain", float)])
+found = np.fromregex(table, r"gain=(\\d+)", [("gain", float)])
 return picture(found["gain"][0])
 """,
         files={"lab.log": ("gain=1\n", "gain=2\n")},
@@ -94,20 +97,22 @@ return picture(found["gain"][0])
     reads(
         "matrix_market",
         "scipy.io.mmread",
+        "lab.mtx",
         """
 import scipy.io
 
-return picture(scipy.io.mmread(os.path.join(place, "lab.mtx")).sum())
+return picture(scipy.io.mmread(table).sum())
 """,
         make=lambda folder, turn: scipy.io.mmwrite(folder / "lab.mtx", np.full((1, 1), float(turn))),
     ),
     reads(
         "colour_table",
         "colour.read_sds_from_csv_file",
+        "lab.csv",
         """
 import colour
 
-return picture(colour.read_sds_from_csv_file(place + "/lab.csv")["gain"].values.mean())
+return picture(colour.read_sds_from_csv_file(table)["gain"].values.mean())
 """,
         files={
             "lab.csv": (
@@ -119,11 +124,12 @@ return picture(colour.read_sds_from_csv_file(place + "/lab.csv")["gain"].values.
     reads(
         "shelve_of_lab",
         "shelve",
+        "lab",
         """
 import dbm.dumb
 import shelve
 
-with shelve.Shelf(dbm.dumb.open(place + "/lab", "r")) as shelf:
+with shelve.Shelf(dbm.dumb.open(table, "r")) as shelf:
     return picture(shelf["gain"])
 """,
         make=_shelf,
@@ -131,18 +137,20 @@ with shelve.Shelf(dbm.dumb.open(place + "/lab", "r")) as shelf:
     reads(
         "process_cat",
         "another program reads the file",
+        "gain.txt",
         """
 from subprocess import check_output as ask
 
-return picture(ask(["cat", os.path.join(place, "gain.txt")]))
+return picture(ask(["cat", table]))
 """,
         files={"gain.txt": TWO},
     ),
     reads(
         "popen_of_os",
         "os.popen",
+        "gain.txt",
         """
-with os.popen(f"cat {place}/gain.txt") as pipe:
+with os.popen(f"cat {table}") as pipe:
     return picture(pipe.read())
 """,
         files={"gain.txt": TWO},
@@ -150,10 +158,11 @@ with os.popen(f"cat {place}/gain.txt") as pipe:
     reads(
         "dumb_database",
         "dbm",
+        "lab",
         """
 import dbm.dumb as base
 
-with base.open(place + "/lab", "r") as lab:
+with base.open(table, "r") as lab:
     return picture(lab["gain"])
 """,
         make=_dumb,
@@ -161,10 +170,11 @@ with base.open(place + "/lab", "r") as lab:
     reads(
         "zip_member",
         "a member of a zip file",
+        "lab.zip",
         """
 import zipfile
 
-with zipfile.ZipFile(Path(place) / "lab.zip") as lab:
+with zipfile.ZipFile(table) as lab:
     return picture(lab.read("gain.txt"))
 """,
         make=_zip,
@@ -172,10 +182,11 @@ with zipfile.ZipFile(Path(place) / "lab.zip") as lab:
     reads(
         "tar_member",
         "a member of a tar file",
+        "lab.tar",
         """
 import tarfile
 
-with tarfile.open(Path(place) / "lab.tar") as lab:
+with tarfile.open(table) as lab:
     return picture(lab.extractfile("gain.txt").read())
 """,
         make=_tar,
@@ -183,10 +194,11 @@ with tarfile.open(Path(place) / "lab.tar") as lab:
     reads(
         "gzip_text",
         "gzip.open",
+        "gain.gz",
         """
 import gzip as squeezed
 
-with squeezed.open(place + "/gain.gz", "rt") as file:
+with squeezed.open(table, "rt") as file:
     return picture(file.read())
 """,
         make=lambda folder, turn: (folder / "gain.gz").write_bytes(gzip.compress(str(turn).encode())),
@@ -194,10 +206,11 @@ with squeezed.open(place + "/gain.gz", "rt") as file:
     reads(
         "database",
         "sqlite3",
+        "lab.db",
         """
 import sqlite3
 
-base = sqlite3.connect(place + "/lab.db")
+base = sqlite3.connect(table)
 ((gain,),) = base.execute("select gain from gains")
 base.close()
 return picture(gain)
@@ -207,10 +220,11 @@ return picture(gain)
     reads(
         "hdf_native",
         "HDF5, whose library opens files itself",
+        "lab.h5",
         """
 import h5py
 
-with h5py.File(Path(place) / "lab.h5") as lab:
+with h5py.File(table) as lab:
     return picture(lab["gain"][()])
 """,
         make=_hdf,
@@ -218,38 +232,42 @@ with h5py.File(Path(place) / "lab.h5") as lab:
     reads(
         "memory_map",
         "np.memmap",
+        "lab.bin",
         """
-return picture(np.memmap(place + "/lab.bin", dtype=np.float32, mode="r")[0])
+return picture(np.memmap(table, dtype=np.float32, mode="r")[0])
 """,
         make=lambda folder, turn: np.full(1, turn, np.float32).tofile(folder / "lab.bin"),
     ),
     reads(
         "pandas_table",
         "pandas.read_csv, and another engine",
+        "lab.csv",
         """
 import pandas
 
-return picture(pandas.read_csv(place + "/lab.csv", engine="python")["gain"].sum())
+return picture(pandas.read_csv(table, engine="python")["gain"].sum())
 """,
         files={"lab.csv": ("gain\n1\n", "gain\n2\n")},
     ),
     reads(
         "run_as_script",
         "runpy runs a settings file of Python",
+        "settings.txt",
         """
 import runpy
 
-return picture(runpy.run_path(place + "/settings.txt")["GAIN"])
+return picture(runpy.run_path(table)["GAIN"])
 """,
         files={"settings.txt": ("GAIN = 1\n", "GAIN = 2\n")},
     ),
     reads(
         "module_from_a_path",
         "importlib loads a file as a module",
+        "settings.py",
         """
 import importlib.util
 
-spec = importlib.util.spec_from_file_location("lab_settings", place + "/settings.py")
+spec = importlib.util.spec_from_file_location("lab_settings", table)
 module = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(module)
 return picture(module.GAIN)
@@ -259,10 +277,11 @@ return picture(module.GAIN)
     reads(
         "rasters_of_pillow",
         "PIL",
+        "lab.pgm",
         """
 from PIL import Image
 
-with Image.open(place + "/lab.pgm") as lab:
+with Image.open(table) as lab:
     return picture(np.asarray(lab).mean())
 """,
         files={"lab.pgm": (b"P5 1 1 255\n\x01", b"P5 1 1 255\n\x02")},

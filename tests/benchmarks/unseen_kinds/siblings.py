@@ -1,13 +1,13 @@
 """Another file of the same recipe, or a helper of it, changes what a node computes."""
 
-from unseen_kinds.case import Case
+from unseen_kinds.case import OTHER, Case
 
 BOTH = "own.py, other.py"
 
 
 def sibling(name: str, about: str, code: str, first: str, second: str, **files) -> Case:
     """Return a case whose file `other.py` changes from one text to another."""
-    return Case(name, about, code, nodes=BOTH, files={"other.py": (first, second), **files})
+    return Case(name, about, code, nodes=BOTH, files={"other.py": (first + OTHER, second + OTHER), **files})
 
 
 CASES = [
