@@ -42,6 +42,7 @@ from unseen_kinds.case import Case, now
 BAD = ("stale", "refused", "unsaved", "no case")
 _ROOT = Path(__file__).parents[2]
 _PLAIN = ("PATH", "HOME", "VIRTUAL_ENV", "LANG", "LC_ALL", "USER", "TMPDIR", "LD_LIBRARY_PATH")
+_SHOWN = 400  #: of an output, this many numbers are compared and written down
 _PATIENCE = 900  #: s that one run may take on a machine that is busy with other work
 
 
@@ -139,7 +140,7 @@ def call(case: Case, place: Place, turn: int, cache: Path) -> Run:
         return Run(ended.returncode, {}, {}, ended.stderr.strip() or ended.stdout.strip())
     report = json.loads(ended.stdout)
     numbers = load_file(place.folder / Path(report["report"]).parent / "data" / "outputs.safetensors")
-    values = {name: np.asarray(value, float).ravel().tolist() for name, value in numbers.items()}
+    values = {name: np.asarray(value, float).ravel()[:_SHOWN].tolist() for name, value in numbers.items()}
     states = {step["step"]: step["state"] for step in report["steps"]}
     return Run(0, values, states, "\n".join([*report["warnings"], ended.stderr.strip()]).strip())
 
@@ -161,7 +162,7 @@ def judged(case: Case, place: Place) -> dict[str, object]:
     first, second = runs
     words = "\n".join(dict.fromkeys([first.words, second.words])).strip()
     if case.honest:
-        cached = set(second.states.values()) == {"cached"}
+        cached = set(second.states.values()) <= {"cached", "not needed"}
         return {"verdict": "kept" if cached and not words else "unsaved", "words": words, "states": second.states}
     truth = second
     if set(second.states.values()) != {"run"}:
@@ -224,6 +225,13 @@ def table(found: dict[str, dict[str, object]]) -> str:
     return "\n".join(lines)
 
 
+def selected(every: dict[str, Case], words: list[str]) -> dict[str, Case]:
+    """Return the cases that a name, or a part of a name, chooses; all if there is none."""
+    exact = set(words) & set(every)
+    parts = set(words) - exact
+    return {n: case for n, case in every.items() if not words or n in exact or any(part in n for part in parts)}
+
+
 def main() -> None:
     """Try the cases that are chosen, and print what was found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -234,7 +242,7 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="print the names, and end")
     parser.add_argument("--scratch", type=Path, default=Path.home(), help="where the folders of the cases are made")
     words = parser.parse_args()
-    chosen = {name: case for name, case in cases() if not words.names or any(part in name for part in words.names)}
+    chosen = selected(dict(cases()), words.names)
     if words.list:
         print("\n".join(chosen))
         return

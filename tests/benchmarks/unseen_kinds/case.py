@@ -1,6 +1,7 @@
 """What a case is: the code of an own node, what it reads, and how this changes between two runs.
 
-Wherever a value may change, a pair `(first, second)` says both; a single value stays. `None` is a file that is not there.
+Wherever a value may change, a pair `(first, second)` says both; a single value stays. `None` stands for a
+file that is not there.
 """
 
 from __future__ import annotations
@@ -49,8 +50,8 @@ Change = Text | tuple[Text, Text]
 class Case:
     """One own node, or a few, and what changes around it.
 
-    In texts of `env`, `files` and `folder`, `{folder}` stands for the folder of the case, `{prefix}` for that of Python,
-    and `{tmp}` for that of temporary files.
+    In texts of `env`, `files` and `folder`, `{folder}` stands for the folder of the case, `{prefix}` for that of
+    Python, and `{tmp}` for that of temporary files.
     """
 
     name: str

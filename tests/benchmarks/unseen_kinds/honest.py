@@ -120,7 +120,7 @@ CASES = [
 
         @node()
         def value() -> Tensor:
-            light = colour.SDS_ILLUMINANTS["D65"].copy().align(colour.SpectralShape(400, 700, 10))
+            light = colour.SDS_ILLUMINANTS["D65"].copy().align(colour.SpectralShape(360, 780, 5))
             return torch.as_tensor(colour.sd_to_XYZ(light) / 100).float()
         """,
     ),
@@ -293,10 +293,11 @@ CASES = [
         def value(*, steps: int = 5) -> Tensor:
             x = torch.zeros(2, 2, requires_grad=True)
             adam = torch.optim.Adam([x], lr=0.1)
-            for _ in range(steps):
-                adam.zero_grad()
-                ((x - 1) ** 2).sum().backward()
-                adam.step()
+            with torch.enable_grad():
+                for _ in range(steps):
+                    adam.zero_grad()
+                    ((x - 1) ** 2).sum().backward()
+                    adam.step()
             return x.detach()
         """,
     ),
@@ -659,7 +660,13 @@ CASES = [
             return picture(airy(GLASS[glass]))
         """,
         files={
-            "optics_lab/__init__.py": "from optics_lab.tables import GLASS\n\n\ndef airy(n):\n    return ((n - 1) / (n + 1)) ** 2\n",
+            "optics_lab/__init__.py": """
+from optics_lab.tables import GLASS
+
+
+def airy(n):
+    return ((n - 1) / (n + 1)) ** 2
+""",
             "optics_lab/tables.py": "GLASS = {'bk7': 1.517}\n",
         },
     ),
@@ -738,7 +745,12 @@ CASES = [
         "xarray_parameter",
         "xarray.open_dataset of an HDF5 file",
         "lab.h5",
-        "import xarray\n\nwith xarray.open_dataset(header, engine='h5netcdf', phony_dims='sort') as lab:\n    return picture(lab['gain'].sum())",
+        """
+import xarray
+
+with xarray.open_dataset(header, engine='h5netcdf', phony_dims='sort') as lab:
+    return picture(lab['gain'].sum())
+""",
         make=_hdf,
     ),
     file(
@@ -752,7 +764,12 @@ CASES = [
         "exr_parameter",
         "an EXR file",
         "lab.exr",
-        "import OpenEXR\n\nwith OpenEXR.File(str(header)) as lab:\n    return torch.from_numpy(lab.channels()['RGB'].pixels)",
+        """
+import OpenEXR
+
+with OpenEXR.File(str(header)) as lab:
+    return torch.from_numpy(lab.channels()['RGB'].pixels)
+""",
         make=_exr,
     ),
     file(

@@ -76,13 +76,6 @@ def _link(folder: Path, turn: int) -> None:
     os.symlink("one" if turn == 1 else "three", folder / "lab.txt")
 
 
-def _order(folder: Path, turn: int) -> None:
-    for name in ("x", "y") if turn == 1 else ("y", "x"):
-        (folder / "set" / name).unlink(missing_ok=True)
-        (folder / "set").mkdir(exist_ok=True)
-        (folder / "set" / name).write_text(name)
-
-
 def _compiled(folder: Path, turn: int) -> None:
     (folder / "lab.c").write_text(f"int gain(void) {{ return {turn}; }}")
     (folder / "lab.so").unlink(missing_ok=True)
@@ -233,18 +226,6 @@ return picture(yaml.load(Path(header).read_text(), Loader)["gain"])
             .replace("PAIR", "1")
             .replace("return 0  #", "# more\n    return 0  #" if turn == 2 else "return 0  #")
         ),
-    ),
-    Case(
-        "order_of_folder",
-        "the order of files in a declared folder",
-        """
-        @node(depends=["set"])
-        def value() -> Tensor:
-            with os.scandir("set") as entries:
-                return picture(ord(next(iter(entries)).name))
-        """,
-        files={"set/keep": ""},
-        make=_order,
     ),
     Case(
         "declared_folder_grows",

@@ -1,9 +1,14 @@
 """Packages that are installed beside those of neusee: what they are, hold and read."""
 
 from unseen_kinds.case import Case
+from unseen_kinds.machine import table
 
 SITE = {"PYTHONPATH": "{folder}/site"}
-METADATA = "Metadata-Version: 2.1\nName: labtools\nVersion: 1.0\n"
+METADATA = """
+Metadata-Version: 2.1
+Name: labtools
+Version: 1.0
+"""
 NODE = """
     import labtools
 
@@ -33,7 +38,16 @@ CASES = [
         env=SITE,
         files={
             **record("labtools/__init__.py"),
-            "site/labtools/__init__.py": ("def gain():\n    return 1\n", "def gain():\n    return 2\n"),
+            "site/labtools/__init__.py": (
+                """
+def gain():
+    return 1
+""",
+                """
+def gain():
+    return 2
+""",
+            ),
         },
     ),
     Case(
@@ -44,7 +58,12 @@ CASES = [
         files={
             **record("labtools/__init__.py", "labtools/gain.txt"),
             "site/labtools/__init__.py": (
-                "from importlib.resources import files\n\n\ndef gain():\n"
+                """
+from importlib.resources import files
+
+
+def gain():
+"""
                 "    return files('labtools').joinpath('gain.txt').read_text()\n"
             ),
             "site/labtools/gain.txt": ("1", "2"),
@@ -53,13 +72,31 @@ CASES = [
     installed(
         "variable_at_import",
         "the package reads a variable when it is imported",
-        {"labtools/__init__.py": "import os\n\nGAIN = os.environ['LAB_GAIN']\n\n\ndef gain():\n    return GAIN\n"},
+        {
+            "labtools/__init__.py": """
+import os
+
+GAIN = os.environ['LAB_GAIN']
+
+
+def gain():
+    return GAIN
+"""
+        },
         env={"LAB_GAIN": ("1", "2")},
     ),
     installed(
         "variable_at_call",
         "the package reads a variable when it is called",
-        {"labtools/__init__.py": "import os\n\n\ndef gain():\n    return os.getenv('LAB_GAIN')\n"},
+        {
+            "labtools/__init__.py": """
+import os
+
+
+def gain():
+    return os.getenv('LAB_GAIN')
+"""
+        },
         env={"LAB_GAIN": ("1", "2")},
     ),
     installed(
@@ -67,8 +104,15 @@ CASES = [
         "the package reads a file at home when it is imported",
         {
             "labtools.py": (
-                "from pathlib import Path\n\nGAIN = (Path.home() / '.labtools').read_text()\n\n\n"
-                "def gain():\n    return GAIN\n"
+                """
+from pathlib import Path
+
+GAIN = (Path.home() / '.labtools').read_text()
+"""
+                """
+def gain():
+    return GAIN
+"""
             ),
         },
         env={"HOME": ("{folder}/site/one", "{folder}/site/two")},
@@ -82,8 +126,16 @@ CASES = [
         "the package uses another one if it is there",
         {
             "labtools.py": (
-                "try:\n    import labfast\nexcept ImportError:\n    labfast = None\n\n\n"
-                "def gain():\n    return 1 if labfast is None else 2\n"
+                """
+try:
+    import labfast
+except ImportError:
+    labfast = None
+"""
+                """
+def gain():
+    return 1 if labfast is None else 2
+"""
             ),
             "labfast.py": (None, "SPEED = 1\n"),
         },
@@ -92,7 +144,13 @@ CASES = [
         "second_package",
         "the package imports a package that changes",
         {
-            "labtools.py": "import labcore\n\n\ndef gain():\n    return labcore.GAIN\n",
+            "labtools.py": """
+import labcore
+
+
+def gain():
+    return labcore.GAIN
+""",
             "labcore.py": ("GAIN = 1\n", "GAIN = 2\n"),
         },
     ),
@@ -101,7 +159,13 @@ CASES = [
         "the package imports it by a name that it builds",
         {
             "labtools.py": (
-                "import importlib\n\n\ndef gain():\n    return importlib.import_module('lab' + 'core').GAIN\n"
+                """
+import importlib
+
+
+def gain():
+    return importlib.import_module('lab' + 'core').GAIN
+"""
             ),
             "labcore.py": ("GAIN = 1\n", "GAIN = 2\n"),
         },
@@ -111,12 +175,23 @@ CASES = [
         "the package asks for plugins by entry points; a plugin is installed",
         {
             "labtools.py": (
-                "from importlib.metadata import entry_points\n\n\n"
-                "def gain():\n    return 1 + sum(p.load() for p in entry_points(group='lab.gains'))\n"
+                """
+from importlib.metadata import entry_points
+"""
+                """
+def gain():
+    return 1 + sum(p.load() for p in entry_points(group='lab.gains'))
+"""
             ),
             "labplug.py": "GAIN = 1\n",
             "labplug-1.0.dist-info/METADATA": METADATA.replace("labtools", "labplug"),
-            "labplug-1.0.dist-info/entry_points.txt": (None, "[lab.gains]\nextra = labplug:GAIN\n"),
+            "labplug-1.0.dist-info/entry_points.txt": (
+                None,
+                """
+[lab.gains]
+extra = labplug:GAIN
+""",
+            ),
         },
     ),
     installed(
@@ -125,7 +200,10 @@ CASES = [
         {
             "labplug.py": ("GAIN = 1\n", "GAIN = 2\n"),
             "labplug-1.0.dist-info/METADATA": METADATA.replace("labtools", "labplug"),
-            "labplug-1.0.dist-info/entry_points.txt": "[lab.gains]\nextra = labplug:GAIN\n",
+            "labplug-1.0.dist-info/entry_points.txt": """
+[lab.gains]
+extra = labplug:GAIN
+""",
         },
         """
         from importlib.metadata import entry_points
@@ -140,7 +218,15 @@ CASES = [
         "the package loads all modules of its folder of plugins",
         {
             "labtools/__init__.py": (
-                "import importlib\nimport pkgutil\n\nfrom labtools import plugins\n\n\ndef gain():\n"
+                """
+import importlib
+import pkgutil
+
+from labtools import plugins
+
+
+def gain():
+"""
                 "    names = [m.name for m in pkgutil.iter_modules(plugins.__path__)]\n"
                 "    return sum(importlib.import_module('labtools.plugins.' + n).GAIN for n in names)\n"
             ),
@@ -155,8 +241,16 @@ CASES = [
         {
             "labplug.py": "",
             "labplug-1.0.dist-info/METADATA": (
-                "Metadata-Version: 2.1\nName: labplug\nVersion: 1.0\n",
-                "Metadata-Version: 2.1\nName: labplug\nVersion: 2.0\n",
+                """
+Metadata-Version: 2.1
+Name: labplug
+Version: 1.0
+""",
+                """
+Metadata-Version: 2.1
+Name: labplug
+Version: 2.0
+""",
             ),
         },
         """
@@ -172,8 +266,16 @@ CASES = [
         "sitecustomize patches NumPy",
         {
             "sitecustomize.py": (
-                "import numpy\n\nnumpy.trapezoid = lambda values: 1.0\n",
-                "import numpy\n\nnumpy.trapezoid = lambda values: 2.0\n",
+                """
+import numpy
+
+numpy.trapezoid = lambda values: 1.0
+""",
+                """
+import numpy
+
+numpy.trapezoid = lambda values: 2.0
+""",
             )
         },
         """
@@ -197,7 +299,14 @@ CASES = [
     installed(
         "namespace_package",
         "a namespace package whose second part changes",
-        {"lab/one.py": "from lab import two\n\nGAIN = two.GAIN\n", "lab/two.py": ("GAIN = 1\n", "GAIN = 2\n")},
+        {
+            "lab/one.py": """
+from lab import two
+
+GAIN = two.GAIN
+""",
+            "lab/two.py": ("GAIN = 1\n", "GAIN = 2\n"),
+        },
         """
         from lab.one import GAIN
 
@@ -211,30 +320,21 @@ CASES = [
         "the package reads a settings file beside its folder",
         {
             "labtools/__init__.py": (
-                "from pathlib import Path\n\n\ndef gain():\n"
+                """
+from pathlib import Path
+
+
+def gain():
+"""
                 "    return (Path(__file__).parents[1] / 'labtools.cfg').read_text()\n"
             ),
             "labtools.cfg": ("1", "2"),
         },
     ),
-    Case(
-        "file_below_prefix",
-        "a settings file in the folder etc of the virtual environment",
-        """
-        @node()
-        def value() -> Tensor:
-            return picture(Path(sys.prefix, "etc", "neusee_unseen_kind.cfg").read_text())
-        """,
-        files={"{prefix}/etc/neusee_unseen_kind.cfg": ("1", "2")},
-    ),
-    Case(
+    table("file_below_prefix", "a settings file in the virtual environment", "{prefix}/etc/neusee_unseen_kind.cfg"),
+    table(
         "file_beside_numpy",
         "a table that somebody put beside NumPy",
-        """
-        @node()
-        def value() -> Tensor:
-            return picture(np.loadtxt(os.path.join(np.__path__[0], "neusee_unseen_kind.txt")))
-        """,
-        files={"{prefix}/lib/python3.11/site-packages/numpy/neusee_unseen_kind.txt": ("1", "2")},
+        "{prefix}/lib/python3.11/site-packages/numpy/neusee_unseen_kind.txt",
     ),
 ]

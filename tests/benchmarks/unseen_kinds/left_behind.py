@@ -40,7 +40,13 @@ CASES = [
         "an attribute of a function",
         "helper.gain = gain",
         "helper.gain",
-        "def helper():\n    pass\n\n\nhelper.gain = 0",
+        """
+def helper():
+    pass
+
+
+helper.gain = 0
+""",
     ),
     left("class_attribute", "an attribute of a class", "Lab.gain = gain", "Lab.gain", "class Lab:\n    gain = 0"),
     left(
@@ -65,7 +71,12 @@ class Lab:
         "a default argument that can change",
         "remember(gain)",
         "remember()",
-        "def remember(gain=None, seen=[0]):\n    if gain:\n        seen[0] = gain\n    return seen[0]\n",
+        """
+def remember(gain=None, seen=[0]):
+    if gain:
+        seen[0] = gain
+    return seen[0]
+""",
     ),
     left(
         "closure",
@@ -91,42 +102,71 @@ SET, GET = cell()
         "a ContextVar",
         "GAIN.set(gain)",
         "GAIN.get()",
-        "import contextvars\n\nGAIN = contextvars.ContextVar('gain', default=0)",
+        """
+import contextvars
+
+GAIN = contextvars.ContextVar('gain', default=0)
+""",
     ),
     left(
         "thread_local",
         "threading.local",
         "LOCAL.gain = gain",
         "getattr(LOCAL, 'gain', 0)",
-        "import threading\n\nLOCAL = threading.local()",
+        """
+import threading
+
+LOCAL = threading.local()
+""",
     ),
     left(
         "weak_dictionary",
         "a WeakKeyDictionary",
         "KEPT[Lab] = gain",
         "KEPT.get(Lab, 0)",
-        "import weakref\n\n\nclass Lab:\n    pass\n\n\nKEPT = weakref.WeakKeyDictionary()",
+        """
+import weakref
+
+
+class Lab:
+    pass
+
+
+KEPT = weakref.WeakKeyDictionary()
+""",
     ),
     left(
         "data_frame",
         "a cell of a DataFrame",
         "TABLE.loc[0, 'gain'] = gain",
         "TABLE.loc[0, 'gain']",
-        "import pandas\n\nTABLE = pandas.DataFrame({'gain': [0]})",
+        """
+import pandas
+
+TABLE = pandas.DataFrame({'gain': [0]})
+""",
     ),
     left(
         "attributes_of_xarray",
         "an attribute of a DataArray",
         "DATA.attrs['gain'] = gain",
         "DATA.attrs.get('gain', 0)",
-        "import xarray\n\nDATA = xarray.DataArray([0])",
+        """
+import xarray
+
+DATA = xarray.DataArray([0])
+""",
     ),
     left(
         "values_of_xarray",
         "the values of a DataArray",
         "DATA[0] = gain",
         "DATA[0]",
-        "import xarray\n\nDATA = xarray.DataArray([0])",
+        """
+import xarray
+
+DATA = xarray.DataArray([0])
+""",
     ),
     left("array", "an element of an array", "TABLE[0] = gain", "TABLE[0]", "TABLE = np.zeros(2)"),
     left(
@@ -136,13 +176,27 @@ SET, GET = cell()
         "NET.running_mean[0]",
         "NET = torch.nn.BatchNorm2d(1, affine=False)",
     ),
-    left("queue", "a queue", "QUEUE.put(gain)", "QUEUE.qsize()", "import queue\n\nQUEUE = queue.Queue()"),
+    left(
+        "queue",
+        "a queue",
+        "QUEUE.put(gain)",
+        "QUEUE.qsize()",
+        """
+import queue
+
+QUEUE = queue.Queue()
+""",
+    ),
     left(
         "counter",
         "itertools.count",
         "[next(COUNT) for _ in range(gain)]",
         "next(COUNT)",
-        "import itertools\n\nCOUNT = itertools.count()",
+        """
+import itertools
+
+COUNT = itertools.count()
+""",
     ),
     left(
         "generator",
@@ -157,14 +211,36 @@ SET, GET = cell()
         "functools.lru_cache of a function of the surroundings",
         "CURRENT[0] = gain; gain_now()",
         "gain_now()",
-        "import functools\n\nCURRENT = [0]\n\n\n@functools.lru_cache\ndef gain_now():\n    return CURRENT[0]",
+        """
+import functools
+
+CURRENT = [0]
+
+
+@functools.lru_cache
+def gain_now():
+    return CURRENT[0]
+""",
     ),
     left(
         "cached_property",
         "functools.cached_property",
         "LAB.seed = gain; LAB.gain",
         "LAB.gain",
-        "import functools\n\n\nclass Lab:\n    seed = 0\n\n    @functools.cached_property\n    def gain(self):\n        return self.seed\n\n\nLAB = Lab()",
+        """
+import functools
+
+
+class Lab:
+    seed = 0
+
+    @functools.cached_property
+    def gain(self):
+        return self.seed
+
+
+LAB = Lab()
+""",
     ),
     left("seed_of_torch", "a seed", "torch.manual_seed(gain)", "torch.rand(1)"),
     left("seed_of_numpy", "a seed of NumPy", "np.random.seed(gain)", "np.random.rand()"),
@@ -309,7 +385,13 @@ SET, GET = cell()
         "a database in memory that the process shares",
         "BASE.execute('update gains set gain = ?', (gain,))",
         "BASE.execute('select gain from gains').fetchone()[0]",
-        "import sqlite3\n\nBASE = sqlite3.connect('file:lab?mode=memory&cache=shared', uri=True, check_same_thread=False)\nBASE.execute('create table if not exists gains (gain int)')\nBASE.execute('insert into gains values (0)')",
+        """
+import sqlite3
+
+BASE = sqlite3.connect('file:lab?mode=memory&cache=shared', uri=True, check_same_thread=False)
+BASE.execute('create table if not exists gains (gain int)')
+BASE.execute('insert into gains values (0)')
+""",
     ),
     left(
         "scratch_file",
@@ -331,7 +413,13 @@ SET, GET = cell()
         "a class that the step makes",
         "KEPT.append(type('Mine', (Lab,), {'gain': gain}))",
         "sum(kind.gain for kind in Lab.__subclasses__())",
-        "class Lab:\n    gain = 0\n\n\nKEPT = []",
+        """
+class Lab:
+    gain = 0
+
+
+KEPT = []
+""",
     ),
     left(
         "attribute_of_library",
@@ -366,21 +454,44 @@ SET, GET = cell()
         "an attribute of a member of an enum",
         "Kind.RAW.gain = gain",
         "Kind.RAW.gain",
-        "import enum\n\n\nclass Kind(enum.Enum):\n    RAW = 1\n\n\nKind.RAW.gain = 0",
+        """
+import enum
+
+
+class Kind(enum.Enum):
+    RAW = 1
+
+
+Kind.RAW.gain = 0
+""",
     ),
     left(
         "slots",
         "a slot of a frozen dataclass",
         "object.__setattr__(LAB, 'gain', gain)",
         "LAB.gain",
-        "import dataclasses\n\n\n@dataclasses.dataclass(frozen=True, slots=True)\nclass Lab:\n    gain: int = 0\n\n\nLAB = Lab()",
+        """
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Lab:
+    gain: int = 0
+
+
+LAB = Lab()
+""",
     ),
     left(
         "ctypes_memory",
         "memory that ctypes holds",
         "CELL.value = gain",
         "CELL.value",
-        "import ctypes\n\nCELL = ctypes.c_int(0)",
+        """
+import ctypes
+
+CELL = ctypes.c_int(0)
+""",
     ),
     left("byte_array", "a bytearray", "CELL.__setitem__(0, gain)", "CELL[0]", "CELL = bytearray(2)"),
     left(
@@ -388,14 +499,22 @@ SET, GET = cell()
         "an anonymous memory map",
         "CELL.__setitem__(0, gain)",
         "CELL[0]",
-        "import mmap\n\nCELL = mmap.mmap(-1, 16)",
+        """
+import mmap
+
+CELL = mmap.mmap(-1, 16)
+""",
     ),
     left(
         "text_stream",
         "a StringIO",
         "TEXT.write('x' * gain)",
         "len(TEXT.getvalue())",
-        "import io\n\nTEXT = io.StringIO()",
+        """
+import io
+
+TEXT = io.StringIO()
+""",
     ),
     left(
         "signal_timer",
@@ -441,7 +560,11 @@ SET, GET = cell()
         "a method that is replaced",
         "setattr(Lab, 'gain', lambda self: gain)",
         "Lab().gain()",
-        "class Lab:\n    def gain(self):\n        return 0",
+        """
+class Lab:
+    def gain(self):
+        return 0
+""",
     ),
     left(
         "module_attribute_of_helper",
@@ -450,7 +573,17 @@ SET, GET = cell()
         "shared.get('gain')",
         "import shared",
         files={
-            "shared.py": "_BOX = {}\n\n\ndef put(name, number):\n    _BOX[name] = number\n\n\ndef get(name):\n    return _BOX.get(name, 0)\n"
+            "shared.py": """
+_BOX = {}
+
+
+def put(name, number):
+    _BOX[name] = number
+
+
+def get(name):
+    return _BOX.get(name, 0)
+"""
         },
     ),
     left(
@@ -459,7 +592,15 @@ SET, GET = cell()
         "shared.ALL[0][1].gain = gain",
         "shared.ALL[0][1].gain",
         "import shared",
-        files={"shared.py": "class Lab:\n    gain = 0\n\n\nALL = [('lab', Lab())]\n"},
+        files={
+            "shared.py": """
+class Lab:
+    gain = 0
+
+
+ALL = [('lab', Lab())]
+"""
+        },
     ),
     left(
         "installed_memo",
@@ -469,7 +610,17 @@ SET, GET = cell()
         "import labtools",
         env={"PYTHONPATH": "{folder}/site"},
         files={
-            "site/labtools.py": "_BOX = {}\n\n\ndef put(gain):\n    _BOX['gain'] = gain\n\n\ndef get():\n    return _BOX.get('gain', 0)\n"
+            "site/labtools.py": """
+_BOX = {}
+
+
+def put(gain):
+    _BOX['gain'] = gain
+
+
+def get():
+    return _BOX.get('gain', 0)
+"""
         },
     ),
     left(
@@ -480,7 +631,20 @@ SET, GET = cell()
         "from labtools import LAB",
         env={"PYTHONPATH": "{folder}/site"},
         files={
-            "site/labtools.py": "class Lab:\n    def __init__(self):\n        self._gain = 0\n\n    def put(self, gain):\n        self._gain = gain\n\n    def get(self):\n        return self._gain\n\n\nLAB = Lab()\n"
+            "site/labtools.py": """
+class Lab:
+    def __init__(self):
+        self._gain = 0
+
+    def put(self, gain):
+        self._gain = gain
+
+    def get(self):
+        return self._gain
+
+
+LAB = Lab()
+"""
         },
     ),
 ]

@@ -12,6 +12,17 @@ def asks(name: str, about: str, lines: str, **words) -> Case:
     return Case(name, about, f"@node()\ndef value(*, place: str = '.') -> Tensor:\n{indented}\n", **words)
 
 
+def table(name: str, about: str, path: str) -> Case:
+    """Return a case whose node reads a table at a path that the recipe has as a text."""
+    code = """
+    @node()
+    def value(*, table: str) -> Tensor:
+        return picture(np.loadtxt(table))
+    """
+    steps = f"a: {{node: own.value, with: {{table: '{path}'}}}}"
+    return Case(name, about, code, steps, files={path: ("1", "2")})
+
+
 def _git(folder: Path, turn: int) -> None:
     head = folder / ".git" / "HEAD"
     head.parent.mkdir(exist_ok=True)
@@ -102,7 +113,12 @@ with tempfile.NamedTemporaryFile() as file:
         "resource.getrusage",
         "import resource\n\nreturn picture(resource.getrusage(0).ru_utime * 1e6)",
     ),
-    asks("uninitialised", "torch.empty", "return torch.empty(300, 300) + torch.tensor(np.empty((300, 300))).float()"),
+    asks(
+        "uninitialised",
+        "memory that nobody has filled",
+        "return torch.empty(2, 2) + torch.from_numpy(np.empty((2, 2)))",
+        env={"MALLOC_PERTURB_": (None, "165")},
+    ),
     asks(
         "processors",
         "the processors that the process may use",
@@ -153,12 +169,7 @@ with tempfile.NamedTemporaryFile() as file:
         folder=("{folder}/one", "{folder}/three"),
         files={"one/gain.txt": "1", "three/gain.txt": "2"},
     ),
-    asks(
-        "words_of_command",
-        "the words of the command",
-        "return picture(len(' '.join(sys.orig_argv)))",
-        prefix=("env", "env --"),
-    ),
+    asks("words_of_command", "the words of the command", "return picture(ord(sys.orig_argv[-1][-1]))"),
     asks(
         "head_of_git",
         "the hash of the repository",
@@ -218,22 +229,11 @@ return picture(number)
 """,
         files={"/dev/shm/neusee_unseen_kind": (b"\x01" * 8, b"\x02" * 8)},
     ),
-    asks(
-        "file_in_tmp",
-        "what an earlier session left among temporary files",
-        """
-import tempfile
-
-return picture((Path(tempfile.gettempdir()) / "neusee_unseen_kind.txt").read_text())
-""",
-        files={"{tmp}/neusee_unseen_kind.txt": ("1", "2")},
-    ),
-    asks(
-        "file_of_system",
-        "settings of the machine",
-        """
-return picture(np.loadtxt(os.path.join("/usr/local/etc", "neusee_unseen_kind.conf")))
-""",
-        files={"/usr/local/etc/neusee_unseen_kind.conf": ("1", "2")},
+    table("file_in_tmp", "what an earlier session left among temporary files", "{tmp}/neusee_unseen_kind.txt"),
+    table("file_of_system", "settings of the machine", "/usr/local/etc/neusee_unseen_kind.conf"),
+    table("file_in_var_tmp", "a scratch table that outlives a restart", "/var/tmp/neusee_unseen_kind.txt"),
+    table("file_in_shared_memory", "a file in shared memory", "/dev/shm/neusee_unseen_kind.txt"),
+    table(
+        "file_in_cache_of_user", "a table that a download left in the cache of the user", "{folder}/.cache/lab/gain.txt"
     ),
 ]

@@ -22,8 +22,18 @@ CASES = [
         def value() -> Tensor:
             return picture(sum(kind.gain for kind in Base.__subclasses__()))
         """,
-        "import own\n\nclass Mine(own.Base):\n    gain = 1\n",
-        "import own\n\nclass Mine(own.Base):\n    gain = 2\n",
+        """
+import own
+
+class Mine(own.Base):
+    gain = 1
+""",
+        """
+import own
+
+class Mine(own.Base):
+    gain = 2
+""",
     ),
     sibling(
         "attribute",
@@ -35,8 +45,16 @@ CASES = [
         def value() -> Tensor:
             return picture(GAIN)
         """,
-        "import own\n\nown.GAIN = 1.0\n",
-        "import own\n\nown.GAIN = 2.0\n",
+        """
+import own
+
+own.GAIN = 1.0
+""",
+        """
+import own
+
+own.GAIN = 2.0
+""",
     ),
     sibling(
         "registry",
@@ -52,8 +70,20 @@ CASES = [
         def value() -> Tensor:
             return picture(GAINS["gain"]())
         """,
-        "from own import register\n\n@register\ndef gain():\n    return 1\n",
-        "from own import register\n\n@register\ndef gain():\n    return 2\n",
+        """
+from own import register
+
+@register
+def gain():
+    return 1
+""",
+        """
+from own import register
+
+@register
+def gain():
+    return 2
+""",
     ),
     sibling(
         "patched_library",
@@ -63,8 +93,16 @@ CASES = [
         def value() -> Tensor:
             return picture(np.trapezoid([1.0, 1.0]))
         """,
-        "import numpy\n\nnumpy.trapezoid = lambda values: 1.0\n",
-        "import numpy\n\nnumpy.trapezoid = lambda values: 2.0\n",
+        """
+import numpy
+
+numpy.trapezoid = lambda values: 1.0
+""",
+        """
+import numpy
+
+numpy.trapezoid = lambda values: 2.0
+""",
     ),
     sibling(
         "weights",
@@ -77,8 +115,16 @@ CASES = [
         def value() -> Tensor:
             return NET(torch.ones(2, 2)).detach()
         """,
-        "import own\n\nown.NET.weight.data.fill_(1.0)\n",
-        "import own\n\nown.NET.weight.data.fill_(2.0)\n",
+        """
+import own
+
+own.NET.weight.data.fill_(1.0)
+""",
+        """
+import own
+
+own.NET.weight.data.fill_(2.0)
+""",
     ),
     sibling(
         "single_dispatch",
@@ -94,8 +140,20 @@ CASES = [
         def value() -> Tensor:
             return picture(gain(1.0))
         """,
-        "import own\n\n@own.gain.register\ndef _(kind: float):\n    return 1\n",
-        "import own\n\n@own.gain.register\ndef _(kind: float):\n    return 2\n",
+        """
+import own
+
+@own.gain.register
+def _(kind: float):
+    return 1
+""",
+        """
+import own
+
+@own.gain.register
+def _(kind: float):
+    return 2
+""",
     ),
     sibling(
         "codec",
@@ -105,8 +163,16 @@ CASES = [
         def value() -> Tensor:
             return picture(b"\\xff".decode("ascii", "lab"))
         """,
-        "import codecs\n\ncodecs.register_error('lab', lambda error: ('1', error.end))\n",
-        "import codecs\n\ncodecs.register_error('lab', lambda error: ('2', error.end))\n",
+        """
+import codecs
+
+codecs.register_error('lab', lambda error: ('1', error.end))
+""",
+        """
+import codecs
+
+codecs.register_error('lab', lambda error: ('2', error.end))
+""",
     ),
     sibling(
         "dialect",
@@ -118,8 +184,16 @@ CASES = [
         def value() -> Tensor:
             return picture(len(next(csv.reader(["1;2,3,4"], dialect="lab"))))
         """,
-        "import csv\n\ncsv.register_dialect('lab', delimiter=';')\n",
-        "import csv\n\ncsv.register_dialect('lab', delimiter=',')\n",
+        """
+import csv
+
+csv.register_dialect('lab', delimiter=';')
+""",
+        """
+import csv
+
+csv.register_dialect('lab', delimiter=',')
+""",
     ),
     sibling(
         "method_of_tensor",
@@ -129,8 +203,16 @@ CASES = [
         def value() -> Tensor:
             return torch.ones(2, 2).amplified()
         """,
-        "import torch\n\ntorch.Tensor.amplified = lambda self: self * 1\n",
-        "import torch\n\ntorch.Tensor.amplified = lambda self: self * 2\n",
+        """
+import torch
+
+torch.Tensor.amplified = lambda self: self * 1
+""",
+        """
+import torch
+
+torch.Tensor.amplified = lambda self: self * 2
+""",
     ),
     sibling(
         "hook_of_json",
@@ -142,8 +224,16 @@ CASES = [
         def value() -> Tensor:
             return picture(json.dumps(object()))
         """,
-        "import json\n\njson.JSONEncoder.default = lambda self, thing: 1\n",
-        "import json\n\njson.JSONEncoder.default = lambda self, thing: 2\n",
+        """
+import json
+
+json.JSONEncoder.default = lambda self, thing: 1
+""",
+        """
+import json
+
+json.JSONEncoder.default = lambda self, thing: 2
+""",
     ),
     sibling(
         "variable_of_process",
@@ -155,10 +245,18 @@ CASES = [
         def value() -> Tensor:
             import tempfile
 
-            return picture(len(tempfile.gettempprefix()) + len(os.path.expanduser("~lab")) + len(os.path.expanduser("~")))
+            return picture(len(tempfile.gettempprefix()) + len(os.path.expanduser("~")))
         """,
-        "import os\n\nos.environ['HOME'] = '/a'\n",
-        "import os\n\nos.environ['HOME'] = '/ab'\n",
+        """
+import os
+
+os.environ['HOME'] = '/a'
+""",
+        """
+import os
+
+os.environ['HOME'] = '/ab'
+""",
     ),
     sibling(
         "mock",
@@ -170,8 +268,16 @@ CASES = [
         def value() -> Tensor:
             return picture(math.hypot(3, 4))
         """,
-        "from unittest import mock\n\nmock.patch('math.hypot', lambda a, b: 1).start()\n",
-        "from unittest import mock\n\nmock.patch('math.hypot', lambda a, b: 2).start()\n",
+        """
+from unittest import mock
+
+mock.patch('math.hypot', lambda a, b: 1).start()
+""",
+        """
+from unittest import mock
+
+mock.patch('math.hypot', lambda a, b: 2).start()
+""",
     ),
     sibling(
         "helper_of_other",
@@ -185,8 +291,16 @@ CASES = [
         "import patches\n",
         **{
             "patches.py": (
-                "import numpy\n\nnumpy.trapezoid = lambda values: 1.0\n",
-                "import numpy\n\nnumpy.trapezoid = lambda values: 2.0\n",
+                """
+import numpy
+
+numpy.trapezoid = lambda values: 1.0
+""",
+                """
+import numpy
+
+numpy.trapezoid = lambda values: 2.0
+""",
             )
         },
     ),
@@ -200,9 +314,23 @@ CASES = [
         def value() -> Tensor:
             return picture(GAIN.get())
         """,
-        "from shared import GAIN\n\nGAIN.set(1)\n",
-        "from shared import GAIN\n\nGAIN.set(2)\n",
-        **{"shared.py": "import contextvars\n\nGAIN = contextvars.ContextVar('gain', default=0)\n"},
+        """
+from shared import GAIN
+
+GAIN.set(1)
+""",
+        """
+from shared import GAIN
+
+GAIN.set(2)
+""",
+        **{
+            "shared.py": """
+import contextvars
+
+GAIN = contextvars.ContextVar('gain', default=0)
+"""
+        },
     ),
     sibling(
         "entry_in_builtins",
@@ -212,8 +340,16 @@ CASES = [
         def value() -> Tensor:
             return picture(LAB_GAIN)
         """,
-        "import builtins\n\nbuiltins.LAB_GAIN = 1\n",
-        "import builtins\n\nbuiltins.LAB_GAIN = 2\n",
+        """
+import builtins
+
+builtins.LAB_GAIN = 1
+""",
+        """
+import builtins
+
+builtins.LAB_GAIN = 2
+""",
     ),
     sibling(
         "import_hook",
@@ -225,7 +361,17 @@ CASES = [
 
             return picture(lab_gain.GAIN)
         """,
-        "import sys\nimport types\n\nsys.modules['lab_gain'] = types.SimpleNamespace(GAIN=1)\n",
-        "import sys\nimport types\n\nsys.modules['lab_gain'] = types.SimpleNamespace(GAIN=2)\n",
+        """
+import sys
+import types
+
+sys.modules['lab_gain'] = types.SimpleNamespace(GAIN=1)
+""",
+        """
+import sys
+import types
+
+sys.modules['lab_gain'] = types.SimpleNamespace(GAIN=2)
+""",
     ),
 ]
