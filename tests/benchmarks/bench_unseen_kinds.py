@@ -145,9 +145,9 @@ def call(case: Case, place: Place, turn: int, cache: Path) -> Run:
     return Run(0, values, states, "\n".join([*report["warnings"], ended.stderr.strip()]).strip())
 
 
-def same(one: Run, other: Run) -> bool:
-    """Return whether two runs have the same bits."""
-    return repr(one.values) == repr(other.values)
+def same(one: Run, other: Run, watched: str) -> bool:
+    """Return whether an output of two runs has the same bits."""
+    return repr(one.values[watched]) == repr(other.values[watched])
 
 
 def judged(case: Case, place: Place) -> dict[str, object]:
@@ -170,7 +170,13 @@ def judged(case: Case, place: Place) -> dict[str, object]:
         if truth.code:
             return {"verdict": "no case", "words": truth.words, "turn": 3}
     values = {"first": first.values, "second": second.values, "truth": truth.values}
-    return {"verdict": _of_values(first, second, truth, words), "words": words, "states": second.states} | values
+    if same(first, truth, case.watched):
+        verdict = "no case"
+    elif not same(second, truth, case.watched):
+        verdict = "stale"
+    else:
+        verdict = "told" if words else "right"
+    return {"verdict": verdict, "words": words, "states": second.states} | values
 
 
 def _of_failure(case: Case, run: Run) -> str:
@@ -178,15 +184,6 @@ def _of_failure(case: Case, run: Run) -> str:
     if run.code != 2 or "nothing was run" in run.words:
         return "no case"
     return "refused" if case.honest else "told"
-
-
-def _of_values(first: Run, second: Run, truth: Run, words: str) -> str:
-    """Return the verdict on the values of three runs."""
-    if same(first, truth):
-        return "no case"
-    if not same(second, truth):
-        return "stale"
-    return "told" if words else "right"
 
 
 def tried(name: str, case: Case, root: Path, scratch: Path) -> dict[str, object]:

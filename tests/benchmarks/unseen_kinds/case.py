@@ -66,6 +66,7 @@ class Case:
     stdin: str | tuple[str, str] = ""
     prefix: str | tuple[str, str] = ""  #: words in front of the command, such as `taskset -c 0`
     output: str = "a"
+    watched: str = "a"  #: the output whose value is compared
     honest: bool = False  #: nothing changes: the second run should find the result in the cache
 
     def own(self) -> str:

@@ -29,7 +29,7 @@ def before(*, gain: int) -> Tensor:
 def value() -> Tensor:
     return picture({get})
 """
-    return Case(name, about, code, STEPS, output="a, b", **words)
+    return Case(name, about, code, STEPS, output="a, b", watched="b", **words)
 
 
 CASES = [
@@ -339,7 +339,7 @@ LAB = Lab()
     left(
         "networkx",
         "the configuration of networkx",
-        "networkx.config.warnings_to_ignore = {'x'} if gain == 1 else set()",
+        "networkx.config.warnings_to_ignore = {'cache'} if gain == 1 else set()",
         "len(networkx.config.warnings_to_ignore)",
         "import networkx",
     ),

@@ -11,6 +11,23 @@ def setting(name: str, about: str, lines: str, other: str, first: str, second: s
     return Case(name, about, code, nodes="own.py, other.py", files={"other.py": texts})
 
 
+def setting_of_import(name: str, about: str, line: str, other: str, first: str, second: str) -> Case:
+    """Return a case whose module makes a constant when it is imported, after `other.py`."""
+    code = f"""
+try:
+    GAIN = float({line} > 0)
+except Exception:
+    GAIN = 7.0
+
+
+@node()
+def value() -> Tensor:
+    return picture(GAIN)
+"""
+    texts = (other.replace("WORD", first) + OTHER, other.replace("WORD", second) + OTHER)
+    return Case(name, about, code, nodes="other.py, own.py", files={"other.py": texts})
+
+
 CASES = [
     Case(
         "time_zone",
@@ -36,15 +53,10 @@ CASES = [
         """,
         env={"TZ": ("UTC", "Asia/Tokyo")},
     ),
-    setting(
+    setting_of_import(
         "seterr",
-        "np.seterr raises where it warned",
-        """
-try:
-    return picture(np.float64(1.0) / np.float64(0.0) > 0)
-except FloatingPointError:
-    return picture(7)
-""",
+        "np.seterr raises where it warned, and a constant of the module meets it",
+        "np.float64(1.0) / np.float64(0.0)",
         "import numpy\n\nnumpy.seterr(divide='WORD')\n",
         "ignore",
         "raise",
@@ -110,33 +122,39 @@ return picture(deep(0) // 500)
         "2000",
         "6000",
     ),
-    setting(
+    setting_of_import(
         "warnings_as_errors",
-        "a warning that another file makes an error",
-        """
-import warnings
-
-try:
-    warnings.warn("dark frame is old", UserWarning, stacklevel=1)
-except UserWarning:
-    return picture(2)
-return picture(1)
-""",
+        "a warning that another file makes an error, and a constant of the module meets it",
+        "__import__('warnings').warn('dark frame is old') or 5",
         "import warnings\n\nwarnings.simplefilter('WORD')\n",
         "ignore",
         "error",
     ),
     setting(
-        "fft_workers",
-        "the workers of scipy.fft",
+        "fft_backend",
+        "another file sets a backend of scipy.fft",
         """
 import scipy.fft
 
-return picture(scipy.fft.get_workers())
+return picture(scipy.fft.fft(np.ones(2))[0].real)
 """,
-        "import scipy.fft\n\nscipy.fft.set_workers(WORD).__enter__()\n",
-        "1",
-        "2",
+        """
+import numpy
+import scipy.fft
+
+
+class Backend:
+    __ua_domain__ = "numpy.scipy.fft"
+
+    @staticmethod
+    def __ua_function__(method, args, kwargs):
+        return numpy.full(2, WORD + 0j)
+
+
+scipy.fft.set_global_backend(Backend)
+""",
+        "5",
+        "6",
     ),
     setting(
         "pandas_option",
