@@ -290,14 +290,6 @@ return picture(ImageFile.LOAD_TRUNCATED_IMAGES)
         "True",
     ),
     setting(
-        "gradients_off",
-        "another file switches gradients off",
-        "return picture(torch.ones(2, requires_grad=True).sum().requires_grad)",
-        "import torch\n\ntorch.set_grad_enabled(WORD)\n",
-        "True",
-        "False",
-    ),
-    setting(
         "sympy_and_digits",
         "the longest integer that becomes a text",
         """
@@ -345,15 +337,15 @@ return picture(logging.getLogger("lab").isEnabledFor(logging.INFO))
         "40",
     ),
     setting(
-        "profile_of_gc",
-        "whether the collector is on",
+        "threshold_of_gc",
+        "how often the collector runs",
         """
 import gc
 
-return picture(gc.isenabled())
+return picture(gc.get_threshold()[0])
 """,
-        "import gc\n\ngc.WORD()\n",
-        "enable",
-        "disable",
+        "import gc\n\ngc.set_threshold(WORD)\n",
+        "700",
+        "800",
     ),
 ]

@@ -304,32 +304,25 @@ numpy.trapezoid = lambda values: 2.0
             )
         },
     ),
-    sibling(
+    Case(
         "contextvar",
-        "the other file sets a context variable of a helper",
+        "the other file sets a context variable of a helper before the node is imported",
         """
         from shared import GAIN
 
+        NOW = GAIN.get()
+
         @node()
         def value() -> Tensor:
-            return picture(GAIN.get())
+            return picture(NOW)
         """,
-        """
-from shared import GAIN
-
-GAIN.set(1)
-""",
-        """
-from shared import GAIN
-
-GAIN.set(2)
-""",
-        **{
-            "shared.py": """
-import contextvars
-
-GAIN = contextvars.ContextVar('gain', default=0)
-"""
+        nodes="other.py, own.py",
+        files={
+            "shared.py": "import contextvars\n\nGAIN = contextvars.ContextVar('gain', default=0)\n",
+            "other.py": (
+                "from shared import GAIN\n\nGAIN.set(1)\n" + OTHER,
+                "from shared import GAIN\n\nGAIN.set(2)\n" + OTHER,
+            ),
         },
     ),
     sibling(
