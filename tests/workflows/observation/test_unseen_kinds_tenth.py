@@ -8,16 +8,42 @@ from pathlib import Path
 import pytest
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "bench_unseen_kinds.py"
-TENTH = """
-draws.torch_poisson environment.bytes environment.which_program environment.path_of_python honest.astropy_table
-honest.linear_of_module honest.xarray_interpolation honest.threads_in_node honest.weights_normalised
-honest.hdf_parameter honest.stem_parameter indirect.yaml_with_include indirect.url_of_file installed.optional_package
-installed.typing_stub_beside left_behind.context_variable left_behind.generator left_behind.print_options
-left_behind.astropy_configuration left_behind.memory_file left_behind.table_of_library
-left_behind.deterministic_switch machine.clock_of_astropy machine.hash_of_object machine.open_files
-machine.rights_of_parameter paths.dictionary_of_paths paths.text_parameter readers.shelve_of_lab readers.pandas_table
-settings.mpmath_digits settings.default_dtype settings.threshold_of_gc siblings.hook_of_json
-""".split()
+TENTH = [
+    "draws.torch_poisson",
+    "environment.bytes",
+    "environment.which_program",
+    "environment.path_of_python",
+    "honest.astropy_table",
+    "honest.linear_of_module",
+    "honest.xarray_interpolation",
+    "honest.threads_in_node",
+    "honest.weights_normalised",
+    "honest.hdf_parameter",
+    "honest.stem_parameter",
+    "indirect.yaml_with_include",
+    "indirect.url_of_file",
+    "installed.optional_package",
+    "installed.typing_stub_beside",
+    "left_behind.context_variable",
+    "left_behind.generator",
+    "left_behind.print_options",
+    "left_behind.astropy_configuration",
+    "left_behind.memory_file",
+    "left_behind.table_of_library",
+    "left_behind.deterministic_switch",
+    "machine.clock_of_astropy",
+    "machine.hash_of_object",
+    "machine.open_files",
+    "machine.rights_of_parameter",
+    "paths.dictionary_of_paths",
+    "paths.text_parameter",
+    "readers.shelve_of_lab",
+    "readers.pandas_table",
+    "settings.mpmath_digits",
+    "settings.default_dtype",
+    "settings.threshold_of_gc",
+    "siblings.hook_of_json",
+]
 GOOD = {"right", "told", "kept", "skipped"}
 KNOWN = {
     "environment.which_program": "which program the path finds is a fact of the process that no key has",
