@@ -41,7 +41,7 @@ from unseen_kinds.case import Case, now
 
 BAD = ("stale", "refused", "unsaved", "no case")
 _ROOT = Path(__file__).parents[2]
-_PLAIN = ("PATH", "HOME", "VIRTUAL_ENV", "LANG", "LC_ALL", "USER", "TMPDIR", "LD_LIBRARY_PATH")
+_PLAIN = ("PATH", "HOME", "XDG_CACHE_HOME", "VIRTUAL_ENV", "LANG", "LC_ALL", "USER", "TMPDIR")
 _SHOWN = 400  #: of an output, this many numbers are compared and written down
 _PATIENCE = 900  #: s that one run may take on a machine that is busy with other work
 
@@ -51,7 +51,6 @@ class Place:
     """Where a case runs, and with which checkout of neusee."""
 
     root: Path
-    scratch: Path
     folder: Path
 
 
@@ -110,7 +109,6 @@ def environment(case: Case, place: Place, turn: int, cache: Path) -> dict[str, s
     """Return the variables of a run."""
     env = {name: os.environ[name] for name in _PLAIN if name in os.environ}
     env |= {"NEUSEE_CACHE": str(cache), "PYTHONPATH": str(place.root / ".src"), "OMP_NUM_THREADS": "1"}
-    env |= {"XDG_CACHE_HOME": str(place.scratch / "xdg"), "PYTHONPYCACHEPREFIX": str(place.scratch / "byte_code")}
     for name, change in case.env.items():
         value = now(change, turn)
         if value is None:
@@ -193,7 +191,7 @@ def tried(name: str, case: Case, root: Path, scratch: Path) -> dict[str, object]
         shutil.rmtree(old)
     folder.mkdir(parents=True)
     try:
-        found = judged(case, Place(root, scratch, folder))
+        found = judged(case, Place(root, folder))
     except (PermissionError, FileNotFoundError) as error:
         found = {"verdict": "skipped", "words": str(error)}
     except (subprocess.TimeoutExpired, ImportError) as error:
