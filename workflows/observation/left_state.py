@@ -131,10 +131,17 @@ def _found(name: str) -> Any:
 
 
 def _attributes(value: Any) -> dict[str, Any]:
-    """Return the attributes of an object, or a digest of one that is a list, a dict or an array."""
+    """Return the attributes of an object, or a digest of one that is a list, a dict or an array.
+
+    The entries of a dict in an attribute of an object count too: a table of a library is often a class around one.
+    """
     names = getattr(value, "__dict__", None)
     if isinstance(names, dict | MappingProxyType):
-        return {name: part for name, part in names.copy().items() if not name.startswith("__")}
+        found = {name: part for name, part in names.copy().items() if not name.startswith("__")}
+        tables = [] if isinstance(value, ModuleType | type) else [n for n, part in found.items() if type(part) is dict]
+        for table in tables:
+            found |= {f"{table}[{key!r}]": entry for key, entry in found[table].items() if isinstance(key, str)}
+        return found
     return {"": LoadedState(sys, (), lambda _: False).digest({"value": value})}
 
 
