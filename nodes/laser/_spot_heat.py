@@ -36,7 +36,7 @@ def spot_heat(fill: Tensor, waves: Tensor) -> Tensor:
 
     Shapes: fill, waves, of one shape or of shapes that broadcast -> that shape, float64.
     Units:  none.
-    Error:  0.2 % below to 0.5 % above; beyond 8 waves or a fill of 8 an upper bound, at most 1.5 % above.
+    Error:  0.2 % below to 0.5 % above; beyond 8 waves or a fill of 8 an upper bound, at most 2.5 % above.
     Raises: nothing.
     Source: Carslaw, Jaeger, Conduction of Heat in Solids, 2nd ed., section 10.5, for the heat; `round_spot` for the
             irradiance; geometric optics beyond 8 waves.

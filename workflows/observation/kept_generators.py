@@ -1,7 +1,7 @@
 """Generators that installed packages make for themselves when they are imported.
 
-That an import makes one says nothing of a result. A step that draws from one later depends on chance, or on the steps
-that drew before it.
+No result depends on an import that makes one. A step that draws from one later depends on chance, or on the steps that
+drew before it.
 """
 
 from __future__ import annotations

@@ -62,6 +62,12 @@ def test_the_heat_is_that_of_the_sampled_spot(fill, waves):
     assert heat_of(fill, waves) == pytest.approx(summed_heat(fill, waves), rel=0.012)
 
 
+@pytest.mark.parametrize(("fill", "waves"), [(0.0, 9.0), (0.0, 9.5), (0.0, 12.0), (0.5, 10.0), (2.0, 9.0)])
+def test_beyond_the_table_the_heat_is_an_upper_bound_that_is_near(fill, waves):
+    found = summed_heat(fill, waves, samples=4096)
+    assert found * 0.998 < heat_of(fill, waves) < found * 1.025
+
+
 @pytest.mark.parametrize("fill", [0.0, 1.0, 7.9, 8.1])
 def test_the_heat_falls_with_defocus_without_a_step(fill):
     waves = torch.linspace(0, 20, 4001)
