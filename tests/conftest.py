@@ -1,5 +1,6 @@
 import gc
 import os
+import threading
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -51,6 +52,17 @@ def nodes_of_tests_are_not_observed():
     from neusee.workflows.keys import module_owner
 
     module_owner.PROVEN = ("neusee.", "tests.", "engine_toys.")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def a_thread_of_others():
+    """Let own steps compute in the process of the test, as in a notebook, with one worker of xdist or without any."""
+    end = threading.Event()
+    other = threading.Thread(target=end.wait, name="a thread of others", daemon=True)
+    other.start()
+    yield
+    end.set()
+    other.join()
 
 
 @pytest.fixture(autouse=True)

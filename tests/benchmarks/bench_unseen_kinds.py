@@ -14,7 +14,9 @@ that the next call goes on; `--again` tries those again that were bad.
 | stale | the second run gives another value than the truth |
 | kept | an honest node: the second run took it from the cache |
 | refused, unsaved | an honest node that is refused, or computed again |
-| no case | the change does not change the truth, or the node fails: mend the case |
+| unreached | the change does not reach the step, so that it changes no truth: the step has neither variables of the
+  environment that no key has, nor what other steps leave in the process |
+| no case | the node fails: mend the case |
 | skipped | this machine lacks what the case needs |
 """
 
@@ -169,7 +171,7 @@ def judged(case: Case, place: Place) -> dict[str, object]:
             return {"verdict": "no case", "words": truth.words, "turn": 3}
     values = {"first": first.values, "second": second.values, "truth": truth.values}
     if same(first, truth, case.watched):
-        verdict = "no case"
+        verdict = "unreached" if same(first, second, case.watched) else "stale"
     elif not same(second, truth, case.watched):
         verdict = "stale"
     else:

@@ -11,6 +11,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from neusee.workflows.observation.known_variables import OF_LANGUAGES, OF_THREADS, is_known
+
 
 @dataclass(frozen=True, slots=True)
 class Surrounding:
@@ -81,31 +83,6 @@ FRESH = frozenset({LOCALE, HASH, THREADS, MEMORY})
 ALL = (FOLDER, LOCALE, HASH, THREADS, ZONE, RANDOM, WORK, ERRORS, HOME, VARIABLES, MEMORY)
 
 ZONE_ELSEWHERE = "NSC-13:45"  #: a zone that needs no table: UTC and 13 h 45 min
-_THREADS = (
-    "OMP_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-)
-_LOCALE = (
-    "LC_ALL",
-    "LANG",
-    "LANGUAGE",
-    "LC_CTYPE",
-    "LC_NUMERIC",
-    "LC_TIME",
-    "LC_COLLATE",
-    "LC_MESSAGES",
-    "LC_MONETARY",
-)
-_WHO = ("HOME", "USER", "LOGNAME", "USERNAME")
-_FEW = ("PATH", "VIRTUAL_ENV", "TMPDIR", "TZ", "TZDIR", "LOCPATH", *_THREADS, *_LOCALE, *_WHO)
-#: beginnings of the names of variables that find libraries and devices, and those that neusee reads
-_KEPT = (
-    *("LD_", "DYLD_", "PYTHON", "CONDA", "XDG_", "NEUSEE_", "GLIBC_", "MALLOC_", "CUDA", "NVIDIA", "HIP", "ROCM"),
-    *("OMP_", "GOMP_", "KMP_", "MKL_", "OPENBLAS_", "TORCH", "PYTORCH"),
-)
 #: languages that write 1,5; Turkish first, whose i is another letter
 _LANGUAGES = ("tr_", "de_", "fr_", "es_", "it_", "nl_", "pt_", "pl_", "sv_", "da_", "fi_", "nb_", "cs_", "ru_", "uk_")
 
@@ -166,10 +143,10 @@ class Others:
         given = {**environ, "PYTHONHASHSEED": str(self.hash_seed + 1 if HASH in changes else self.hash_seed)}
         given.setdefault("XDG_CACHE_HOME", os.path.join(os.path.expanduser("~"), ".cache"))  # of compiled programs
         if LOCALE in changes:
-            given = {name: value for name, value in given.items() if name not in _LOCALE}
+            given = {name: value for name, value in given.items() if name not in OF_LANGUAGES}
             given |= {"LC_ALL": self.locale, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
         if THREADS in changes:
-            given |= dict.fromkeys(_THREADS, str(self.threads))
+            given |= dict.fromkeys(OF_THREADS, str(self.threads))
         if MEMORY in changes:
             given["MALLOC_PERTURB_"] = "165"  # the library of C fills what it gives and takes
         return given
@@ -208,7 +185,7 @@ def others(environ: Mapping[str, str]) -> Others:
         threads=3 if here == 1 else 1,
         threads_here=here,
         locale=other_locale(now, installed_locales(environ), environ),
-        variables=tuple(sorted(name for name in environ if name not in _FEW and not name.startswith(_KEPT))),
+        variables=tuple(sorted(name for name in environ if not is_known(name))),
     )
 
 

@@ -31,10 +31,16 @@ class MemoryLimit(Exception):
     """Error of a step or a report during which the memory of the process exceeded the limit of the run."""
 
     def __str__(self) -> str:
+        return f"{self._what()}: {_ADVICE}"
+
+    def __reduce__(self) -> tuple[type[MemoryLimit], tuple[str]]:
+        return MemoryLimit, (self._what(),)
+
+    def _what(self) -> str:
         if self.args:
-            return f"{self.args[0]}: {_ADVICE}"
+            return str(self.args[0])
         limits = f", the limit is {format_size(int(_last[1]))}" if _last[1] else ""
-        return f"the process holds {format_size(int(_last[0]))}{limits}: {_ADVICE}"
+        return f"the process holds {format_size(int(_last[0]))}{limits}"
 
 
 _last = [0.0, 0.0]  # bytes of the process and the limit when a step was last stopped

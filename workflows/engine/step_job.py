@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
@@ -22,6 +22,7 @@ from neusee.workflows.engine.memory_use import PeakMemory
 from neusee.workflows.engine.memory_watch import guarded
 from neusee.workflows.engine.node_call import call, examine
 from neusee.workflows.engine.provenance import timestamp, versions
+from neusee.workflows.engine.step_process import ProcessEnded, call_in_fork, may_fork
 from neusee.workflows.engine.write_behind import LARGE, WriteBehind
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.graph.run_error import RunError
@@ -29,7 +30,7 @@ from neusee.workflows.keys.cache_key import Key, device_kind, is_private, plain
 from neusee.workflows.keys.input_file_digest import file_stamps
 from neusee.workflows.keys.tainted_code import hold_back, may_be_stored
 from neusee.workflows.keys.user_code import OwnCode
-from neusee.workflows.observation.own_call import call_observed, tainted_modules
+from neusee.workflows.observation.own_call import call_observed, say_hidden, say_lost, tainted_modules, undeclared
 from neusee.workflows.observation.taints import Taint
 from neusee.workflows.store.lease import Lease
 from neusee.workflows.store.metadata import INLINE
@@ -41,7 +42,7 @@ Fetch = Callable[[Key], Any]
 #: function that is told each computed result: the recipe of the run, the keys known so far, the step and its value
 Show = Callable[[Recipe, Mapping[str, Key], str, Any], None]
 T = TypeVar("T")
-_STATS = tuple(field.name for field in fields(TensorStats))
+_STATS = tuple(each.name for each in fields(TensorStats))
 _WATCHED = 1 << 20  #: bytes of inputs from which the memory of a step is measured
 
 
@@ -171,20 +172,20 @@ def gathered(read: Read, fetch: Fetch) -> Any:
 def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     """Compute a step and return its value with statistics, checks and costs."""
     step = work.step
-    taints: list[Taint] = []
-    evaluate = _observing(partial(call, step, params=step.params, seed=work.seed, device=work.device), work.own, taints)
+    seen = _Seen()
+    evaluate = _observing(partial(call, step, params=step.params, seed=work.seed, device=work.device), work, seen)
     stamps = file_stamps(step.params)
     began, clock = time.time(), time.perf_counter()
     size = sum(t.nbytes for t in tensors_in(inputs))
     watched = size >= _WATCHED or not work.unlocked
-    own = work.own is not None and work.device.startswith("cpu")
-    with PeakMemory(work.device, watched) as peak, torch.no_grad(), guarded(), refusing_allocations(own):
+    own_here = work.own is not None and work.device.startswith("cpu") and not _is_apart(work)
+    with PeakMemory(work.device, watched) as peak, torch.no_grad(), guarded(), refusing_allocations(own_here):
         if step.node.bands and (work.parts > 1 or work.device.startswith("cpu")):
             value = call_by_band(step, inputs, evaluate, work.origin["code"], store.blobs, work.parts)
         else:
             value = evaluate(inputs)
         bare = plain_of(value)
-        checks = _observing(examine, work.own, taints)(step, bare, inputs)
+        checks = _observing(examine, work, seen)(step, bare, inputs) if step.node.hooks.check else ()
     seconds = time.perf_counter() - clock
     same = stamps == file_stamps(step.params)
     if not same or work.origin["params"] != {name: plain(param) for name, param in step.params.items()}:
@@ -193,23 +194,54 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     sized = measured_size(step.node, inputs, step.params, bare)
     deviation = step.node.hooks.approximation_error(bare) if step.node.hooks.approximation_error else None
     facts = TensorStats.of(bare)
-    found_here = tuple(dict.fromkeys(taints))
-    return Outcome(work, value, facts, checks, began, seconds, found, deviation, peak.bytes, sized, taints=found_here)
+    taints = tuple(dict.fromkeys(seen.taints))
+    most = None if peak.bytes is None else peak.bytes + seen.peak
+    return Outcome(work, value, facts, checks, began, seconds, found, deviation, most, sized, taints=taints)
 
 
-def _observing(function: Callable[..., T], own: OwnCode | None, taints: list[Taint]) -> Callable[..., T]:
-    """Return a function that is observed where the code is not of neusee, and that adds what it finds to ``taints``."""
+@dataclass(slots=True)
+class _Seen:
+    """What was seen of the calls of own code in one step."""
+
+    taints: list[Taint] = field(default_factory=list)
+    peak: int = 0  #: peak bytes of a process of its own
+
+
+def _observing(function: Callable[..., T], work: StepJob, seen: _Seen) -> Callable[..., T]:
+    """Return a function that is observed where the code is not of neusee, and that adds what it finds to ``seen``."""
+    own = work.own
     if own is None:
         return function
 
     def watched(*args: Any, **more: Any) -> T:
-        value, found = call_observed(partial(function, *args, **more), own)
-        taints.extend(found)
+        try:
+            value, found = _called_observed(partial(function, *args, **more), own, _is_apart(work), seen)
+        except ProcessEnded as error:
+            raise RunError(work.step, [], error) from error
+        seen.taints.extend(found)
         if found:
             hold_back(tainted_modules(own, found))
         return value
 
     return watched
+
+
+def _is_apart(work: StepJob) -> bool:
+    """Return True for code that may change what other code finds: it runs in a process of its own."""
+    return work.own is not None and work.own.may_change and work.device.startswith("cpu") and may_fork()
+
+
+def _called_observed(function: Callable[[], T], own: OwnCode, apart: bool, seen: _Seen) -> tuple[T, list[Taint]]:
+    """Call a function of own code, in a process of its own if ``apart`` and its value can be sent."""
+    returned = call_in_fork(partial(call_observed, function, own), own.variables) if apart else None
+    if returned is None:
+        return call_observed(function, own)
+    seen.peak = max(seen.peak, returned.peak or 0)
+    value, found = returned.value
+    home, lost = min(own.modules), [taint for taint in found if taint.kind == "memory"]
+    say_lost(home, lost)
+    say_hidden(home, returned.asked, own.free)
+    return value, [*(taint for taint in found if taint not in lost), *undeclared(own, returned.asked)]
 
 
 def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:

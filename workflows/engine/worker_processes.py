@@ -15,7 +15,6 @@ import os
 import pickle
 import signal
 import sys
-import threading
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -26,10 +25,10 @@ from typing import Generic, TypeVar
 import torch
 
 from neusee.workflows.engine.processors import free_processors
+from neusee.workflows.observation.step_thread import is_alone
 from neusee.workflows.store.lease import retire
 
 T = TypeVar("T")
-_OWN = ("MainThread", "neusee")  #: how the names of threads of this program begin
 _PARENT_DIES = 1  #: PR_SET_PDEATHSIG of Linux
 
 
@@ -57,8 +56,16 @@ def workers_for(pieces: int, asked: int = 0) -> int:
     """
     if sys.platform != "linux":
         return 1
-    alone = all(thread.name.startswith(_OWN) for thread in threading.enumerate())
-    return max(1, min(pieces, asked or (free_processors() or 1 if alone else 1)))
+    return max(1, min(pieces, asked or (free_processors() or 1 if is_alone() else 1)))
+
+
+def end_with(parent: int) -> None:
+    """Let this fork end when the process that forked it ends, also after ``kill -9``; ``parent`` is that process."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PARENT_DIES, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
 
 
 def shared(
@@ -179,11 +186,7 @@ def _serve(pipe: Connection, others: Sequence[Connection], work: Callable[[int],
     for other in others:
         other.close()  # else the pipes of a killed process stay open
     ignore_interrupts()
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(_PARENT_DIES, signal.SIGKILL)
-    if os.getppid() != parent:
-        return
+    end_with(parent)
     torch.set_num_threads(1)  # the threads of the parent are not in a fork of it
     with suppress(EOFError, OSError):
         while True:

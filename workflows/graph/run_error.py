@@ -22,14 +22,15 @@ class RunError(RuntimeError):
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _unpickled, (self.step, str(self), repr(self.cause))
+        plain = type(self.cause).__module__ == "builtins" and all(isinstance(each, str) for each in self.cause.args)
+        return _unpickled, (self.step, str(self), self.cause if plain else repr(self.cause))
 
 
-def _unpickled(step: str, text: str, cause: str) -> RunError:
+def _unpickled(step: str, text: str, cause: BaseException | str) -> RunError:
     """Return the `RunError` of another process, which keeps its text but not the traceback of its cause."""
     error = RunError.__new__(RunError, text)
     RuntimeError.__init__(error, text)
-    error.step, error.cause = step, RuntimeError(cause)
+    error.step, error.cause = step, cause if isinstance(cause, BaseException) else RuntimeError(cause)
     return error
 
 

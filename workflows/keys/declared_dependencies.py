@@ -18,7 +18,7 @@ from neusee.workflows.keys.unfollowed_code import UnfollowedCode
 from neusee.workflows.keys.unfollowed_constructs import Construct
 
 FREE = "unaffected:"
-_ENV = "env:"
+VARIABLE = "env:"
 _FIX = {
     "file": 'give it as a parameter of type Path, or declare it: depends=["{name}"], beside the module',
     "env": 'make it a parameter, or declare it: depends=["env:{name}"]',
@@ -49,8 +49,8 @@ def resolve(
     """
     found = Declared({}, [], [])
     for entry in entries:
-        if entry.startswith(_ENV):
-            name = entry.removeprefix(_ENV)
+        if entry.startswith(VARIABLE):
+            name = entry.removeprefix(VARIABLE)
             values = dict.fromkeys([then.get(name, os.environ.get(name)), os.environ.get(name)])
             found.parts[f"environment variable {name}"] = {"value": digest(*values)[:16]}
         elif not entry.startswith(FREE):
@@ -91,8 +91,8 @@ def _covers(entry: str, item: Construct) -> bool:
         free = entry.removeprefix(FREE)
         named = (item.kind, item.name, PurePath(item.name).name, item.text)
         return free in named or item.text.startswith((f"{free}.", f"{free}("))
-    if entry.startswith(_ENV):
-        return item.kind == "env" and item.name in ("", entry.removeprefix(_ENV))
+    if entry.startswith(VARIABLE):
+        return item.kind == "env" and item.name in ("", entry.removeprefix(VARIABLE))
     if item.kind == "file":
         return not item.name or not PurePath(entry).suffix or PurePath(entry).name == PurePath(item.name).name
     if item.kind == "source":

@@ -69,7 +69,7 @@ def reach_of(tree: ast.Module, bound: Mapping[str, str]) -> Reach:
     """Return what a module reaches; ``bound`` has the full name of each imported name, relative ones with a dot."""
     found = _Pass(bound)
     found.visit_all(tree.body, Scope(tree, None))
-    unused = {full for name, full in bound.items() if name not in found.named and not _is_calm(full)}
+    unused = {full for name, full in bound.items() if name not in found.named and not is_calm(full)}
     return Reach(
         sorted(found.outward), sorted(found.passed), sorted(unused), found.inward, found.changes_arguments, found.seeks
     )
@@ -150,7 +150,7 @@ class _Pass:
         name, given = full if last in full.split(".") else f"{full}.{last}", self._given(call, scope)
         if _is_quiet(name, call):
             return
-        if not _is_calm(full):
+        if not is_calm(full):
             self.passed |= given
             if bare or _changes(last):
                 self.outward.add(name)
@@ -159,7 +159,7 @@ class _Pass:
         if (bare and named) or name.startswith("torch.library."):
             self.outward.add(name)
         if bare or last.endswith("_"):
-            self.outward |= {each for each in given if not _is_calm(each)}
+            self.outward |= {each for each in given if not is_calm(each)}
 
     def _given(self, call: ast.Call, scope: Scope) -> set[str]:
         """Return the names of what other modules hold and a call is given, not of what their functions return."""
@@ -181,10 +181,11 @@ class _Pass:
         if isinstance(item, ast.ClassDef):
             for base in [*item.bases, *(word.value for word in item.keywords)]:
                 found = self._imports(base, scope)
-                self.outward |= {name for name in found if not _is_calm(name) and not _starts(name, _QUIET)}
+                self.outward |= {name for name in found if not is_calm(name) and not _starts(name, _QUIET)}
 
 
-def _is_calm(name: str) -> bool:
+def is_calm(name: str) -> bool:
+    """Return True for a name of a package whose functions change nothing that they are not given."""
     return name.partition(".")[0] in CALM
 
 

@@ -58,6 +58,7 @@ _NAMES: Mapping[str, tuple[str, str]] = {
     **{f"datetime.datetime.{name}": ("state", _CLOCK) for name in ("now", "utcnow", "today")},
     **dict.fromkeys(("datetime.date.today", "threading.get_ident", "resource", "tracemalloc"), ("state", _CLOCK)),
     **dict.fromkeys(("locale", "decimal", "numpy.geterr", "numpy.get_printoptions"), ("state", _SETTING)),
+    **dict.fromkeys(("sys.flags", "sys.warnoptions", "sys._xoptions"), ("state", _SETTING)),
     **dict.fromkeys(("torch.get_num_threads", "torch.get_num_interop_threads", "psutil"), ("state", _CLOCK)),
     **dict.fromkeys(
         ("torch.cuda.is_available", "torch.cuda.device_count", "torch.cuda.get_device_name"), ("state", _CLOCK)

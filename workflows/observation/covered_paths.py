@@ -61,14 +61,23 @@ def program() -> tuple[str, ...]:
 
     A virtual environment may be made in the folder of a project, so only its parts count, not its whole folder.
     """
-    inside = [*map(Path, neusee.nodes.__path__), Path(__file__).parents[1]]
     prefixes = {sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix}
     python = [os.path.join(prefix, part) for prefix in prefixes for part in _OF_PYTHON]
     paths = sysconfig.get_paths()
     installed = [paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
-    packaged = [Path(neusee.__file__ or "").parent / name for name in ("__init__.py", "__main__.py", "__pycache__")]
     zipped = os.path.join(sys.base_prefix, "lib", f"python{sys.version_info[0]}{sys.version_info[1]}.zip")
-    return _real([*inside, *packaged, *python, *installed, zipped, site.getusersitepackages()])
+    return (*_neusee(), *_real([*python, *installed, zipped, site.getusersitepackages()]))
+
+
+@functools.cache
+def _neusee() -> tuple[str, ...]:
+    packaged = [Path(neusee.__file__ or "").parent / name for name in ("__init__.py", "__main__.py", "__pycache__")]
+    return _real([*map(Path, neusee.nodes.__path__), Path(__file__).parents[1], *packaged])
+
+
+def is_of_neusee(path: str) -> bool:
+    """Return True for a file of the program."""
+    return _is_below(path, _neusee())
 
 
 def caches() -> tuple[str, ...]:

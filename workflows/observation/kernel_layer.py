@@ -35,6 +35,22 @@ def client() -> NotificationClient:
     return _clients[-1]
 
 
+def begun_for_fork() -> NotificationClient | None:
+    """Return the process that answers, which a fork of this one may use too; None if the kernel watches nothing."""
+    if missing():
+        return None
+    try:
+        return client()
+    except NoServer:
+        return None  # the fork tries again, and says that it is not watched
+
+
+def give_up() -> None:
+    """Start another process that answers at the next call: a fork may have left half an answer of the present one."""
+    while _clients:
+        _clients.pop().close()
+
+
 def stop_here(answering: NotificationClient) -> None:
     """Stop the current thread at the calls of the table from now on; raise `NoServer` if nobody would answer.
 
@@ -51,7 +67,4 @@ def stop_here(answering: NotificationClient) -> None:
         os.close(listener)  # the server alone holds it: where the server dies, calls fail and nothing waits
 
 
-@atexit.register
-def _close() -> None:
-    while _clients:
-        _clients.pop().close()
+atexit.register(give_up)

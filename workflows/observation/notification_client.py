@@ -34,6 +34,7 @@ class NotificationClient:
     def __init__(self) -> None:
         """Start the process; raise `NoServer` if it does not answer or may not read the memory of this process."""
         self.process = os.getpid()
+        self._is_of_parent = False  #: True in a fork, which cannot see whether the server of its parent has ended
         self._server: subprocess.Popen[bytes] | None = None
         self._socket, theirs = socket.socketpair()
         try:
@@ -69,6 +70,13 @@ class NotificationClient:
             raise ValueError("it may not read the memory of this process")
         self._socket.settimeout(None)
 
+    def observe_here(self) -> None:
+        """Let the server answer for the process that calls this: a fork of that which started it, while that waits."""
+        self._is_of_parent = self.process != os.getpid()
+        self.process = os.getpid()
+        self._socket.sendall(b"O" + self.process.to_bytes(HEADER - 1, "little"))
+        self._ask_for_sight(self.server())
+
     def hand_over(self, listener: int) -> None:
         """Let the server answer the calls of a listener, whose observation begins; raise `NoServer` if it is dead."""
         try:
@@ -89,7 +97,9 @@ class NotificationClient:
 
     def alive(self) -> bool:
         """Return True if the server is that of this process, not of the process that it was forked from, and runs."""
-        return self.process == os.getpid() and self._server is not None and self._server.poll() is None
+        if self.process != os.getpid() or self._server is None:
+            return False
+        return self._is_of_parent or self._server.poll() is None
 
     def close(self) -> None:
         """Let the server end as soon as no thread is left whose calls it answers; nobody waits for that."""

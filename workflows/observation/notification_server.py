@@ -4,7 +4,8 @@ It is a process of its own, because a native reader may hold the lock of the int
 It imports the standard library and a few files of this room alone, so it starts fast. It ends when its parent and all
 that its parent observed have ended: a process that a step left behind would wait at its next call for ever.
 
-Messages of the parent: ``P``: can you read this memory, ``L`` with a listener: a new observation begins, ``R``: report.
+Messages of the parent: ``O`` with its number: this process is observed now, a fork of the parent or the parent itself,
+``P``: can you read this memory, ``L`` with a listener: a new observation begins, ``R``: report.
 """
 
 from __future__ import annotations
@@ -136,6 +137,8 @@ class Server:
         kind = message[:1]
         if not kind:
             self._remove(self._parent.fileno())
+        elif kind == b"O":
+            self._process = int.from_bytes(message[1:], "little")
         elif kind == b"P":
             self._reply(Task(self._process).text(int.from_bytes(message[1:], "little")))
         elif kind == b"L":

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import TypeVar
 
 from neusee.workflows.observation import audit_events, kernel_layer, python_watch
@@ -38,16 +39,49 @@ def observed(
     """
     if python_watch.watch_here() is not None:
         return function(), ()
+    with one_at_a_time():
+        told = state() if state is not None else list[Taint]
+        step, taints = _observed(function, covered)
+        taints += tuple(told())
+    return step.value(), taints
+
+
+@contextmanager
+def one_at_a_time() -> Iterator[None]:
+    """Wait until no other thread of this process observes a call."""
     turn = _turn[0]
     while not turn.acquire(timeout=_LOOK):
         pass
     try:
-        told = state() if state is not None else list[Taint]
-        step, taints = _observed(function, covered)
-        taints += tuple(told())
+        yield
     finally:
         turn.release()
-    return step.value(), taints
+
+
+@contextmanager
+def watched_in_fork() -> Iterator[Callable[[], None]]:
+    """Give what a fork of this process calls first, so that the kernel watches it as it would watch this process.
+
+    Only one fork is observed at a time, and this process waits for it: see `one_at_a_time`.
+    """
+    answering, succeeded = kernel_layer.begun_for_fork(), False
+
+    def begin() -> None:
+        if answering is not None:
+            with suppress(OSError, ValueError):  # then the call says that it is not watched
+                answering.observe_here()
+
+    try:
+        yield begin
+        succeeded = True
+    finally:
+        if answering is not None:
+            try:
+                answering.observe_here()
+            except (OSError, ValueError):
+                succeeded = False
+            if not succeeded:
+                kernel_layer.give_up()
 
 
 def observed_import(load: Callable[[], T], covered: Covered) -> tuple[T, tuple[Taint, ...]]:

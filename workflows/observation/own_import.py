@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import functools
 import importlib
+import importlib.util
+import re
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -13,9 +16,13 @@ from neusee.workflows.keys.declared_dependencies import FREE
 from neusee.workflows.keys.loaded_source import say_once
 from neusee.workflows.keys.module_origin import origin_of
 from neusee.workflows.keys.tainted_code import taint_code
+from neusee.workflows.observation.hidden_variables import Asked, hidden_while_importing
 from neusee.workflows.observation.observed_call import observed_import
-from neusee.workflows.observation.own_call import WORDS
-from neusee.workflows.observation.taints import Covered, Taint
+from neusee.workflows.observation.own_call import WORDS, say_hidden
+from neusee.workflows.observation.step_thread import is_alone
+from neusee.workflows.observation.taints import Covered, Taint, taint
+
+_VARIABLE = re.compile(rb"[\"']env:(\w+)[\"']")  #: as a module declares a variable of the environment
 
 
 def import_observed(name: str) -> ModuleType:
@@ -27,7 +34,10 @@ def import_observed(name: str) -> ModuleType:
         return sys.modules[name]
     before = set(sys.modules)
     load = functools.partial(importlib.import_module, name)
-    module, found = observed_import(load, Covered(frozenset(), lambda _: True))
+    with _hidden(name) as asked:
+        module, found = observed_import(load, Covered(frozenset(), lambda _: True))
+    say_hidden(name, asked)
+    found += tuple(taint("variable", each) for each in asked.of_own_code)
     new = [each for each in sys.modules if each not in before and origin_of(each, frozenset()).kind == "source"]
     taints = tuple(taint for taint in found if not any(declares(each, taint) for each in new))
     if taints:
@@ -38,6 +48,26 @@ def import_observed(name: str) -> ModuleType:
                 name, f"{name} {reached}: the results of its nodes are not stored; to have them stored, {taint.fix}"
             )
     return module
+
+
+@contextmanager
+def _hidden(name: str) -> Iterator[Asked]:
+    """Hide variables of the environment from the libraries that a module imports, but not beside foreign threads."""
+    if not is_alone():
+        yield Asked()
+        return
+    with hidden_while_importing(_declared_variables(name)) as asked:
+        yield asked
+
+
+def _declared_variables(name: str) -> frozenset[str]:
+    """Return the variables that a module, or one beside or below it, declares; it is not imported yet."""
+    spec = importlib.util.find_spec(name)
+    if spec is None or not spec.has_location or spec.origin is None:
+        return frozenset()
+    folder = Path(spec.origin).parent
+    sources = folder.rglob("*.py") if spec.submodule_search_locations else folder.glob("*.py")
+    return frozenset(each.decode() for source in sources for each in _VARIABLE.findall(source.read_bytes()))
 
 
 def declares(module: str, taint: Taint) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextvars
 import ctypes
 import gc
+import re
 import threading
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
@@ -15,8 +16,15 @@ from typing import Any, Generic, TypeVar
 import torch
 
 T = TypeVar("T")
+#: names of the threads of this program, and of a worker of dask that computes its steps
+_OWN = re.compile(r"(MainThread|neusee|\d+-Dask-|Dask-Offload|Nanny stop queue|Thread-\d+ \(monitor_parent\)).*")
 _LOOK = 0.05  #: s after which a waiting caller sees an exception that another thread raises in it
 _raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc
+
+
+def is_alone() -> bool:
+    """Return True if all threads of this process are of this program."""
+    return all(_OWN.fullmatch(thread.name) for thread in threading.enumerate())
 
 
 class StepThread(Generic[T]):

@@ -6,7 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-Kind = Literal["file", "folder", "write", "attribute", "process", "network", "random", "import", "memory", "unknown"]
+Kind = Literal[
+    "file", "folder", "write", "attribute", "process", "network", "random", "import", "memory", "variable", "unknown"
+]
 
 
 class Covered(NamedTuple):
@@ -38,6 +40,7 @@ _FIX: dict[Kind, str] = {
     "import": 'write the import as a statement, or declare the module: depends=["{name}"]; or write cache: false',
     "memory": "return it as a value to the steps that read it, or, if no result depends on it, declare "
     'depends=["unaffected:{name}"]; or write cache: false',
+    "variable": 'make it a parameter, or declare it, depends=["env:{name}"]; or write cache: false',
     "unknown": "write cache: false",
 }
 _SEED = "set the seed in the node before it draws, {call}, from a parameter or a constant"

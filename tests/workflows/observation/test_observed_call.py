@@ -214,7 +214,7 @@ def test_a_step_whose_watcher_dies_runs_again_and_is_tainted(tmp_path, taints, w
 
 def test_a_step_whose_watcher_cannot_be_started_is_tainted(taints, watched, monkeypatch):
     observed(lambda: None, NOTHING)
-    kernel_layer._close()
+    kernel_layer.give_up()
     monkeypatch.setattr(sys, "executable", "/no/such/python")
     assert [kind for kind, _ in taints(lambda: None)] == ["unknown"]
 
@@ -228,7 +228,7 @@ def test_a_process_that_was_forked_has_a_watcher_of_its_own(tmp_path, taints, wa
         try:
             good = taints((tmp_path / "gain.csv").read_text) == [("file", "gain.csv")] and server() != first
             code.write_text("good" if good else "bad")
-            kernel_layer._close()
+            kernel_layer.give_up()
         except BaseException:
             code.write_text(traceback.format_exc())
         finally:

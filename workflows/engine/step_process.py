@@ -1,0 +1,202 @@
+"""Call of own code in a process of its own: whatever it changes in Python, or in a library, ends with the call.
+
+Code of a user may set an option of a library, fill a table, patch a function or move the working folder. No list of
+such changes is complete, so a step of code that may make one is computed by a fork of this process. The fork has the
+inputs at hand, sends the value back, and ends. The next step, of the user or of neusee, finds the process as it was.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import select
+import signal
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import torch
+
+from neusee.workflows.engine.allocation_limit import refusing_allocations
+from neusee.workflows.engine.memory_use import resident
+from neusee.workflows.engine.memory_watch import guarded, limit_now, limited
+from neusee.workflows.engine.worker_processes import deaf_fork, end_with, ignore_interrupts
+from neusee.workflows.observation.hidden_variables import Asked, hide_for_good
+from neusee.workflows.observation.observed_call import one_at_a_time, watched_in_fork
+from neusee.workflows.observation.step_thread import is_alone
+
+T = TypeVar("T")
+_LOOK = 0.05  #: s after which the caller sees an exception that another thread raises in it
+_UNSENT = 3  #: exit code of a fork whose value cannot be sent
+
+
+class ProcessEnded(RuntimeError):
+    """Error of a call whose process ended before the call did: killed, or crashed by a library."""
+
+
+class Returned(NamedTuple, Generic[T]):
+    """What a call in a process of its own gave."""
+
+    value: T
+    peak: int | None  #: peak bytes of the process beside what it began with
+    asked: Asked  #: variables of the environment that the code asked for and does not have
+
+
+class _Sent(NamedTuple):
+    """What goes through the file of the fork."""
+
+    returned: Returned[Any] | None
+    error: BaseException | None
+    said: list[warnings.WarningMessage]
+
+
+def may_fork() -> bool:
+    """Return True where a fork is safe, and what the call prints goes where this process prints.
+
+    A lock that a thread of another library holds would stay locked in a fork, as in a notebook.
+    """
+    return sys.platform == "linux" and is_alone() and all(_is_a_file(stream) for stream in (sys.stdout, sys.stderr))
+
+
+def call_in_fork(function: Callable[[], T], variables: frozenset[str]) -> Returned[T] | None:
+    """Return what a function gives in a fork of this process; None if its value cannot be sent.
+
+    ``variables`` are those of the environment that the code declares. Raises what the function raises, with its text
+    and without its traceback, and `ProcessEnded`.
+    """
+    with one_at_a_time():
+        return _called(function, variables)
+
+
+def _called(function: Callable[[], T], variables: frozenset[str]) -> Returned[T] | None:
+    limit = limit_now()
+    with open(os.memfd_create("neusee step"), "rb") as file, watched_in_fork() as begin_watch:
+        child = _forked()
+        if not child:
+            begin_watch()
+            _answer(function, variables, limit, file.fileno())
+        code = _waited(child)
+        if code == _UNSENT:
+            return None
+        if code:
+            raise ProcessEnded(_reason(code))
+        sent: _Sent = torch.load(f"/proc/self/fd/{file.fileno()}", mmap=True, weights_only=False)
+    for each in sent.said:
+        warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+    if sent.error is not None:
+        raise sent.error
+    return sent.returned
+
+
+def _is_a_file(stream: Any) -> bool:
+    try:
+        return stream is None or stream.fileno() >= 0
+    except (OSError, ValueError, AttributeError):
+        return False
+
+
+# --- in the process that waits ----------------------------------------------------------------------------------------
+
+
+def _forked() -> int:
+    for stream in (sys.stdout, sys.stderr):  # or the fork would print what still waits here once more
+        if stream is not None:
+            stream.flush()
+    with warnings.catch_warnings(), deaf_fork():  # Python 3.12 warns of every fork beside a thread
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return os.fork()
+
+
+def _waited(child: int) -> int:
+    """Return the exit code of a process, negative for a signal, when it has ended; kill it if an exception comes."""
+    try:
+        with _descriptor(child) as descriptors:
+            while True:
+                ended, status = os.waitpid(child, os.WNOHANG)
+                if ended:
+                    return os.waitstatus_to_exitcode(status)
+                select.select(descriptors, [], [], _LOOK if descriptors else _LOOK / 50)
+    except BaseException:
+        with suppress(ProcessLookupError, ChildProcessError):
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+        raise
+
+
+@contextmanager
+def _descriptor(child: int) -> Iterator[list[int]]:
+    """Give a descriptor that tells the end of a process, or none where the system has none."""
+    try:
+        descriptor = os.pidfd_open(child)
+    except (OSError, AttributeError):
+        yield []
+        return
+    try:
+        yield [descriptor]
+    finally:
+        os.close(descriptor)
+
+
+def _reason(code: int) -> str:
+    if code > 0:
+        return f"the process of the step ended with the exit code {code}"
+    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+    kinds = {"SIGKILL": "killed, as by a system that has too little memory", "SIGSEGV": "a library crashed"}
+    return f"the process of the step was ended by {name}" + (f": {kinds[name]}" if name in kinds else "")
+
+
+# --- in the fork ------------------------------------------------------------------------------------------------------
+
+
+def _answer(function: Callable[[], Any], variables: frozenset[str], limit: float | None, file: int) -> None:
+    """Call the function, write what it gives to a file, and end this process."""
+    code = 1
+    try:
+        ignore_interrupts()
+        end_with(os.getppid())
+        sent = _sent(function, variables, limit)
+        code = _write(sent, file)
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(Exception):
+                stream.flush()
+        os._exit(code)
+
+
+def _sent(function: Callable[[], Any], variables: frozenset[str], limit: float | None) -> _Sent:
+    with warnings.catch_warnings(record=True) as said:
+        try:
+            return _Sent(_returned(function, variables, limit), None, said)
+        except BaseException as error:
+            return _Sent(None, error, said)
+
+
+def _returned(function: Callable[[], Any], variables: frozenset[str], limit: float | None) -> Returned[Any]:
+    with ExitStack() as stack:
+        if limit is not None:
+            stack.enter_context(limited(limit))
+        stack.enter_context(guarded())
+        stack.enter_context(refusing_allocations(True))
+        asked = hide_for_good(variables)
+        before = resident("VmRSS:")
+        value = function()
+        highest = resident("VmHWM:")  # a fork begins to count anew
+    peak = None if before is None or highest is None else max(0, highest - before)
+    return Returned(value, peak, asked)
+
+
+def _write(sent: _Sent, file: int) -> int:
+    """Write what the parent reads; return the exit code of the fork."""
+    plain = [_plain_warning(each) for each in sent.said]
+    try:
+        with open(file, "wb", closefd=False) as binary:
+            torch.save(sent._replace(said=plain), binary)
+    except (pickle.PicklingError, TypeError, AttributeError):
+        return _UNSENT
+    return 0
+
+
+def _plain_warning(each: warnings.WarningMessage) -> warnings.WarningMessage:
+    return warnings.WarningMessage(str(each.message), each.category, each.filename, each.lineno)
