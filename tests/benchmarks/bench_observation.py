@@ -1,8 +1,8 @@
-"""Print what it costs to observe a call of an own node, beside plain calls of the same node in turns.
+"""Print what it costs to observe a call of an own node, here or in a process of its own, beside plain calls in turns.
 
     python tests/benchmarks/bench_observation.py [CALLS]
 
-Each pair is one plain and one observed call, in turns, so that other work on the machine meets both. The parts say what
+Each turn is one plain call and one of each other kind, so that other work on the machine meets all. The parts say what
 an observed call that does nothing spends its time on. That the steps of a packaged recipe are not observed at all is a
 test (`tests/workflows/observation/test_shipped_nodes.py`).
 """
@@ -14,12 +14,14 @@ import platform
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 import torch
 
+from neusee.workflows.engine.memory_use import process_memory
+from neusee.workflows.engine.step_process import call_in_fork
 from neusee.workflows.observation import kernel_layer
 from neusee.workflows.observation.observed_call import observed
 from neusee.workflows.observation.shared_generators import SharedGenerators
@@ -46,6 +48,13 @@ def node(seconds: float) -> Callable[[], object]:
     return compute
 
 
+def apart(compute: Callable[[], object]) -> object:
+    """Return what a function computes in a process of its own."""
+    returned = call_in_fork(partial(observed, compute, COVERED), frozenset())
+    assert returned is not None
+    return returned.value
+
+
 def timed(call: Callable[[], object]) -> float:
     """Return the seconds of a call."""
     began = time.perf_counter()
@@ -53,7 +62,7 @@ def timed(call: Callable[[], object]) -> float:
     return time.perf_counter() - began
 
 
-def quantiles(seconds: list[float]) -> str:
+def quantiles(seconds: Sequence[float]) -> str:
     """Return median and 95 % quantile in ms, with the interquartile range of the first."""
     low, middle, high, most = np.percentile(np.array(seconds) * 1e3, [25, 50, 75, 95])
     return f"p50 {middle:.2f} [{low:.2f}, {high:.2f}] p95 {most:.2f}"
@@ -95,18 +104,20 @@ def main(calls: int) -> None:
     torch.set_num_threads(1)
     observed(int, COVERED)  # starts the process that answers
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}")
-    for seconds in (0.0, 1e-3, 1e-2, 1e-1):
+    print(f"this process holds {process_memory() / 1e6:.0f} MB")
+    for seconds in (0.0, 1e-3, 1e-2, 1e-1, 1.0):
         compute = node(seconds) if seconds else int
-        pairs = [
-            (timed(compute), timed(partial(observed, compute, COVERED)))
-            for _ in range(calls if seconds < 0.05 else calls // 4)
-        ]
-        plain, seen = ([pair[which] for pair in pairs] for which in (0, 1))
-        more = [late - early for early, late in pairs]
-        within = np.mean([each <= max(AIM, SHARE * early) for each, (early, _) in zip(more, pairs, strict=True)])
-        ratio = np.median(seen) / max(float(np.median(plain)), 1e-9)
-        print(f"{seconds * 1e3:3.0f} ms: plain {quantiles(plain)}, observed {quantiles(seen)} ms")
-        print(f"        more {quantiles(more)} ms; ratio of medians {ratio:.2f}; {within:.0%} within the aim")
+        ways = (compute, partial(observed, compute, COVERED), partial(apart, compute))
+        turns = [[timed(way) for way in ways] for _ in range(calls // (1 if seconds < 0.05 else round(40 * seconds)))]
+        plain, *others = zip(*turns, strict=True)
+        print(f"{seconds * 1e3:3.0f} ms: plain {quantiles(plain)} ms")
+        for name, seen in zip(("observed", "observed in a process of its own"), others, strict=True):
+            more = [late - early for late, early in zip(seen, plain, strict=True)]
+            within = np.mean([late <= max(AIM, SHARE * early) for late, early in zip(more, plain, strict=True)])
+            ratio = np.median(seen) / max(float(np.median(plain)), 1e-9)
+            print(
+                f"        {name}: more {quantiles(more)} ms; ratio of medians {ratio:.2f}; {within:.0%} within the aim"
+            )
     began = processor_time()
     for _ in range(10 * calls):
         observed(int, COVERED)

@@ -73,5 +73,5 @@ def write_again(answer: Answer, seconds: float) -> Path:
 
 def printed(answer: Answer, page: Path) -> str:
     """Return the text of an answer with the path of its page."""
-    path = json.dumps(str(page), ensure_ascii=False)[1:-1] if answer.as_json else str(page)
+    path = json.dumps(str(page))[1:-1] if answer.as_json else str(page)
     return answer.text.replace(PAGE, path)

@@ -7,9 +7,9 @@ import itertools
 import shlex
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import replace
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO, cast
 
 import typer
 
@@ -118,9 +118,26 @@ def failing(*errors: type[Exception], code: int = BAD, before: str = "") -> Iter
         fail(f"{before}{error.args[0] if isinstance(error, LookupError) else error}", code)
 
 
+class _ForResult:
+    """In place of stdout while it is kept for the result: a stream that writes to stderr."""
+
+    def __init__(self, result: TextIO) -> None:
+        self.result = result
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(sys.stderr, name)
+
+
+def keep_for_result(context: typer.Context) -> None:
+    """Keep stdout for what `say` prints: what own code prints goes to stderr until the command ends."""
+    if not isinstance(sys.stdout, _ForResult):
+        context.with_resource(redirect_stdout(cast(TextIO, _ForResult(sys.stdout))))
+
+
 def say(lines: list[str]) -> None:
     """Print lines to stdout."""
-    print(*lines, sep="\n", flush=True)
+    stream = sys.stdout
+    print(*lines, sep="\n", file=stream.result if isinstance(stream, _ForResult) else stream, flush=True)
 
 
 def say_line(line: str) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing
+from neusee.workflows.cli.command_frame import fail, failing, keep_for_result
 from neusee.workflows.cli.interruption import print_warning
 from neusee.workflows.report.text_table import lasts
 from neusee.workflows.store.byte_sizes import parse_size
@@ -33,8 +33,18 @@ Words = Annotated[
 Debug = Annotated[bool, typer.Option("--debug", help="Show where in the code an error arose.")]
 Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu.")]
 OneDevice = Annotated[str, typer.Option("--device", help="Where to compute: cpu or cuda.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Print only the path of the page.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object, and nothing else.")]
+
+
+def _result_alone(context: typer.Context, value: bool) -> bool:
+    """Print nothing but the result to stdout."""
+    if value:
+        keep_for_result(context)
+    return value
+
+
+_JSON = "Print the result as one JSON object, and nothing else."
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print only the path of the result.", callback=_result_alone)]
+AsJson = Annotated[bool, typer.Option("--json", help=_JSON, callback=_result_alone)]
 Exact = Annotated[bool, typer.Option("--exact", help="Compute every step in full; omit nothing.")]
 _MEMORY = "Limit of the memory of the program, and of each GPU: 6 GB. One call of a library may pass it a little."
 Memory = Annotated[str, typer.Option("--memory", help=_MEMORY)]

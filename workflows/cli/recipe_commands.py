@@ -19,6 +19,7 @@ from neusee.workflows.cli.command_options import (
     Exact,
     Memory,
     Out,
+    Quiet,
     Words,
     check_device,
     check_executor,
@@ -52,7 +53,7 @@ Job = Annotated[
 def run(
     words: Words = None,
     as_json: AsJson = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the report.")] = False,
+    quiet: Quiet = False,
     debug: Debug = False,
     device: Device = "cpu",
     executor: Where = "local",

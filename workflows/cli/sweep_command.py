@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from neusee.workflows.cli.command_frame import fail, refusing, search_for_garbage, split, the_store
-from neusee.workflows.cli.command_options import AsJson, Debug, Device, Out, Words, check_device
+from neusee.workflows.cli.command_options import AsJson, Debug, Device, Out, Quiet, Words, check_device
 from neusee.workflows.cli.interruption import kept_in, resumable
 
 
@@ -28,7 +28,7 @@ def sweep(
     ] = 0,
     netcdf: Annotated[bool, typer.Option("--netcdf", help="Write sweep.nc too (needs neusee[xarray]).")] = False,
     as_json: AsJson = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the table.")] = False,
+    quiet: Quiet = False,
     debug: Debug = False,
     device: Device = "cpu",
     out: Out = Path("runs"),

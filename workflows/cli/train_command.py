@@ -14,7 +14,16 @@ import typer
 
 from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, the_store
 from neusee.workflows.cli.command_list import FAILED
-from neusee.workflows.cli.command_options import AsJson, Debug, Out, ProgressLines, Words, check_device, progress_lines
+from neusee.workflows.cli.command_options import (
+    AsJson,
+    Debug,
+    Out,
+    ProgressLines,
+    Quiet,
+    Words,
+    check_device,
+    progress_lines,
+)
 from neusee.workflows.cli.interruption import kept_training, resumable, say_json
 from neusee.workflows.keys.regular_file import text_of
 
@@ -43,7 +52,7 @@ def train(
     device: Annotated[str, typer.Option("--device", help="Where to train: cpu or cuda.")] = "cpu",
     mesh: Annotated[str, typer.Option("--mesh", help=_MESH)] = "",
     as_json: AsJson = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print only the path of the folder.")] = False,
+    quiet: Quiet = False,
     debug: Debug = False,
     out: Out = Path("runs"),
 ) -> None:

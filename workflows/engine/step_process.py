@@ -156,6 +156,7 @@ def _answer(function: Callable[[], Any], variables: frozenset[str], limit: float
     try:
         ignore_interrupts()
         end_with(os.getppid())
+        _print_as_parent()
         sent = _sent(function, variables, limit)
         code = _write(sent, file)
     finally:
@@ -163,6 +164,12 @@ def _answer(function: Callable[[], Any], variables: frozenset[str], limit: float
             with suppress(Exception):
                 stream.flush()
         os._exit(code)
+
+
+def _print_as_parent() -> None:
+    """Let libraries of C print to stderr where Python does, while stdout is kept for the result of the command."""
+    if sys.stdout is not None and sys.stdout.fileno() == 2:
+        os.dup2(2, 1)
 
 
 def _sent(function: Callable[[], Any], variables: frozenset[str], limit: float | None) -> _Sent:

@@ -18,6 +18,7 @@ from neusee.workflows.observation.recorded_call import Record
 from neusee.workflows.observation.system_calls import Does
 
 _installed: list[bool] = []
+_OF_CODE = (*SOURCES, ".pyc", ".so", ".pyd", ".zip", ".egg")  #: files that an import looks for
 
 
 def listen() -> None:
@@ -32,6 +33,8 @@ def _heard(event: str, arguments: tuple[Any, ...]) -> None:
         return
     if event in _FOR_BOTH and not watch.trusted():
         _FOR_BOTH[event](watch, arguments)
+    if event == "open" and watch.trusted():
+        _settings(watch, arguments)
     if event == "subprocess.Popen":
         _program(watch, arguments)
     elif event in _HANDLERS and not watch.kernel and not watch.trusted():
@@ -78,6 +81,19 @@ def _source(watch: Watch, arguments: tuple[Any, ...]) -> None:
         frame = sys._getframe(2)
         with _unwatched(watch):
             watch.heard(os.path.realpath(os.fsdecode(path)), quotes_source(frame))
+
+
+def _settings(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    """Take note of a file that an installed package reads while it is imported, such as settings in the home folder.
+
+    Its code, its tables and caches are installed: the judgement leaves them out.
+    """
+    path, _, flags = arguments
+    if isinstance(path, int) or flags & (os.O_CREAT | os.O_TRUNC) or os.fsdecode(path).endswith(_OF_CODE):
+        return
+    real = os.path.realpath(os.fsdecode(path))
+    if os.path.isfile(real):
+        watch.settings.add(real)
 
 
 def _copied(watch: Watch, arguments: tuple[Any, ...]) -> None:

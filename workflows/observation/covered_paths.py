@@ -80,10 +80,18 @@ def is_of_neusee(path: str) -> bool:
     return _is_below(path, _neusee())
 
 
+def _cache() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+
+
+def is_cached(path: str) -> bool:
+    """Return True for a file in the folder in which libraries keep what they can make anew, such as a list of fonts."""
+    return _is_below(path, _real([_cache()]))
+
+
 def caches() -> tuple[str, ...]:
     """Return the folders of code that libraries compile for this machine, and that no result depends on."""
-    home = Path.home()
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache")
+    home, cache = Path.home(), _cache()
     named = [os.environ[name] for name in ("CUDA_CACHE_PATH", "TRITON_CACHE_DIR") if os.environ.get(name)]
     # the first is `folder` of neusee.nodes._cpp_library
     return _real([cache / "neusee" / "build", cache / "torch" / "kernels", home / ".nv", home / ".triton", *named])

@@ -29,6 +29,7 @@ class Watch:
         self.generators: list[Seedable] = []  #: that were made before their seed, if any, was known
         self.bodies: dict[str, str] = {}  #: file of each module of the user that was executed, by name
         self.quiet: dict[str, bool] = {}  #: files, and whether all who asked for their source or marks need no record
+        self.settings: set[str] = set()  #: files that installed packages read while they were imported
         self.temporary: set[str] = set()  #: files and folders with names that chance gave
         self._threads: set[threading.Thread] = set()
         self._local = threading.local()

@@ -38,7 +38,8 @@ class StepThread(Generic[T]):
         self._error: BaseException | None = None
         self.unprepared: Exception | None = None  #: the error of ``prepare``; the function did not run
         self._ended = False
-        self._end = threading.Lock()
+        self._begin, self._end = threading.Lock(), threading.Lock()
+        self._begin.acquire()
         self._end.acquire()
         self.thread = threading.Thread(target=self._keep, name="neusee step", daemon=True)
 
@@ -49,7 +50,10 @@ class StepThread(Generic[T]):
         to end, any other one does: the memory of a step that was stopped must be free.
         """
         try:
-            self.thread.start()
+            try:
+                self.thread.start()
+            finally:  # the step waits for it: an exception in the middle of `Thread.start` would leave half a thread
+                self._begin.release()
             self._join()
         except KeyboardInterrupt:
             self._stop(KeyboardInterrupt)
@@ -78,6 +82,7 @@ class StepThread(Generic[T]):
             _raise_in(ctypes.c_ulong(self.thread.ident), ctypes.py_object(kind))
 
     def _keep(self) -> None:
+        self._begin.acquire()
         try:
             if self._is_prepared():
                 self._value = self._context.run(self._in_modes)

@@ -8,8 +8,11 @@ from typing import Any
 
 
 def json_line(document: dict[str, Any]) -> str:
-    """Return the result of a command as one JSON object on one line; a number that is not finite is null."""
-    return json.dumps(_finite(document), ensure_ascii=False, default=str, allow_nan=False)
+    """Return the result of a command as one JSON object on one line of ASCII, which each terminal can show.
+
+    A number that is not finite is null.
+    """
+    return json.dumps(_finite(document), default=str, allow_nan=False)
 
 
 def _finite(value: Any) -> Any:

@@ -36,6 +36,37 @@ def test_an_installed_package_that_is_imported_late_is_none(module, taints, laye
     assert taints(lambda: importlib.import_module(module)) == []
 
 
+@pytest.fixture
+def configured(tmp_path, monkeypatch):
+    """An installed library that reads its settings, a cache and a table of its own while it is imported."""
+    site, settings, cache = tmp_path / "site", tmp_path / "settings.cfg", tmp_path / "cache" / "fonts.json"
+    (site / "configured_library-1.0.dist-info").mkdir(parents=True)
+    (site / "own_table.txt").write_text("1")
+    cache.parent.mkdir()
+    cache.write_text("2")
+    code = "import pathlib\nhere = pathlib.Path(__file__)\ntable = (here.parent / 'own_table.txt').read_text()\n"
+    code += f"fonts = pathlib.Path({str(cache)!r}).read_text()\nsettings = pathlib.Path({str(settings)!r})\n"
+    code += "gain = settings.read_text() if settings.exists() else '0'\n"
+    (site / "configured_library.py").write_text(code)
+    monkeypatch.syspath_prepend(site)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    yield settings
+    sys.modules.pop("configured_library", None)
+
+
+def test_settings_that_a_library_reads_when_it_is_imported_are_found(configured, taints, layer):
+    assert taints(lambda: importlib.import_module("configured_library").gain) == []  # there are none
+    del sys.modules["configured_library"]
+    configured.write_text("5")
+    assert taints(lambda: importlib.import_module("configured_library").gain) == [("file", "settings.cfg")]
+
+
+def test_declared_settings_of_a_library_are_none(configured, taints, layer):
+    configured.write_text("5")
+    found = taints(lambda: importlib.import_module("configured_library").gain, configured)
+    assert found == []
+
+
 def test_a_package_that_is_not_installed_is_none(taints, layer):
     def step():
         with pytest.raises(ModuleNotFoundError):
