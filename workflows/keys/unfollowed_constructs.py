@@ -31,8 +31,6 @@ _DRAWING = (
 )
 _TIMES = ("time", "perf_counter", "monotonic", "process_time", "thread_time")
 
-_LEGACY = ("rand", "randn", "randint", "random", "normal", "uniform", "choice", "permutation", "shuffle", "poisson")
-
 #: What the names of Python and of libraries do, by their first parts.
 _NAMES: Mapping[str, tuple[str, str]] = {
     **dict.fromkeys(("os.environ", "os.environb", "os.getenv", "os.getenvb", "os.path.expandvars"), ("env", _VARIABLE)),
@@ -49,7 +47,7 @@ _NAMES: Mapping[str, tuple[str, str]] = {
     **dict.fromkeys(("torch.ops.load_library", "torch.classes.load_library", "torch.hub"), ("run", _RUN)),
     **dict.fromkeys(("importlib.resources", "pkgutil.get_data", "__file__", "__spec__", "__loader__"), ("file", _FILE)),
     **dict.fromkeys(("inspect.getsource", "inspect.getsourcelines", "inspect.getfile", "linecache"), ("file", _FILE)),
-    **dict.fromkeys(("sqlite3", "urllib", "http", "requests", "httpx", "socket", "ftplib"), ("file", _FILE)),
+    **dict.fromkeys(("urllib", "http", "requests", "httpx", "socket", "ftplib"), ("file", _FILE)),
     **dict.fromkeys(("os.getcwd", "pathlib.Path.cwd"), ("file", _FILE)),
     **dict.fromkeys(("pathlib.Path.home", "os.path.expanduser", "sys.path", "sys.argv"), ("state", _CLOCK)),
     **dict.fromkeys(("os.cpu_count", "os.getpid", "os.uname", "platform", "getpass", "uuid"), ("state", _CLOCK)),
@@ -64,11 +62,6 @@ _NAMES: Mapping[str, tuple[str, str]] = {
         ("torch.cuda.is_available", "torch.cuda.device_count", "torch.cuda.get_device_name"), ("state", _CLOCK)
     ),
     **dict.fromkeys(_DRAWING, ("state", _DRAWN)),
-    **{
-        f"numpy.random.{name}": ("state", _DRAWN)
-        for name in ("rand", "randn", "randint", "random", "normal", "uniform")
-    },
-    **{f"numpy.random.{name}": ("state", _DRAWN) for name in _LEGACY},
 }
 _BUILTINS = frozenset({"exec", "eval", "compile", "__import__", "__file__", "__spec__", "__loader__"})
 _METHODS = frozenset(

@@ -39,13 +39,13 @@ def import_observed(name: str) -> ModuleType:
     say_hidden(name, asked)
     found += tuple(taint("variable", each) for each in asked.of_own_code)
     new = [each for each in sys.modules if each not in before and origin_of(each, frozenset()).kind == "source"]
-    taints = tuple(taint for taint in found if not any(declares(each, taint) for each in new))
+    taints = tuple(each for each in found if not any(declares(own, each) for own in new))
     if taints:
         taint_code(new, taints)
-        for taint in taints:
-            reached = f"{WORDS[taint.kind]} {taint.what} when it is imported, which no cache key covers"
+        for each in taints:
+            reached = f"{WORDS[each.kind]} {each.what} when it is imported, which no cache key covers"
             say_once(
-                name, f"{name} {reached}: the results of its nodes are not stored; to have them stored, {taint.fix}"
+                name, f"{name} {reached}: the results of its nodes are not stored; to have them stored, {each.fix}"
             )
     return module
 

@@ -246,6 +246,13 @@ def test_a_default_for_a_file_that_is_not_there_is_found(data, taints, layer):
     assert taints(step) == [("file", "data/missing.csv")]
 
 
+def test_a_text_of_several_lines_that_is_taken_for_a_name_is_none_if_there_is_no_such_file(data, taints, layer):
+    text = data / "x, y\n1, 2\n"
+    assert taints(text.exists) == []
+    text.write_text("there")
+    assert taints(text.read_text) == [("file", "data/x, y\n1, 2\n")]
+
+
 def test_temporary_files_that_are_read_back_are_none(taints, layer):
     def step():
         with tempfile.TemporaryDirectory() as folder:
