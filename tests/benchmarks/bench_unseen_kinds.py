@@ -41,6 +41,7 @@ import unseen_kinds
 from safetensors.numpy import load_file
 from unseen_kinds.case import Case, now
 
+VERDICTS = ("right", "told", "unreached", "stale", "kept", "refused", "unsaved", "no case", "skipped")
 BAD = ("stale", "refused", "unsaved", "no case")
 _ROOT = Path(__file__).parents[2]
 _PLAIN = ("PATH", "HOME", "XDG_CACHE_HOME", "VIRTUAL_ENV", "LANG", "LC_ALL", "USER", "TMPDIR")
@@ -212,9 +213,14 @@ def results(path: Path) -> dict[str, dict[str, object]]:
 
 
 def table(found: dict[str, dict[str, object]]) -> str:
-    """Return how often each verdict was reached, and the bad cases with what was said."""
-    counts = Counter(str(line["verdict"]) for line in found.values())
-    lines = ["| verdict | cases |", "|---|---|", *(f"| {verdict} | {counts[verdict]} |" for verdict in sorted(counts))]
+    """Return how often each verdict was reached in each family, and the bad cases with what was said."""
+    counts = Counter((name.partition(".")[0], str(line["verdict"])) for name, line in found.items())
+    verdicts = [each for each in VERDICTS if any(verdict == each for _, verdict in counts)]
+    lines = [f"| family | {' | '.join(verdicts)} |", f"|---{'|---' * len(verdicts)}|"]
+    for family in sorted({family for family, _ in counts}):
+        lines.append(f"| {family} | {' | '.join(str(counts[family, each] or '') for each in verdicts)} |")
+    sums = [sum(count for (_, verdict), count in counts.items() if verdict == each) for each in verdicts]
+    lines.append(f"| all {sum(sums)} | {' | '.join(map(str, sums))} |")
     for name, line in found.items():
         if line["verdict"] in BAD:
             words = str(line.get("words", "")).replace("\n", " ")[-300:]
