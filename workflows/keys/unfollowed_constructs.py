@@ -34,6 +34,7 @@ _TIMES = ("time", "perf_counter", "monotonic", "process_time", "thread_time")
 #: What the names of Python and of libraries do, by their first parts.
 _NAMES: Mapping[str, tuple[str, str]] = {
     **dict.fromkeys(("os.environ", "os.environb", "os.getenv", "os.getenvb", "os.path.expandvars"), ("env", _VARIABLE)),
+    **dict.fromkeys(("posix.environ", "nt.environ"), ("env", _VARIABLE)),
     **dict.fromkeys(("importlib.import_module", "__import__", "importlib.__import__", "runpy"), ("import", _BY_NAME)),
     **dict.fromkeys(("sys.modules", "importlib.util", "importlib.machinery"), ("import", _BY_NAME)),
     **dict.fromkeys(("pkgutil.iter_modules", "pkgutil.walk_packages", "importlib.metadata"), ("import", _BY_NAME)),

@@ -19,6 +19,7 @@ from neusee.workflows.observation import python_watch
 from neusee.workflows.observation.covered_paths import is_installed, is_of_neusee
 from neusee.workflows.observation.known_variables import OF_WINDOWS, is_known
 
+ALL = "(all of them)"  #: in place of a name, where code asks for all variables
 _IMPORT = "<frozen importlib"  #: begins the name of the file of Python's own import
 
 
@@ -43,11 +44,18 @@ class _Shown(dict[bytes, bytes]):
         who, text = _who_asks(), os.fsdecode(name)
         if who == "library" and name in self.hidden and text not in OF_WINDOWS:
             self._asked.of_libraries[text] = None
-        if who == "own" and not is_shown(text, self._declared):
+        if who == "own" and not is_shown(text, self._declared) and ALL not in self._asked.of_own_code:
             self._asked.of_own_code[text] = None
         if who == "library" or name not in self.hidden:
             raise KeyError(name)
         return self.hidden[name]
+
+    def __iter__(self) -> Iterator[bytes]:
+        """Yield the names of all variables to own code and to neusee, and of those that are not hidden to a library."""
+        who = _who_asks()
+        if who == "own":
+            self._asked.of_own_code[ALL] = None
+        return iter([*self.keys(), *(() if who == "library" else self.hidden)])
 
 
 def is_shown(name: str, declared: frozenset[str]) -> bool:

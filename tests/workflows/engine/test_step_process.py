@@ -212,3 +212,10 @@ def test_own_code_finds_each_variable_and_is_noted(monkeypatch):
     returned = call_in_fork(lambda: (os.environ["ASKED_FOR"], os.getenv("NEVER_SET"), os.getenv("HOME")), NONE)
     assert returned.value[:2] == ("5", None)
     assert [*returned.asked.of_own_code] == ["ASKED_FOR", "NEVER_SET"]
+
+
+def test_own_code_that_asks_for_all_variables_finds_them_and_is_noted_once(monkeypatch):
+    monkeypatch.setenv("ASKED_FOR", "5")
+    returned = call_in_fork(lambda: {**os.environ}["ASKED_FOR"] + str(len(os.environ.copy())), NONE)
+    assert returned.value == "5" + str(len(os.environ))
+    assert [*returned.asked.of_own_code] == ["(all of them)"]
