@@ -43,6 +43,7 @@ from unseen_kinds.case import Case, now
 
 VERDICTS = ("right", "told", "unreached", "stale", "kept", "refused", "unsaved", "no case", "skipped")
 BAD = ("stale", "refused", "unsaved", "no case")
+OF_NEUSEE = ("cache key", "not stored", "no other step")  #: in each of its own warnings, and in none of a library
 _ROOT = Path(__file__).parents[2]
 _PLAIN = ("PATH", "HOME", "XDG_CACHE_HOME", "VIRTUAL_ENV", "LANG", "LC_ALL", "USER", "TMPDIR")
 _SHOWN = 400  #: of an output, this many numbers are compared and written down
@@ -164,7 +165,8 @@ def judged(case: Case, place: Place) -> dict[str, object]:
     words = "\n".join(dict.fromkeys([first.words, second.words])).strip()
     if case.honest:
         cached = set(second.states.values()) <= {"cached", "not needed"}
-        return {"verdict": "kept" if cached and not words else "unsaved", "words": words, "states": second.states}
+        warned = any(each in words for each in OF_NEUSEE)
+        return {"verdict": "kept" if cached and not warned else "unsaved", "words": words, "states": second.states}
     truth = second
     if set(second.states.values()) != {"run"}:
         truth = call(case, place, 2, cache.with_suffix(".empty"))
