@@ -62,6 +62,7 @@ NO_SIZE = {
     "workflows/answers/stored_results.py:_digest_by": DIGEST,
     "workflows/answers/witnesses.py:file_digest": DIGEST,
     "workflows/calibration/emcee_sampler.py:_write": OWN,
+    "workflows/engine/step_process.py:_called": "a file in memory that the fork of this function has just written",
     "workflows/calibration/emcee_sampler.py:_write_draws": WRITTEN,
     "workflows/cli/catalogue.py:_uses": PACKAGED,
     "workflows/cli/catalogue.py:glossary_lines": PACKAGED,

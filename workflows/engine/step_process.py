@@ -73,10 +73,10 @@ def call_in_fork(function: Callable[[], T], variables: frozenset[str]) -> Return
 def _called(function: Callable[[], T], variables: frozenset[str]) -> Returned[T] | None:
     limit = limit_now()
     with open(os.memfd_create("neusee step"), "rb") as file, watched_in_fork() as begin_watch:
-        child = _forked()
+        parent, child = os.getpid(), _forked()
         if not child:
             begin_watch()
-            _answer(function, variables, limit, file.fileno())
+            _answer(function, variables, limit, file.fileno(), parent)
         code = _waited(child)
         if code == _UNSENT:
             return None
@@ -150,15 +150,16 @@ def _reason(code: int) -> str:
 # --- in the fork ------------------------------------------------------------------------------------------------------
 
 
-def _answer(function: Callable[[], Any], variables: frozenset[str], limit: float | None, file: int) -> None:
+def _answer(
+    function: Callable[[], Any], variables: frozenset[str], limit: float | None, file: int, parent: int
+) -> None:
     """Call the function, write what it gives to a file, and end this process."""
     code = 1
     try:
         ignore_interrupts()
-        end_with(os.getppid())
-        _print_as_parent()
-        sent = _sent(function, variables, limit)
-        code = _write(sent, file)
+        if end_with(parent):
+            _print_as_parent()
+            code = _write(_sent(function, variables, limit), file)
     finally:
         for stream in (sys.stdout, sys.stderr):
             with suppress(Exception):

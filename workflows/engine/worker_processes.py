@@ -59,13 +59,12 @@ def workers_for(pieces: int, asked: int = 0) -> int:
     return max(1, min(pieces, asked or (free_processors() or 1 if is_alone() else 1)))
 
 
-def end_with(parent: int) -> None:
-    """Let this fork end when the process that forked it ends, also after ``kill -9``; ``parent`` is that process."""
+def end_with(parent: int) -> bool:
+    """Let this fork end when the process that forked it, ``parent``, ends, also after ``kill -9``; False if it did."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_PARENT_DIES, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
+    return os.getppid() == parent
 
 
 def shared(
@@ -186,7 +185,8 @@ def _serve(pipe: Connection, others: Sequence[Connection], work: Callable[[int],
     for other in others:
         other.close()  # else the pipes of a killed process stay open
     ignore_interrupts()
-    end_with(parent)
+    if not end_with(parent):
+        return
     torch.set_num_threads(1)  # the threads of the parent are not in a fork of it
     with suppress(EOFError, OSError):
         while True:

@@ -15,6 +15,7 @@ from types import ModuleType
 from neusee.workflows.keys.declared_dependencies import FREE
 from neusee.workflows.keys.loaded_source import say_once
 from neusee.workflows.keys.module_origin import origin_of
+from neusee.workflows.keys.regular_file import bytes_of
 from neusee.workflows.keys.tainted_code import taint_code
 from neusee.workflows.observation.hidden_variables import Asked, hidden_while_importing
 from neusee.workflows.observation.observed_call import observed_import
@@ -67,7 +68,8 @@ def _declared_variables(name: str) -> frozenset[str]:
         return frozenset()
     folder = Path(spec.origin).parent
     sources = folder.rglob("*.py") if spec.submodule_search_locations else folder.glob("*.py")
-    return frozenset(each.decode() for source in sources for each in _VARIABLE.findall(source.read_bytes()))
+    texts = [bytes_of(source) for source in sources if source.is_file()]
+    return frozenset(each.decode() for text in texts for each in _VARIABLE.findall(text))
 
 
 def declares(module: str, taint: Taint) -> bool:
