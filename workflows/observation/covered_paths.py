@@ -15,6 +15,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import neusee.nodes
+from neusee.workflows.keys.regular_file import bytes_of
 
 #: folders and files of the system that a library reads on its own, with the reason why no result depends on them
 SYSTEM = {
@@ -84,9 +85,18 @@ def _cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
 
-def is_cached(path: str) -> bool:
-    """Return True for a file in the folder in which libraries keep what they can make anew, such as a list of fonts."""
-    return _is_below(path, _real([_cache()]))
+def decides(path: str) -> bool:
+    """Return True for a file of settings that may decide what a library does when it is imported.
+
+    Not in the folder of caches, where libraries keep what they can make anew, such as a list of fonts, and not if all
+    of its lines are empty or comments, as in those that dask writes for its user.
+    """
+    if _is_below(path, _real([_cache()])):
+        return False
+    try:
+        return any(line.strip() and not line.lstrip().startswith(b"#") for line in bytes_of(path).splitlines())
+    except OSError:
+        return True
 
 
 def caches() -> tuple[str, ...]:

@@ -120,8 +120,6 @@ class Judgement:
             self.add("attribute", record.path)
 
     def _check(self, record: Record) -> None:
-        if "\n" in record.path and not os.path.lexists(record.path):
-            return  # a text of several lines, of which a library asks whether it is the name of a file
         if not (record.path in self._folders or self._is_covered(record.path) or is_searched_program(record.path)):
             self._looks[record.path] = None
 
@@ -173,6 +171,8 @@ class Judgement:
             self.add("file", path)
 
     def _is_covered(self, path: str) -> bool:
+        if "\n" in path and not os.path.lexists(path):
+            return True  # a text of several lines, of which a library asks whether it is the name of a file
         return self._is_covered_as_a_whole(path) or self._is_source(path)
 
     def _is_covered_as_a_whole(self, path: str) -> bool:

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from neusee.workflows.observation import audit_events, kernel_layer, python_watch
 from neusee.workflows.observation.asked_chance import WatchedChance
-from neusee.workflows.observation.covered_paths import is_cached
+from neusee.workflows.observation.covered_paths import decides
 from neusee.workflows.observation.judgement import Judgement
 from neusee.workflows.observation.legacy_numpy import WatchedLegacyGenerators
 from neusee.workflows.observation.notification_client import NoServer, NotificationClient
@@ -134,7 +134,7 @@ def _judged(watch: Watch, covered: Covered, records: list[Record]) -> tuple[Tain
     judgement = Judgement(covered, watch.bodies, quiet, watch.temporary)
     # where Python knows which source of chance was asked, what the kernel says of it is the same once more
     judgement.judge(record for record in records if record.does != "entropy" or not chance)
-    judgement.judge(Record("input", path) for path in sorted(watch.settings) if not is_cached(path))
+    judgement.judge(Record("input", path) for path in sorted(watch.settings) if decides(path))
     judgement.judge_modules()
     for source in sorted(chance):
         judgement.add("random", source)

@@ -249,6 +249,12 @@ def test_a_default_for_a_file_that_is_not_there_is_found(data, taints, layer):
 def test_a_text_of_several_lines_that_is_taken_for_a_name_is_none_if_there_is_no_such_file(data, taints, layer):
     text = data / "x, y\n1, 2\n"
     assert taints(text.exists) == []
+
+    def opened():
+        with pytest.raises(FileNotFoundError):
+            text.read_text()
+
+    assert taints(opened) == []
     text.write_text("there")
     assert taints(text.read_text) == [("file", "data/x, y\n1, 2\n")]
 

@@ -57,7 +57,10 @@ def configured(tmp_path, monkeypatch):
 def test_settings_that_a_library_reads_when_it_is_imported_are_found(configured, taints, layer):
     assert taints(lambda: importlib.import_module("configured_library").gain) == []  # there are none
     del sys.modules["configured_library"]
-    configured.write_text("5")
+    configured.write_text("# gain: 5\n\n  # no more\n")
+    assert taints(lambda: importlib.import_module("configured_library").gain) == []
+    del sys.modules["configured_library"]
+    configured.write_text("# gain\n5")
     assert taints(lambda: importlib.import_module("configured_library").gain) == [("file", "settings.cfg")]
 
 

@@ -46,7 +46,6 @@ TENTH = [
 ]
 GOOD = {"right", "told", "unreached", "kept", "skipped"}
 KNOWN = {
-    "honest.astropy_table": "astropy asks whether the text of a table is the name of a file",
     "honest.linear_of_module": "the first weights of a layer of the module are drawn, though they are set afterwards",
 }
 
