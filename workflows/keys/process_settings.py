@@ -54,6 +54,7 @@ def own_settings(reads_time: bool) -> dict[str, str]:
     With ``reads_time`` the code may read the time zone.
     """
     now = {"floating-point errors": _errors(), "printed numbers": _printing(), "encoding of texts": _encoding()}
+    now["code at the start of Python"] = _code_at_start()
     if reads_time:
         now["time zone"] = _time_zone()
     return {name: value for name, value in now.items() if value != USUAL[name]}
@@ -78,6 +79,15 @@ def _printing() -> str:
 def _encoding() -> str:
     """Return the encoding of a text file that is opened without one."""
     return codecs.lookup(locale.getpreferredencoding(False)).name
+
+
+def _code_at_start() -> str:
+    """Return a digest of the modules with which a user or a system changes Python when it starts."""
+    files = [getattr(sys.modules.get(name), "__file__", None) for name in ("sitecustomize", "usercustomize")]
+    texts = [Path(file).read_bytes() for file in files if file is not None and Path(file).is_file()]
+    if not texts:
+        return OWN_USUAL["code at the start of Python"]
+    return hashlib.blake2b(b"\0".join(texts), digest_size=4).hexdigest()
 
 
 def _time_zone() -> str:

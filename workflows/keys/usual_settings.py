@@ -8,6 +8,7 @@ OWN_USUAL = {
     "printed numbers": "as NumPy prints",
     "encoding of texts": "utf-8",
     "time zone": "UTC",
+    "code at the start of Python": "none",
 }
 #: settings of a new process
 USUAL = {

@@ -53,7 +53,7 @@ SYSTEM = {
 
 #: files in the folders above that give chance
 CHANCE = ("/dev/random", "/dev/urandom", "/dev/hwrng", "/proc/sys/kernel/random")
-_OF_PYTHON = ("lib", "lib64", "bin", "include", "share", "ssl", "etc", "conda-meta", "DLLs", "Library", "pyvenv.cfg")
+_OF_PYTHON = ("lib", "lib64", "bin", "include", "share", "ssl", "conda-meta", "DLLs", "Library", "pyvenv.cfg")
 
 
 @functools.cache

@@ -150,8 +150,14 @@ def _changed_others(own: OwnCode, before: dict[str, dict[str, Any]]) -> Iterator
         then = before.get(place, now)
         for name in dict.fromkeys([*then, *now]):
             new, old = now.get(name, _ABSENT), then.get(name, _ABSENT)
-            if not (isinstance(new, ModuleType) or _is_alike(new, old)):
+            lazy = old is _ABSENT and _is_of_package(new, place)
+            if not (isinstance(new, ModuleType) or lazy or _is_alike(new, old)):
                 yield f"{place}.{name}".rstrip(".")
+
+
+def _is_of_package(value: Any, place: str) -> bool:
+    """Return True for a function or a class of the package itself, which it imports when it is first asked for."""
+    return str(getattr(value, "__module__", "")).partition(".")[0] == place.partition(".")[0]
 
 
 def _is_alike(one: Any, other: Any) -> bool:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,13 @@ from neusee.workflows.recipe.node_families import import_own
 ROOT = Path(__file__).parents[3]
 HEAD = "import torch\nfrom neusee.nodes import node\n"
 NODE = HEAD + "{before}\n\n@node()\ndef {name}(*, k: float = 1.0):\n    return {result}\n"
+
+
+@pytest.fixture(autouse=True)
+def plain_start(monkeypatch):
+    """As if nothing had changed Python when it started."""
+    for name in ("sitecustomize", "usercustomize"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
 
 
 @pytest.fixture
@@ -69,6 +77,19 @@ def test_how_numbers_are_printed_counts(own):
         assert own() != usual
     with np.printoptions(legacy="1.13"):
         assert "legacy" not in str(own_settings(False))
+
+
+@pytest.mark.parametrize("name", ["sitecustomize", "usercustomize"])
+def test_code_that_runs_when_python_starts_counts_by_its_text(name, own, tmp_path, monkeypatch):
+    usual, file = own(), tmp_path / f"{name}.py"
+    monkeypatch.setitem(sys.modules, name, SimpleNamespace(__file__=str(file)))
+    assert own_settings(False) == {}
+    file.write_text("import numpy")
+    first = own()
+    assert own_settings(False).keys() == {"code at the start of Python"}
+    assert first != usual
+    file.write_text("import numpy\nnumpy.pi = 3")
+    assert own() != first
 
 
 def test_the_encoding_of_texts_counts(own, monkeypatch):

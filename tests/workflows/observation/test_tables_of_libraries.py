@@ -2,7 +2,7 @@
 
 from types import SimpleNamespace
 
-from neusee.workflows.observation.left_state import _attributes
+from neusee.workflows.observation.left_state import _attributes, _is_of_package
 
 
 class Table:
@@ -26,3 +26,11 @@ def test_the_tables_of_a_module_are_its_attributes_alone():
     table = SimpleNamespace(names={"D65": 6504.0})
     assert _attributes(table).keys() == {"names", "names['D65']"}
     assert not [name for name in _attributes(Table) if "[" in name]
+
+
+def test_what_a_package_imports_of_itself_at_the_first_use_is_no_change():
+    from decimal import Decimal
+
+    assert _is_of_package(Decimal.from_float, "decimal") is False  # a bound method has no module of the package
+    assert _is_of_package(Decimal, "decimal")
+    assert not _is_of_package(lambda: 1, "decimal")
