@@ -8,13 +8,13 @@ inputs at hand, sends the value back, and ends. The next step, of the user or of
 from __future__ import annotations
 
 import os
-import pickle
 import select
 import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
@@ -61,7 +61,7 @@ def may_fork() -> bool:
 
 
 def call_in_fork(function: Callable[[], T], variables: frozenset[str]) -> Returned[T] | None:
-    """Return what a function gives in a fork of this process; None if its value cannot be sent.
+    """Return what a function gives in a fork of this process; None if its value cannot be sent, or nothing is forked.
 
     ``variables`` are those of the environment that the code declares. Raises what the function raises, with its text
     and without its traceback, and `ProcessEnded`.
@@ -71,12 +71,14 @@ def call_in_fork(function: Callable[[], T], variables: frozenset[str]) -> Return
 
 
 def _called(function: Callable[[], T], variables: frozenset[str]) -> Returned[T] | None:
-    limit = limit_now()
+    limit, parent = limit_now(), os.getpid()
     with open(os.memfd_create("neusee step"), "rb") as file, watched_in_fork() as begin_watch:
-        parent, child = os.getpid(), _forked()
+        try:
+            child = _forked()
+        except OSError:  # no memory or no permission for one more process
+            return None
         if not child:
-            begin_watch()
-            _answer(function, variables, limit, file.fileno(), parent)
+            _answer(begin_watch, partial(_sent, function, variables, limit), file.fileno(), parent)
         code = _waited(child)
         if code == _UNSENT:
             return None
@@ -150,16 +152,15 @@ def _reason(code: int) -> str:
 # --- in the fork ------------------------------------------------------------------------------------------------------
 
 
-def _answer(
-    function: Callable[[], Any], variables: frozenset[str], limit: float | None, file: int, parent: int
-) -> None:
-    """Call the function, write what it gives to a file, and end this process."""
+def _answer(begin_watch: Callable[[], None], work: Callable[[], _Sent], file: int, parent: int) -> None:
+    """Do the work, write what it gives to a file, and end this process, whatever happens."""
     code = 1
     try:
         ignore_interrupts()
         if end_with(parent):
+            begin_watch()
             _print_as_parent()
-            code = _write(_sent(function, variables, limit), file)
+            code = _write(work(), file)
     finally:
         for stream in (sys.stdout, sys.stderr):
             with suppress(Exception):
@@ -201,7 +202,7 @@ def _write(sent: _Sent, file: int) -> int:
     try:
         with open(file, "wb", closefd=False) as binary:
             torch.save(sent._replace(said=plain), binary)
-    except (pickle.PicklingError, TypeError, AttributeError):
+    except Exception:  # of the class of any value: it cannot be pickled, or does not fit into memory once more
         return _UNSENT
     return 0
 

@@ -112,6 +112,14 @@ def test_value_that_cannot_be_sent_is_left_to_the_caller():
     assert call_in_fork(lambda: lambda: 1, NONE) is None
 
 
+def test_without_another_process_the_caller_computes(monkeypatch):
+    def refuse():
+        raise BlockingIOError("no more processes")
+
+    monkeypatch.setattr(os, "fork", refuse)
+    assert call_in_fork(lambda: 1, NONE) is None
+
+
 def test_exception_in_the_waiting_thread_ends_the_process(tmp_path):
     told, here = tmp_path / "pid", threading.get_ident()
 
