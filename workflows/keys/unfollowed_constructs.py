@@ -50,7 +50,9 @@ _NAMES: Mapping[str, tuple[str, str]] = {
     **dict.fromkeys(("inspect.getsource", "inspect.getsourcelines", "inspect.getfile", "linecache"), ("file", _FILE)),
     **dict.fromkeys(("urllib", "http", "requests", "httpx", "socket", "ftplib"), ("file", _FILE)),
     **dict.fromkeys(("os.getcwd", "pathlib.Path.cwd"), ("file", _FILE)),
-    **dict.fromkeys(("pathlib.Path.home", "os.path.expanduser", "sys.path", "sys.argv"), ("state", _CLOCK)),
+    **dict.fromkeys(
+        ("pathlib.Path.home", "os.path.expanduser", "sys.path", "sys.argv", "sys.orig_argv"), ("state", _CLOCK)
+    ),
     **dict.fromkeys(("os.cpu_count", "os.getpid", "os.uname", "platform", "getpass", "uuid"), ("state", _CLOCK)),
     **{f"time.{name}{unit}": ("state", _CLOCK) for name in _TIMES for unit in ("", "_ns")},
     **{f"time.{name}": ("state", _CLOCK) for name in ("localtime", "gmtime", "strftime", "ctime", "asctime")},
