@@ -388,7 +388,7 @@ REFUSED = {
         {ONE: source("part.rng.seed()", FROM), TWO: "import torch\n\n\nclass part:\n    rng = torch.Generator()\n"},
         r"_two\.py: part is or holds a Generator, ",
     ),
-    "numbers without a seed": ({ONE: source("np.random.rand()", "import numpy as np")}, "numpy.random.rand: random"),
+    "numbers without a seed": ({ONE: source("random.random()", "import random")}, "random.random: random"),
     "declared file that is missing": ({ONE: source("k", depends="depends=['no.csv']")}, "depends='no.csv' is no file"),
     "declared text that is no list": ({ONE: source("k", "__depends__ = 3")},
         "__depends__ must be a tuple of texts"),
