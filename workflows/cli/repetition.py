@@ -38,7 +38,9 @@ def say_and_keep(text: str, recipe: Recipe, store: Store | None = None, memory: 
 
     ``store``: the store on which the answer rests. ``memory``: bytes that must be free, without which it would differ.
     """
-    print(text, flush=True)
+    from neusee.workflows.cli.command_frame import say_line  # imports typer, which a stored answer does not need
+
+    say_line(text)
     for command in repeated_command.running:
         command.keep(text, False, recipe, Said(store, memory) if store else None)
 

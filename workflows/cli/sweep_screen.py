@@ -10,6 +10,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neusee.workflows.cli.command_frame import say_line
 from neusee.workflows.cli.command_list import DONE, FAILED, INTERRUPTED
 from neusee.workflows.cli.interruption import say_json
 from neusee.workflows.report.console import Mode, ProgressTable, mode_for
@@ -69,7 +70,7 @@ def run_sweep(
         if as_json:
             say_json(_document(result, path, again))
         else:
-            print(path / "sweep.csv", flush=True)
+            say_line(str(path / "sweep.csv"))
     else:
         print(*_closing(result, path, again, time.perf_counter() - began, work.store.failure), sep="\n", flush=True)
     return INTERRUPTED if state == "interrupted" else FAILED if result.failed else DONE

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from neusee.nodes.exact_convolution import tf32_setting
+from neusee.workflows.keys.regular_file import bytes_of
 from neusee.workflows.keys.usual_settings import OWN_USUAL, USUAL
 
 _KINDS, _is_cast = ("cpu", "cuda"), torch.is_autocast_enabled
@@ -84,7 +85,7 @@ def _encoding() -> str:
 def _code_at_start() -> str:
     """Return a digest of the modules with which a user or a system changes Python when it starts."""
     files = [getattr(sys.modules.get(name), "__file__", None) for name in ("sitecustomize", "usercustomize")]
-    texts = [Path(file).read_bytes() for file in files if file is not None and Path(file).is_file()]
+    texts = [bytes_of(file) for file in files if file is not None and Path(file).is_file()]
     if not texts:
         return OWN_USUAL["code at the start of Python"]
     return hashlib.blake2b(b"\0".join(texts), digest_size=4).hexdigest()
