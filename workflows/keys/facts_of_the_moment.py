@@ -23,6 +23,7 @@ _LAST = frozenset(
         *("now", "utcnow", "today", "formatdate", "default_timer", "Timer", "timeit", "relativeCreated"),
         *("data_ptr", "get_native_id", "native_id", "sched_getaffinity", "process_cpu_count", "getpriority"),
         *("getloadavg", "get_terminal_size", "getswitchinterval", "gettempdir", "gettempdirb"),
+        *("isEnabledFor", "getEffectiveLevel", "makeLogRecord"),
     }
 )
 _FULL = frozenset({"shutil.which", "os.nice", "os.times", "sys.getrefcount", "sys.getsizeof"})

@@ -74,7 +74,9 @@ def _taken(item: ast.AST, scope: Scope) -> list[ast.expr]:
 
 
 def _is_hash(call: ast.Call, scope: Scope) -> bool:
-    """Return True for a call of the builtin ``hash``."""
+    """Return True for a call of the builtin ``hash``, or of the method behind it."""
+    if isinstance(call.func, ast.Attribute) and call.func.attr == "__hash__":
+        return True
     return isinstance(call.func, ast.Name) and call.func.id == "hash" and scope.holder("hash") is None
 
 

@@ -22,6 +22,12 @@ MOMENT = {
     "processors": "import os\ndef f():\n    return len(os.sched_getaffinity(0))",
     "priority": "import os\ndef f():\n    return os.nice(0)",
     "terminal": "import shutil\ndef f():\n    return shutil.get_terminal_size().columns",
+    "folder of temporary files": "import tempfile\ndef f():\n    return len(tempfile.gettempdir())",
+    "level of a log": "import logging\ndef f():\n    return logging.getLogger('lab').isEnabledFor(logging.INFO)",
+    "record of a log": "import logging\ndef f():\n    return logging.makeLogRecord({}).created",
+    "flags": "import sys\ndef f():\n    return sys.flags.dev_mode",
+    "words of the command": "import sys\ndef f():\n    return len(sys.orig_argv)",
+    "variables of the system": "import posix\ndef f():\n    return posix.environ[b'GAIN']",
     "program": "from shutil import which\ndef f():\n    return which('git')",
 }
 FREE = {

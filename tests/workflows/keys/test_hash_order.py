@@ -16,6 +16,7 @@ TAKEN = {
     "any one": "x = {'a', 'b'}.pop()",
     "the first one": "x = next(iter(frozenset(words)))",
     "a hash": "x = hash('a')",
+    "the method of a hash": "x = ('a', 'b').__hash__()",
     "inside of a sum": "x = sum(f(list(set(w))) for w in words)",
 }
 FREE = {
