@@ -107,11 +107,11 @@ def main(calls: int) -> None:
     print(f"this process holds {process_memory() / 1e6:.0f} MB")
     for seconds in (0.0, 1e-3, 1e-2, 1e-1, 1.0):
         compute = node(seconds) if seconds else int
-        ways = (compute, partial(observed, compute, COVERED), partial(apart, compute))
-        turns = [[timed(way) for way in ways] for _ in range(calls // (1 if seconds < 0.05 else round(40 * seconds)))]
-        plain, *others = zip(*turns, strict=True)
-        print(f"{seconds * 1e3:3.0f} ms: plain {quantiles(plain)} ms")
-        for name, seen in zip(("observed", "observed in a process of its own"), others, strict=True):
+        ways = {"observed": partial(observed, compute, COVERED), "in a process of its own": partial(apart, compute)}
+        for name, way in ways.items():  # one after the other: memory that a fork has shared is slow at its next use
+            count = calls // (1 if seconds < 0.05 else round(40 * seconds))
+            plain, seen = zip(*((timed(compute), timed(way)) for _ in range(count)), strict=True)
+            print(f"{seconds * 1e3:3.0f} ms: plain {quantiles(plain)} ms")
             more = [late - early for late, early in zip(seen, plain, strict=True)]
             within = np.mean([late <= max(AIM, SHARE * early) for late, early in zip(more, plain, strict=True)])
             ratio = np.median(seen) / max(float(np.median(plain)), 1e-9)

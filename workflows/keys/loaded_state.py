@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import inspect
 import io
+import mmap
 import operator
 import random
 import re
@@ -49,7 +50,7 @@ _KINDS: tuple[tuple[str, tuple[type, ...]], ...] = (
     ("function", (FunctionType,)),
     ("class", (type,)),
     ("array", (torch.Tensor, np.ndarray)),
-    ("changing", (torch.Generator, np.random.Generator, np.random.RandomState, random.Random, io.IOBase)),
+    ("changing", (torch.Generator, np.random.Generator, np.random.RandomState, random.Random, io.IOBase, mmap.mmap)),
     ("table", (Mapping,)),
     ("list", (list, tuple, deque)),
     ("set", (set, frozenset)),

@@ -384,6 +384,10 @@ REFUSED = {
         {ONE: source("part.random()", "import numpy as np\npart = np.random.default_rng(1)")},
         r"__init__\.py: part is or holds a Generator, ",
     ),
+    "memory of several processes": (
+        {ONE: source("part[0]", "import mmap\npart = mmap.mmap(-1, 16)")},
+        r"__init__\.py: part is or holds a mmap, ",
+    ),
     "random numbers of a class": (
         {ONE: source("part.rng.seed()", FROM), TWO: "import torch\n\n\nclass part:\n    rng = torch.Generator()\n"},
         r"_two\.py: part is or holds a Generator, ",
