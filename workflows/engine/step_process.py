@@ -7,6 +7,7 @@ inputs at hand, sends the value back, and ends. The next step, of the user or of
 
 from __future__ import annotations
 
+import io
 import os
 import select
 import signal
@@ -29,6 +30,7 @@ from neusee.workflows.observation.step_thread import is_alone
 
 T = TypeVar("T")
 _LOOK = 0.05  #: s after which the caller sees an exception that another thread raises in it
+_BESIDE_TABLE = "rich_proxied_file"  #: attribute of a stream of rich beside a live table
 _UNSENT = 3  #: exit code of a fork whose value cannot be sent
 
 
@@ -50,6 +52,7 @@ class _Sent(NamedTuple):
     returned: Returned[Any] | None
     error: BaseException | None
     said: list[warnings.WarningMessage]
+    printed: dict[str, str]  #: texts for streams that draw beside a table: see `_collected`
 
 
 def may_fork() -> bool:
@@ -85,6 +88,8 @@ def _called(function: Callable[[], T], variables: frozenset[str]) -> Returned[T]
         if code:
             raise ProcessEnded(_reason(code))
         sent: _Sent = torch.load(f"/proc/self/fd/{file.fileno()}", mmap=True, weights_only=False)
+    for name, text in sent.printed.items():
+        getattr(sys, name).write(text)
     for each in sent.said:
         warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
     if sent.error is not None:
@@ -154,13 +159,14 @@ def _reason(code: int) -> str:
 
 def _answer(begin_watch: Callable[[], None], work: Callable[[], _Sent], file: int, parent: int) -> None:
     """Do the work, write what it gives to a file, and end this process, whatever happens."""
-    code = 1
+    code, collected = 1, _collected()
     try:
         ignore_interrupts()
         if end_with(parent):
             begin_watch()
             _print_as_parent()
-            code = _write(work(), file)
+            sent = work()
+            code = _write(sent._replace(printed={name: text.getvalue() for name, text in collected.items()}), file)
     finally:
         for stream in (sys.stdout, sys.stderr):
             with suppress(Exception):
@@ -168,18 +174,26 @@ def _answer(begin_watch: Callable[[], None], work: Callable[[], _Sent], file: in
         os._exit(code)
 
 
+def _collected() -> dict[str, io.StringIO]:
+    """Collect what is printed to streams that draw beside a table: a thread of the parent may hold their lock."""
+    collected = {name: io.StringIO() for name in ("stdout", "stderr") if hasattr(getattr(sys, name), _BESIDE_TABLE)}
+    for name, text in collected.items():
+        setattr(sys, name, text)
+    return collected
+
+
 def _print_as_parent() -> None:
     """Let libraries of C print to stderr where Python does, while stdout is kept for the result of the command."""
-    if sys.stdout is not None and sys.stdout.fileno() == 2:
+    if sys.stdout is not None and not isinstance(sys.stdout, io.StringIO) and sys.stdout.fileno() == 2:
         os.dup2(2, 1)
 
 
 def _sent(function: Callable[[], Any], variables: frozenset[str], limit: float | None) -> _Sent:
     with warnings.catch_warnings(record=True) as said:
         try:
-            return _Sent(_returned(function, variables, limit), None, said)
+            return _Sent(_returned(function, variables, limit), None, said, {})
         except BaseException as error:
-            return _Sent(None, error, said)
+            return _Sent(None, error, said, {})
 
 
 def _returned(function: Callable[[], Any], variables: frozenset[str], limit: float | None) -> Returned[Any]:

@@ -22,6 +22,12 @@ class LiveTable(Live):
             vertical_overflow="visible",
         )
 
+    def start(self, refresh: bool = False) -> None:
+        """Start to draw, in a thread with a name of this program."""
+        super().start(refresh)
+        if self._refresh_thread is not None:
+            self._refresh_thread.name = "neusee table"
+
 
 class LastRows:
     """The names of the columns of a table, and as many of its last lines as the screen has room for."""

@@ -2,6 +2,8 @@
 
 import json
 import os
+import pty
+import re
 import subprocess
 import sys
 
@@ -73,3 +75,40 @@ def test_code_that_changes_nothing_prints_beside_the_result_too(called, tmp_path
     done = called("run", "r.yaml", "--json")
     json.loads(done.stdout)
     assert b"printed beside" in done.stderr
+
+
+ON_TERMINAL = """
+import os
+import torch
+from torch import Tensor
+from neusee.nodes import node
+
+
+@node(depends=["unaffected:state"])
+def printed(*, by: float = 2.0) -> Tensor:
+    print("process", os.getpid())
+    return torch.full((2, 3, 4), by)
+"""
+
+
+@pytest.mark.parametrize("imports", ["", "import decimal"], ids=["changes nothing", "may change something"])
+def test_beside_the_table_of_a_terminal_a_step_has_its_process_and_its_words(imports, tmp_path):
+    (tmp_path / "own_prints.py").write_text(imports + ON_TERMINAL, encoding="utf-8")
+    (tmp_path / "r.yaml").write_text(RECIPE, encoding="utf-8")
+    mine, theirs = pty.openpty()
+    env = {**os.environ, "NEUSEE_CACHE": str(tmp_path / "cache"), "TERM": "xterm"}
+    command = [sys.executable, "-m", "neusee", "run", "r.yaml", "--out", str(tmp_path / "out")]
+    with subprocess.Popen(command, env=env, cwd=tmp_path, stdin=theirs, stdout=theirs, stderr=theirs) as program:
+        os.close(theirs)
+        shown = b"".join(iter(lambda: _read(mine), b""))
+    os.close(mine)
+    assert program.returncode == 0, shown
+    number = int(re.search(rb"process (\d+)", shown).group(1))
+    assert (number != program.pid) == bool(imports)
+
+
+def _read(terminal):
+    try:
+        return os.read(terminal, 4096)
+    except OSError:  # the other end is closed
+        return b""
