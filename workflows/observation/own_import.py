@@ -7,7 +7,7 @@ import importlib
 import importlib.util
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -40,7 +40,7 @@ def import_observed(name: str) -> ModuleType:
     say_hidden(name, asked)
     found += tuple(taint("variable", each) for each in asked.of_own_code)
     new = [each for each in sys.modules if each not in before and origin_of(each, frozenset()).kind == "source"]
-    taints = tuple(each for each in found if not any(declares(own, each) for own in new))
+    taints = tuple(each for each in found if not _is_declared(each, new))
     if taints:
         taint_code(new, taints)
         for each in taints:
@@ -49,6 +49,10 @@ def import_observed(name: str) -> ModuleType:
                 name, f"{name} {reached}: the results of its nodes are not stored; to have them stored, {each.fix}"
             )
     return module
+
+
+def _is_declared(found: Taint, modules: Iterable[str]) -> bool:
+    return any(declares(module, found) for module in modules)
 
 
 @contextmanager
@@ -68,8 +72,11 @@ def _declared_variables(name: str) -> frozenset[str]:
         return frozenset()
     folder = Path(spec.origin).parent
     sources = folder.rglob("*.py") if spec.submodule_search_locations else folder.glob("*.py")
-    texts = [bytes_of(source) for source in sources if source.is_file()]
-    return frozenset(each.decode() for text in texts for each in _VARIABLE.findall(text))
+    names = set[str]()
+    for source in sources:
+        if source.is_file():
+            names.update(each.decode() for each in _VARIABLE.findall(bytes_of(source)))
+    return frozenset(names)
 
 
 def declares(module: str, taint: Taint) -> bool:
