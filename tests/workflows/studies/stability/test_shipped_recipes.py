@@ -50,7 +50,8 @@ def test_no_cell_of_a_shipped_recipe_fails(recipe, store, tmp_path):
         # a picture of 1e15 has no noise, so that the filter inverts lens and pixel: the covariance lost 3.3e-5. The
         # gradient is off by 1e-16 of the ratio of scene and noise, as stated, which is more than itself
         ("plain_lens", "huge", "deconvolved", "warn"),
-        ("axicon", "steps past pi", "level", "warn"),  # the slope of a maximum of two nearly equal elements
+        # either of the two elements may be the larger one by the rounding of the processor
+        ("axicon", "steps past pi", "level", "warn or pass"),  # the slope of a maximum of two nearly equal elements
         ("train_small", "two levels", "laser_psf[mask,drawn]", "pass"),  # 2.1e-6 in speckle, once
         ("first_light +damage=published", "NaN", "dazzle[plain]", "pass"),  # counted as a dark pixel
         ("first_light +damage=published", "float16", "dead[mask]", "pass"),  # white exceeded float16
@@ -61,4 +62,5 @@ def test_cells_that_failed_once(recipe, case, step, mark, tmp_path):
     extreme = next(each for each in CASES if each.name == case)
     name, *changes = recipe.split()
     chain = CaseRecipe.of(load(name, changes), extreme, Code(tmp_path / "code.json"))
-    assert judge_step(chain.steps[step], chain.inputs(step), extreme, chain.recipe.seed).mark == mark
+    judged = judge_step(chain.steps[step], chain.inputs(step), extreme, chain.recipe.seed)
+    assert judged.mark in mark.split(" or ")
