@@ -5,10 +5,14 @@ from torch import Tensor
 
 
 def mirrored(x: Tensor, down: int, right: int) -> Tensor:
-    """Pad a picture with its mirror image below and to the right; wide padding mirrors the picture repeatedly."""
+    """Pad a picture with its mirror image below and to the right; wide padding mirrors the
+    picture repeatedly.
+    """
     if down == right == 0:
         return x
-    rows, columns = (_indices(n, n + add, x.device) for n, add in zip(x.shape[-2:], (down, right), strict=True))
+    rows, columns = (
+        _indices(n, n + add, x.device) for n, add in zip(x.shape[-2:], (down, right), strict=True)
+    )
     return x[..., rows, :][..., columns]
 
 

@@ -1,4 +1,6 @@
-"""Bytes that arrays take in memory, from the headers of .npy, .npz, .mat, .safetensors, .pt and HDF5 files."""
+"""Bytes that arrays take in memory, from the headers of .npy, .npz, .mat, .safetensors, .pt and
+HDF5 files.
+"""
 
 import json
 import math
@@ -36,8 +38,11 @@ _CHUNK = 1 << 18  #: bytes that are decompressed at once to count them
 _HEADER = 100_000_000  #: bytes of the header of a .safetensors file, at most, as its library has it
 
 
-def npy_needs(file: Path | str, copies: float, beside: float = 0.0, parameter: str = "file") -> None:
-    """Ask for the memory of a .npy file: ``copies`` of its numbers, and ``beside`` bytes for each of them.
+def npy_needs(
+    file: Path | str, copies: float, beside: float = 0.0, parameter: str = "file"
+) -> None:
+    """Ask for the memory of a .npy file: ``copies`` of its numbers, and ``beside`` bytes for each
+    of them.
 
     Raises ParameterError for a file that is shorter than its header says.
     """
@@ -49,8 +54,13 @@ def npy_needs(file: Path | str, copies: float, beside: float = 0.0, parameter: s
         there = os.fstat(raw.fileno()).st_size - raw.tell()
     count = math.prod(map(int, shape))
     if not dtype.hasobject and count * dtype.itemsize > there:
-        text = f"its header states {in_bytes(count * dtype.itemsize)} of numbers, and {in_bytes(there)} follow"
-        raise ParameterError(parameter, f"{file} cannot be read: {text}: copy or save the file again")
+        text = (
+            f"its header states {in_bytes(count * dtype.itemsize)} of numbers, and"
+            f" {in_bytes(there)} follow"
+        )
+        raise ParameterError(
+            parameter, f"{file} cannot be read: {text}: copy or save the file again"
+        )
     needs(count * (copies * dtype.itemsize + beside), file, _numbers(shape, dtype), parameter)
 
 
@@ -60,15 +70,21 @@ def _numbers(shape: tuple[int, ...], dtype: Any) -> str:
 
 def _npy_header(raw: Any) -> tuple[tuple[int, ...], "np.dtype[Any]"]:
     version = np.lib.format.read_magic(raw)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    read = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
     shape, _, dtype = read(raw)
     return shape, dtype
 
 
-# --- archives ---------------------------------------------------------------------------------------------------------
+# --- archives -------------------------------------------------------------------------------------
 
 
-def npz_needs(file: Path | str, copies: float, beside: float = 0.0, parameter: str = "file") -> None:
+def npz_needs(
+    file: Path | str, copies: float, beside: float = 0.0, parameter: str = "file"
+) -> None:
     """Ask for the memory of all arrays in a .npz file, as `npy_needs` does.
 
     Raises ParameterError for an array of more bytes than the archive states for it.
@@ -79,13 +95,19 @@ def npz_needs(file: Path | str, copies: float, beside: float = 0.0, parameter: s
         size = math.prod(map(int, shape))
         if not dtype.hasobject and size * dtype.itemsize > there:
             text = f"its array {name} states {_numbers(shape, dtype)}, and {in_bytes(there)} follow"
-            raise ParameterError(parameter, f"{file} cannot be read: {text}: copy or save the file again")
+            raise ParameterError(
+                parameter, f"{file} cannot be read: {text}: copy or save the file again"
+            )
         total, count = total + size * (copies * dtype.itemsize + beside), count + 1
     needs(total, file, f"{count} arrays", parameter)
 
 
-def _npz_headers(file: Path | str, parameter: str) -> list[tuple[str, int, tuple[int, ...], "np.dtype[Any]"]]:
-    """Return name, stated bytes, shape and type of each array in a .npz file, as far as its headers can be read."""
+def _npz_headers(
+    file: Path | str, parameter: str
+) -> list[tuple[str, int, tuple[int, ...], "np.dtype[Any]"]]:
+    """Return name, stated bytes, shape and type of each array in a .npz file, as far as its
+    headers can be read.
+    """
     found = []
     with opened(file, parameter) as raw, suppress(*_BROKEN), zipfile.ZipFile(raw) as archive:
         for entry in archive.infolist():
@@ -95,9 +117,11 @@ def _npz_headers(file: Path | str, parameter: str) -> list[tuple[str, int, tuple
 
 
 def archive_needs(file: Path | str, copies: float, parameter: str = "file") -> None:
-    """Ask for the memory of all that a zip archive holds when it is decompressed, such as a .pt, .pt2 or .npz file.
+    """Ask for the memory of all that a zip archive holds when it is decompressed, such as a .pt,
+    .pt2 or .npz file.
 
-    Readers of archives stop at the size that the archive states for each file. Any other file counts as it is.
+    Readers of archives stop at the size that the archive states for each file. Any other file
+    counts as it is.
     """
     sizes = list[int]()
     with opened(file, parameter) as raw:
@@ -109,7 +133,7 @@ def archive_needs(file: Path | str, copies: float, parameter: str = "file") -> N
     needs(copies * sum(sizes), file, what, parameter)
 
 
-# --- .safetensors -----------------------------------------------------------------------------------------------------
+# --- .safetensors ---------------------------------------------------------------------------------
 
 
 def safetensors_need(file: Path | str, copies: float = 1.0, parameter: str = "file") -> None:
@@ -131,14 +155,18 @@ def safetensors_need(file: Path | str, copies: float = 1.0, parameter: str = "fi
 
 
 def _not_whole(file: Path | str, why: str, parameter: str) -> ParameterError:
-    text = f"{Path(file).name} is not a safetensors file and cannot be read: its header states {why}"
+    text = (
+        f"{Path(file).name} is not a safetensors file and cannot be read: its header states {why}"
+    )
     return ParameterError(parameter, f"{text}: copy or save the file again")
 
 
 def _last_byte(header: bytes) -> int:
     """Return the byte at which the tensors end, or 0 for a header that the library refuses."""
     try:
-        return max((int(entry["data_offsets"][1]) for entry in _entries(json.loads(header))), default=0)
+        return max(
+            (int(entry["data_offsets"][1]) for entry in _entries(json.loads(header))), default=0
+        )
     except (ValueError, TypeError, LookupError, RecursionError):
         return 0
 
@@ -147,14 +175,17 @@ def _entries(header: Any) -> Iterator[Any]:
     return (entry for name, entry in header.items() if name != "__metadata__")
 
 
-# --- .mat -------------------------------------------------------------------------------------------------------------
+# --- .mat -----------------------------------------------------------------------------------------
 
 
-def mat_needs(file: Path | str, copies: float = 2.0, together: bool = False, parameter: str = "file") -> None:
+def mat_needs(
+    file: Path | str, copies: float = 2.0, together: bool = False, parameter: str = "file"
+) -> None:
     """Ask for the memory of the largest variable in a .mat file, or of all variables ``together``.
 
-    There are ``copies`` of the numbers as they are stored or as they are read, whichever are more. Compressed variables
-    are decompressed in small parts to be counted, because a part of one can state more than the variable does.
+    There are ``copies`` of the numbers as they are stored or as they are read, whichever are more.
+    Compressed variables are decompressed in small parts to be counted, because a part of one can
+    state more than the variable does.
     """
     with opened(file, parameter) as raw:
         size = os.fstat(raw.fileno()).st_size
@@ -195,14 +226,18 @@ def _mat_sizes(raw: BinaryIO, size: int) -> Iterator[tuple[bool, int]]:
 
 
 def _mat_stated(part: bytes, order: str) -> int:
-    """Return the bytes of the numbers of a variable as they are read, from its flags and dimensions; 0 if unknown."""
+    """Return the bytes of the numbers of a variable as they are read, from its flags and
+    dimensions; 0 if unknown.
+    """
     if len(part) < 24:
         return 0
     flags, _, kind, length = struct.unpack(f"{order}8x4I", part[:24])
     each = _MAT_CLASSES.get(flags & 0xFF, 0) * (2 if flags & _MAT_COMPLEX else 1)
     if kind != _MAT_INT32 or not each or length > len(part) - 24:
         return 0
-    return each * math.prod(int(n) for n in struct.unpack(f"{order}{length // 4}i", part[24 : 24 + length // 4 * 4]))
+    return each * math.prod(
+        int(n) for n in struct.unpack(f"{order}{length // 4}i", part[24 : 24 + length // 4 * 4])
+    )
 
 
 def _inflated(raw: BinaryIO, length: int) -> Iterator[bytes]:
@@ -218,25 +253,40 @@ def _inflated(raw: BinaryIO, length: int) -> Iterator[bytes]:
             packed = stream.unconsumed_tail
 
 
-# --- FITS and HDF5, whose libraries read headers alone ----------------------------------------------------------------
+# --- FITS and HDF5, whose libraries read headers alone --------------------------------------------
 
 
-def fits_needs(file: Path | str, shape: tuple[int, ...], bits: int, parameter: str = "file") -> None:
-    """Ask for the memory of an image of a FITS file: its numbers, scaled to float64, and the copy of the caller."""
+def fits_needs(
+    file: Path | str, shape: tuple[int, ...], bits: int, parameter: str = "file"
+) -> None:
+    """Ask for the memory of an image of a FITS file: its numbers, scaled to float64, and the
+    copy of the caller.
+    """
     count = math.prod(map(int, shape))
-    needs(count * (abs(bits) / 8 + 16), file, f"{' x '.join(map(str, shape))} numbers of {abs(bits)} bits", parameter)
+    needs(
+        count * (abs(bits) / 8 + 16),
+        file,
+        f"{' x '.join(map(str, shape))} numbers of {abs(bits)} bits",
+        parameter,
+    )
 
 
 def refuse_packed(file: Path | str, parameter: str = "file") -> None:
-    """Raise ParameterError for a file that is compressed as a whole, which a library would unpack without a limit."""
+    """Raise ParameterError for a file that is compressed as a whole, which a library would
+    unpack without a limit.
+    """
     with opened(file, parameter) as raw:
         head = raw.read(6)
     if head.startswith((b"\x1f\x8b", b"BZh", b"PK\x03\x04", b"\xfd7zXZ", b"\x1f\x9d")):
-        raise ParameterError(parameter, f"{file} is compressed as a whole: unpack it, such as by gunzip")
+        raise ParameterError(
+            parameter, f"{file} is compressed as a whole: unpack it, such as by gunzip"
+        )
 
 
 def hdf5_needs(file: Path | str, groups: Any, copies: float = 1.0) -> None:
-    """Ask for the memory of all data in the opened ``groups`` of an HDF5 file, from their shapes and types."""
+    """Ask for the memory of all data in the opened ``groups`` of an HDF5 file, from their shapes
+    and types.
+    """
     total = 0.0
     for group in groups:
         for each in group.values():

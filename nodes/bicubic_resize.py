@@ -1,4 +1,6 @@
-"""Bicubic resampling as two matrix products, deterministic on every device and differentiable to any order."""
+"""Bicubic resampling as two matrix products, deterministic on every device and differentiable to
+any order.
+"""
 
 import functools
 
@@ -12,26 +14,36 @@ from neusee.nodes._half_precision import single
 def enlarge(image: Tensor, height: int, width: int) -> Tensor:
     """Resample pictures (…, y, x) by bicubic interpolation without an antialiasing filter.
 
-    Kornia's `resize` gives the same numbers, but on CUDA the sum of its gradient has no fixed order.
+    Kornia's `resize` gives the same numbers, but on CUDA the sum of its gradient has no fixed
+    order.
     """
-    rows, columns = (_interpolation(n, new, image) for n, new in zip(image.shape[-2:], (height, width), strict=True))
+    rows, columns = (
+        _interpolation(n, new, image)
+        for n, new in zip(image.shape[-2:], (height, width), strict=True)
+    )
     return rows @ image @ columns.T
 
 
 def resize(image: Tensor, height: int, width: int) -> Tensor:
-    """Resample pictures (…, y, x) without aliasing, by Keys' bicubic kernel scaled to the coarser of the two grids.
+    """Resample pictures (…, y, x) without aliasing, by Keys' bicubic kernel scaled to the coarser
+    of the two grids.
 
-    The result equals torch's ``interpolate(mode="bicubic", antialias=True)`` within round-off, also in single
-    precision under autocast. Kornia's `resize` first blurs with a Gaussian and differs by up to 0.08 of white on noise.
+    The result equals torch's ``interpolate(mode="bicubic", antialias=True)`` within round-off, also
+    in single precision under autocast. Kornia's `resize` first blurs with a Gaussian and differs by
+    up to 0.08 of white on noise.
     """
     image = single(image)
-    rows, columns = (_keys(n, new).to(image) for n, new in zip(image.shape[-2:], (height, width), strict=True))
+    rows, columns = (
+        _keys(n, new).to(image) for n, new in zip(image.shape[-2:], (height, width), strict=True)
+    )
     with torch.autocast(image.device.type, enabled=False):
         return rows @ image @ columns.T
 
 
 def _interpolation(size: int, new: int, like: Tensor) -> Tensor:
-    """Return the matrix (new, size) that interpolates ``size`` samples bicubically to ``new`` samples."""
+    """Return the matrix (new, size) that interpolates ``size`` samples bicubically to ``new``
+    samples.
+    """
     unit = torch.eye(size, dtype=like.dtype, device=like.device)[None, None]
     return F.interpolate(unit, size=(new, size), mode="bicubic", align_corners=False)[0, 0]
 

@@ -1,4 +1,6 @@
-"""Parameters of nodes that are files: which they are, and the paths that a caller in Python writes as texts."""
+"""Parameters of nodes that are files: which they are, and the paths that a caller in Python
+writes as texts.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,9 @@ from neusee.nodes.units import IsFile, files_of
 
 
 def is_file(hint: Any) -> bool:
-    """Return True if a parameter's type annotation contains `IsFile` at any depth, so that the parameter is a path."""
+    """Return True if a parameter's type annotation contains `IsFile` at any depth, so that the
+    parameter is a path.
+    """
     extras = getattr(hint, "__metadata__", ())
     return any(isinstance(extra, IsFile) for extra in extras) or any(map(is_file, get_args(hint)))
 
@@ -24,7 +28,8 @@ def texts_of(hint: Any) -> list[Any]:
 def as_paths(hint: Any, value: Any) -> Any:
     """Return a path or paths for a text or a list of texts, and every other value as it is.
 
-    Args: hint: the annotation of a parameter that `is_file`; a text that the annotation names stays a text.
+    Args: hint: the annotation of a parameter that `is_file`; a text that the annotation names stays
+            a text.
     """
     if isinstance(value, str) and value in texts_of(hint):
         return value

@@ -10,11 +10,13 @@ from typing import Any, TypeVar
 from neusee.nodes import ParameterError
 from neusee.nodes.input_size import lines_of
 
-PIXELS = 64_000_000  #: of a picture, at most; a PNG of this size takes 1.3 GB of memory to decode and convert
+#: of a picture, at most; a PNG of this size takes 1.3 GB of memory to decode and convert
+PIXELS = 64_000_000
 VALUES = 1_000_000_000  #: numbers in a cube, a height map or a frame, at most; 4 GB as float32
 ROWS = 1_000_000  #: lines of a table, at most
 __depends__ = ["unaffected:time"]  #: the clock decides whether a file is read again, and no result
-_SETTLED = 2_000_000_000  #: ns after a change of a file in which a second change may not change its times
+#: ns after a change of a file in which a second change may not change its times
+_SETTLED = 2_000_000_000
 _CELLS = 8.0  #: bytes in memory for each byte of a table, in texts of cells of several digits
 _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "vertical bars"}
 
@@ -22,27 +24,40 @@ Result = TypeVar("Result")
 
 
 def refuse_large_picture(file: Path, rows: int, columns: int) -> None:
-    """Raise ParameterError for a picture whose header states more pixels than the limit, before it is decoded."""
+    """Raise ParameterError for a picture whose header states more pixels than the limit, before
+    it is decoded.
+    """
     if rows * columns > PIXELS:
-        text = f"{file.name} has {columns} x {rows} pixels, more than the limit of {PIXELS / 1e6:g} million: "
-        raise ParameterError("file", f"{text}reduce it, such as by magick {file.name} -resize 50% small{file.suffix}")
+        text = (
+            f"{file.name} has {columns} x {rows} pixels, more than the limit of {PIXELS / 1e6:g}"
+            " million: "
+        )
+        raise ParameterError(
+            "file", f"{text}reduce it, such as by magick {file.name} -resize 50% small{file.suffix}"
+        )
 
 
 def refuse_large_array(file: Path, shape: Sequence[int]) -> None:
-    """Raise ParameterError for an array whose header states more values than the limit, before it is read."""
+    """Raise ParameterError for an array whose header states more values than the limit, before
+    it is read.
+    """
     count = functools.reduce(lambda one, other: one * int(other), shape, 1)
     if count > VALUES:
         sizes = " x ".join(map(str, shape))
-        text = f"{file.name} has {sizes} values, more than the limit of {VALUES / 1e6:g} million: give a smaller array"
+        text = (
+            f"{file.name} has {sizes} values, more than the limit of {VALUES / 1e6:g} million: give"
+            " a smaller array"
+        )
         raise ParameterError("file", text)
 
 
 def file_version(file: Path) -> tuple[int, ...] | None:
-    """Return numbers that differ for each version of a file, or None for a file that has just been changed.
+    """Return numbers that differ for each version of a file, or None for a file that has just been
+    changed.
 
-    The numbers are device, inode, size, and the times of the last change of content and of the entry, which no program
-    can set. A second change within a tick of the clock leaves them as they are, so that a file younger than two seconds
-    has no version yet.
+    The numbers are device, inode, size, and the times of the last change of content and of the
+    entry, which no program can set. A second change within a tick of the clock leaves them as they
+    are, so that a file younger than two seconds has no version yet.
     """
     about = file.stat()
     changed = max(about.st_mtime_ns, about.st_ctime_ns)
@@ -52,7 +67,9 @@ def file_version(file: Path) -> tuple[int, ...] | None:
 
 
 def once_per_version(check: Callable[..., Result]) -> Callable[..., Result]:
-    """Return a function that remembers the results of ``check`` until the file, its first argument, changes."""
+    """Return a function that remembers the results of ``check`` until the file, its first
+    argument, changes.
+    """
 
     @functools.lru_cache(maxsize=256)
     def remembered(version: tuple[int, ...], *arguments: Any) -> Result:
@@ -69,9 +86,15 @@ def once_per_version(check: Callable[..., Result]) -> Callable[..., Result]:
 
 
 def not_finite(file: Path, count: int) -> str:
-    """Return the message for a file with values that are NaN or infinite, or an empty text for a count of 0."""
+    """Return the message for a file with values that are NaN or infinite, or an empty text for a
+    count of 0.
+    """
     fix = "replace these values by finite numbers, such as 0"
-    return f"{file.name} holds {count} values that are not finite (NaN or infinity): {fix}" if count else ""
+    return (
+        f"{file.name} holds {count} values that are not finite (NaN or infinity): {fix}"
+        if count
+        else ""
+    )
 
 
 def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
@@ -79,7 +102,8 @@ def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
 
     A line that begins with ``#`` is a comment, such as the source of the table.
 
-    Raises ValueError for text that is not UTF-8, for another separator than a comma, and for more rows than the limit.
+    Raises ValueError for text that is not UTF-8, for another separator than a comma, and for more
+    rows than the limit.
     """
     reader = csv.reader("" if line.startswith("#") else line for line in lines_of(file, _CELLS))
     first = True
@@ -94,10 +118,16 @@ def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
             first = False
             yield reader.line_num, row
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{file.name} is not a CSV file in UTF-8 ({error}): save the table as CSV") from None
+        raise ValueError(
+            f"{file.name} is not a CSV file in UTF-8 ({error}): save the table as CSV"
+        ) from None
 
 
 def _refuse_separator(file: Path, header: list[str]) -> None:
-    found = next((name for mark, name in _SEPARATORS.items() if len(header) == 1 and mark in header[0]), None)
+    found = next(
+        (name for mark, name in _SEPARATORS.items() if len(header) == 1 and mark in header[0]), None
+    )
     if found:
-        raise ValueError(f"{file.name} separates its columns by {found}: separate the columns by commas")
+        raise ValueError(
+            f"{file.name} separates its columns by {found}: separate the columns by commas"
+        )

@@ -1,7 +1,9 @@
-"""Bytes that a reader of a file would need, compared with the memory that is left before anything is allocated.
+"""Bytes that a reader of a file would need, compared with the memory that is left before anything
+is allocated.
 
-A reader finds the bytes in the header alone and asks `needs`. Files are opened without waiting: a pipe, a device or a
-socket in the place of a file is refused, because it never ends, or never begins.
+A reader finds the bytes in the header alone and asks `needs`. Files are opened without waiting: a
+pipe, a device or a socket in the place of a file is refused, because it never ends, or never
+begins.
 """
 
 import os
@@ -15,7 +17,8 @@ from typing import NamedTuple
 
 from neusee.nodes import ParameterError
 
-#: what is free decides whether a file is read, and no result; the files are those of the system, or of an argument
+#: what is free decides whether a file is read, and no result; the files are those of the system, or
+#: of an argument
 __depends__ = ["unaffected:file", "unaffected:resource", "unaffected:_measures"]
 SMALL = 16 << 20  #: bytes that every reader may take without asking
 TEXT = 64 << 20  #: bytes of a text that is read as a whole, at most
@@ -42,7 +45,8 @@ class BeyondMemory(ParameterError):
 
 
 def needs(count: float, file: Path | str, what: str, parameter: str = "file") -> None:
-    """Raise `BeyondMemory` if a reader would need more than the memory that is left: ``count`` bytes.
+    """Raise `BeyondMemory` if a reader would need more than the memory that is left: ``count``
+    bytes.
 
     ``what`` says what the bytes are, such as ``30 pages of 4000 x 3000 pixels``.
     """
@@ -67,15 +71,22 @@ def measured_by(measure: Callable[[], Room]) -> None:
 
 
 def free_memory() -> Room:
-    """Return the memory that is free on this machine, in its control group, and below the limit of addresses."""
+    """Return the memory that is free on this machine, in its control group, and below the limit
+    of addresses.
+    """
     found = [float("inf")]
     with suppress(OSError, ValueError, StopIteration):
         lines = Path("/proc/meminfo").read_text().splitlines()
-        found.append(1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")))
+        found.append(
+            1024.0
+            * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+        )
     with suppress(OSError, ValueError):
         most = int((_GROUP / "memory.max").read_text())
         kept = dict(line.split() for line in (_GROUP / "memory.stat").read_text().splitlines())
-        found.append(float(most - int((_GROUP / "memory.current").read_text()) + int(kept["inactive_file"])))
+        found.append(
+            float(most - int((_GROUP / "memory.current").read_text()) + int(kept["inactive_file"]))
+        )
     addresses = resource.getrlimit(resource.RLIMIT_AS)[0]
     if addresses != resource.RLIM_INFINITY:
         with suppress(OSError, ValueError):
@@ -95,16 +106,22 @@ def in_bytes(count: float) -> str:
     return f"{count:.0f} bytes"
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
+# --- files ----------------------------------------------------------------------------------------
 
 
 def kind_of(mode: int) -> str:
-    """Return what stands in the place of a file, such as ``a pipe``, or an empty text for a regular file."""
-    return "" if stat.S_ISREG(mode) else next((kind for fits, kind in _KINDS if fits(mode)), "no file")
+    """Return what stands in the place of a file, such as ``a pipe``, or an empty text for a
+    regular file.
+    """
+    return (
+        "" if stat.S_ISREG(mode) else next((kind for fits, kind in _KINDS if fits(mode)), "no file")
+    )
 
 
 def refuse_other_than_file(file: Path | str, parameter: str = "file") -> None:
-    """Raise ParameterError for a pipe, a device, a socket or a folder; a file that is missing passes."""
+    """Raise ParameterError for a pipe, a device, a socket or a folder; a file that is missing
+    passes.
+    """
     try:
         mode = os.stat(file).st_mode
     except OSError:
@@ -114,11 +131,15 @@ def refuse_other_than_file(file: Path | str, parameter: str = "file") -> None:
 
 def _refuse(file: Path | str, mode: int, parameter: str) -> None:
     if kind := kind_of(mode):
-        raise ParameterError(parameter, f"{file} is not a regular file but {kind}: give the path of a file")
+        raise ParameterError(
+            parameter, f"{file} is not a regular file but {kind}: give the path of a file"
+        )
 
 
 def opened(file: Path | str, parameter: str = "file") -> BufferedReader:
-    """Open a regular file to read its bytes, without waiting for a pipe; raise ParameterError for anything else."""
+    """Open a regular file to read its bytes, without waiting for a pipe; raise ParameterError
+    for anything else.
+    """
     refuse_other_than_file(file, parameter)  # some devices do something when they are opened
     number = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
@@ -143,19 +164,26 @@ def bytes_of(file: Path | str, copies: float = 1.0, parameter: str = "file") -> 
         return bytes_in.read(size + 1)
 
 
-def text_of(file: Path | str, encoding: str = "utf-8", errors: str = "strict", most: int = TEXT) -> str:
+def text_of(
+    file: Path | str, encoding: str = "utf-8", errors: str = "strict", most: int = TEXT
+) -> str:
     """Return the text of a file of at most ``most`` bytes, with ``\\n`` at the end of each line."""
     with opened(file) as bytes_in:
         size = os.fstat(bytes_in.fileno()).st_size
         if size > most:
             limit = f"more than the limit of {in_bytes(most)} for such a file"
-            raise ParameterError("file", f"{file} has {in_bytes(size)}, {limit}: give a shorter file")
+            raise ParameterError(
+                "file", f"{file} has {in_bytes(size)}, {limit}: give a shorter file"
+            )
         needs(8.0 * size, file, f"a text of {in_bytes(size)}")
-        return bytes_in.read(most).decode(encoding, errors).replace("\r\n", "\n").replace("\r", "\n")
+        return (
+            bytes_in.read(most).decode(encoding, errors).replace("\r\n", "\n").replace("\r", "\n")
+        )
 
 
 def lines_of(file: Path, copies: float = 1.0) -> Iterator[str]:
-    """Yield the lines of a table in UTF-8, each with its end; refuse a line that is too long to be one of a table.
+    """Yield the lines of a table in UTF-8, each with its end; refuse a line that is too long to be
+    one of a table.
 
     ``copies`` are bytes that the caller keeps for each byte of the file.
     """
@@ -168,5 +196,7 @@ def lines_of(file: Path, copies: float = 1.0) -> Iterator[str]:
                 number += 1
                 if len(line) > LINE:
                     fix = "break the line, or give another file"
-                    raise ParameterError("file", f"{file.name}:{number} has more than {LINE} characters: {fix}")
+                    raise ParameterError(
+                        "file", f"{file.name}:{number} has more than {LINE} characters: {fix}"
+                    )
                 yield line

@@ -1,7 +1,7 @@
 """Import of files and folders with nodes of a user, under the names that the files have.
 
-Such a module is an ordinary module of the process: its folder is searched by ``import``, so that it can import helpers
-beside it. A process that receives one of its nodes imports the same file.
+Such a module is an ordinary module of the process: its folder is searched by ``import``, so that it
+can import helpers beside it. A process that receives one of its nodes imports the same file.
 """
 
 from __future__ import annotations
@@ -15,21 +15,27 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
-#: file of each module that was imported here, by name, in the order of the imports; None for one imported by its name
+#: file of each module that was imported here, by name, in the order of the imports; None for one
+#: imported by its name
 _files: dict[str, Path | None] = {}
 
 
-def import_file(path: Path, load: Callable[[str], ModuleType] = importlib.import_module) -> ModuleType:
-    """Import a file such as ``bloom.py``, or a package folder with ``__init__.py``, and return the module.
+def import_file(
+    path: Path, load: Callable[[str], ModuleType] = importlib.import_module
+) -> ModuleType:
+    """Import a file such as ``bloom.py``, or a package folder with ``__init__.py``, and return the
+    module.
 
     ``load`` imports the module by its name.
-    Raises `ImportError` if there is no such file, if another module has its name or the name of a helper beside it, and
-    whatever the code raises.
+    Raises `ImportError` if there is no such file, if another module has its name or the name of a
+    helper beside it, and whatever the code raises.
     """
     file = path / "__init__.py" if path.is_dir() else path
     name = path.name if path.is_dir() else path.stem
     if not file.is_file():
-        raise ImportError(f"{path} has no __init__.py" if path.is_dir() else f"there is no file {path}")
+        raise ImportError(
+            f"{path} has no __init__.py" if path.is_dir() else f"there is no file {path}"
+        )
     if not name.isidentifier():
         raise ImportError(f"{name} is not the name of a module: use letters, digits and _")
     _refuse_taken(name, file)
@@ -41,7 +47,11 @@ def import_file(path: Path, load: Callable[[str], ModuleType] = importlib.import
     try:
         module = load(name)
     except BaseException:
-        for added in [module for module in sys.modules if module not in known and f"{module}.".startswith(f"{name}.")]:
+        for added in [
+            module
+            for module in sys.modules
+            if module not in known and f"{module}.".startswith(f"{name}.")
+        ]:
             del sys.modules[added]
         raise
     for helper, beside in _helpers(file, path.parent):
@@ -56,20 +66,25 @@ def note_module(name: str) -> None:
 
 
 def own_modules() -> tuple[str, ...]:
-    """Return the names of the modules with nodes of a user that this process has imported, in their order."""
+    """Return the names of the modules with nodes of a user that this process has imported, in
+    their order.
+    """
     return tuple(name for name in _files if name in sys.modules)
 
 
 def own_files() -> tuple[str, ...]:
-    """Return the files and folders that this process has imported as modules of nodes, and the names of others."""
+    """Return the files and folders that this process has imported as modules of nodes, and the
+    names of others.
+    """
     return tuple(str(file or name) for name, file in _files.items())
 
 
 def import_missing(files: tuple[str, ...], needed: str) -> None:
     """Import the modules of another process that this process lacks.
 
-    The other process may have imported files that no longer exist, or that this process cannot import. Only what the
-    module ``needed`` raises is raised: `ImportError` for a missing file, and whatever its code raises.
+    The other process may have imported files that no longer exist, or that this process cannot
+    import. Only what the module ``needed`` raises is raised: `ImportError` for a missing file, and
+    whatever its code raises.
     """
     for each in files:
         try:
@@ -88,7 +103,9 @@ def _import_if_missing(file: str) -> None:
 
 
 def _top_name(file: str) -> str:
-    """Return the first part of the name of the module in a file or folder, or of a module that is given by its name."""
+    """Return the first part of the name of the module in a file or folder, or of a module that
+    is given by its name.
+    """
     return Path(file).stem if os.path.isabs(file) else file.partition(".")[0]
 
 

@@ -11,24 +11,32 @@ from neusee.nodes import ParameterError
 from neusee.nodes.input_size import needs, opened
 
 __depends__ = ["unaffected:file"]  #: the size of an open file
-_IN_MEMORY = {"1": 1, "L": 1, "P": 1, "LA": 4, "I;16": 2, "I;16B": 2, "I;16L": 2}  #: bytes of a pixel of Pillow
+#: bytes of a pixel of Pillow
+_IN_MEMORY = {"1": 1, "L": 1, "P": 1, "LA": 4, "I;16": 2, "I;16B": 2, "I;16L": 2}
 _COEFFICIENTS = 6  #: bytes of a pixel of a JPEG that is stored in several scans
 _WIDTH, _HEIGHT, _BITS, _SAMPLES, _TILE_WIDTH, _TILE_LENGTH = 256, 257, 258, 277, 322, 323
 _TIFF_TAGS = frozenset((_WIDTH, _HEIGHT, _BITS, _SAMPLES, _TILE_WIDTH, _TILE_LENGTH))
-_TIFF_SIZES = {1: "B", 3: "H", 4: "I", 16: "Q"}  #: of the types of a TIFF tag that are whole numbers
+#: of the types of a TIFF tag that are whole numbers
+_TIFF_SIZES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _EXR_SIZES = {0: 4, 1: 2, 2: 4}  #: bytes of a number, by the type of the channel
 _MULTIPART, _DEEP = 1 << 12, 1 << 11
 _LONGEST = 1 << 20  #: bytes of a list of channels, at most
 
 
 def picture_needs(file: Path, image: Any, beside: float, parameter: str = "file") -> None:
-    """Ask for the memory of the first picture that Pillow has opened, with ``beside`` bytes for each of its pixels."""
+    """Ask for the memory of the first picture that Pillow has opened, with ``beside`` bytes for
+    each of its pixels.
+    """
     each = _IN_MEMORY.get(image.mode, 4) + beside
     each += _COEFFICIENTS if image.format in ("JPEG", "MPO") else 0
-    needs(each * image.width * image.height, file, f"{image.width} x {image.height} pixels", parameter)
+    needs(
+        each * image.width * image.height, file, f"{image.width} x {image.height} pixels", parameter
+    )
 
 
-def pages_need(file: Path, image: Any, copies: float, beside: float = 0.0, parameter: str = "file") -> None:
+def pages_need(
+    file: Path, image: Any, copies: float, beside: float = 0.0, parameter: str = "file"
+) -> None:
     """Ask for the memory of all pages of a file that Pillow has opened.
 
     There are ``copies`` of the numbers of each page, and ``beside`` bytes for each of its pixels.
@@ -38,10 +46,15 @@ def pages_need(file: Path, image: Any, copies: float, beside: float = 0.0, param
         return
     pages, size = int(getattr(image, "n_frames", 1)), image.width * image.height
     each = copies * _IN_MEMORY.get(image.mode, 4) + beside
-    needs(pages * size * each, file, f"{pages} pages of {image.width} x {image.height} pixels", parameter)
+    needs(
+        pages * size * each,
+        file,
+        f"{pages} pages of {image.width} x {image.height} pixels",
+        parameter,
+    )
 
 
-# --- TIFF -------------------------------------------------------------------------------------------------------------
+# --- TIFF -----------------------------------------------------------------------------------------
 
 
 class Page(NamedTuple):
@@ -58,26 +71,40 @@ class Page(NamedTuple):
         return self.samples * max(self.sample, 8) / 8 * max(self.width * self.height, self.tile)
 
 
-def tiff_needs(file: Path, copies: float, beside: float = 0.0, parameter: str = "file", first: bool = False) -> None:
-    """Ask for the memory of all pages of a TIFF file, or of the ``first`` one, as `pages_need` does."""
+def tiff_needs(
+    file: Path, copies: float, beside: float = 0.0, parameter: str = "file", first: bool = False
+) -> None:
+    """Ask for the memory of all pages of a TIFF file, or of the ``first`` one, as `pages_need`
+    does.
+    """
     count, total, page = 0, 0.0, Page(0, 0, 8, 1, 0)
-    with opened(file, parameter) as raw, suppress(struct.error):  # the reader says what a damaged file lacks
+    # the reader says what a damaged file lacks
+    with opened(file, parameter) as raw, suppress(struct.error):
         for page in tiff_pages(raw):
             count += 1
             total += copies * page.bytes + beside * page.width * page.height
             if first:
                 break
-    needs(total, file, f"{count} page{'s' * (count != 1)} of {page.width} x {page.height} pixels", parameter)
+    needs(
+        total,
+        file,
+        f"{count} page{'s' * (count != 1)} of {page.width} x {page.height} pixels",
+        parameter,
+    )
 
 
 def tiff_pages(raw: BinaryIO) -> Iterator[Page]:
-    """Yield the size of each page of an open TIFF file, in its order; end where a page was there before."""
+    """Yield the size of each page of an open TIFF file, in its order; end where a page was there
+    before.
+    """
     head = raw.read(16)
     order = {b"II": "<", b"MM": ">"}.get(head[:2])
     if order is None:
         return
     big = struct.unpack(f"{order}H", head[2:4])[0] == 43
-    (place,) = struct.unpack(f"{order}Q", head[8:16]) if big else struct.unpack(f"{order}I", head[4:8])
+    (place,) = (
+        struct.unpack(f"{order}Q", head[8:16]) if big else struct.unpack(f"{order}I", head[4:8])
+    )
     seen, most = set[int](), os.fstat(raw.fileno()).st_size
     while 0 < place < most and place not in seen:
         seen.add(place)
@@ -97,7 +124,9 @@ def _tiff_page(raw: BinaryIO, place: int, order: str, big: bool) -> tuple[Page, 
         if tag in _TIFF_TAGS and kind in _TIFF_SIZES:
             found[tag] = _tiff_number(raw, order, _TIFF_SIZES[kind], length, value)
     after = raw.read(8 if big else 4)
-    (following,) = struct.unpack(f"{order}{address}", after) if len(after) == (8 if big else 4) else (0,)
+    (following,) = (
+        struct.unpack(f"{order}{address}", after) if len(after) == (8 if big else 4) else (0,)
+    )
     page = Page(
         found.get(_WIDTH, 0),
         found.get(_HEIGHT, 0),
@@ -119,7 +148,7 @@ def _tiff_number(raw: BinaryIO, order: str, kind: str, length: int, value: bytes
     return int(struct.unpack(f"{order}{kind}", value[:size])[0])
 
 
-# --- OpenEXR ----------------------------------------------------------------------------------------------------------
+# --- OpenEXR --------------------------------------------------------------------------------------
 
 
 class ExrPart(NamedTuple):
@@ -136,10 +165,11 @@ class ExrPart(NamedTuple):
 
 
 def exr_needs(file: Path | str, beside: float = 8.0, parameter: str = "file") -> None:
-    """Ask for the memory of an OpenEXR file: all channels of all parts, which the library reads at once.
+    """Ask for the memory of an OpenEXR file: all channels of all parts, which the library reads at
+    once.
 
-    ``beside`` are the bytes for each value of the largest part that the caller makes of them. A part with deep samples
-    is refused, because its header does not say how many there are.
+    ``beside`` are the bytes for each value of the largest part that the caller makes of them. A
+    part with deep samples is refused, because its header does not say how many there are.
     """
     with opened(file, parameter) as raw:
         try:
@@ -147,7 +177,9 @@ def exr_needs(file: Path | str, beside: float = 8.0, parameter: str = "file") ->
         except (struct.error, ValueError):
             return  # the library says what a damaged file lacks
     if any(part.deep for part in parts):
-        raise ParameterError(parameter, f"{file} has deep samples, several a pixel: flatten the picture")
+        raise ParameterError(
+            parameter, f"{file} has deep samples, several a pixel: flatten the picture"
+        )
     values = max((part.width * part.height * len(part.channels) for part in parts), default=0)
     largest = max(parts, key=lambda part: part.bytes, default=ExrPart(0, 0, {}, False))
     what = f"{largest.width} x {largest.height} pixels in {len(largest.channels)} channels"
@@ -156,7 +188,9 @@ def exr_needs(file: Path | str, beside: float = 8.0, parameter: str = "file") ->
 
 
 def exr_part_sizes(raw: BinaryIO) -> Iterator[ExrPart]:
-    """Yield the size of each part of an open OpenEXR file, from its headers; nothing for another file."""
+    """Yield the size of each part of an open OpenEXR file, from its headers; nothing for another
+    file.
+    """
     magic, version = struct.unpack("<iI", raw.read(8))
     if magic != 20000630:
         return

@@ -1,7 +1,9 @@
-"""The stand-ins of large commands: how a test runs what the README and the guide tell a reader to type.
+"""The stand-ins of large commands: how a test runs what the README and the guide tell a reader to
+type.
 
-A command runs as it stands, or as a stand-in: the same words with small sizes, counts and machines instead of the large
-ones. `STAND_INS` says which words change and why; `NotDeclared` is raised for a large command without a stand-in.
+A command runs as it stands, or as a stand-in: the same words with small sizes, counts and machines
+instead of the large ones. `STAND_INS` says which words change and why; `NotDeclared` is raised for
+a large command without a stand-in.
 """
 
 from __future__ import annotations
@@ -31,16 +33,19 @@ SMALL_OPTIONS = {
     "sensor/small": SMALL_SENSOR,
     **{f"scene/{name}": "scene: {shape: [28, 28]}" for name in ("china", "siemens", "night")},
 }
-LARGEST = {"optics.samples": 128, "optics.bands": 31, "scene.shape": 96, "sensor.shape": 64}  #: of a small camera
+#: of a small camera
+LARGEST = {"optics.samples": 128, "optics.bands": 31, "scene.shape": 96, "sensor.shape": 64}
 
-OF_PACKAGE = re.compile(r"\boptics: [a-z]")  #: in a recipe that takes its optics from an option of the package
+#: in a recipe that takes its optics from an option of the package
+OF_PACKAGE = re.compile(r"\boptics: [a-z]")
 
 #: commands that compute little or nothing, and run as they are written
 LIGHT = (
     "validate", "plan", "why", "config", "recipes", "nodes", "new", "init", "check", "schema", "cache", "compare",
     "handbook",
 )  # fmt: skip
-#: commands that run as they are written, but for the small options that hide those of the packaged camera
+#: commands that run as they are written, but for the small options that hide those of the packaged
+#: camera
 SIZED = ("run", "sweep", "restore")
 
 
@@ -49,34 +54,61 @@ class NotDeclared(LookupError):
 
 
 class StandIn(NamedTuple):
-    """Small sizes, counts and machines with which a test runs a command of a page, and the reason."""
+    """Small sizes, counts and machines with which a test runs a command of a page, and the
+    reason.
+    """
 
     why: str
     more: tuple[str, ...] = ()  #: words after those of the page
     instead: Mapping[str, str] = {}  #: words in the place of words of the page
-    constants: Mapping[str, Any] = {}  #: ``module:name`` of a number of the program that is made small
+    #: ``module:name`` of a number of the program that is made small
+    constants: Mapping[str, Any] = {}
     processes: int = 1  #: of a mesh
     code: int = 0  #: the exit code
 
 
 PITCH = "doe.pitch=14.96 um"
 FULL_MASK = StandIn("the height map has the 540 samples of the full pupil", more=(PITCH,))
-FIELD = {"sensor.shape=[512,512]": "sensor.shape=[24,24]", "scene.shape=[576,576]": "scene.shape=[28,28]"}
+FIELD = {
+    "sensor.shape=[512,512]": "sensor.shape=[24,24]",
+    "scene.shape=[576,576]": "scene.shape=[28,28]",
+}
 PIPELINES = "flat+none, half_ring+wiener, pixelwise@mask.npy+wiener"
 EVALUATE = 'evaluate first_light "sensor.shape=[512,512]" "scene.shape=[576,576]"'
 SIX = "train train_small train.stages.1.iterations=6 train.stages.2.iterations=6"
-SHORT = {f"train.stages.{stage}.iterations=6": f"train.stages.{stage}.iterations=1" for stage in (1, 2)}
+SHORT = {
+    f"train.stages.{stage}.iterations=6": f"train.stages.{stage}.iterations=1" for stage in (1, 2)
+}
 ONE = tuple(SHORT.values())
 TRAINING = (
-    "optics.samples=48", "optics.pitch=168.27 um", "optics.bands=5", "optics.window=[40, 40]", "scene.shape=[40, 40]",
-    "sensor.shape=[32, 32]", "train.network.width=4", "train.critics.width=4",
-)  # fmt: skip
-LIMITED = "train.mask={kind: polynomial, learn_stop: true, limit: 0.01, weights: {filtered_error: 1, lsr: 0, bsr: 0}}"
-PAPER_TRAINING = (*TRAINING, *ONE, "train.size=null", "train.stages.1.batch=2", "train.stages.2.batch=2")
-DEMONSTRATION = (
-    *TRAINING[:-2], "train.network.width=4", "train.mask.iterations=2", "train.stages.2.iterations=1", "train.pool=2",
+    "optics.samples=48",
+    "optics.pitch=168.27 um",
+    "optics.bands=5",
+    "optics.window=[40, 40]",
+    "scene.shape=[40, 40]",
+    "sensor.shape=[32, 32]",
+    "train.network.width=4",
+    "train.critics.width=4",
+)
+LIMITED = (
+    "train.mask={kind: polynomial, learn_stop: true, limit: 0.01, weights: {filtered_error: 1, lsr:"
+    " 0, bsr: 0}}"
+)
+PAPER_TRAINING = (
+    *TRAINING,
+    *ONE,
     "train.size=null",
-)  # fmt: skip
+    "train.stages.1.batch=2",
+    "train.stages.2.batch=2",
+)
+DEMONSTRATION = (
+    *TRAINING[:-2],
+    "train.network.width=4",
+    "train.mask.iterations=2",
+    "train.stages.2.iterations=1",
+    "train.pool=2",
+    "train.size=null",
+)
 SMALLNET = (*TRAINING[:-2], "train.stages.2.iterations=2", "train.critics.width=4")
 
 
@@ -86,19 +118,29 @@ def three_omissions(*found: Any) -> Any:
 
 
 def without_walk(problem: Any, mode: Any, seed: int, *_: Any, **how: Any) -> Any:
-    """Draw from the posterior of a sensor by weights, which takes a hundredth of the time of a walk."""
+    """Draw from the posterior of a sensor by weights, which takes a hundredth of the time of a
+    walk.
+    """
     from tests.workflows.studies.calibration.test_calibration_study import resampled
 
     return resampled(problem, mode, seed)
 
 
-#: of the fine grid of the pupil in front of which `neusee safety` puts a laser, and the fewest draws that it takes
+#: of the fine grid of the pupil in front of which `neusee safety` puts a laser, and the fewest
+#: draws that it takes
 SAFETY = ("safety.draws=100", "optics.samples=128", "optics.window=[128, 128]")
-DAZZLE = ("wide.window=[99, 99]", "safety.dazzle.share=0.001")  #: behind the mask, with so few samples
+#: behind the mask, with so few samples
+DAZZLE = ("wide.window=[99, 99]", "safety.dazzle.share=0.001")
 PROTECTION = (
-    "optics.samples=128", "optics.pitch=63.11 um", "optics.bands=3", "optics.window=[64, 64]", "scene.shape=[64, 64]",
-    "sensor.shape=[48, 48]", "--bands", "2",
-)  # fmt: skip
+    "optics.samples=128",
+    "optics.pitch=63.11 um",
+    "optics.bands=3",
+    "optics.window=[64, 64]",
+    "scene.shape=[64, 64]",
+    "sensor.shape=[48, 48]",
+    "--bands",
+    "2",
+)
 TWO = (*PROTECTION, "--draws", "2")
 
 CLUSTER = "tcp://scheduler:8786"
@@ -109,15 +151,24 @@ CUT = {"calibration.emcee_sampler:_FIRST": 80, "calibration.emcee_sampler:_LONGE
 LABORATORY = "calibrate my/lab --sensor lab"
 DRAWN = {"calibration.emcee_sampler:sample": drawn_chains}
 ONE_PLOT = {"calibration.emva_figures:PICTURES": {"photon_transfer": PICTURES["photon_transfer"]}}
-#: two lasers of an evaluation's page, as weak as its points: each saturated pixel adds an unknown to the filter
+#: two lasers of an evaluation's page, as weak as its points: each saturated pixel adds an unknown
+#: to the filter
 WEAK = {
     "evaluation.comparison_pictures:_WEAKEST": 30.0,
     "evaluation.comparison_pictures:CASES": {name: LASERS[name] for name in ("green", "red", NONE)},
 }
 PROTOCOL = (
-    "scene.shape=[28,28]", "sensor.shape=[24,24]", "--scenes", "1", "--strengths", "0,30", "--pipelines",
-    "flat+none, half_ring+none", "--equal-protection", "1e-5",
-)  # fmt: skip
+    "scene.shape=[28,28]",
+    "sensor.shape=[24,24]",
+    "--scenes",
+    "1",
+    "--strengths",
+    "0,30",
+    "--pipelines",
+    "flat+none, half_ring+none",
+    "--equal-protection",
+    "1e-5",
+)
 #: two of the six lasers of the protocol's page, and weak ones
 TWO_OF_SIX = {
     "evaluation.comparison_pictures:_WEAKEST": 30.0,
@@ -125,11 +176,16 @@ TWO_OF_SIX = {
 }
 #: settings of an accuracy study, each measured once
 FEW_POINTS = {
-    "studies.accuracy.accuracy_study:_FEWER": (1e-1,), "studies.accuracy.accuracy_study:TIMES": 1,
-    "studies.accuracy.recipe_knobs:_FEWER": (1 / 3,), "studies.accuracy.recipe_knobs:_FEWER_SCALES": (0.75,),
+    "studies.accuracy.accuracy_study:_FEWER": (1e-1,),
+    "studies.accuracy.accuracy_study:TIMES": 1,
+    "studies.accuracy.recipe_knobs:_FEWER": (1 / 3,),
+    "studies.accuracy.recipe_knobs:_FEWER_SCALES": (0.75,),
     "studies.accuracy.single_steps:_TIMES": 1,
-}  # fmt: skip
-FEW_STOPS = {"protection.protection_result:_RATIO": 0.5, "protection.protection_result:_MASK_STOPS": (1.0, 0.7)}
+}
+FEW_STOPS = {
+    "protection.protection_result:_RATIO": 0.5,
+    "protection.protection_result:_MASK_STOPS": (1.0, 0.7),
+}
 
 #: of a recipe that states the sizes of its frame itself
 SMALL_FRAME = ("scene.shape=[40, 40]", "sensor.shape=[32, 32]")
@@ -175,11 +231,13 @@ STAND_INS = {
     "train train_small train.photographs=my_photographs": StandIn("ten minutes", more=(*TRAINING, *ONE)),
     "train train_small train.photographs=my_photographs train.validate_every=100 train.patience=5": StandIn(
         "ten minutes", more=(*TRAINING, *ONE)),
-    "train train_small train.photographs=my_photographs train.augment.symmetries=all train.augment.exposure=2 "
+    "train train_small train.photographs=my_photographs train.augment.symmetries=all "
+    "train.augment.exposure=2 "
     "train.augment.colour=0.3": StandIn("ten minutes", more=(*TRAINING, *ONE)),
     "train train_small train.photographs=my_photographs train.picture=restored +mismatch=usual": StandIn(
         "ten minutes", more=(*TRAINING, *ONE)),
-    "train train_small train.photographs=my_photographs train.picture=restored +height_error=smooth "
+    "train train_small train.photographs=my_photographs train.picture=restored "
+    "+height_error=smooth "
     "\"train.mismatch={height_error.rms: 'uniform(0 nm, 20 nm)', height_error.depth: 'normal(0, 0.01)'}\"": StandIn(
         "ten minutes", more=(*TRAINING, *ONE)),
     'train my/train_smallnet.yaml "train.export=[pt2]"': StandIn("minutes", more=SMALLNET),
@@ -272,16 +330,21 @@ STAND_INS = {
 
 
 def stand_in(words: str, folder: Path) -> StandIn | None:
-    """Return the stand-in of a command, or None if it runs as it stands; raise `NotDeclared` if it is too large."""
+    """Return the stand-in of a command, or None if it runs as it stands; raise `NotDeclared` if
+    it is too large.
+    """
     kind, declared = words.split()[0], STAND_INS.get(words)
     if kind in LIGHT:
         return declared
     if declared is None and kind not in SIZED and not words.startswith("study uncertainty"):
         raise NotDeclared(f"neusee {words}: say in STAND_INS how a test runs this command")
     text = _recipe_text(words, folder)
-    if (declared is None and not OF_PACKAGE.search(text)) or kind in ("sheet", "calibrate"):  # no expected numbers
+    # no expected numbers
+    if (declared is None and not OF_PACKAGE.search(text)) or kind in ("sheet", "calibrate"):
         return declared
-    found = declared or StandIn("the camera is small; expected numbers are those of the full camera")
+    found = declared or StandIn(
+        "the camera is small; expected numbers are those of the full camera"
+    )
     numbers = re.search(r"^expect:", text, re.MULTILINE) and OF_PACKAGE.search(text)
     return found._replace(more=(*found.more, *(["~expect"] if numbers else [])))
 
@@ -289,9 +352,18 @@ def stand_in(words: str, folder: Path) -> StandIn | None:
 def _recipe_text(words: str, folder: Path) -> str:
     """Return the text of the recipe that a command names, that of first light if it names none."""
     named = [word for word in shlex.split(words)[1:] if not re.search(r"[=~]|^-", word)]
-    name = next((word for word in named if word.endswith(".yaml") or (ROOT / f"recipes/{word}.yaml").is_file()), None)
+    name = next(
+        (
+            word
+            for word in named
+            if word.endswith(".yaml") or (ROOT / f"recipes/{word}.yaml").is_file()
+        ),
+        None,
+    )
     own = name is not None and name.endswith(".yaml")
-    return (folder / str(name) if own else ROOT / f"recipes/{name or 'first_light'}.yaml").read_text(encoding="utf-8")
+    return (
+        folder / str(name) if own else ROOT / f"recipes/{name or 'first_light'}.yaml"
+    ).read_text(encoding="utf-8")
 
 
 def typed(words: str, found: StandIn | None) -> list[str]:

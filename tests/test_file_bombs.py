@@ -1,4 +1,5 @@
-"""Files of strangers that would take gigabytes, or would never end: each is refused in one sentence and little memory.
+"""Files of strangers that would take gigabytes, or would never end: each is refused in one sentence
+and little memory.
 
 All are read by one child process, whose readers may use 100 MB more than it holds.
 """
@@ -13,7 +14,8 @@ import pytest
 from tests import file_bombs as bombs
 
 LEFT = 100 * bombs.MB  #: bytes that readers may use
-MOST = 130 * bombs.MB  #: bytes by which the process may grow: what a reader was allowed, and libraries
+#: bytes by which the process may grow: what a reader was allowed, and libraries
+MOST = 130 * bombs.MB
 MEMORY = "more than the"  #: in each sentence about memory
 OTHER = "is not a regular file but"
 
@@ -199,7 +201,9 @@ for name, (file, code) in json.load(sys.stdin).items():
 
 @pytest.fixture(scope="module")
 def answers(tmp_path_factory):
-    """What the child says of each bomb: the text of the error, the bytes by which it grew, and the seconds."""
+    """What the child says of each bomb: the text of the error, the bytes by which it grew, and
+    the seconds.
+    """
     folder, jobs = tmp_path_factory.mktemp("bombs"), {}
     for number, (name, (make, file, code, _)) in enumerate(BOMBS.items()):
         path = folder / str(number) / file
@@ -208,9 +212,15 @@ def answers(tmp_path_factory):
         jobs[name] = (str(path), code)
     done = subprocess.run(
         [sys.executable, "-c", READ.replace("LEFT", str(LEFT))],
-        input=json.dumps(jobs), capture_output=True, text=True, cwd=folder, timeout=1200,
-    )  # fmt: skip
-    found = {name: (text, *numbers) for name, text, *numbers in map(json.loads, done.stdout.splitlines())}
+        input=json.dumps(jobs),
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        timeout=1200,
+    )
+    found = {
+        name: (text, *numbers) for name, text, *numbers in map(json.loads, done.stdout.splitlines())
+    }
     assert set(found) == set(BOMBS), done.stderr[-2000:]
     return found | {"paths": {name: path for name, (path, _) in jobs.items()}}
 

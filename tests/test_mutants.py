@@ -1,4 +1,6 @@
-"""The table of mutants: each fault can still be made, and the tests that must find it are still there."""
+"""The table of mutants: each fault can still be made, and the tests that must find it are still
+there.
+"""
 
 import importlib.util
 from pathlib import Path

@@ -1,7 +1,8 @@
-"""Every reader of a file states its size: which memory it needs is known before anything is allocated.
+"""Every reader of a file states its size: which memory it needs is known before anything is
+allocated.
 
-A function that calls a reader of a library, or opens a file, must call one of `STATES` as well, or stand in `NO_SIZE`
-with the reason why the file cannot be one of a stranger.
+A function that calls a reader of a library, or opens a file, must call one of `STATES` as well, or
+stand in `NO_SIZE` with the reason why the file cannot be one of a stranger.
 """
 
 import ast
@@ -13,12 +14,14 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FILES = sorted([*ROOT.glob("nodes/**/*.py"), *ROOT.glob("workflows/**/*.py")])
 
-#: functions that compare the bytes of a file with the memory that is left, or read a file that they have compared
+#: functions that compare the bytes of a file with the memory that is left, or read a file that they
+#: have compared
 STATES = re.compile(
     r"(needs|picture_needs|pages_need|tiff_needs|exr_needs|npy_needs|npz_needs|archive_needs|safetensors_need|"
     r"mat_needs|fits_needs|hdf5_needs|bytes_of|text_of|lines_of|head_of|opened)"
 )
-#: functions of libraries that read a file of pictures, arrays or tables, by the end of what is called
+#: functions of libraries that read a file of pictures, arrays or tables, by the end of what is
+#: called
 READERS = re.compile(
     r"(.*\.)?(load_file|safe_open|loadmat|whosmat|HDFBackend|ZipFile|read_image_\w+|fromfile|memmap|loadtxt|"
     r"genfromtxt|imread|imopen|read_csv|read_excel|read_table|open_dataset|open_dataarray|open_mfdataset|from_netcdf|"
@@ -34,7 +37,8 @@ LAST = re.compile(
 )
 WRITES = re.compile(r"[wxa][bt+]*")
 
-#: functions that need state no size, each with the reason: the file is one of the program, or of the system
+#: functions that need state no size, each with the reason: the file is one of the program, or of
+#: the system
 SYSTEM = "the system answers in a few kilobytes"
 SOURCE = "source code that is installed, or that the user runs"
 PACKAGED = "a file of the package"
@@ -42,7 +46,10 @@ OWN = "a file that this function has just written"
 WRITTEN = "it writes, and reads nothing"
 HEADER = "the header alone; what reads the numbers states their size"
 CHECKED = "the caller has compared all that the archive holds"
-STORE = "a file of the cache, opened without waiting, whose length its record states or whose kind has a limit"
+STORE = (
+    "a file of the cache, opened without waiting, whose length its record states or whose kind has"
+    " a limit"
+)
 OPENS = "it opens the file for others, without waiting for a pipe"
 DIGEST = "a digest, in pieces of a few kilobytes, opened without waiting"
 NO_SIZE = {
@@ -62,7 +69,9 @@ NO_SIZE = {
     "workflows/answers/stored_results.py:_digest_by": DIGEST,
     "workflows/answers/witnesses.py:file_digest": DIGEST,
     "workflows/calibration/emcee_sampler.py:_write": OWN,
-    "workflows/engine/step_process.py:_called": "a file in memory that the fork of this function has just written",
+    "workflows/engine/step_process.py:_called": (
+        "a file in memory that the fork of this function has just written"
+    ),
     "workflows/calibration/emcee_sampler.py:_write_draws": WRITTEN,
     "workflows/cli/catalogue.py:_uses": PACKAGED,
     "workflows/cli/catalogue.py:glossary_lines": PACKAGED,
@@ -123,11 +132,13 @@ NO_SIZE = {
     "workflows/training/training_page.py:write_page": OWN,
 }
 
-# --- what a file says -------------------------------------------------------------------------------------------------
+# --- what a file says -----------------------------------------------------------------------------
 
 
 def functions(tree):
-    """Every innermost function with its name and all that stands in it; what stands outside is in ``module``."""
+    """Every innermost function with its name and all that stands in it; what stands outside is
+    in ``module``.
+    """
     inner = {ast.FunctionDef, ast.AsyncFunctionDef}
     found = []
 
@@ -149,10 +160,13 @@ def functions(tree):
 
 
 def reads(items):
-    """The readers in a function: what is called, and what is only named, such as a function of a table of readers."""
+    """The readers in a function: what is called, and what is only named, such as a function of a
+    table of readers.
+    """
     calls = {id(item.func): item for item in items if isinstance(item, ast.Call)}
     for item in items:
-        if not LAST.fullmatch(getattr(item, "attr", getattr(item, "id", ""))):  # the text of every item takes seconds
+        # the text of every item takes seconds
+        if not LAST.fullmatch(getattr(item, "attr", getattr(item, "id", ""))):
             continue
         if id(item) in calls:
             is_reader = READERS.fullmatch(ast.unparse(item)) and not _writes(calls[id(item)])
@@ -163,7 +177,9 @@ def reads(items):
 
 
 def _is_handed_on(item):
-    return re.fullmatch(r"(np|numpy|torch)\.load|\w+\.(read_image_\w+|load_file|loadmat|imread)", ast.unparse(item))
+    return re.fullmatch(
+        r"(np|numpy|torch)\.load|\w+\.(read_image_\w+|load_file|loadmat|imread)", ast.unparse(item)
+    )
 
 
 def _writes(call):
@@ -174,10 +190,16 @@ def _writes(call):
 
 
 def stateless(path, tree):
-    """The functions of a file that read and state no size: ``file:function`` with what they call."""
+    """The functions of a file that read and state no size: ``file:function`` with what they
+    call.
+    """
     for name, items in functions(tree):
         found = sorted(set(reads(items)))
-        called = {getattr(item.func, "attr", getattr(item.func, "id", "")) for item in items if type(item) is ast.Call}
+        called = {
+            getattr(item.func, "attr", getattr(item.func, "id", ""))
+            for item in items
+            if type(item) is ast.Call
+        }
         if found and not any(map(STATES.fullmatch, called)):
             yield f"{path.relative_to(ROOT).as_posix()}:{name}", found
 
@@ -186,7 +208,7 @@ def parsed(path):
     return ast.parse(path.read_text())
 
 
-# --- the tests --------------------------------------------------------------------------------------------------------
+# --- the tests ------------------------------------------------------------------------------------
 
 
 def test_every_reader_states_its_size():
@@ -220,4 +242,8 @@ def test_a_new_reader_without_a_size_is_found(code):
 def test_a_reader_that_states_its_size_is_none_of_them():
     code = "def _new(file):\n    npy_needs(file, 1.0)\n    return np.load(file)\n"
     assert not list(stateless(ROOT / "nodes" / "new.py", ast.parse(code)))
-    assert not list(stateless(ROOT / "nodes" / "new.py", ast.parse("def _new(file):\n    open(file, 'wb').write(b'')")))
+    assert not list(
+        stateless(
+            ROOT / "nodes" / "new.py", ast.parse("def _new(file):\n    open(file, 'wb').write(b'')")
+        )
+    )

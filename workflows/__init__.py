@@ -1,4 +1,5 @@
-"""The machinery that reads a recipe, runs its steps in order, stores their results and reports on the run.
+"""The machinery that reads a recipe, runs its steps in order, stores their results and reports on
+the run.
 
     from neusee.workflows import load
     result = load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}).run()

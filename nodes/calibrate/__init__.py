@@ -1,4 +1,6 @@
-"""Calibration nodes, which estimate the constants of a sensor with uncertainties from frames of flat light."""
+"""Calibration nodes, which estimate the constants of a sensor with uncertainties from frames of
+flat light.
+"""
 
 from neusee.nodes.calibrate import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.calibrate._budget._camera_sources import (
@@ -10,7 +12,13 @@ from neusee.nodes.calibrate._budget._camera_sources import (
 from neusee.nodes.calibrate._budget._laboratory import Laboratory, laboratory_contributions
 from neusee.nodes.calibrate._budget._sheet_budget import MODEL, sheet_budgets
 from neusee.nodes.calibrate._budget._traceability import Traceability
-from neusee.nodes.calibrate._budget._uncertainty_budget import COVERAGE, NOT_INVOLVED, NOT_STATED, Budget, Contribution
+from neusee.nodes.calibrate._budget._uncertainty_budget import (
+    COVERAGE,
+    NOT_INVOLVED,
+    NOT_STATED,
+    Budget,
+    Contribution,
+)
 from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
 from neusee.nodes.calibrate._frames._emva_descriptor import (
     descriptor,
@@ -19,7 +27,12 @@ from neusee.nodes.calibrate._frames._emva_descriptor import (
     descriptor_series,
     refuse_descriptor,
 )
-from neusee.nodes.calibrate._frames._frame_headers import FrameHeader, frame_divisor, frame_header, frame_means
+from neusee.nodes.calibrate._frames._frame_headers import (
+    FrameHeader,
+    frame_divisor,
+    frame_header,
+    frame_means,
+)
 from neusee.nodes.calibrate._frames._frame_statistics import levels, reduce
 from neusee.nodes.calibrate._frames._hot_pixels import hot_pixels
 from neusee.nodes.calibrate._frames._level_frames import frames
@@ -30,15 +43,27 @@ from neusee.nodes.calibrate._likelihood._camera_likelihood import camera, expect
 from neusee.nodes.calibrate._likelihood._likelihood_node import density
 from neusee.nodes.calibrate._likelihood._linear_sensor import Likelihood
 from neusee.nodes.calibrate._likelihood._sufficient_statistics import Sufficient, sufficient
-from neusee.nodes.calibrate._prior._camera_prior import CAMERA_NAMES, CameraCoordinates, camera_prior
+from neusee.nodes.calibrate._prior._camera_prior import (
+    CAMERA_NAMES,
+    CameraCoordinates,
+    camera_prior,
+)
 from neusee.nodes.calibrate._prior._first_guess import guess, guess_camera
 from neusee.nodes.calibrate._prior._free_parameters import Prior, Ridge
 from neusee.nodes.calibrate._prior._sensor_prior import NAMES, Coordinates, prior
 from neusee.nodes.calibrate._scatter._point_source import Rings, point_source
 from neusee.nodes.calibrate._scatter._scatter_likelihood import guess_scatter, stray_light
-from neusee.nodes.calibrate._scatter._scatter_prior import SCATTER_NAMES, ScatterCoordinates, stray_prior
+from neusee.nodes.calibrate._scatter._scatter_prior import (
+    SCATTER_NAMES,
+    ScatterCoordinates,
+    stray_prior,
+)
 from neusee.nodes.calibrate._sheet._general_model import general_model
-from neusee.nodes.calibrate._sheet._nonuniformity import Nonuniformity, SpatialSeries, spatial_series
+from neusee.nodes.calibrate._sheet._nonuniformity import (
+    Nonuniformity,
+    SpatialSeries,
+    spatial_series,
+)
 from neusee.nodes.calibrate._sheet._patterns import (
     DefectHistogram,
     Profiles,

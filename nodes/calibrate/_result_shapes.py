@@ -1,4 +1,6 @@
-"""Shapes of the results of the calibration nodes; the number of histogram cells is only known from values."""
+"""Shapes of the results of the calibration nodes; the number of histogram cells is only known
+from values.
+"""
 
 from typing import Any
 

@@ -19,26 +19,36 @@ Scale = Annotated[float, Field(ge=0.01, le=1)]  #: share of the pupil's diameter
 Excess = Annotated[float, Field(gt=-1, le=1)]  #: share of the height
 _VIOLET = 400e-9  #: m, wavelength at which a change of height is converted to a change of phase
 _ROUNDING = 1.2e-7  #: of the height, float32
-_LARGEST = 31  #: times its standard deviation, no sample of a smooth random field is larger; as for `flare.dirt`
+#: times its standard deviation, no sample of a smooth random field is larger; as for `flare.dirt`
+_LARGEST = 31
 
 
 @node()
 def height_error(
-    height: Tensor, stop: Stop, *, rms: Rms = 0.0, scale: Scale = 0.1, depth: Excess = 0.0, rng: torch.Generator
+    height: Tensor,
+    stop: Stop,
+    *,
+    rms: Rms = 0.0,
+    scale: Scale = 0.1,
+    depth: Excess = 0.0,
+    rng: torch.Generator,
 ) -> Tensor:
-    """Return the height map as it was made: ``depth`` deeper as a whole, with a smooth random error of the height.
+    """Return the height map as it was made: ``depth`` deeper as a whole, with a smooth random error
+    of the height.
 
-    An etching that takes too long, or a dose that is too high, makes every height greater by the same share ``depth``.
-    The random error is a Gaussian field with the root mean square ``rms`` over many masks and the correlation
-    exp(-(d / ``scale``)**2) at the distance d, both in diameters of the pupil. Its draw does not depend on the sampling
-    of the pupil. It may make a height negative, which moves the surface below the substrate and not the light.
+    An etching that takes too long, or a dose that is too high, makes every height greater by the
+    same share ``depth``. The random error is a Gaussian field with the root mean square ``rms``
+    over many masks and the correlation exp(-(d / ``scale``)**2) at the distance d, both in
+    diameters of the pupil. Its draw does not depend on the sampling of the pupil. It may make a
+    height negative, which moves the surface below the substrate and not the light.
 
     Shapes: (v, u), stop -> (v, u).
     Units:  rms m; scale in diameters of the pupil; depth as a share of the height; result m.
-    Error:  1e-7 of the deepest height (float32); the correlation is exact to 1e-4 on a lattice of half a ``scale``.
+    Error:  1e-7 of the deepest height (float32); the correlation is exact to 1e-4 on a lattice of
+            half a ``scale``.
     Raises: ValueError for a height in half precision, or of another shape than the pupil grid.
-    Source: by definition; a depth error as a share of the depth: Swanson, MIT Lincoln Laboratory Technical Report 854
-            (1989), section on fabrication errors.
+    Source: by definition; a depth error as a share of the depth: Swanson, MIT Lincoln Laboratory
+            Technical Report 854 (1989), section on fabrication errors.
     """
     refuse_half(height=height)
     grid = grid_of(stop)
@@ -53,7 +63,8 @@ def height_error(
 
 @height_error.skip_bound
 def _(height: TensorStats, *_: Any, rms: float, depth: float, **__: Any) -> float:
-    """Return an upper bound of the relative change of a height map, which is never below its phase at 400 nm in rad.
+    """Return an upper bound of the relative change of a height map, which is never below its phase
+    at 400 nm in rad.
 
     The phase is that of a change of optical path by as much as the height, as for an index of 2.
     """
@@ -63,11 +74,17 @@ def _(height: TensorStats, *_: Any, rms: float, depth: float, **__: Any) -> floa
     if not (depth and deepest) and not rms:
         return 0.0
     change = (abs(depth) + _ROUNDING) * deepest + _LARGEST * rms
-    return max(2 * math.pi * change / _VIOLET, change / (deepest - change) if deepest > change else math.inf)
+    return max(
+        2 * math.pi * change / _VIOLET,
+        change / (deepest - change) if deepest > change else math.inf,
+    )
 
 
 @height_error.check
 def _(result: Tensor, height: Tensor, *_: Any, **__: Any) -> list[Check]:
     change = (result - height).detach().double()
-    text = f"{float(change.square().mean().sqrt()) * 1e9:.3g} nm root mean square from the height of the design"
+    text = (
+        f"{float(change.square().mean().sqrt()) * 1e9:.3g} nm root mean square from the height of"
+        " the design"
+    )
     return [Check(text, bool(torch.isfinite(change).all()))]

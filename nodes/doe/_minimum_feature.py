@@ -18,17 +18,20 @@ _REACH = 6.0  #: standard deviations beyond which the spot holds 1e-9 of its dos
 
 @node(rtol=1e-5)
 def smooth(height: Tensor, stop: Stop, *, feature: PupilPitch) -> Tensor:
-    """Average the height map over the round Gaussian spot of a tool, whose full width at half maximum is ``feature``.
+    """Average the height map over the round Gaussian spot of a tool, whose full width at half
+    maximum is ``feature``.
 
-    Depth follows dose, and dose is the wanted height averaged over the spot: steps get flanks of ``feature``, pillars
-    that are narrower vanish, planes and wide features stay. An average lies between the least and the greatest
-    height under the spot, so the mask does not become deeper. At the edge of the grid, the average covers only the
-    samples inside the grid. The spot is a Gaussian and not a disc, whose transfer function has negative lobes: with a
-    Gaussian, features that are too small fade, and no feature is inverted.
+    Depth follows dose, and dose is the wanted height averaged over the spot: steps get flanks of
+    ``feature``, pillars that are narrower vanish, planes and wide features stay. An average lies
+    between the least and the greatest height under the spot, so the mask does not become deeper. At
+    the edge of the grid, the average covers only the samples inside the grid. The spot is a
+    Gaussian and not a disc, whose transfer function has negative lobes: with a Gaussian, features
+    that are too small fade, and no feature is inverted.
 
     Shapes: (v, u), stop -> (v, u).
     Units:  m.
-    Error:  1e-6 of the deepest height (float32). A spot below 1.5 samples is not resolved by the grid.
+    Error:  1e-6 of the deepest height (float32). A spot below 1.5 samples is not resolved by the
+            grid.
     Raises: ValueError for a height in half precision, or of another shape than the pupil grid.
     Source: Gaussian spot of laser lithography: Gale et al., Opt. Eng. 33, 3556 (1994).
     """
@@ -40,8 +43,8 @@ def smooth(height: Tensor, stop: Stop, *, feature: PupilPitch) -> Tensor:
 
 
 def _average(samples: int, feature: float) -> Tensor:
-    """Return the float64 matrix that averages along one axis over a tool spot of ``feature`` samples; each row sums to
-    1.
+    """Return the float64 matrix that averages along one axis over a tool spot of ``feature``
+    samples; each row sums to 1.
     """
     sigma = feature / math.sqrt(8 * math.log(2))
     index = torch.arange(samples, dtype=torch.float64)
@@ -52,7 +55,9 @@ def _average(samples: int, feature: float) -> Tensor:
 
 @smooth.reference
 def _(height: Tensor, stop: Stop, *, feature: float) -> Tensor:
-    """Compute the average of the height map over the tool's spot, for the samples of one row after another."""
+    """Compute the average of the height map over the tool's spot, for the samples of one row
+    after another.
+    """
     samples, pitch, _ = grid_of(stop)
     sigma = feature / pitch / math.sqrt(8 * math.log(2))
     x, index = height.double(), torch.arange(samples, dtype=torch.float64)

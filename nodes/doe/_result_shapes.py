@@ -4,7 +4,15 @@ from typing import Any
 
 from torch import Tensor
 
-from neusee.nodes.doe._analytic_masks import axicon, cubic, flat, half_rings, spiral_axicon, vortex, zernike
+from neusee.nodes.doe._analytic_masks import (
+    axicon,
+    cubic,
+    flat,
+    half_rings,
+    spiral_axicon,
+    vortex,
+    zernike,
+)
 from neusee.nodes.doe._equal_filter import equal_filter
 from neusee.nodes.doe._fabrication_limits import fabricate
 from neusee.nodes.doe._height_error import height_error
@@ -31,7 +39,9 @@ for node in (flat, vortex, axicon, spiral_axicon, cubic, half_rings, zernike, pi
 
 
 @unet.work
-def _(result: Tensor, *inputs: Any, grid: int = 270, width: int = 32, **params: Any) -> tuple[float, float]:
+def _(
+    result: Tensor, *inputs: Any, grid: int = 270, width: int = 32, **params: Any
+) -> tuple[float, float]:
     side = min(grid, len(result))
     return 4.0 * width * side**2, float(width * side) ** 2 + result.numel()
 

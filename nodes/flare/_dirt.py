@@ -1,4 +1,6 @@
-"""Dirt on the window in front of the lens, with statistics that do not depend on the sampling of the pupil."""
+"""Dirt on the window in front of the lens, with statistics that do not depend on the sampling of
+the pupil.
+"""
 
 import math
 from typing import Annotated, Any
@@ -39,20 +41,24 @@ def dirt(
     dents: Rms = 0.0,
     rng: torch.Generator,
 ) -> Dirt:
-    """Add the dirt of a windshield to the pupil: grains of dust, scratches, a greasy film, smudges and dents.
+    """Add the dirt of a windshield to the pupil: grains of dust, scratches, a greasy film, smudges
+    and dents.
 
-    dust, scratches: expected numbers (Wu et al.: 30 each). The radius of the largest grain is drawn about
-        ``dust_radius``, the width of the widest scratch about ``scratch_width``. A scratch has up to 16 steps, none
-        longer than ``scratch_length``. All lengths are relative to the diameter.
-    grease: root mean square of a phase screen with correlation length ``grease_scale`` (0.02 to 0.2).
-    smudges: opacity of the field under the thickest of the soft patches, whose size is ``smudge_scale``.
-    dents: root mean square of Zernike terms 4 to 15 (0.1 to 2 waves). With all five at zero the glass is clean.
+    dust, scratches: expected numbers (Wu et al.: 30 each). The radius of the largest grain is drawn
+        about ``dust_radius``, the width of the widest scratch about ``scratch_width``. A scratch
+        has up to 16 steps, none longer than ``scratch_length``. All lengths are relative to the
+        diameter.
+    grease: root mean square of a phase screen with correlation length ``grease_scale`` (0.02 to
+    0.2). smudges: opacity of the field under the thickest of the soft patches, whose size is
+    ``smudge_scale``. dents: root mean square of Zernike terms 4 to 15 (0.1 to 2 waves). With all
+    five at zero the glass is clean.
 
     Shapes: stop -> Dirt (v, u).
     Units:  grease, dents waves at 550 nm; result amplitude 1, path m.
-    Error:  covered area of a mark: 1 % from 3 samples across, 10 % at 1 sample, unbiased at any size.
-    Source: numbers, sizes and opacities of dust and scratches: Wu et al., ICCV 2021 (arXiv 2011.12485), relative to
-        their 6000 samples; grease, smudges and dents are ours.
+    Error:  covered area of a mark: 1 % from 3 samples across, 10 % at 1 sample, unbiased at any
+            size.
+    Source: numbers, sizes and opacities of dust and scratches: Wu et al., ICCV 2021 (arXiv
+        2011.12485), relative to their 6000 samples; grease, smudges and dents are ours.
     """
     grid = grid_of(stop)
     grains_rng, lines_rng, film_rng, patches_rng, dents_rng = _streams(5, rng)
@@ -62,7 +68,9 @@ def dirt(
     bends = _dents(WAVE * dents, dents_rng)
     amplitude, path = (torch.empty(grid.samples, grid.samples) for _ in range(2))
     for rows in stripes(grid):
-        amplitude[rows] = 1 - smudges * torch.sigmoid(3 * (patches[0][rows] @ patches[1])) if smudges else 1.0
+        amplitude[rows] = (
+            1 - smudges * torch.sigmoid(3 * (patches[0][rows] @ patches[1])) if smudges else 1.0
+        )
         path[rows] = WAVE * grease * (film[0][rows] @ film[1]) if grease else 0.0
         if bends:
             path[rows] += surface(bends, grid, rows=rows)
@@ -70,24 +78,37 @@ def dirt(
 
 
 def _streams(count: int, rng: torch.Generator) -> list[torch.Generator]:
-    """Create one random generator for each kind of dirt, so that more dust leaves the scratches unchanged."""
+    """Create one random generator for each kind of dirt, so that more dust leaves the scratches
+    unchanged.
+    """
     seeds = torch.randint(2**62, (count,), generator=rng, device=rng.device).tolist()
     return [torch.Generator(rng.device).manual_seed(seed) for seed in seeds]
 
 
 def _uniform(rng: torch.Generator, low: float = 0.0, high: float = 1.0) -> float:
-    return low + (high - low) * float(torch.rand((), generator=rng, device=rng.device, dtype=torch.float64))
+    return low + (high - low) * float(
+        torch.rand((), generator=rng, device=rng.device, dtype=torch.float64)
+    )
 
 
 def _about(mean: float, spread: float, rng: torch.Generator) -> float:
     """Sample a normal distribution, and replace a negative number by 0."""
-    return max(mean + spread * float(torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)), 0.0)
+    return max(
+        mean
+        + spread * float(torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)),
+        0.0,
+    )
 
 
 def _grains(mean: float, radius: float, rng: torch.Generator) -> list[Grain]:
     largest = _about(radius, radius / 2, rng)
     return [
-        Grain(_uniform(rng, -0.5, 0.5), _uniform(rng, -0.5, 0.5), _uniform(rng) * largest, _uniform(rng, 0.5, 1.0))
+        Grain(
+            _uniform(rng, -0.5, 0.5),
+            _uniform(rng, -0.5, 0.5),
+            _uniform(rng) * largest,
+            _uniform(rng, 0.5, 1.0),
+        )
         for _ in range(round(_about(mean, mean / 6, rng)))
     ]
 
@@ -109,7 +130,9 @@ def _scratch(length: float, widest: float, rng: torch.Generator) -> Scratch:
 
 
 def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
-    """Return random Zernike coefficients of the dents in a window, whose root sum of squares is ``rms``."""
+    """Return random Zernike coefficients of the dents in a window, whose root sum of squares is
+    ``rms``.
+    """
     draw = torch.randn(len(DENT_TERMS), generator=rng, device=rng.device, dtype=torch.float64)
     parts = (rms * draw / draw.norm()).tolist()
     return dict(zip(DENT_TERMS, parts, strict=True)) if rms else {}
@@ -117,13 +140,21 @@ def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
 
 @dirt.zero_bound
 def _(
-    stop: TensorStats, *, dust: float, scratches: float, grease: float, smudges: float, dents: float, **_: Any
+    stop: TensorStats,
+    *,
+    dust: float,
+    scratches: float,
+    grease: float,
+    smudges: float,
+    dents: float,
+    **_: Any,
 ) -> float:
-    """Return an upper bound of the change of the pupil field by dirt, at 400 nm or longer; 0 for a clean window.
+    """Return an upper bound of the change of the pupil field by dirt, at 400 nm or longer; 0 for a
+    clean window.
 
-    A grain or a scratch may be black. A film is a sum of normal numbers, which the generator keeps below 8.6, so that
-    the film stays below 31 times its root mean square. The twelve terms of a dent together reach sqrt(50) times their
-    root mean square, at the rim.
+    A grain or a scratch may be black. A film is a sum of normal numbers, which the generator keeps
+    below 8.6, so that the film stays below 31 times its root mean square. The twelve terms of a
+    dent together reach sqrt(50) times their root mean square, at the rim.
     """
     if not any((dust, scratches, grease, smudges, dents)):
         return 0.0
@@ -135,7 +166,10 @@ def _(
 @dirt.check
 def _(result: Dirt, stop: Stop, **_: Any) -> list[Check]:
     passed, rms = _effect(result, grid_of(stop))
-    text = f"dirt passes {passed:.4f} of the light, bends it by {rms:.3g} waves root mean square at 550 nm"
+    text = (
+        f"dirt passes {passed:.4f} of the light, bends it by {rms:.3g} waves root mean square at"
+        " 550 nm"
+    )
     low, high = (float(x) for x in torch.aminmax(result.amplitude))
     return [
         Check(text, passed > 0),
@@ -144,11 +178,15 @@ def _(result: Dirt, stop: Stop, **_: Any) -> list[Check]:
 
 
 def _effect(dirt: Dirt, grid: PupilGrid) -> tuple[float, float]:
-    """Return the share of the light that passes the dirt, and the root mean square path in the dirt, in waves."""
+    """Return the share of the light that passes the dirt, and the root mean square path in the
+    dirt, in waves.
+    """
     sums = torch.zeros(4, dtype=torch.float64)
     for rows in stripes(grid):
         open_ = inside(grid, dirt.path.device, rows)
         light, waves = dirt.amplitude[rows][open_].double(), dirt.path[rows][open_].double() / WAVE
-        sums += torch.stack([open_.sum(), light.square().sum(), waves.sum(), waves.square().sum()]).cpu()
+        sums += torch.stack(
+            [open_.sum(), light.square().sum(), waves.sum(), waves.square().sum()]
+        ).cpu()
     passed, mean, square = (sums[1:] / sums[0]).tolist()
     return passed, math.sqrt(max(square - mean**2, 0.0))

@@ -1,4 +1,6 @@
-"""Round grains and scratches on glass, drawn with their correct area at any sampling of the pupil."""
+"""Round grains and scratches on glass, drawn with their correct area at any sampling of the
+pupil.
+"""
 
 import math
 from collections.abc import Sequence
@@ -20,7 +22,9 @@ class Grain(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """A scratched line through points; positions (from the centre) and width are in diameters of the stop."""
+    """A scratched line through points; positions (from the centre) and width are in diameters of
+    the stop.
+    """
 
     points: Sequence[tuple[float, float]]  #: (v, u)
     width: float
@@ -28,7 +32,9 @@ class Scratch(NamedTuple):
 
 
 def stamp(amplitude: Tensor, marks: Sequence[Grain | Scratch], grid: PupilGrid) -> Tensor:
-    """Darken the pupil amplitude (v, u) in place by each grain and scratch, and return the amplitude."""
+    """Darken the pupil amplitude (v, u) in place by each grain and scratch, and return the
+    amplitude.
+    """
     scale, middle = grid.diameter / grid.pitch, (grid.samples - 1) / 2
     for mark in marks:
         points = [(mark.v, mark.u)] if isinstance(mark, Grain) else list(mark.points)
@@ -38,26 +44,36 @@ def stamp(amplitude: Tensor, marks: Sequence[Grain | Scratch], grid: PupilGrid) 
     return amplitude
 
 
-def _darken(amplitude: Tensor, places: list[tuple[float, float]], size: float, opacity: float) -> None:
+def _darken(
+    amplitude: Tensor, places: list[tuple[float, float]], size: float, opacity: float
+) -> None:
     window = _window(places, size / 2 + 1, amplitude.shape[-1])
     if window is None:
         return
     rows, columns = window
     y = torch.arange(rows.start, rows.stop, dtype=torch.float32, device=amplitude.device)[:, None]
-    x = torch.arange(columns.start, columns.stop, dtype=torch.float32, device=amplitude.device)[None, :]
+    x = torch.arange(columns.start, columns.stop, dtype=torch.float32, device=amplitude.device)[
+        None, :
+    ]
     cover = amplitude.new_zeros(len(y), x.shape[1])
     for start, end in zip(places, places[1:] or places, strict=False):
         near = _window([start, end], size / 2 + 1, amplitude.shape[-1])
         if near is None:
             continue
-        v, u = (slice(n.start - w.start, n.stop - w.start) for n, w in zip(near, window, strict=True))
+        v, u = (
+            slice(n.start - w.start, n.stop - w.start) for n, w in zip(near, window, strict=True)
+        )
         new = _cover(_distance(y[v], x[:, u], start, end), size, len(places) == 1)
         cover[v, u] = torch.maximum(cover[v, u], new)
     amplitude[rows, columns] *= 1 - opacity * cover
 
 
-def _window(places: list[tuple[float, float]], margin: float, samples: int) -> tuple[slice, slice] | None:
-    """Return the rows and columns of samples that a grain or scratch can touch, or None if it is outside the grid."""
+def _window(
+    places: list[tuple[float, float]], margin: float, samples: int
+) -> tuple[slice, slice] | None:
+    """Return the rows and columns of samples that a grain or scratch can touch, or None if it is
+    outside the grid.
+    """
     spans = []
     for axis in (0, 1):
         low = max(int(min(place[axis] for place in places) - margin), 0)
@@ -72,14 +88,18 @@ def _distance(y: Tensor, x: Tensor, start: tuple[float, float], end: tuple[float
     """Return the distance of each sample, in samples, from the line between two points."""
     along_y, along_x = end[0] - start[0], end[1] - start[1]
     length = along_y**2 + along_x**2
-    share = ((y - start[0]) * along_y + (x - start[1]) * along_x) / length if length > 0 else torch.zeros_like(y + x)
+    share = (
+        ((y - start[0]) * along_y + (x - start[1]) * along_x) / length
+        if length > 0
+        else torch.zeros_like(y + x)
+    )
     share = share.clamp(0, 1)
     return torch.hypot(y - start[0] - share * along_y, x - start[1] - share * along_x)
 
 
 def _cover(distance: Tensor, size: float, round_: bool) -> Tensor:
-    """Return the covered share of each sample under a grain or scratch ``size`` samples wide; the shares sum to the
-    area.
+    """Return the covered share of each sample under a grain or scratch ``size`` samples wide; the
+    shares sum to the area.
     """
     if round_:
         square = size**2 / 4

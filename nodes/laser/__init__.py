@@ -1,4 +1,6 @@
-"""Laser beams in absolute units, and what they do: damage and dazzle of a sensor, exposure of an eye."""
+"""Laser beams in absolute units, and what they do: damage and dazzle of a sensor, exposure of an
+eye.
+"""
 
 from neusee.nodes.laser import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.laser._air import Law, air_transmittance, size_exponent
@@ -19,7 +21,13 @@ from neusee.nodes.laser._beam import (
     share_through,
     underfilled,
 )
-from neusee.nodes.laser._bright_pixels import BrightPixels, bright_pixels, hidden_light, round_pixels, with_frame
+from neusee.nodes.laser._bright_pixels import (
+    BrightPixels,
+    bright_pixels,
+    hidden_light,
+    round_pixels,
+    with_frame,
+)
 from neusee.nodes.laser._damage_curve import Bracket, CurveEnds, first_damage
 from neusee.nodes.laser._damage_distances import (
     airy_diameter,
@@ -74,7 +82,13 @@ from neusee.nodes.laser._eye_dazzle import (
     unsteady,
     veil_per_lux,
 )
-from neusee.nodes.laser._eye_limits import eye_aperture, eye_mpe, eye_mpe_formula, eye_share, hazard_distance
+from neusee.nodes.laser._eye_limits import (
+    eye_aperture,
+    eye_mpe,
+    eye_mpe_formula,
+    eye_share,
+    hazard_distance,
+)
 from neusee.nodes.laser._eye_trains import (
     TRAIN_RULES,
     TrainLimit,
@@ -101,7 +115,11 @@ from neusee.nodes.laser._protection import (
     white_share,
 )
 from neusee.nodes.laser._round_spot import defocused_peak, round_spot, spot_peak
-from neusee.nodes.laser._silicon_absorption import absorbed_share, absorption_bracket, silicon_absorption
+from neusee.nodes.laser._silicon_absorption import (
+    absorbed_share,
+    absorption_bracket,
+    silicon_absorption,
+)
 from neusee.nodes.laser._spot_on_sensor import (
     frame_power,
     heated_diameter,

@@ -1,4 +1,6 @@
-"""Dead pixels in the raw frame of a sensor that a laser has damaged: points, lines, crosses and whole frames."""
+"""Dead pixels in the raw frame of a sensor that a laser has damaged: points, lines, crosses and
+whole frames.
+"""
 
 from __future__ import annotations
 
@@ -27,26 +29,33 @@ def damaged_pixels(
     bits: Bits = 16,
     device: str = "CMOS",
 ) -> Tensor:
-    """Draw the pixels that lasers have destroyed in a raw frame, from the patterns of the step `laser.damage`.
+    """Draw the pixels that lasers have destroyed in a raw frame, from the patterns of the step
+    `laser.damage`.
 
-    `point` is a white pixel, `destruction` a black pixel, `line` a black row of a CMOS or a white column of a CCD,
-    `cross` a black row and a black column, and `frame` a black frame. What stands later here covers what stands before.
+    `point` is a white pixel, `destruction` a black pixel, `line` a black row of a CMOS or a white
+    column of a CCD, `cross` a black row and a black column, and `frame` a black frame. What stands
+    later here covers what stands before.
 
-    Shapes: raw (channel, y, x), each pattern (y, x) of at least that size -> (channel, y, x), float32 for half
-            precision, which cannot hold the white of 16 bits.
+    Shapes: raw (channel, y, x), each pattern (y, x) of at least that size -> (channel, y, x),
+            float32 for half precision, which cannot hold the white of 16 bits.
     Units:  DN.
-    Error:  a drawing of the published kinds of damage. Which neighbours a line takes with it, how bright a dead column
-            is, and what changes later are left out.
-    Source: Schwarz et al., Opt. Eng. 56, 034108 (2017), abstract (dead pixels, columns and rows); Bi et al., Opt.
-            Express 32, 4709 (2024), abstract (point, line, cross); Photonics 12, 790 (2025), abstract (white points,
-            black lines in both directions, no valid frame). That lines of a CCD are white columns is ours.
+    Error:  a drawing of the published kinds of damage. Which neighbours a line takes with it, how
+            bright a dead column is, and what changes later are left out.
+    Source: Schwarz et al., Opt. Eng. 56, 034108 (2017), abstract (dead pixels, columns and rows);
+            Bi et al., Opt. Express 32, 4709 (2024), abstract (point, line, cross); Photonics 12,
+            790 (2025), abstract (white points, black lines in both directions, no valid frame).
+            That lines of a CCD are white columns is ours.
     """
     shape = (raw.shape[-2], raw.shape[-1])
     pattern = torch.zeros(shape, dtype=torch.uint8, device=raw.device)
     for each in damages or ():
         pattern |= crop(each.pattern, shape=shape).to(raw.device)
     white = float(max(1, min(2**bits - 1, int(full_well * gain - 0.5))))
-    drawn = single(raw).masked_fill(_of(pattern, "point"), white).masked_fill(_of(pattern, "destruction"), 0.0)
+    drawn = (
+        single(raw)
+        .masked_fill(_of(pattern, "point"), white)
+        .masked_fill(_of(pattern, "destruction"), 0.0)
+    )
     if device.casefold() == "ccd":
         drawn = drawn.masked_fill(_of(pattern, "line").any(-2, keepdim=True), white)
     else:

@@ -1,8 +1,9 @@
 """Published thresholds of damage: brackets and single figures, each with what was read and where.
 
-The sources were read as abstracts and summaries, not as full tables, so that none has a spread of devices and none has
-a probability. A bracket such as "tens of kW/cm2" is taken as 10 to 100 kW/cm2 around its geometric middle. The range of
-wavelengths around the laser of the experiment, and the range of durations, are ours.
+The sources were read as abstracts and summaries, not as full tables, so that none has a spread of
+devices and none has a probability. A bracket such as "tens of kW/cm2" is taken as 10 to 100 kW/cm2
+around its geometric middle. The range of wavelengths around the laser of the experiment, and the
+range of durations, are ours.
 """
 
 import math
@@ -10,8 +11,8 @@ import math
 from neusee.nodes.laser._damage_laws import DamageLaw, Kind
 
 _SCHWARZ = (
-    "Schwarz et al., Opt. Eng. 56, 034108 (2017), as summarised in Laser Focus World, July 2018: 532 nm, spot 25.7 um "
-    "continuous, 28.2 um for pulses of 10 ns"
+    "Schwarz et al., Opt. Eng. 56, 034108 (2017), as summarised in Laser Focus World, July 2018:"
+    " 532 nm, spot 25.7 um continuous, 28.2 um for pulses of 10 ns"
 )
 _TENS = f"{_SCHWARZ}; a bracket, tens of kW/cm2, read as 10 to 100 kW/cm2"
 _FRONT_SIDE = (
@@ -62,7 +63,9 @@ PUBLISHED_DAMAGE: tuple[DamageLaw, ...] = (
     _bracket("CMOS"),
     _bracket("CCD"),
     _single("CMOS", "point", 0.1, 28.2e-6, f"{_SCHWARZ}; first traces"),
-    _single("CCD", "point", 0.1, 28.2e-6, f"{_SCHWARZ}; first traces, sometimes drawn out along columns"),
+    _single(
+        "CCD", "point", 0.1, 28.2e-6, f"{_SCHWARZ}; first traces, sometimes drawn out along columns"
+    ),
     _single("CMOS", "destruction", 100.0, 28.2e-6, f"{_SCHWARZ}; lasting destruction"),
     _single("CMOS", "point", 78.9e-3, None, f"{_FRONT_SIDE}; white bright spot"),
     _single("CMOS", "cross", 241.9e-3, None, f"{_FRONT_SIDE}; horizontal and vertical black lines"),

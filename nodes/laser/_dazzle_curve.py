@@ -23,10 +23,12 @@ DECADES = tuple(10 ** (k / 4) for k in range(4, 25))  #: 10 to 1e6
 class DazzleCurve(NamedTuple):
     """The number of dazzled pixels against the strength of a laser."""
 
-    strengths: Tensor  #: (strength,) float64, multiple of saturation at the peak behind the clear lens
+    #: (strength,) float64, multiple of saturation at the peak behind the clear lens
+    strengths: Tensor
     pixels: Tensor  #: (strength,) float64
     share: Tensor  #: (strength,) float64, of the window of the PSF
-    clear: Tensor  #: (strength,) float64, pixels behind the clear lens by the mean of the Airy pattern
+    #: (strength,) float64, pixels behind the clear lens by the mean of the Airy pattern
+    clear: Tensor
 
 
 @node(rtol=1e-6)
@@ -39,20 +41,24 @@ def dazzle_curve(
 ) -> DazzleCurve:
     """Count the pixels in which a laser exceeds saturation, for each of several strengths.
 
-    A strength is the irradiance of the brightest pixel behind the clear lens in multiples of saturation. ``level`` is
-    the share of saturation at which a pixel counts: 1 for saturated pixels, less for pixels that are veiled. `clear` is
-    the closed form pi (lambda N / (pi p))^2 (4 S / pi)^(2/3), with lambda N / p from the cut-off of the lens. Where
-    pixels average, S is that at a point.
+    A strength is the irradiance of the brightest pixel behind the clear lens in multiples of
+    saturation. ``level`` is the share of saturation at which a pixel counts: 1 for saturated
+    pixels, less for pixels that are veiled. `clear` is the closed form pi (lambda N / (pi p))^2 (4
+    S / pi)^(2/3), with lambda N / p from the cut-off of the lens. Where pixels average, S is that
+    at a point.
 
     Shapes: psf.intensity (band, y, x), bands (band,) -> four of (strength,) float64.
     Units:  none, and pixels.
-    Error:  light outside the window of the PSF counts nothing: choose a window that holds the area. `clear` is within
-            7 % of the count for S from 1e4 where lambda N / p is above 2.5 or pixels sample a point, and is 0 for S up
-            to 1; smaller spots that pixels average need `dazzled_pixels`.
+    Error:  light outside the window of the PSF counts nothing: choose a window that holds the area.
+            `clear` is within 7 % of the count for S from 1e4 where lambda N / p is above 2.5 or
+            pixels sample a point, and is 0 for S up to 1; smaller spots that pixels average need
+            `dazzled_pixels`.
     Raises: ValueError for a PSF that is not finite.
-    Source: Born and Wolf, Principles of Optics, 7th ed., section 8.5.2 (the Airy pattern and its far rings).
+    Source: Born and Wolf, Principles of Optics, 7th ed., section 8.5.2 (the Airy pattern and its
+            far rings).
     """
-    weights = bands.weights.double() * bands.centres.double()  # photons of each wavelength, whose wells they fill
+    # photons of each wavelength, whose wells they fill
+    weights = bands.weights.double() * bands.centres.double()
     light = torch.zeros(psf.intensity[0].numel(), dtype=torch.float64, device=psf.intensity.device)
     for weight, band in zip(weights.tolist(), psf.intensity.detach(), strict=True):
         light = light + weight * band.flatten().double()
@@ -73,4 +79,6 @@ def _(result: DazzleCurve, *inputs: Any, **params: Any) -> list[Check]:
     top = int(result.strengths.argmax())
     share, strength = float(result.share[top]), float(result.strengths[top])
     text = f"{share:.2%} of the window is dazzled at strength {strength:.3g}"
-    return [Check(text if share < 0.5 else f"{text}: the PSF may reach beyond its window", share < 0.5)]
+    return [
+        Check(text if share < 0.5 else f"{text}: the PSF may reach beyond its window", share < 0.5)
+    ]

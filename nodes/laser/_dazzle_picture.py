@@ -1,4 +1,6 @@
-"""Dazzled pixels of a picture: those that a laser saturates, and those where its light veils a stated feature."""
+"""Dazzled pixels of a picture: those that a laser saturates, and those where its light veils a
+stated feature.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,16 @@ from neusee.nodes.units import Count, Electrons, Ratio, Shape
 
 
 class Dazzle(NamedTuple):
-    """The pixels that a laser takes from a picture; pixels that are lost without it are not counted."""
+    """The pixels that a laser takes from a picture; pixels that are lost without it are not
+    counted.
+    """
 
     saturated: Tensor  #: () float64, pixels with a channel that the laser fills
-    veiled: Tensor  #: () float64, other pixels at which the laser's light hides the feature in every channel
+    #: () float64, other pixels at which the laser's light hides the feature in every channel
+    veiled: Tensor
     share: Tensor  #: () float64, both, relative to all pixels
-    visible: Tensor  #: () float64, share of all pixels at which the feature is visible without the laser
+    #: () float64, share of all pixels at which the feature is visible without the laser
+    visible: Tensor
 
 
 @node(rtol=1e-6)
@@ -43,31 +49,43 @@ def dazzle(
     rule: Rule = "snr",
     threshold: Ratio = 5.0,
 ) -> Dazzle:
-    """Count the pixels that lasers saturate, and those where their light hides a feature of a stated size and contrast.
+    """Count the pixels that lasers saturate, and those where their light hides a feature of a
+    stated size and contrast.
 
-    The feature covers ``feature`` x ``feature`` pixels and differs by the Weber contrast C from the scene, whose
-    mean over these pixels is its background n. The mean of the laser's light over them is the veil v. Rule `snr`: the
-    feature is visible where C n sqrt(A) / sqrt(n + v + sigma^2) is at least ``threshold`` (5 is Rose's criterion); rule
-    `contrast`: where C n / (n + v) is. One channel that shows it is enough.
+    The feature covers ``feature`` x ``feature`` pixels and differs by the Weber contrast C from the
+    scene, whose mean over these pixels is its background n. The mean of the laser's light over them
+    is the veil v. Rule `snr`: the feature is visible where C n sqrt(A) / sqrt(n + v + sigma^2) is
+    at least ``threshold`` (5 is Rose's criterion); rule `contrast`: where C n / (n + v) is. One
+    channel that shows it is enough.
 
-    Shapes: photons of the scene (channel, y, x), each laser and ghost the same -> four scalars, float64.
+    Shapes: photons of the scene (channel, y, x), each laser and ghost the same -> four scalars,
+            float64.
     Units:  photons, electrons and pixels.
-    Error:  mean numbers without noise; 1e-6 of a threshold, so that a pixel there may fall on either side. Patterns of
-            the sensor under the veil (PRNU) and the search of a viewer are left out.
+    Error:  mean numbers without noise; 1e-6 of a threshold, so that a pixel there may fall on
+            either side. Patterns of the sensor under the veil (PRNU) and the search of a viewer are
+            left out.
     Raises: ValueError for light that is not finite.
-    Source: Rose, J. Opt. Soc. Am. 38, 196 (1948), for the threshold 5; Weber contrast by definition.
+    Source: Rose, J. Opt. Soc. Am. 38, 196 (1948), for the threshold 5; Weber contrast by
+            definition.
     """
     scene = crop(photons.detach(), shape=shape).double() * quantum_efficiency
     veil = torch.zeros_like(scene)
     for light in (*(lasers or ()), *(ghosts or ())):
         veil += crop(light.detach(), shape=shape).double() * quantum_efficiency
     if not transformed():
-        refuse_not_finite("its dazzled pixels cannot be counted", photons=scene.sum(), laser=veil.sum())
+        refuse_not_finite(
+            "its dazzled pixels cannot be counted", photons=scene.sum(), laser=veil.sum()
+        )
     room = full_well - offset
     lost, filled = (scene >= room).any(-3), (scene + veil >= room).any(-3)
     background, mean = _over_feature(scene, feature), _over_feature(veil, feature)
     most = veil_limit(
-        background, contrast=contrast, feature=feature, threshold=threshold, rule=rule, read_noise=read_noise
+        background,
+        contrast=contrast,
+        feature=feature,
+        threshold=threshold,
+        rule=rule,
+        read_noise=read_noise,
     )
     visible = (most >= 0).any(-3) & ~lost
     saturated = filled & ~lost
@@ -78,7 +96,9 @@ def dazzle(
 
 
 def _over_feature(image: Tensor, size: int) -> Tensor:
-    """Return the mean of an image (channel, y, x) over a square of ``size`` pixels around each pixel."""
+    """Return the mean of an image (channel, y, x) over a square of ``size`` pixels around each
+    pixel.
+    """
     rows, columns = image.shape[-2:]
     mean, half = image[None], size // 2
     for window, padding in (((size, 1), (half, 0)), ((1, size), (0, half))):
@@ -95,4 +115,9 @@ def _(*, full_well: float, offset: float = 0.0, read_noise: float, **params: obj
 @dazzle.check
 def _(result: Dazzle, *inputs: Any, **params: Any) -> list[Check]:
     text = f"the laser saturates {int(result.saturated)} pixels and veils {int(result.veiled)} more"
-    return [Check(f"{text}, {float(result.share):.2%} of the picture together", bool(torch.isfinite(result.share)))]
+    return [
+        Check(
+            f"{text}, {float(result.share):.2%} of the picture together",
+            bool(torch.isfinite(result.share)),
+        )
+    ]

@@ -1,8 +1,9 @@
 """Exposure limits of the human eye for a small source, and the distance where a laser meets them.
 
-The limits are those of IEC 60825-1:2014, Table A.1 (ICNIRP 2013, ANSI Z136.1-2014): a source that the eye sees under
-less than 1.5 mrad. They are written out here from the formulas, and are an estimate, no certificate. Ultraviolet light,
-pulses below 10 ps and extended sources are refused. Trains of pulses are in `_eye_trains`.
+The limits are those of IEC 60825-1:2014, Table A.1 (ICNIRP 2013, ANSI Z136.1-2014): a source that
+the eye sees under less than 1.5 mrad. They are written out here from the formulas, and are an
+estimate, no certificate. Ultraviolet light, pulses below 10 ps and extended sources are refused.
+Trains of pulses are in `_eye_trains`.
 """
 
 from __future__ import annotations
@@ -19,18 +20,21 @@ _FIRST, _LAST = 400e-9, 100e-6  #: m
 
 
 def eye_mpe(wavelength: float, duration: float) -> float:
-    """Return the largest permissible radiant exposure of the eye in J/m2 for one exposure of a duration in s.
+    """Return the largest permissible radiant exposure of the eye in J/m2 for one exposure of a
+    duration in s.
 
-    Divided by the duration it is the largest permissible irradiance. It is compared with the mean over the limiting
-    aperture of `eye_aperture`.
+    Divided by the duration it is the largest permissible irradiance. It is compared with the mean
+    over the limiting aperture of `eye_aperture`.
 
-    400 to 1400 nm (retina, small source): 2e-3 C_A J/m2 up to 5 us and 18 C_A t^0.75 up to 10 s below 1050 nm;
-    2e-2 C_C up to 13 us and 90 C_C t^0.75 up to 10 s from 1050 nm; 10 C_A C_C W/m2 beyond 10 s. C_A = 10^(0.002
-    (nm - 700)) from 700 nm and 5 from 1050 nm; C_C = 10^(0.018 (nm - 1150)) from 1150 nm and 8 + 10^(0.04 (nm - 1250))
-    from 1200 nm. Below 500 nm and beyond 10 s at most 100 C_3 J/m2 up to 100 s, then C_3 W/m2, with C_3 = 10^(0.02 (nm
-    - 450)) from 450 nm (photochemical). From 700 nm at most the limit of the skin, which protects cornea and lens.
-    From 1400 nm (cornea): 1e3 J/m2 up to 1 ms (1500 to 1800 nm 1e4 J/m2 up to 10 s; from 2600 nm 100 J/m2 up to 0.1
-    us), then 5600 t^0.25 up to 10 s and 1000 W/m2.
+    400 to 1400 nm (retina, small source): 2e-3 C_A J/m2 up to 5 us and 18 C_A t^0.75 up to 10 s
+    below 1050 nm; 2e-2 C_C up to 13 us and 90 C_C t^0.75 up to 10 s from 1050 nm; 10 C_A C_C W/m2
+    beyond 10 s. C_A = 10^(0.002 (nm - 700)) from 700 nm and 5 from 1050 nm; C_C = 10^(0.018 (nm -
+    1150)) from 1150 nm and 8 + 10^(0.04 (nm - 1250)) from 1200 nm. Below 500 nm and beyond 10 s at
+    most 100 C_3 J/m2 up to 100 s, then C_3 W/m2, with C_3 = 10^(0.02 (nm
+    - 450)) from 450 nm (photochemical). From 700 nm at most the limit of the skin, which protects
+      cornea and lens.
+    From 1400 nm (cornea): 1e3 J/m2 up to 1 ms (1500 to 1800 nm 1e4 J/m2 up to 10 s; from 2600 nm
+    100 J/m2 up to 0.1 us), then 5600 t^0.25 up to 10 s and 1000 W/m2.
 
     Raises ParameterError for a wavelength or a duration beyond these formulas.
     Source: IEC 60825-1:2014, Tables A.1 and A.5; ICNIRP, Health Phys. 105, 271 (2013).
@@ -39,7 +43,8 @@ def eye_mpe(wavelength: float, duration: float) -> float:
 
 
 def eye_mpe_formula(wavelength: float, duration: float) -> str:
-    """Return the formula of `eye_mpe` that holds, in J/m2, with its numbers put in: ``18 * 1 * 0.25**0.75``.
+    """Return the formula of `eye_mpe` that holds, in J/m2, with its numbers put in: ``18 * 1 *
+    0.25**0.75``.
 
     Raises ParameterError as `eye_mpe` does.
     """
@@ -54,7 +59,9 @@ class _Law(NamedTuple):
 
 
 def _strictest(wavelength: float, duration: float) -> _Law:
-    """Return the law that limits the exposure of the eye at a wavelength in m for a duration in s."""
+    """Return the law that limits the exposure of the eye at a wavelength in m for a duration in
+    s.
+    """
     _refuse(wavelength, duration)
     nm = wavelength * 1e9
     if nm >= 1400:
@@ -73,13 +80,18 @@ def _constant(factor: float, weight: float, duration: float, full: float) -> _La
     """Return factor x weight, for durations shorter than ``full`` s less in proportion."""
     if duration >= full:
         return _Law(factor * weight, f"{factor:g} * {weight:.7g}")
-    return _Law(factor * weight * duration / full, f"{factor:g} * {weight:.7g} * {duration:.7g} / {full:g}")
+    return _Law(
+        factor * weight * duration / full, f"{factor:g} * {weight:.7g} * {duration:.7g} / {full:g}"
+    )
 
 
 def _refuse(wavelength: float, duration: float) -> None:
     """Raise ParameterError where this module has no formula."""
     if not _FIRST <= wavelength <= _LAST:
-        text = f"no exposure limit of the eye at {wavelength * 1e9:g} nm: 400 nm to 100 um are known here"
+        text = (
+            f"no exposure limit of the eye at {wavelength * 1e9:g} nm: 400 nm to 100 um are known"
+            " here"
+        )
         raise ParameterError("wavelength", f"{text}; take the limit from the standard")
     if not _SHORTEST <= duration <= _LONGEST:
         text = f"no exposure limit of the eye for {duration:g} s: 10 ps to 30 000 s are known here"
@@ -91,19 +103,31 @@ def _near_infrared(nm: float) -> tuple[float, float]:
     absorbed = 1.0 if nm < 700 else math.pow(10, 0.002 * (nm - 700)) if nm < 1050 else 5.0
     if nm < 1150:
         return absorbed, 1.0
-    return absorbed, math.pow(10, 0.018 * (nm - 1150)) if nm < 1200 else 8 + math.pow(10, 0.04 * (nm - 1250))
+    return absorbed, (
+        math.pow(10, 0.018 * (nm - 1150)) if nm < 1200 else 8 + math.pow(10, 0.04 * (nm - 1250))
+    )
 
 
 def _retina(nm: float, duration: float) -> _Law:
-    """Return the limit in J/m2 from 400 to 1400 nm for a small source: heat, and photochemistry below 500 nm."""
+    """Return the limit in J/m2 from 400 to 1400 nm for a small source: heat, and photochemistry
+    below 500 nm.
+    """
     absorbed, spread = _near_infrared(nm)
     if duration >= 10:
         heat = _power_law(10, absorbed * spread, duration, 1)
         blue = _power_law(1, math.pow(10, 0.02 * max(0.0, nm - 450)), max(100.0, duration), 1)
         return heat if nm >= 500 else min(heat, blue)
     if nm < 1050:
-        return _constant(2e-3, absorbed, 1, 0) if duration <= 5e-6 else _power_law(18, absorbed, duration, 0.75)
-    return _constant(2e-2, spread, 1, 0) if duration <= 13e-6 else _power_law(90, spread, duration, 0.75)
+        return (
+            _constant(2e-3, absorbed, 1, 0)
+            if duration <= 5e-6
+            else _power_law(18, absorbed, duration, 0.75)
+        )
+    return (
+        _constant(2e-2, spread, 1, 0)
+        if duration <= 13e-6
+        else _power_law(90, spread, duration, 0.75)
+    )
 
 
 def _skin(nm: float, duration: float) -> _Law:
@@ -129,7 +153,8 @@ def _cornea(nm: float, duration: float) -> _Law:
 def eye_aperture(wavelength: float, duration: float) -> float:
     """Return the diameter in m of the aperture over which an exposure of the eye is averaged.
 
-    7 mm, the widest pupil, from 400 to 1400 nm; beyond, 1 mm up to 0.35 s, 1.5 t^(3/8) mm up to 10 s, then 3.5 mm.
+    7 mm, the widest pupil, from 400 to 1400 nm; beyond, 1 mm up to 0.35 s, 1.5 t^(3/8) mm up to 10
+    s, then 3.5 mm.
     Source: IEC 60825-1:2014, Table A.6.
     """
     _refuse(wavelength, duration)
@@ -138,13 +163,17 @@ def eye_aperture(wavelength: float, duration: float) -> float:
     return 1e-3 if duration <= 0.35 else 1e-3 * min(3.5, 1.5 * math.pow(duration, 0.375))
 
 
-def hazard_distance(beam: Beam, limit: float, aperture: float = 0.0, transmittance: float = 1.0) -> float:
-    """Return the distance in m beyond which the exposure on the axis of a beam is below a limit, or 0 for none.
+def hazard_distance(
+    beam: Beam, limit: float, aperture: float = 0.0, transmittance: float = 1.0
+) -> float:
+    """Return the distance in m beyond which the exposure on the axis of a beam is below a limit, or
+    0 for none.
 
-    ``limit`` is in W/m2 for a continuous beam and in J/m2 for each pulse of a pulsed one. The exposure is the mean over
-    a round ``aperture`` in m, or that on the axis for 0. Both have a closed inverse: w^2 = 2 P T / (pi limit) on the
-    axis, and w^2 = -(d^2 / 2) / ln(1 - pi d^2 limit / (4 P T)) through an aperture d, then R = 2 sqrt(w^2 - w0^2) /
-    theta. ``transmittance`` is that of the optics or of air, the same at every distance.
+    ``limit`` is in W/m2 for a continuous beam and in J/m2 for each pulse of a pulsed one. The
+    exposure is the mean over a round ``aperture`` in m, or that on the axis for 0. Both have a
+    closed inverse: w^2 = 2 P T / (pi limit) on the axis, and w^2 = -(d^2 / 2) / ln(1 - pi d^2 limit
+    / (4 P T)) through an aperture d, then R = 2 sqrt(w^2 - w0^2) / theta. ``transmittance`` is that
+    of the optics or of air, the same at every distance.
     """
     emitted = beam.power if beam.pulse_energy is None else beam.pulse_energy
     assert emitted is not None  # `beam` has made the one or the other
@@ -160,7 +189,8 @@ def hazard_distance(beam: Beam, limit: float, aperture: float = 0.0, transmittan
 
 
 def eye_share(limit: float, aperture: float, emitted: float) -> float:
-    """Return the share of a power in W, or of an energy in J, that fills a round aperture in m with a limit.
+    """Return the share of a power in W, or of an energy in J, that fills a round aperture in m with
+    a limit.
 
     ``limit`` is in W/m2 or J/m2.
     """

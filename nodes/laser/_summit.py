@@ -1,4 +1,6 @@
-"""The peak of a sampled spot: between its samples, and the light outside its window that may hold a higher one."""
+"""The peak of a sampled spot: between its samples, and the light outside its window that may
+hold a higher one.
+"""
 
 import torch
 from torch import Tensor
@@ -7,20 +9,23 @@ from neusee.nodes.laser._bright_pixels import light_with_wings
 
 _NEAR = 0.5  #: of the brightest sample, from which the summit of a lobe may be higher than it
 _FLOOR = 1e-30  #: of the brightest sample, below which light is dark
-_CROSS = ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1))  #: a sample and its four neighbours, in samples along y and x
-_WINGS = 0.03  #: share of the light outside a window, at most, that the wings of a spot in the window explain
+#: a sample and its four neighbours, in samples along y and x
+_CROSS = ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1))
+#: share of the light outside a window, at most, that the wings of a spot in the window explain
+_WINGS = 0.03
 
 
 def summit_gain(image: Tensor) -> Tensor:
-    """Return the peak of a spot over its brightest sample: the highest summit of the parabolas through its lobes.
+    """Return the peak of a spot over its brightest sample: the highest summit of the parabolas
+    through its lobes.
 
-    A lobe is a sample that none of its four neighbours exceeds. Its summit is that of a parabola along y and of one
-    along x, in logarithms, for which a Gaussian lobe is exact.
+    A lobe is a sample that none of its four neighbours exceeds. Its summit is that of a parabola
+    along y and of one along x, in logarithms, for which a Gaussian lobe is exact.
 
     Shapes: image (y, x) -> ().
     Units:  any -> none.
-    Error:  0.4 % of the peak for the lobes of a round pupil with 4 samples in wavelength times f-number, which is up to
-            7.5 % above the brightest sample.
+    Error:  0.4 % of the peak for the lobes of a round pupil with 4 samples in wavelength times
+            f-number, which is up to 7.5 % above the brightest sample.
     Raises: nothing.
     Source: by definition.
     """
@@ -42,17 +47,19 @@ def summit_gain(image: Tensor) -> Tensor:
 
 
 def unseen_light(image: Tensor, passing: float) -> Tensor:
-    """Return the share of a beam's light outside the window of its spot that may be in one spot there.
+    """Return the share of a beam's light outside the window of its spot that may be in one spot
+    there.
 
-    Of a window that holds nearly all light, the wings go on outside by the radial law of `with_frame`: what they
-    explain is in no spot. A window that lacks more may lack a part of the spot itself, so that no law counts.
-    ``passing`` is the light through the lens, in the unit of the image. A spot of the share s of the light has at most
-    s times the peak of the clear lens in focus with the same beam.
+    Of a window that holds nearly all light, the wings go on outside by the radial law of
+    `with_frame`: what they explain is in no spot. A window that lacks more may lack a part of the
+    spot itself, so that no law counts. ``passing`` is the light through the lens, in the unit of
+    the image. A spot of the share s of the light has at most s times the peak of the clear lens in
+    focus with the same beam.
 
     Shapes: image (y, x) -> ().
     Units:  share of the light through the clear pupil -> none.
-    Error:  an upper bound for light that the mask takes from a part of the pupil, or from all of it evenly; a spot that
-            the border of the window cuts has up to 10 % more.
+    Error:  an upper bound for light that the mask takes from a part of the pupil, or from all of it
+            evenly; a spot that the border of the window cuts has up to 10 % more.
     Raises: nothing.
     Source: Cauchy-Schwarz inequality for the field in the pupil; our derivation.
     """

@@ -1,4 +1,6 @@
-"""Losses of a mask with a grey filter that holds the peak of a laser at a limit: error and information of a picture."""
+"""Losses of a mask with a grey filter that holds the peak of a laser at a limit: error and
+information of a picture.
+"""
 
 import math
 from collections.abc import Iterator
@@ -21,7 +23,7 @@ from neusee.nodes.losses._filtered_picture import (
     peak_share,
     quanta,
     round_mtf,
-)  # fmt: skip
+)
 from neusee.nodes.optics._lens_band import averaging, cut_off, round_lens, stop_width
 from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_shares
 from neusee.nodes.units import Electrons, Fraction
@@ -50,28 +52,34 @@ def filtered_error(
     up_to: HighestFrequency | None = None,
     power: NormPower | None = None,
 ) -> Tensor:
-    """Average over channels the logarithm of the error of a natural picture after a Wiener filter, over its variance.
+    """Average over channels the logarithm of the error of a natural picture after a Wiener filter,
+    over its variance.
 
-    Behind a mask with a grey filter that lowers the peak of a laser to ``limit`` times that of the clear lens, in every
-    band. The scene has a power spectrum 1 / frequency^2 and a variance ``contrast`` of relative brightness; frequency 0
-    does not count. A pixel has the noise of its light, of an even ``veil`` of the laser, and of reading. The Wiener
-    filter of a channel knows the PSF of a grey scene. The transmittance of the grey filter follows from the mask: the
-    largest that keeps the limit is the best. ``power`` replaces the maximum over pixels by a norm, whose gradient
-    reaches every bright pixel. ``up_to`` excludes finer frequencies.
+    Behind a mask with a grey filter that lowers the peak of a laser to ``limit`` times that of the
+    clear lens, in every band. The scene has a power spectrum 1 / frequency^2 and a variance
+    ``contrast`` of relative brightness; frequency 0 does not count. A pixel has the noise of its
+    light, of an even ``veil`` of the laser, and of reading. The Wiener filter of a channel knows
+    the PSF of a grey scene. The transmittance of the grey filter follows from the mask: the largest
+    that keeps the limit is the best. ``power`` replaces the maximum over pixels by a norm, whose
+    gradient reaches every bright pixel. ``up_to`` excludes finer frequencies.
 
     Shapes: psf.intensity (band, y, x), responses (channel, band) -> ().
-    Units:  none; natural logarithm of a share, 0 if nothing is seen. light, veil and read_noise e- in a pixel behind
-            the clear lens without a filter; transmittance: share of the light that the pupil behind the mask lets
-            through, a tensor () if it is learnt; up_to cycles per pixel.
-    Error:  1e-6 in float32. Clipped pixels, edges and unknown glare are neglected. Light that leaves the window counts
-            as noise, because as much comes from outside. The norm is up to n^(1/power) above the maximum.
+    Units:  none; natural logarithm of a share, 0 if nothing is seen. light, veil and read_noise e-
+            in a pixel behind the clear lens without a filter; transmittance: share of the light
+            that the pupil behind the mask lets through, a tensor () if it is learnt; up_to cycles
+            per pixel.
+    Error:  1e-6 in float32. Clipped pixels, edges and unknown glare are neglected. Light that
+            leaves the window counts as noise, because as much comes from outside. The norm is up to
+            n^(1/power) above the maximum.
     Raises: ValueError where the inputs differ in the number of bands.
-    Source: Wiener filter as in Goodman, Introduction to Fourier Optics, 4th ed., ch. 8; NEQ as in Barrett and Myers,
-            Foundations of Image Science, 2004, ch. 13; spectrum of natural scenes: Field, J. Opt. Soc. Am. A 4, 2379
-            (1987). The limit by a filter is ours.
+    Source: Wiener filter as in Goodman, Introduction to Fourier Optics, 4th ed., ch. 8; NEQ as in
+            Barrett and Myers, Foundations of Image Science, 2004, ch. 13; spectrum of natural
+            scenes: Field, J. Opt. Soc. Am. A 4, 2379 (1987). The limit by a filter is ours.
     """
     exposure = Exposure(light, read_noise, veil, transmittance)
-    snr, spectrum, counted = _behind(psf, (illuminant, responses, bands), exposure, (limit, power, contrast, up_to))
+    snr, spectrum, counted = _behind(
+        psf, (illuminant, responses, bands), exposure, (limit, power, contrast, up_to)
+    )
     lost = error_share(snr, spectrum, _size(psf), counted)
     return lost.clamp_min(1e-30).log().mean().to(single(psf.intensity))
 
@@ -92,21 +100,25 @@ def information(
     up_to: HighestFrequency | None = None,
     power: NormPower | None = None,
 ) -> Tensor:
-    """Average over channels and frequencies the negative information log2(1 + NEQ S) about a natural picture.
+    """Average over channels and frequencies the negative information log2(1 + NEQ S) about a
+    natural picture.
 
-    S is the power spectrum of the scene, and NEQ = (T n MTF)^2 / (T n + veil + read^2) are the noise equivalent quanta
-    behind mask and grey filter. Scene, filter and parameters are those of `losses.filtered_error`. Fine detail counts
-    here as much as coarse detail, whereas the error is that of coarse detail.
+    S is the power spectrum of the scene, and NEQ = (T n MTF)^2 / (T n + veil + read^2) are the
+    noise equivalent quanta behind mask and grey filter. Scene, filter and parameters are those of
+    `losses.filtered_error`. Fine detail counts here as much as coarse detail, whereas the error is
+    that of coarse detail.
 
     Shapes: psf.intensity (band, y, x), responses (channel, band) -> ().
     Units:  bits per frequency, negative; the parameters as in `losses.filtered_error`.
     Error:  1e-6 in float32. Neglects what `losses.filtered_error` neglects.
     Raises: ValueError where the inputs differ in the number of bands.
-    Source: Shannon, Proc. IRE 37, 10 (1949), for Gaussian signals and noise; NEQ as in Barrett and Myers, Foundations
-            of Image Science, 2004, ch. 13.
+    Source: Shannon, Proc. IRE 37, 10 (1949), for Gaussian signals and noise; NEQ as in Barrett and
+            Myers, Foundations of Image Science, 2004, ch. 13.
     """
     exposure = Exposure(light, read_noise, veil, transmittance)
-    snr, _, counted = _behind(psf, (illuminant, responses, bands), exposure, (limit, power, contrast, up_to))
+    snr, _, counted = _behind(
+        psf, (illuminant, responses, bands), exposure, (limit, power, contrast, up_to)
+    )
     return -bits(snr, _size(psf), counted).mean().to(single(psf.intensity))
 
 
@@ -147,7 +159,9 @@ def _(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, **settings:
 @information.reference
 def _(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, **settings: Any) -> Tensor:
     each = _by_definition(psf, illuminant, responses, bands, **settings)
-    return -torch.stack([snr[counted].log1p().mean() / math.log(2) for snr, _, counted in each]).mean()
+    return -torch.stack(
+        [snr[counted].log1p().mean() / math.log(2) for snr, _, counted in each]
+    ).mean()
 
 
 def _by_definition(
@@ -172,7 +186,11 @@ def _by_definition(
     spectrum = torch.where(square > 0, 1 / square, 0.0)
     spectrum = spectrum * (contrast * x * y / spectrum.sum().clamp_min(1e-300))
     lsr = (psf.intensity.double() / psf.clear_peak[:, None, None]).flatten()
-    worst = lsr.max() if power is None else (power * lsr.clamp_min(1e-300).log()).logsumexp(0).div(power).exp()
+    worst = (
+        lsr.max()
+        if power is None
+        else (power * lsr.clamp_min(1e-300).log()).logsumexp(0).div(power).exp()
+    )
     passed = torch.minimum(torch.ones(()), limit / worst) if limit is not None else torch.ones(())
     seen = responses.double() * (illuminant.double() * bands.centres)
     for share in seen / seen.sum(-1, keepdim=True):
@@ -196,11 +214,13 @@ def best_stop(
     up_to: float | None = None,
     measure: Literal["filtered_error", "information"] = "filtered_error",
 ) -> tuple[float, float, float]:
-    """Return the least loss of a round stop with a grey filter at the same limit, its diameter and transmittance.
+    """Return the least loss of a round stop with a grey filter at the same limit, its diameter and
+    transmittance.
 
-    The diameter is a share of that of the clear aperture, whose cut-off is that of ``plain``. The peak of a stop falls
-    with the fourth power of its diameter, but for what pixels average away, and its light with the second power.
-    ``measure`` names the loss: ``filtered_error`` or ``information``.
+    The diameter is a share of that of the clear aperture, whose cut-off is that of ``plain``. The
+    peak of a stop falls with the fourth power of its diameter, but for what pixels average away,
+    and its light with the second power. ``measure`` names the loss: ``filtered_error`` or
+    ``information``.
     """
     size, grey = _size(plain), grey_shares(illuminant, responses, bands)
     cuts, sides = cut_off(plain).cpu(), averaging(plain).cpu()
@@ -211,7 +231,12 @@ def best_stop(
     def loss_of(width: float) -> tuple[float, float, float]:
         filtered = filter_of(_stop_peak(width, cuts, sides), limit)
         exposure = Exposure(light, read_noise, veil, width**2)
-        snr = quanta((width**2 * blur * round_mtf(at, width * cuts, grey)).square(), exposure, filtered) * spectrum
+        snr = (
+            quanta(
+                (width**2 * blur * round_mtf(at, width * cuts, grey)).square(), exposure, filtered
+            )
+            * spectrum
+        )
         lost = error_share(snr, spectrum, size, counted).clamp_min(1e-30).log()
         loss = lost if measure == "filtered_error" else -bits(snr, size, counted)
         return float(loss.mean()), width, float(filtered)
@@ -225,7 +250,9 @@ def best_stop(
 
 
 def _stop_peak(width: float, cuts: Tensor, sides: Tensor) -> Tensor:
-    """Return the largest LSR of any band of a stop, whose pixels average less of a wider spot away."""
+    """Return the largest LSR of any band of a stop, whose pixels average less of a wider spot
+    away.
+    """
     ratios = round_lens(width * cuts, sides).peak / round_lens(cuts, sides).peak
     return width**4 * ratios.max()
 
@@ -234,5 +261,8 @@ def _pixel_contrast(size: tuple[int, int], side: float) -> Tensor | float:
     """Return the transfer function of pixels that average, at the frequencies of `frequencies`."""
     if not side:
         return 1.0
-    fy, fx = torch.fft.fftfreq(size[0], dtype=torch.float64), torch.fft.rfftfreq(size[1], dtype=torch.float64)
+    fy, fx = (
+        torch.fft.fftfreq(size[0], dtype=torch.float64),
+        torch.fft.rfftfreq(size[1], dtype=torch.float64),
+    )
     return torch.sinc(side * fy)[:, None] * torch.sinc(side * fx)

@@ -1,4 +1,6 @@
-"""Losses of a restored picture: differences from the true picture by pixel and by spatial frequency."""
+"""Losses of a restored picture: differences from the true picture by pixel and by spatial
+frequency.
+"""
 
 from typing import Annotated, Literal
 
@@ -12,7 +14,8 @@ from neusee.nodes.metrics._picture_quality import require_same_shape
 
 Reduction = Literal["mean", "sum"]
 _LEAST = 1e-30  #: least power, because the root has no gradient at 0
-_NEAR, _BEYOND = 1e-6, 0.1  #: least mean square of a difference, and the slope of colours that no display shows
+#: least mean square of a difference, and the slope of colours that no display shows
+_NEAR, _BEYOND = 1e-6, 0.1
 
 
 @node()
@@ -27,7 +30,8 @@ def charbonnier(
 
     ``reduction`` sum adds up the pixels instead, which is the only reduction that the paper names.
 
-    Kornia's `charbonnier_loss` has a fixed epsilon of 1, and is a square for all differences of pictures in [0, 1].
+    Kornia's `charbonnier_loss` has a fixed epsilon of 1, and is a square for all differences of
+    pictures in [0, 1].
 
     Shapes: estimate and truth alike -> ().
     Units:  those of the pictures; epsilon in their square.
@@ -41,17 +45,21 @@ def charbonnier(
 
 @node()
 def fft_l1(estimate: Tensor, truth: Tensor, *, reduction: Reduction = "mean") -> Tensor:
-    """Average the absolute difference between the spatial Fourier spectra of the estimated and the true picture.
+    """Average the absolute difference between the spatial Fourier spectra of the estimated and the
+    true picture.
 
-    ``reduction`` sum adds up the frequencies of a transform that is not normalised, as the paper prints. For n pixels,
-    the sum is n^(3/2) times the mean, so that the weight of the loss depends on the size of the picture.
+    ``reduction`` sum adds up the frequencies of a transform that is not normalised, as the paper
+    prints. For n pixels, the sum is n^(3/2) times the mean, so that the weight of the loss depends
+    on the size of the picture.
 
-    The transform is in float64: in single precision a coefficient near 0 has neither a reliable size nor a reliable
-    direction, and the gradient is that direction.
+    The transform is in float64: in single precision a coefficient near 0 has neither a reliable
+    size nor a reliable direction, and the gradient is that direction.
 
     Shapes: estimate and truth (..., y, x) -> ().
-    Units:  those of the pictures: for the mean the transform is unitary, so the size of a picture does not matter.
-    Error:  round-off of the type of the loss, 1e-7 in float32; a coefficient below 1e-15 has no gradient.
+    Units:  those of the pictures: for the mean the transform is unitary, so the size of a picture
+            does not matter.
+    Error:  round-off of the type of the loss, 1e-7 in float32; a coefficient below 1e-15 has no
+            gradient.
     Raises: ValueError for pictures of different shapes.
     Source: NeuSee, section Two-Stage Training (L_REC), with a unitary transform and the mean.
     """
@@ -66,9 +74,10 @@ def fft_l1(estimate: Tensor, truth: Tensor, *, reduction: Reduction = "mean") ->
 def log_error(estimate: Tensor, truth: Tensor) -> Tensor:
     """Average over pictures the logarithm of the mean squared difference of the encoded pictures.
 
-    It is -ln(10) / 10 of the PSNR of `metrics.quality`. A decibel counts alike in every picture, whereas in a mean of
-    errors a few pictures that cannot be restored rule. Outside of [0, 1] a tenth of the linear value counts, so that
-    the loss has a slope where a display shows black or white.
+    It is -ln(10) / 10 of the PSNR of `metrics.quality`. A decibel counts alike in every picture,
+    whereas in a mean of errors a few pictures that cannot be restored rule. Outside of [0, 1] a
+    tenth of the linear value counts, so that the loss has a slope where a display shows black or
+    white.
 
     Shapes: estimate and truth (..., 3, y, x), linear sRGB -> ().
     Units:  none; 0 for pictures that differ by 1 everywhere.

@@ -1,4 +1,6 @@
-"""The Wiener loss of a mask: the share of a picture that a Wiener filter cannot recover behind the mask."""
+"""The Wiener loss of a mask: the share of a picture that a Wiener filter cannot recover behind
+the mask.
+"""
 
 from typing import Annotated
 
@@ -29,19 +31,23 @@ def wiener(
     colour: OneBandShare = 1.0,
     up_to: HighestFrequency | None = None,
 ) -> Tensor:
-    """Average over channels the logarithm of (error variance after a Wiener filter) / (variance of the picture).
+    """Average over channels the logarithm of (error variance after a Wiener filter) / (variance of
+    the picture).
 
-    The power of the pictures falls with frequency as in the prior of `restore.wiener`. The filter uses the PSF of a
-    channel for a grey scene. The error at a frequency has two parts: the part of the picture that noise hides, and, for
-    the share ``colour`` of the variance, which belongs to one band alone, the difference of the PSF of that band from
-    the PSF of the channel. ``up_to`` excludes finer frequencies, which a reduced picture loses.
+    The power of the pictures falls with frequency as in the prior of `restore.wiener`. The filter
+    uses the PSF of a channel for a grey scene. The error at a frequency has two parts: the part of
+    the picture that noise hides, and, for the share ``colour`` of the variance, which belongs to
+    one band alone, the difference of the PSF of that band from the PSF of the channel. ``up_to``
+    excludes finer frequencies, which a reduced picture loses.
 
     Shapes: psf.intensity (band, y, x), responses (channel, band) -> ().
-    Units:  none; ``noise``: variance of a pixel's noise over the picture's variance; up_to in cycles per pixel.
-    Error:  1e-5 in float32. Clipped pixels, the edges and the dependence of noise on light are neglected: the loss
-            compares masks and does not predict an error.
+    Units:  none; ``noise``: variance of a pixel's noise over the picture's variance; up_to in
+            cycles per pixel.
+    Error:  1e-5 in float32. Clipped pixels, the edges and the dependence of noise on light are
+            neglected: the loss compares masks and does not predict an error.
     Raises: ValueError where the inputs differ in the number of bands.
-    Source: Wiener filter as in Goodman, Introduction to Fourier Optics, 4th ed., ch. 8; the share of one band is ours.
+    Source: Wiener filter as in Goodman, Introduction to Fourier Optics, 4th ed., ch. 8; the share
+            of one band is ours.
     """
     y, x = psf.intensity.shape[-2:]
     intensity = single(psf.intensity)
@@ -65,8 +71,13 @@ def _square(spectrum: Tensor) -> Tensor:
 
 
 def _counted(size: tuple[int, int], up_to: float | None) -> Tensor:
-    """Return True at the spatial frequencies above 0 and up to ``up_to``, in the layout of `torch.fft.rfft2`."""
-    fy, fx = torch.fft.fftfreq(size[0], dtype=torch.float64), torch.fft.rfftfreq(size[1], dtype=torch.float64)
+    """Return True at the spatial frequencies above 0 and up to ``up_to``, in the layout of
+    `torch.fft.rfft2`.
+    """
+    fy, fx = (
+        torch.fft.fftfreq(size[0], dtype=torch.float64),
+        torch.fft.rfftfreq(size[1], dtype=torch.float64),
+    )
     square = fy[:, None].square() + fx.square()
     inside: Tensor = (square > 0) & (square <= (1.0 if up_to is None else up_to**2))
     return inside

@@ -8,10 +8,27 @@ from neusee.nodes.metrics._attacked_picture import (
     attacked_picture,
     glare_levels,
 )
-from neusee.nodes.metrics._detail_targets import TARGETS, detail_energy, detail_targets, detection_snr
-from neusee.nodes.metrics._filtered_picture import Filtered, channel_psf, decibels, filtered_picture, noise_variance
+from neusee.nodes.metrics._detail_targets import (
+    TARGETS,
+    detail_energy,
+    detail_targets,
+    detection_snr,
+)
+from neusee.nodes.metrics._filtered_picture import (
+    Filtered,
+    channel_psf,
+    decibels,
+    filtered_picture,
+    noise_variance,
+)
 from neusee.nodes.metrics._heat_ratio import heat_ratio
-from neusee.nodes.metrics._mask_limits import Limits, least_lsr, limits, most_contrast, most_unsuppressed
+from neusee.nodes.metrics._mask_limits import (
+    Limits,
+    least_lsr,
+    limits,
+    most_contrast,
+    most_unsuppressed,
+)
 from neusee.nodes.metrics._peak_irradiance import Peak, peak_irradiance
 from neusee.nodes.metrics._picture_quality import Quality, quality
 from neusee.nodes.metrics._picture_spectrum import (
@@ -22,7 +39,12 @@ from neusee.nodes.metrics._picture_spectrum import (
     radial_contrast,
     remaining_error,
 )
-from neusee.nodes.metrics._protection_bounds import ProtectionBounds, largest_glare, protection_bounds, stop_diameter
+from neusee.nodes.metrics._protection_bounds import (
+    ProtectionBounds,
+    largest_glare,
+    protection_bounds,
+    stop_diameter,
+)
 from neusee.nodes.metrics._psf_contrast import Mtf, encircled, encircled_curve, mtf, over_clear_peak
 from neusee.nodes.metrics._saturated_pixels import Saturated, saturated
 from neusee.nodes.metrics._spectral_error import spectral_error

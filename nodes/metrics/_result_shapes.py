@@ -70,12 +70,20 @@ light_outside.shape(_each_band)
 
 
 @spectral_error.shape
-def _(pupil: Pupil, bands: Bands, illuminant: Any = None, responses: Tensor | None = None, **params: Any) -> Tensor:
+def _(
+    pupil: Pupil,
+    bands: Bands,
+    illuminant: Any = None,
+    responses: Tensor | None = None,
+    **params: Any,
+) -> Tensor:
     return double(1 if responses is None else len(responses))
 
 
 @spectral_error.work
-def _(result: Tensor, pupil: Pupil, bands: Bands, *others: Any, **params: Any) -> tuple[float, float]:
+def _(
+    result: Tensor, pupil: Pupil, bands: Bands, *others: Any, **params: Any
+) -> tuple[float, float]:
     count, across = len(bands.centres), max(pupil.height.shape)
     values = 2.0 * count * _SIDE**2
     thinned = -(-across // max(1, across // _SAMPLES))

@@ -31,25 +31,33 @@ def spectral_error(
     pixel_pitch: PixelPitch,
     sensor: SensorSampling = "point",
 ) -> Tensor:
-    """Estimate the error that the number of bands causes in the PSF of a white point, or of a laser line.
+    """Estimate the error that the number of bands causes in the PSF of a white point, or of a laser
+    line.
 
-    The bands are doubled: the light halfway between the centres of adjoining bands is added, which gives a rule of
-    twice as many points. The estimate is the root mean square difference of the PSFs of both rules. Bands that do not
-    adjoin are split into halves instead. Without illuminant and responses, the weights are those of the line. The
-    tolerance of a recipe is relative to the bands of the recipe, and does not include this error.
+    The bands are doubled: the light halfway between the centres of adjoining bands is added, which
+    gives a rule of twice as many points. The estimate is the root mean square difference of the
+    PSFs of both rules. Bands that do not adjoin are split into halves instead. Without illuminant
+    and responses, the weights are those of the line. The tolerance of a recipe is relative to the
+    bands of the recipe, and does not include this error.
 
-    Shapes: pupil (v, u), bands (band,), illuminant (band,), responses (channel, band) -> (channel,) float64.
-    Units:  none; root mean square of the error over that of the PSF, within 256 pixels about the axis.
-    Error:  a factor of 2, compared with 8 times as many bands; up to 2.5 times too large below 2e-4. The pupil is
-            thinned to 256 samples or more across, and the index between bands is interpolated. A channel without light
-            has error 0. The PSFs are in float64: they differ by as little as the rounding of float32.
+    Shapes: pupil (v, u), bands (band,), illuminant (band,), responses (channel, band) -> (channel,)
+            float64.
+    Units:  none; root mean square of the error over that of the PSF, within 256 pixels about the
+            axis.
+    Error:  a factor of 2, compared with 8 times as many bands; up to 2.5 times too large below
+            2e-4. The pupil is thinned to 256 samples or more across, and the index between bands is
+            interpolated. A channel without light has error 0. The PSFs are in float64: they differ
+            by as little as the rounding of float32.
     Raises: ValueError where pupil, bands, illuminant and responses have different bands.
-    Source: comparison of two composite rules: Dahlquist and Bjorck, Numerical Methods, section 7.2 (1974).
+    Source: comparison of two composite rules: Dahlquist and Bjorck, Numerical Methods, section 7.2
+            (1974).
     """
     weights = _weights(bands, illuminant, responses)
     if not weights.shape[1] == len(bands.centres) == len(pupil.wavelengths):
         counts = f"{len(pupil.wavelengths)}, {len(bands.centres)} and {weights.shape[1]}"
-        raise ValueError(f"pupil, bands and weights have {counts} bands: compute all from the same `bands` step")
+        raise ValueError(
+            f"pupil, bands and weights have {counts} bands: compute all from the same `bands` step"
+        )
     more, difference = _finer(bands, weights)
     few = _in_double(_thinned(pupil))
     index = torch.cat([few.index, _interpolated(pupil.wavelengths, pupil.index, more)])
@@ -78,7 +86,9 @@ def _weights(bands: Bands, illuminant: Tensor | None, responses: Tensor | None) 
 
 
 def _finer(bands: Bands, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Return further wavelengths, and the weights (channel, wavelength) of the error, centres of bands first."""
+    """Return further wavelengths, and the weights (channel, wavelength) of the error, centres of
+    bands first.
+    """
     steps = bands.centres.diff()
     if len(steps) and bool(((steps - bands.widths[1:]).abs() <= 0.01 * steps.abs()).all()):
         middle = (bands.centres[1:] + bands.centres[:-1]) / 2
@@ -90,7 +100,9 @@ def _finer(bands: Bands, weights: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _interpolated(at: Tensor, values: Tensor, where: Tensor) -> Tensor:
-    """Interpolate by the polynomial through the four nearest points, or through all points if there are fewer."""
+    """Interpolate by the polynomial through the four nearest points, or through all points if
+    there are fewer.
+    """
     near = (where[:, None] - at).abs().argsort(1)[:, : min(4, len(at))]
     x, y = at[near], values[near]
     apart = x[:, :, None] - x[:, None, :] + torch.eye(x.shape[1], dtype=x.dtype)
@@ -101,7 +113,9 @@ def _interpolated(at: Tensor, values: Tensor, where: Tensor) -> Tensor:
 
 
 def _thinned(pupil: Pupil) -> Pupil:
-    """Return every k-th sample of a large pupil, as long as the samples that are left can follow the phase."""
+    """Return every k-th sample of a large pupil, as long as the samples that are left can follow
+    the phase.
+    """
     step = max(1, len(pupil.height) // _SAMPLES)
     while step > 1 and pupil_has_large_steps(_every(pupil, step)):
         step //= 2
@@ -109,7 +123,10 @@ def _thinned(pupil: Pupil) -> Pupil:
 
 
 def _every(pupil: Pupil, step: int) -> Pupil:
-    return pupil._replace(**{name: getattr(pupil, name)[::step, ::step] for name in _SCREENS}, pitch=pupil.pitch * step)
+    return pupil._replace(
+        **{name: getattr(pupil, name)[::step, ::step] for name in _SCREENS},
+        pitch=pupil.pitch * step,
+    )
 
 
 def _in_double(pupil: Pupil) -> Pupil:
@@ -121,4 +138,9 @@ def _in_double(pupil: Pupil) -> Pupil:
 
 @spectral_error.check
 def _(result: Tensor, pupil: Pupil, bands: Bands, *_: Any, **__: Any) -> list[Check]:
-    return [Check(f"{len(bands.centres)} bands: error of the spectral sampling {float(result.max()):.2g} of the PSF")]
+    return [
+        Check(
+            f"{len(bands.centres)} bands: error of the spectral sampling {float(result.max()):.2g}"
+            " of the PSF"
+        )
+    ]

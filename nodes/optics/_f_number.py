@@ -10,8 +10,14 @@ def refuse_impossible_f_number(focal_length: float, diameter: float, parameter: 
 
     Shapes: scalars.
     Units:  metres.
-    Source: Goodman, Introduction to Fourier Optics, 3rd edition, section 6.2; Born and Wolf, Principles of Optics, 4.5.
+    Source: Goodman, Introduction to Fourier Optics, 3rd edition, section 6.2; Born and Wolf,
+            Principles of Optics, 4.5.
     """
     if diameter > 2 * focal_length * (1 + 1e-9):
-        text = f"a diameter of {diameter * 1e3:.6g} mm with a focal length of {focal_length * 1e3:.6g} mm"
-        raise ParameterError(parameter, f"{text} is f/{focal_length / diameter:.3g}: no lens in air is below f/0.5")
+        text = (
+            f"a diameter of {diameter * 1e3:.6g} mm with a focal length of"
+            f" {focal_length * 1e3:.6g} mm"
+        )
+        raise ParameterError(
+            parameter, f"{text} is f/{focal_length / diameter:.3g}: no lens in air is below f/0.5"
+        )

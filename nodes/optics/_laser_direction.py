@@ -10,7 +10,8 @@ from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.units import Angle, FocalLength, Fraction, PixelPitch, Shape
 
 _WIDEST = 1.0  #: rad; an angle counts as its direction cosine, which is below 1
-_SMALL = 0.01  #: relative difference of an angle and its sine, above which a note says the difference
+#: relative difference of an angle and its sine, above which a note says the difference
+_SMALL = 0.01
 Rule = Literal["width_over_focal_length", "focal_length_over_width"]
 
 
@@ -25,17 +26,19 @@ def direction(
     rule: Rule = "width_over_focal_length",
     rng: Generator,
 ) -> Tensor:
-    """Return the direction of a laser: ``angle``, or a normally distributed angle with 3 sigma = share x W / f per
-    axis.
+    """Return the direction of a laser: ``angle``, or a normally distributed angle with 3 sigma =
+    share x W / f per axis.
 
-    W is the side of the sensor. A draw beyond the edge of the sensor is repeated, so the spot lies on the sensor.
-    The paper prints f / W instead: 6.7 rad for its camera, which no lens images. A draw by f / W is refused.
+    W is the side of the sensor. A draw beyond the edge of the sensor is repeated, so the spot lies
+    on the sensor. The paper prints f / W instead: 6.7 rad for its camera, which no lens images. A
+    draw by f / W is refused.
 
     Shapes: -> (2,), (n_y, n_x) float64.
-    Units:  rad (direction cosines; sine and angle agree to 1e-6 at 2 mrad, and to 1 % at 14 degrees).
+    Units:  rad (direction cosines; sine and angle agree to 1e-6 at 2 mrad, and to 1 % at 14
+            degrees).
     Error:  exact.
-    Raises: ParameterError before the run where ``rule`` asks for a draw by f / W, and for an angle of 1 rad or more,
-            which is no direction cosine.
+    Raises: ParameterError before the run where ``rule`` asks for a draw by f / W, and for an angle
+            of 1 rad or more, which is no direction cosine.
     Source: NeuSee, section Experiment Setup; by definition.
     """
     if angle is not None:
@@ -44,14 +47,20 @@ def direction(
     return torch.stack([_inside(share * edge / 3, edge / 2, rng) for edge in edges])
 
 
-def field_of_view(focal_length: float, pixel_pitch: float, shape: tuple[int, int]) -> tuple[float, float]:
-    """Return the direction cosines (n_y, n_x) between opposite edges of the sensor: side x pitch / f."""
+def field_of_view(
+    focal_length: float, pixel_pitch: float, shape: tuple[int, int]
+) -> tuple[float, float]:
+    """Return the direction cosines (n_y, n_x) between opposite edges of the sensor: side x pitch
+    / f.
+    """
     height, width = (side * pixel_pitch / focal_length for side in shape)
     return height, width
 
 
 def _inside(sigma: float, edge: float, rng: Generator) -> Tensor:
-    """Sample a normal distribution of standard deviation ``sigma``, limited to absolute values of at most ``edge``."""
+    """Sample a normal distribution of standard deviation ``sigma``, limited to absolute values
+    of at most ``edge``.
+    """
     while True:
         drawn = sigma * torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)
         if float(drawn.abs()) <= edge:
@@ -74,8 +83,8 @@ def _(
         wide = share * focal_length / (shape[1] * pixel_pitch)
         raise ParameterError(
             "rule",
-            f"{share:g} f / W = {wide:.3g} rad would put the spot {wide * focal_length:.2g} m off the axis: "
-            "set `angle`, or set rule: width_over_focal_length",
+            f"{share:g} f / W = {wide:.3g} rad would put the spot {wide * focal_length:.2g} m off"
+            " the axis: set `angle`, or set rule: width_over_focal_length",
         )
     return []
 
@@ -83,23 +92,29 @@ def _(
 def angle_notes(angle: tuple[float, float]) -> list[str]:
     """Return a note for an angle that differs by more than 1 % from its sine.
 
-    Raises ParameterError for an angle of 1 rad or more, because the model takes an angle as its direction cosine.
+    Raises ParameterError for an angle of 1 rad or more, because the model takes an angle as its
+    direction cosine.
     """
     size = math.hypot(*angle)
     degrees = f"{math.degrees(size):.4g} deg"
     if size >= _WIDEST:
         raise ParameterError(
             "angle",
-            f"{degrees} off the axis is {size:.4g} rad, but the model takes an angle in rad as its direction cosine, "
-            "which is below 1: give less than 57.3 deg",
+            f"{degrees} off the axis is {size:.4g} rad, but the model takes an angle in rad as its"
+            " direction cosine, which is below 1: give less than 57.3 deg",
         )
     off = 1 - math.sin(size) / size if size else 0.0
-    text = f"{degrees} off the axis: the model takes an angle as its direction cosine, and the two differ by {off:.1%}"
+    text = (
+        f"{degrees} off the axis: the model takes an angle as its direction cosine, and the two"
+        f" differ by {off:.1%}"
+    )
     return [text] if off > _SMALL else []
 
 
 @direction.check
-def _(result: Tensor, *, focal_length: float, pixel_pitch: float, shape: tuple[int, int], **_: Any) -> list[Check]:
+def _(
+    result: Tensor, *, focal_length: float, pixel_pitch: float, shape: tuple[int, int], **_: Any
+) -> list[Check]:
     y, x = (float(n) * focal_length / pixel_pitch for n in result)
     seen = abs(y) <= shape[0] / 2 and abs(x) <= shape[1] / 2
     off = math.degrees(math.hypot(*(float(n) for n in result)))

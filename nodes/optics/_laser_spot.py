@@ -1,4 +1,6 @@
-"""The laser spot on the sensor: a PSF scaled by the strength of a laser, or by its light in watts."""
+"""The laser spot on the sensor: a PSF scaled by the strength of a laser, or by its light in
+watts.
+"""
 
 import math
 from typing import Annotated, Literal
@@ -15,7 +17,8 @@ from neusee.nodes.values import Bands, LaserLight, Psf
 
 Meaning = Literal["first_channel", "irradiance"]
 
-_LSR = 2.2  #: largest laser suppression ratio of a pupil that only absorbs and delays; derived in the bound
+#: largest laser suppression ratio of a pupil that only absorbs and delays; derived in the bound
+_LSR = 2.2
 _SQUARE = 4 / math.pi  #: largest area of the samples of a coarse pupil grid, relative to their disc
 _UNSEEN = 1e-3  #: relative response below which a channel does not see a line
 
@@ -34,20 +37,23 @@ def laser_irradiance(
     pixel_pitch: PixelPitch,
     exposure: Exposure,
 ) -> Tensor:
-    """Scale the PSF of a laser so that its peak behind the clear lens, on axis, is ``strength`` times saturation.
+    """Scale the PSF of a laser so that its peak behind the clear lens, on axis, is ``strength``
+    times saturation.
 
-    By the meaning `first_channel` a laser of strength 1 fills the pixel at that peak in the channel that it fills
-    first, at the nominal exposure. By the meaning `irradiance` of the paper that peak is the sum of I / I_sat over the
-    wavelengths of the line, before the channels. The nominal exposure is ``exposure``, at which a strength is defined;
-    a sensor that exposes longer collects more of the same light. Without a strength the irradiance is that of the
-    `light` in watts. Each wavelength sends its share of the energy (``bands.weights``) through the pupil. The spot is
+    By the meaning `first_channel` a laser of strength 1 fills the pixel at that peak in the channel
+    that it fills first, at the nominal exposure. By the meaning `irradiance` of the paper that peak
+    is the sum of I / I_sat over the wavelengths of the line, before the channels. The nominal
+    exposure is ``exposure``, at which a strength is defined; a sensor that exposes longer collects
+    more of the same light. Without a strength the irradiance is that of the `light` in watts. Each
+    wavelength sends its share of the energy (``bands.weights``) through the pupil. The spot is
     added to the image of the scene and is not convolved.
 
     Shapes: psf.intensity (band, y, x), bands (band,), responses (channel, band) -> (band, y, x).
     Units:  result W/m2 of each sub-band, mean over the exposure; strength is a plain multiple.
     Error:  float32 of the PSF, 1e-6 of its peak; the scale is exact.
-    Raises: ParameterError before the run for a strength at a wavelength that no channel sees; ValueError where PSF,
-            line and responses have different bands, and without strength and light.
+    Raises: ParameterError before the run for a strength at a wavelength that no channel sees;
+            ValueError where PSF, line and responses have different bands, and without strength and
+            light.
     Source: NeuSee, Eq. (peak_irrad_laser_coded); in watts by definition of the PSF.
     """
     if psf.intensity.shape[0] != len(bands.centres):
@@ -56,19 +62,28 @@ def laser_irradiance(
             "the numbers of bands differ, so compute both from one `line` step"
         )
     if strength is not None:
-        sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency, "pixel_pitch": pixel_pitch}
+        sensor = {
+            "full_well": full_well,
+            "quantum_efficiency": quantum_efficiency,
+            "pixel_pitch": pixel_pitch,
+        }
         wells = 1.0 / saturation(bands, **sensor, exposure=exposure)
         energy = strength * bands.weights / unit(psf.clear_peak, bands, wells, responses, meaning)
     elif light is not None:
         energy = light.flux / pixel_pitch**2 * bands.weights
     else:
-        raise ValueError("a laser needs a strength, or its light in watts: give strength, or the input light")
+        raise ValueError(
+            "a laser needs a strength, or its light in watts: give strength, or the input light"
+        )
     intensity = single(psf.intensity)
     return intensity * energy.to(intensity)[:, None, None]
 
 
-def unit(clear_peak: Tensor, bands: Bands, wells: Tensor, responses: Tensor | None, meaning: Meaning) -> Tensor:
-    """Return the saturated pixels of one W/m2 per unit of the PSF at the peak of the clear lens: () float64.
+def unit(
+    clear_peak: Tensor, bands: Bands, wells: Tensor, responses: Tensor | None, meaning: Meaning
+) -> Tensor:
+    """Return the saturated pixels of one W/m2 per unit of the PSF at the peak of the clear lens: ()
+    float64.
 
     ``wells`` are the full wells of one W/m2 in each band.
     """
@@ -76,7 +91,10 @@ def unit(clear_peak: Tensor, bands: Bands, wells: Tensor, responses: Tensor | No
     if meaning == "irradiance":
         return each.sum()
     if responses is None or responses.shape[-1] != len(each):
-        raise ValueError("strength counts the channel that saturates first: give `responses` for the bands of the line")
+        raise ValueError(
+            "strength counts the channel that saturates first: give `responses` for the bands of"
+            " the line"
+        )
     most = (responses.to(each) * each).sum(-1).amax()
     if not bool(most > 0):
         raise ValueError(_no_channel(bands))
@@ -92,7 +110,13 @@ def _(
     meaning: Meaning = "irradiance",
     **sensor: float,
 ) -> list[str]:
-    if not strength or meaning == "irradiance" or bands is None or responses is None or responses.is_meta:
+    if (
+        not strength
+        or meaning == "irradiance"
+        or bands is None
+        or responses is None
+        or responses.is_meta
+    ):
         return []
     if float((responses * bands.weights).sum(-1).amax() / bands.weights.sum()) < _UNSEEN:
         raise ParameterError("strength", _no_channel(bands))
@@ -116,22 +140,27 @@ def _(
     meaning: Meaning = "irradiance",
     **sensor: float,
 ) -> float:
-    """Return an upper bound of the spot's irradiance: saturation x strength x largest laser suppression ratio (LSR).
+    """Return an upper bound of the spot's irradiance: saturation x strength x largest laser
+    suppression ratio (LSR).
 
-    The bound needs no PSF, so no PSF is computed for it. A pixel that samples a point is at most as bright as the clear
-    peak, where all of the pupil is in phase. The same holds for a pixel that averages over a width up to lambda f / D,
-    because within that width all pairs of pupil points still add up. A wider pixel within the alias-free field holds at
-    least 1 / 2.2 of the clear pupil's light on axis, and no other pixel holds more than all of that light.
-    A channel of small response needs more irradiance to saturate; light in watts has its peak at the mean wavelength.
+    The bound needs no PSF, so no PSF is computed for it. A pixel that samples a point is at most as
+    bright as the clear peak, where all of the pupil is in phase. The same holds for a pixel that
+    averages over a width up to lambda f / D, because within that width all pairs of pupil points
+    still add up. A wider pixel within the alias-free field holds at least 1 / 2.2 of the clear
+    pupil's light on axis, and no other pixel holds more than all of that light. A channel of small
+    response needs more irradiance to saturate; light in watts has its peak at the mean wavelength.
     """
     if strength is None:
-        return math.inf if light is None else _LSR * _SQUARE * light.max * (bands.max / bands.min) ** 2
+        return (
+            math.inf if light is None else _LSR * _SQUARE * light.max * (bands.max / bands.min) ** 2
+        )
     if strength == 0:
         return 0.0
     least = 1.0
     if meaning == "first_channel":
         least = responses.min if responses else 0.0
-    ends = torch.tensor([bands.min], dtype=torch.float64)  # the saturation irradiance falls with wavelength
+    # the saturation irradiance falls with wavelength
+    ends = torch.tensor([bands.min], dtype=torch.float64)
     saturating: Tensor = saturation(Bands(ends, ends, ends), **sensor)
     return _LSR * strength * float(saturating) / least if least > 0 else math.inf
 
@@ -146,10 +175,14 @@ def _(
     exposure: float,
     **params: object,
 ) -> tuple[float, float]:
-    """Return the peak behind the clear lens, in photons of the brightest channel per second and square metre."""
+    """Return the peak behind the clear lens, in photons of the brightest channel per second and
+    square metre.
+    """
     if strength is None:
         raise LookupError("the light of a laser in watts is known in the run only")
-    return 0.0, strength * photons_that_fill(full_well, quantum_efficiency) / (exposure * pixel_pitch**2)
+    return 0.0, strength * photons_that_fill(full_well, quantum_efficiency) / (
+        exposure * pixel_pitch**2
+    )
 
 
 @laser_irradiance.check
@@ -166,10 +199,15 @@ def _(
 ) -> list[Check]:
     wells = 1.0 / saturation(bands, **sensor)
     peak = float(result.sum(0).max())
-    watts, at = f"peak of the spot {peak:.4g} W/m2", f"at the nominal exposure of {sensor['exposure']:g} s"
+    watts, at = (
+        f"peak of the spot {peak:.4g} W/m2",
+        f"at the nominal exposure of {sensor['exposure']:g} s",
+    )
     if strength is not None:
         return [Check(f"{watts}, strength {strength:g} {at}", math.isfinite(peak))]
-    if light is None or (meaning == "first_channel" and (responses is None or not float(responses.max()) > 0)):
+    if light is None or (
+        meaning == "first_channel" and (responses is None or not float(responses.max()) > 0)
+    ):
         return [Check(watts, math.isfinite(peak))]
     clear = light.peak / light.even_peak.clamp_min(1e-300) * light.flux / sensor["pixel_pitch"] ** 2
     strength = float(clear * unit(psf.clear_peak, bands, wells, responses, meaning))

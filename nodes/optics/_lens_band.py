@@ -1,4 +1,6 @@
-"""The spatial frequencies that the clear aperture passes, and what its pixels average away, from a PSF alone."""
+"""The spatial frequencies that the clear aperture passes, and what its pixels average away, from
+a PSF alone.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +18,11 @@ _STEPS = 8  #: of the iteration for the diameter of a stop, each at least 10 tim
 
 
 def cut_off(psf: Psf) -> Tensor:
-    """Return the highest spatial frequency that the clear aperture passes, in cycles per pixel: (band,) float64.
+    """Return the highest spatial frequency that the clear aperture passes, in cycles per pixel:
+    (band,) float64.
 
-    A PSF that does not name the frequency counts as that of a round aperture, sampled at points: sqrt(4 p0 / pi).
+    A PSF that does not name the frequency counts as that of a round aperture, sampled at points:
+    sqrt(4 p0 / pi).
     """
     if psf.cut_off.numel():
         return psf.cut_off.double()
@@ -26,25 +30,36 @@ def cut_off(psf: Psf) -> Tensor:
 
 
 def averaging(psf: Psf) -> Tensor:
-    """Return the side in pixels of the square over which each pixel averages, 0 for points: (band,) float64."""
-    return psf.averaged.double() if psf.averaged.numel() else torch.zeros_like(psf.clear_peak, dtype=torch.float64)
+    """Return the side in pixels of the square over which each pixel averages, 0 for points:
+    (band,) float64.
+    """
+    return (
+        psf.averaged.double()
+        if psf.averaged.numel()
+        else torch.zeros_like(psf.clear_peak, dtype=torch.float64)
+    )
 
 
 class RoundLens(NamedTuple):
-    """What a round aperture without aberrations gives, on average over the frequencies that it passes."""
+    """What a round aperture without aberrations gives, on average over the frequencies that it
+    passes.
+    """
 
     peak: Tensor  #: brightest pixel over its value at a point
     power: Tensor  #: mean of the squared transfer function
 
 
 def round_lens(frequency: Tensor, side: Tensor) -> RoundLens:
-    """Return the peak and the contrast of a round aperture with a cut-off ``frequency``, averaged over pixels.
+    """Return the peak and the contrast of a round aperture with a cut-off ``frequency``, averaged
+    over pixels.
 
-    ``frequency`` is in cycles per pixel, and ``side`` is that of the square over which a pixel averages, in pixels.
+    ``frequency`` is in cycles per pixel, and ``side`` is that of the square over which a pixel
+    averages, in pixels.
 
     Shapes: frequency and side (...) -> two of (...), float64.
     Error: 1e-4 for up to 10 cycles across ``side``.
-    Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF as autocorrelation of the pupil).
+    Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF as autocorrelation of the
+            pupil).
     """
     nodes, weights = unit_nodes(_NODES)
     radius, azimuth = (nodes + 0.5)[:, None], (nodes + 0.5) * (math.pi / 2)
@@ -57,10 +72,12 @@ def round_lens(frequency: Tensor, side: Tensor) -> RoundLens:
 
 
 def stop_width(lsr: Tensor, frequency: Tensor, side: Tensor) -> Tensor:
-    """Return the diameter of the stop with the peak ``lsr``, as a share of that of the lens: (...) float64.
+    """Return the diameter of the stop with the peak ``lsr``, as a share of that of the lens: (...)
+    float64.
 
-    The brightest pixel falls with the fourth power of the diameter, but for what pixels average away. ``frequency`` is
-    the cut-off of the lens, and ``side`` that of the square over which a pixel averages, as in `round_lens`.
+    The brightest pixel falls with the fourth power of the diameter, but for what pixels average
+    away. ``frequency`` is the cut-off of the lens, and ``side`` that of the square over which a
+    pixel averages, as in `round_lens`.
     """
     whole, width = round_lens(frequency, side).peak, lsr**0.25
     for _ in range(_STEPS):

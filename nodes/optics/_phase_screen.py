@@ -8,9 +8,11 @@ from torch import Tensor
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes
 
 
-def screen(grid: PupilGrid, scale: float, rng: torch.Generator, device: torch.device | None = None) -> Tensor:
-    """Return a random phase screen (v, u), float64: Gaussian noise with variance 1 and correlation exp(-(d /
-    scale)**2).
+def screen(
+    grid: PupilGrid, scale: float, rng: torch.Generator, device: torch.device | None = None
+) -> Tensor:
+    """Return a random phase screen (v, u), float64: Gaussian noise with variance 1 and correlation
+    exp(-(d / scale)**2).
     """
     rows, columns = factors(grid, scale, rng, device)
     return rows @ columns
@@ -19,10 +21,12 @@ def screen(grid: PupilGrid, scale: float, rng: torch.Generator, device: torch.de
 def factors(
     grid: PupilGrid, scale: float, rng: torch.Generator, device: torch.device | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return matrices (v, n) and (n, u) whose product is a random phase screen, so that single rows can be computed.
+    """Return matrices (v, n) and (n, u) whose product is a random phase screen, so that single rows
+    can be computed.
 
-    ``scale`` is in units of the diameter. Gaussians of width scale / 2 smooth white noise on a lattice. The lattice
-    does not depend on the sampling of the pupil, so the screen does not depend on the sampling either.
+    ``scale`` is in units of the diameter. Gaussians of width scale / 2 smooth white noise on a
+    lattice. The lattice does not depend on the sampling of the pupil, so the screen does not depend
+    on the sampling either.
     """
     width = scale / 2
     half = max(0.5, grid.samples * grid.pitch / (2 * grid.diameter)) + 4 * width

@@ -1,8 +1,9 @@
 """The filter that averages an intensity over square pixels, given the intensity on a finer grid.
 
-The intensity of a pupil of finite width is band-limited. On a grid of more than twice its bandwidth the intensity
-between the samples is known, so that its average over a pixel is a short sum of samples. The weights of this sum are
-the average over a pixel of a low-pass filter, which passes the band of the intensity and stops its repetitions.
+The intensity of a pupil of finite width is band-limited. On a grid of more than twice its bandwidth
+the intensity between the samples is known, so that its average over a pixel is a short sum of
+samples. The weights of this sum are the average over a pixel of a low-pass filter, which passes the
+band of the intensity and stops its repetitions.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ _ROWS = 16  #: pixels whose weights form one dense matrix
 
 @dataclass(frozen=True, slots=True)
 class FineAxis:
-    """A grid along one axis of a window, fine enough for the intensity, and the length of the filter on this grid.
+    """A grid along one axis of a window, fine enough for the intensity, and the length of the
+    filter on this grid.
 
     The middle of the grid is the middle of the window.
     """
@@ -38,7 +40,9 @@ class FineAxis:
 
     @property
     def samples(self) -> int:
-        """Return the number of samples, which reach beyond the window by half a filter on each side."""
+        """Return the number of samples, which reach beyond the window by half a filter on each
+        side.
+        """
         return math.ceil(self.per_pixel * (self.pixels - 1)) + self.taps
 
     def part(self, pixels: int) -> FineAxis:
@@ -47,7 +51,8 @@ class FineAxis:
 
 
 def fine_axis(pixels: int, bandwidth: float, error: float) -> FineAxis:
-    """Return the grid with the fewest samples, each tap of the filter counted twice, for its products.
+    """Return the grid with the fewest samples, each tap of the filter counted twice, for its
+    products.
 
     The grid has more than ``2 bandwidth`` samples a pixel, and at least one.
     """
@@ -72,9 +77,11 @@ def _decibels(error: float) -> float:
 
 
 def _width(gap: float, error: float) -> float:
-    """Return the width in pixels of a low-pass filter whose pass and stop band are ``gap`` cycles a pixel apart.
+    """Return the width in pixels of a low-pass filter whose pass and stop band are ``gap`` cycles a
+    pixel apart.
 
-    Source: Kaiser, Proc. IEEE Int. Symp. Circuits and Systems (1974), the length of a filter by its window.
+    Source: Kaiser, Proc. IEEE Int. Symp. Circuits and Systems (1974), the length of a filter by its
+            window.
     """
     return (_decibels(error) - 7.95) / (14.36 * gap)
 
@@ -87,13 +94,16 @@ def _weights(grid: FineAxis, away: Tensor) -> Tensor:
     at = away[..., None] + nodes
     window = torch.special.i0(beta * (1 - (2 * at / width).square()).clamp_min(0).sqrt())
     low_pass = torch.sinc(grid.per_pixel * at) * window.where(at.abs() <= width / 2, 0.0)
-    weights: Tensor = low_pass @ shares / float(torch.special.i0(torch.tensor(beta, dtype=torch.float64)))
+    weights: Tensor = (
+        low_pass @ shares / float(torch.special.i0(torch.tensor(beta, dtype=torch.float64)))
+    )
     return weights
 
 
 def unit_nodes(count: int) -> tuple[Tensor, Tensor]:
     """Return Gauss-Legendre nodes between -1/2 and 1/2, and their weights, which sum to one."""
-    nodes, weights = _nodes(count)  # kept as numbers, because a transform of `torch.func` wraps new tensors
+    # kept as numbers, because a transform of `torch.func` wraps new tensors
+    nodes, weights = _nodes(count)
     return torch.tensor(nodes, dtype=torch.float64), torch.tensor(weights, dtype=torch.float64)
 
 
@@ -107,7 +117,9 @@ def _nodes(count: int) -> tuple[list[float], list[float]]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _AxisFilter:
-    """The weights of a block of pixels, the same for every block, and the first sample of each block."""
+    """The weights of a block of pixels, the same for every block, and the first sample of each
+    block.
+    """
 
     block: Tensor  #: (pixel, sample)
     first: int  #: sample of the first block
@@ -144,11 +156,17 @@ def _axis_filter(grid: FineAxis, dtype: torch.dtype, device: torch.device) -> _A
 
 
 class PixelFilter:
-    """The average over pixels of an intensity on a fine grid, along y and then along x, and its adjoint."""
+    """The average over pixels of an intensity on a fine grid, along y and then along x, and its
+    adjoint.
+    """
 
     def __init__(self, rows: FineAxis, columns: FineAxis, like: Tensor) -> None:
-        """Take the weights in the type and on the device of ``like``, which no transform of `torch.func` wraps."""
-        self.rows, self.columns = (_axis_filter(grid, like.dtype, like.device) for grid in (rows, columns))
+        """Take the weights in the type and on the device of ``like``, which no transform of
+        `torch.func` wraps.
+        """
+        self.rows, self.columns = (
+            _axis_filter(grid, like.dtype, like.device) for grid in (rows, columns)
+        )
 
     def average(self, fine: Tensor) -> Tensor:
         """Return the average (y, x) over each pixel of an intensity on the fine grid."""
@@ -172,13 +190,17 @@ class PixelFilter:
 
 
 def averaged(fine: Tensor, rows: FineAxis, columns: FineAxis) -> Tensor:
-    """Return the average over pixels of an intensity on the fine grid, with derivatives of any order."""
+    """Return the average over pixels of an intensity on the fine grid, with derivatives of any
+    order.
+    """
     result: Tensor = _Averaged.apply(fine, rows, columns, False)  # type: ignore[no-untyped-call]
     return result
 
 
 class _Averaged(torch.autograd.Function):
-    """The average over pixels or its adjoint, both linear, so that each is the derivative of the other."""
+    """The average over pixels or its adjoint, both linear, so that each is the derivative of the
+    other.
+    """
 
     @staticmethod
     def forward(light: Tensor, rows: FineAxis, columns: FineAxis, adjoint: bool) -> Tensor:

@@ -1,4 +1,6 @@
-"""What a PSF refuses: aliases of the pupil's samples, points too far apart, and more light than the pupil passes."""
+"""What a PSF refuses: aliases of the pupil's samples, points too far apart, and more light than
+the pupil passes.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ _FAST = 1.2  #: f-number below which the scalar theory of this PSF needs a note
 
 
 def refuse_aliases(pupil: Pupil, camera: Geometry) -> None:
-    """Raise ValueError if the PSF window includes aliases, which a sampled pupil repeats every lambda f / pitch.
+    """Raise ValueError if the PSF window includes aliases, which a sampled pupil repeats every
+    lambda f / pitch.
 
     With ``pixel="zoh"`` the repeated light is real, because square pillars do send light there.
     """
@@ -29,15 +32,18 @@ def refuse_aliases(pupil: Pupil, camera: Geometry) -> None:
         reach = max(abs(0 - at), abs(n - 1 - at)) * camera.pixel_pitch
         if reach > limit * (1 + 1e-9):
             raise ValueError(
-                f"the window reaches {reach * 1e3:.3g} mm from the spot along {axis}, but at {shortest * 1e9:.4g} nm "
-                f"a pupil pitch of {pitch * 1e6:.4g} um carries only {limit * 1e3:.3g} mm (lambda f / (2 pitch)) "
-                f"before the PSF repeats: write {_finer_grid(pupil, reach / limit)} for the same aperture, or choose "
-                "a smaller angle or window, or pixel='zoh'"
+                f"the window reaches {reach * 1e3:.3g} mm from the spot along {axis}, but at"
+                f" {shortest * 1e9:.4g} nm a pupil pitch of {pitch * 1e6:.4g} um carries only"
+                f" {limit * 1e3:.3g} mm (lambda f / (2 pitch)) before the PSF repeats: write"
+                f" {_finer_grid(pupil, reach / limit)} for the same aperture, or choose a smaller"
+                " angle or window, or pixel='zoh'"
             )
 
 
 def _finer_grid(pupil: Pupil, factor: float) -> str:
-    """Return the settings of a pupil grid of the same width with a pitch that is ``factor`` times finer."""
+    """Return the settings of a pupil grid of the same width with a pitch that is ``factor``
+    times finer.
+    """
     samples, pitch = pupil.height.shape[0], float(pupil.pitch)
     needed = math.ceil(samples * factor * (1 - 1e-12))
     needed += (needed - samples) % 2  # so that the axis stays on a sample, or between two samples
@@ -47,7 +53,8 @@ def _finer_grid(pupil: Pupil, factor: float) -> str:
 def refuse_coarse_points(pupil: Pupil, camera: Geometry) -> None:
     """Raise ValueError if the middles of the pixels are further apart than wavelength x f-number.
 
-    The sum of equally spaced points is the light of a PSF up to that pitch, which is the period of the fastest fringe.
+    The sum of equally spaced points is the light of a PSF up to that pitch, which is the period of
+    the fastest fringe.
     """
     if camera.sensor != "point":
         return
@@ -58,15 +65,16 @@ def refuse_coarse_points(pupil: Pupil, camera: Geometry) -> None:
         if _coarse(camera, shortest, diameter):
             number = camera.focal_length / diameter
             raise ValueError(
-                f"points {camera.pixel_pitch * 1e6:.3g} um apart miss or repeat the light of a spot at "
-                f"{shortest * 1e9:.4g} nm and f/{number:.3g}, where wavelength x f-number is "
-                f"{shortest * number * 1e6:.3g} um: write sensor.sampling=integrated to average over each pixel, or "
-                "choose a finer pitch"
+                f"points {camera.pixel_pitch * 1e6:.3g} um apart miss or repeat the light of a spot"
+                f" at {shortest * 1e9:.4g} nm and f/{number:.3g}, where wavelength x f-number is"
+                f" {shortest * number * 1e6:.3g} um: write sensor.sampling=integrated to average"
+                " over each pixel, or choose a finer pitch"
             )
 
 
 def spread_points_notes(pupil: Pupil, camera: Geometry) -> list[str]:
-    """Return a note for points so far apart that a peak between them is missed, as of the spot behind a mask.
+    """Return a note for points so far apart that a peak between them is missed, as of the spot
+    behind a mask.
 
     The Airy pattern in the middle between four points says by how much.
     """
@@ -75,11 +83,14 @@ def spread_points_notes(pupil: Pupil, camera: Geometry) -> list[str]:
     fringe = float(pupil.wavelengths.min()) * camera.focal_length / float(pupil.diameter)
     if camera.pixel_pitch <= fringe / 2 * (1 + 1e-9):
         return []
-    away = torch.tensor(math.pi * min(camera.pixel_pitch / math.sqrt(2) / fringe, 1.22), dtype=torch.float64)
+    away = torch.tensor(
+        math.pi * min(camera.pixel_pitch / math.sqrt(2) / fringe, 1.22), dtype=torch.float64
+    )
     lost = 1 - float((2 * torch.special.bessel_j1(away) / away).square())
     return [
-        f"points {camera.pixel_pitch * 1e6:.3g} um apart are further apart than half of wavelength x f-number, "
-        f"{fringe / 2 * 1e6:.3g} um: a peak between them shows up to {lost:.0%} too low"
+        f"points {camera.pixel_pitch * 1e6:.3g} um apart are further apart than half of wavelength"
+        f" x f-number, {fringe / 2 * 1e6:.3g} um: a peak between them shows up to {lost:.0%}"
+        " too low"
     ]
 
 
@@ -88,7 +99,9 @@ def _coarse(camera: Geometry, wavelength: float, diameter: float) -> bool:
 
 
 def _diameter(pupil: Pupil, widest: float) -> float:
-    """Return the diameter of the clear aperture, or its larger side where the pupil does not name the diameter."""
+    """Return the diameter of the clear aperture, or its larger side where the pupil does not
+    name the diameter.
+    """
     named = pupil.diameter
     if not named.is_meta and float(named) > 0:
         return float(named)
@@ -111,21 +124,23 @@ def fast_lens_notes(pupil: Pupil, camera: Geometry) -> list[str]:
     if number > _FAST * (1 + 1e-9):
         return []
     return [
-        f"f/{number:.3g}: the PSF is that of scalar theory, and the acceptance of microlenses is ignored; "
-        "a real sensor loses part of this oblique light"
+        f"f/{number:.3g}: the PSF is that of scalar theory, and the acceptance of microlenses is"
+        " ignored; a real sensor loses part of this oblique light"
     ]
 
 
 def refuse_gained_light(intensity: Tensor, lights: list[float], wavelengths: Tensor) -> None:
-    """Raise ValueError if a window holds more light than the pupil passes, beyond the error of the PSF.
+    """Raise ValueError if a window holds more light than the pupil passes, beyond the error of the
+    PSF.
 
-    ``lights`` has the light that the pupil passes in each band, as a share of that of the clear pupil.
+    ``lights`` has the light that the pupil passes in each band, as a share of that of the clear
+    pupil.
     """
     shares = intensity.detach().sum(-1).sum(-1, dtype=torch.float64).tolist()
     for share, light, wavelength in zip(shares, lights, wavelengths.tolist(), strict=True):
         if share > light * (1 + GAINED_LIGHT[intensity.dtype]):
             raise ValueError(
-                f"the window holds {share:.6g} of the light of the clear pupil at {wavelength * 1e9:.4g} nm, but the "
-                f"pupil passes only {light:.6g}: the samples of the PSF are too far apart; average over each pixel "
-                "(sensor.sampling=integrated)"
+                f"the window holds {share:.6g} of the light of the clear pupil at"
+                f" {wavelength * 1e9:.4g} nm, but the pupil passes only {light:.6g}: the samples of"
+                " the PSF are too far apart; average over each pixel (sensor.sampling=integrated)"
             )

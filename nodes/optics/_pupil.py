@@ -39,19 +39,24 @@ def pupil(
     defocus: Waves = 0.0,
     aberrations: dict[Count, Height] = {},  # noqa: B006 (read only)
 ) -> Pupil:
-    """Build the pupil function from stop, mask, defocus, aberrations, dirt and shade, all in one plane.
+    """Build the pupil function from stop, mask, defocus, aberrations, dirt and shade, all in one
+    plane.
 
-    Field of band b: amplitude * exp(2 pi i (index[b] * height + path) / wavelength[b]). Defocus adds the path
-    W * 550 nm * r**2 with r = 1 at the rim, so W is the peak-to-valley defocus in waves at 550 nm. A `wavefront` adds
-    the taper and the curvature of a laser beam; the lens without defocus is focused at infinity. The stop passes a
-    sample if the centre of the sample lies inside the stop. A shade is a grey filter, a smaller stop or a notch filter.
-    The aperture stays that of the lens, so that the PSF and the laser suppression ratio count the light that is lost.
+    Field of band b: amplitude * exp(2 pi i (index[b] * height + path) / wavelength[b]). Defocus
+    adds the path W * 550 nm * r**2 with r = 1 at the rim, so W is the peak-to-valley defocus in
+    waves at 550 nm. A `wavefront` adds the taper and the curvature of a laser beam; the lens
+    without defocus is focused at infinity. The stop passes a sample if the centre of the sample
+    lies inside the stop. A shade is a grey filter, a smaller stop or a notch filter. The aperture
+    stays that of the lens, so that the PSF and the laser suppression ratio count the light that is
+    lost.
 
     Shapes: height (v, u), index (band,), bands, stop, dirt (v, u), shade (v, u) -> Pupil.
-    Units:  height m; defocus waves at 550 nm; aberrations m of path, root mean square, by Noll index.
+    Units:  height m; defocus waves at 550 nm; aberrations m of path, root mean square, by Noll
+            index.
     Error:  path 1e-7 relative (float32); area of the staircase rim 2 / samples.
     Raises: ValueError where the shapes do not belong together, and for a height in half precision.
-    Source: Goodman, Introduction to Fourier Optics, 3rd ed., section 6.4; Noll, J. Opt. Soc. Am. 66, 207 (1976).
+    Source: Goodman, Introduction to Fourier Optics, 3rd ed., section 6.4; Noll, J. Opt. Soc. Am.
+            66, 207 (1976).
     """
     grid = grid_of(stop)
     _shapes(height, index, bands, grid, dirt, shade)
@@ -73,7 +78,9 @@ def pupil(
 
 
 def _beam_sag(grid: PupilGrid, wavefront: Wavefront | None, device: torch.device) -> float | Tensor:
-    """Return the path (m) by which the curvature of a beam differs from a plane wave at the rim of the stop."""
+    """Return the path (m) by which the curvature of a beam differs from a plane wave at the rim
+    of the stop.
+    """
     if wavefront is None or not bool(wavefront.curvature):
         return 0.0
     return wavefront.curvature.to(device) * grid.diameter**2 / 8
@@ -87,9 +94,15 @@ def _path(lens: Tensor | None, dirt: Dirt | None, like: Tensor) -> Tensor:
 
 
 def _amplitude(
-    grid: PupilGrid, clear: Tensor, dirt: Dirt | None, wavefront: Wavefront | None, shade: Shade | None
+    grid: PupilGrid,
+    clear: Tensor,
+    dirt: Dirt | None,
+    wavefront: Wavefront | None,
+    shade: Shade | None,
 ) -> Tensor:
-    """Return the amplitude behind dirt, the taper of the beam and shade; ``clear`` itself where none is there."""
+    """Return the amplitude behind dirt, the taper of the beam and shade; ``clear`` itself where
+    none is there.
+    """
     amplitude = clear
     if dirt is not None:
         amplitude = amplitude * dirt.amplitude
@@ -102,7 +115,8 @@ def _amplitude(
 
 def _taper(grid: PupilGrid, taper: Tensor, like: Tensor) -> Tensor:
     """Return the amplitude (v, u) of a Gaussian beam with the ``taper`` (1/m2) of a `Wavefront`."""
-    exponent = taper.to(like.device) * grid.diameter**2 / 4  # at the rim of the stop, where v^2 + u^2 = 1
+    # at the rim of the stop, where v^2 + u^2 = 1
+    exponent = taper.to(like.device) * grid.diameter**2 / 4
     along_v, along_u = (torch.exp(-exponent * line.square()) for line in axes(grid, like.device))
     amplitude = torch.empty_like(like)
     for rows in stripes(grid):
@@ -113,7 +127,9 @@ def _taper(grid: PupilGrid, taper: Tensor, like: Tensor) -> Tensor:
 def _lens_path(
     grid: PupilGrid, defocus: float | Tensor, aberrations: Mapping[int, float], like: Tensor
 ) -> Tensor | None:
-    """Return the optical path of defocus and aberrations, or None for a lens without both; ``defocus`` is in m."""
+    """Return the optical path of defocus and aberrations, or None for a lens without both;
+    ``defocus`` is in m.
+    """
     bent = any(aberrations.values())
     if not bool(defocus) and not bent:
         return None
@@ -129,7 +145,12 @@ def _lens_path(
 
 
 def _shapes(
-    height: Tensor, index: Tensor, bands: Bands, grid: PupilGrid, dirt: Dirt | None, shade: Shade | None
+    height: Tensor,
+    index: Tensor,
+    bands: Bands,
+    grid: PupilGrid,
+    dirt: Dirt | None,
+    shade: Shade | None,
 ) -> None:
     refuse_half(height=height)
     refuse_other_grid(height, grid)
@@ -141,18 +162,29 @@ def _shapes(
     for name, screen in (("dirt", dirt), ("shade", shade)):
         if screen is not None and screen.amplitude.shape != height.shape:
             found, wanted = tuple(screen.amplitude.shape), tuple(height.shape)
-            raise ValueError(f"{name} is {found} and height is {wanted}: compute both from one `stop` step")
+            raise ValueError(
+                f"{name} is {found} and height is {wanted}: compute both from one `stop` step"
+            )
 
 
 @pupil.check
-def _(result: Pupil, height: Tensor, index: Tensor, bands: Bands, stop: Stop, *_: Any, **__: Any) -> list[Check]:
+def _(
+    result: Pupil, height: Tensor, index: Tensor, bands: Bands, stop: Stop, *_: Any, **__: Any
+) -> list[Check]:
     samples, pitch, diameter = grid_of(stop)
     passed = _light(result.amplitude) / _light(result.aperture)
     median, share = phase_steps(result)
     text = f"phase step {median:.3f} turn between samples (median), {share:.1%} above half a turn"
     return [
-        Check(f"throughput {passed:.4f} of the clear pupil {min(samples * pitch, diameter) * 1e3:#.3g} mm", passed > 0),
-        Check(text if share <= LARGE_STEPS else f"{text}: aliased, use a finer pupil pitch", share <= LARGE_STEPS),
+        Check(
+            f"throughput {passed:.4f} of the clear pupil"
+            f" {min(samples * pitch, diameter) * 1e3:#.3g} mm",
+            passed > 0,
+        ),
+        Check(
+            text if share <= LARGE_STEPS else f"{text}: aliased, use a finer pupil pitch",
+            share <= LARGE_STEPS,
+        ),
     ]
 
 

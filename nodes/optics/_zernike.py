@@ -12,7 +12,9 @@ _ALL = slice(None)
 
 
 def noll(index: int) -> tuple[int, int]:
-    """Return the radial order n and the signed azimuthal order m (positive: cosine) of a Noll number."""
+    """Return the radial order n and the signed azimuthal order m (positive: cosine) of a Noll
+    number.
+    """
     if index < 1:
         raise ValueError(f"Zernike index {index}: Noll numbers begin at 1 (piston)")
     n = (math.isqrt(8 * index - 7) - 1) // 2
@@ -22,17 +24,25 @@ def noll(index: int) -> tuple[int, int]:
 
 
 def _radial(n: int, m: int) -> list[float]:
-    """Return the coefficients of the orthonormal radial polynomial R(n, m)(r) / r**m in rising powers of r squared."""
+    """Return the coefficients of the orthonormal radial polynomial R(n, m)(r) / r**m in rising
+    powers of r squared.
+    """
     low, high, factorial = (n - m) // 2, (n + m) // 2, math.factorial
     norm = math.sqrt((n + 1) * (1 if m == 0 else 2))
     terms = reversed(range(low + 1))
     return [
-        norm * (-1) ** k * factorial(n - k) / (factorial(k) * factorial(high - k) * factorial(low - k)) for k in terms
+        norm
+        * (-1) ** k
+        * factorial(n - k)
+        / (factorial(k) * factorial(high - k) * factorial(low - k))
+        for k in terms
     ]
 
 
 def _by_azimuth(coefficients: Mapping[int, float]) -> dict[int, list[float]]:
-    """Return one radial polynomial for each signed azimuthal order, summed over the terms of that order."""
+    """Return one radial polynomial for each signed azimuthal order, summed over the terms of
+    that order.
+    """
     sums: dict[int, list[float]] = {}
     for index, rms in coefficients.items():
         n, m = noll(index)
@@ -51,9 +61,11 @@ def _horner(coefficients: list[float], x: Tensor) -> Tensor:
 
 
 def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
-    """Return the weighted sum of Zernike polynomials at (v, u), in units of the radius; the weights are by Noll number.
+    """Return the weighted sum of Zernike polynomials at (v, u), in units of the radius; the weights
+    are by Noll number.
 
-    The sum is written in powers of u + iv, so neither the centre nor the cut of the azimuth needs special treatment.
+    The sum is written in powers of u + iv, so neither the centre nor the cut of the azimuth needs
+    special treatment.
     Source: Noll, J. Opt. Soc. Am. 66, 207 (1976), Eqs. 1 and 2.
     """
     sums = _by_azimuth(coefficients)
@@ -68,8 +80,13 @@ def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
 
 
 def surface(
-    coefficients: Mapping[int, float], grid: PupilGrid, device: torch.device | None = None, rows: slice = _ALL
+    coefficients: Mapping[int, float],
+    grid: PupilGrid,
+    device: torch.device | None = None,
+    rows: slice = _ALL,
 ) -> Tensor:
-    """Return a weighted sum of Zernike polynomials on the pupil grid (v, u), float64, 0 outside the stop."""
+    """Return a weighted sum of Zernike polynomials on the pupil grid (v, u), float64, 0 outside
+    the stop.
+    """
     v, u = axes(grid, device)
     return torch.where(inside(grid, device, rows), combine(coefficients, v[rows], u), 0.0)

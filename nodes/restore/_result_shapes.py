@@ -1,4 +1,6 @@
-"""Shapes of the results of the restoring nodes, and the work of the deconvolution and of the networks."""
+"""Shapes of the results of the restoring nodes, and the work of the deconvolution and of the
+networks.
+"""
 
 import math
 from collections.abc import Sequence
@@ -34,23 +36,48 @@ from neusee.nodes.restore._points._by_field import spread_by_field, wiener_by_fi
 from neusee.nodes.restore._shading._frame_cells import grid
 from neusee.nodes.restore._shading._shading_node import shading
 from neusee.nodes.restore._white_level import white_level
-from neusee.nodes.shape_rules import at_least_single, blank, double, like_first, transform_operations
+from neusee.nodes.shape_rules import (
+    at_least_single,
+    blank,
+    double,
+    like_first,
+    transform_operations,
+)
 from neusee.nodes.values import Bands, FilterFacts, FoundLasers, Psf, Pupil, Shading, WienerProblem
 
 _SYSTEM = 35.0  #: bytes for each element of a dense system: the matrix, its factors and copies
-_INVERTED = 0.30  #: operations of a transform that take as long as one of the cube of the side of an inverted matrix
-_WHITENED = 0.94  #: side of a dense system that needs as much memory as an inverted matrix of side 1
-_FILLED = 790.0  #: operations of a transform that take as long as an element of a matrix of covariances
-_FOCUS = 2.0  #: transforms, of the size of pupil and window together, that take as long as a band of a PSF
-_MODE = 24.0  #: bytes for each pixel of a pattern that the glare may have: its copies, scaled and weighted
-_SEARCHED = 150.0  #: bytes for each pixel of a frame in which lasers are searched: patterns, and slopes of a fit
+#: operations of a transform that take as long as one of the cube of the side of an inverted matrix
+_INVERTED = 0.30
+#: side of a dense system that needs as much memory as an inverted matrix of side 1
+_WHITENED = 0.94
+#: operations of a transform that take as long as an element of a matrix of covariances
+_FILLED = 790.0
+#: transforms, of the size of pupil and window together, that take as long as a band of a PSF
+_FOCUS = 2.0
+#: bytes for each pixel of a pattern that the glare may have: its copies, scaled and weighted
+_MODE = 24.0
+#: bytes for each pixel of a frame in which lasers are searched: patterns, and slopes of a fit
+_SEARCHED = 150.0
 _LINES = 61  #: spectral lines that a search tries, each with five transforms
-_KEPT = 1 / 8  #: bytes of inner results of a network that need as much memory as a byte of the usual work of a node
+#: bytes of inner results of a network that need as much memory as a byte of the usual work of a
+#: node
+_KEPT = 1 / 8
 _LAWS = 400.0  #: bytes, and operations, of the laws of a scene for each element of their matrices
 _FIELD = 60.0  #: products of matrices of the knots
 _LAYER = 1e-3  #: operations of a transform that take as long as one of a layer
 
-for node in (electrons, wiener, wiener_by_field, richardson_lucy, fft_mamba, informed, nafnet, network, unet, unrolled):
+for node in (
+    electrons,
+    wiener,
+    wiener_by_field,
+    richardson_lucy,
+    fft_mamba,
+    informed,
+    nafnet,
+    network,
+    unet,
+    unrolled,
+):
     node.shape(like_first)
 
 
@@ -78,10 +105,14 @@ def _(responses: Any, *, shape: Sequence[int], **params: Any) -> Shading:
 
 
 @shading.work
-def _(result: Shading, *inputs: Any, files: Sequence[Any] = (), **params: Any) -> tuple[float, float]:
+def _(
+    result: Shading, *inputs: Any, files: Sequence[Any] = (), **params: Any
+) -> tuple[float, float]:
     y, x = result.transmission.shape
     knots = result.estimate.numel()
-    return 100.0 * y * x + _LAWS * knots**2, _FIELD * knots**3 + 10.0 * len(files) * (y * x + _LAWS * knots**2)
+    return 100.0 * y * x + _LAWS * knots**2, _FIELD * knots**3 + 10.0 * len(files) * (
+        y * x + _LAWS * knots**2
+    )
 
 
 @nearby_glare.shape
@@ -90,7 +121,9 @@ def _(glare: Tensor, *inputs: Any, patterns: int = 12, **params: Any) -> Tensor:
 
 
 @nearby_glare.work
-def _(result: Tensor, glare: Tensor, pupil: Pupil, *others: Any, **params: Any) -> tuple[float, float]:
+def _(
+    result: Tensor, glare: Tensor, pupil: Pupil, *others: Any, **params: Any
+) -> tuple[float, float]:
     y, x = (n + k for n, k in zip(glare.shape[-2:], pupil.height.shape, strict=True))
     times = (len(result) + 1) * len(pupil.wavelengths)
     return 16.0 * (pupil.height.numel() + y * x), _FOCUS * times * transform_operations(y, x)
@@ -105,7 +138,20 @@ def _(electrons: Tensor, *inputs: Any, most: int = 3, **params: Any) -> FoundLas
     places, wave, width, size, ends, wave_ends, size_ends = values
     number, gain = blank(dtype=torch.int64), double(most, 2)
     straight = (double(most, channels), double(most, channels))
-    return FoundLasers(number, places, wave, width, size, ends, wave_ends, size_ends, certain, gain, spread, *straight)
+    return FoundLasers(
+        number,
+        places,
+        wave,
+        width,
+        size,
+        ends,
+        wave_ends,
+        size_ends,
+        certain,
+        gain,
+        spread,
+        *straight,
+    )
 
 
 @find_lasers.work
@@ -125,7 +171,9 @@ def _(found: Any, pupil: Any, electrons: Tensor, *, patterns: int = 12, **params
     return blank(patterns, *electrons.shape, dtype=at_least_single(electrons))
 
 
-def _summed(result: Tensor, found: Any, pupil: Pupil, electrons: Tensor, **params: Any) -> tuple[float, float]:
+def _summed(
+    result: Tensor, found: Any, pupil: Pupil, electrons: Tensor, **params: Any
+) -> tuple[float, float]:
     """Return the work of sums over all samples of the pupil, for each row and column of pixels."""
     side, (y, x) = max(pupil.height.shape), electrons.shape[-2:]
     count = len(result) if result.ndim > electrons.ndim else 1
@@ -137,7 +185,9 @@ for node in (found_glare, found_nearby):
 
 
 @wiener.work
-def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any) -> tuple[float, float]:
+def _(
+    result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any
+) -> tuple[float, float]:
     border = params.get("border", 1.0)
     y, x = _torus(electrons, psf, border)
     coarse = max(electrons.shape[-2:]) / 2 ** halvings((electrons.shape[-2], electrons.shape[-1]))
@@ -145,25 +195,40 @@ def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any) 
     steps, side = _descent(electrons, psf, border)
     operations = steps + _FILLED * unknowns**2
     largest = max(unknowns, _WHITENED * side)
-    nearby = _MODE * sum(len(each) for each in (others[5] if len(others) > 5 else None) or ()) * electrons.numel()
+    nearby = (
+        _MODE
+        * sum(len(each) for each in (others[5] if len(others) > 5 else None) or ())
+        * electrons.numel()
+    )
     return max(31.0 * len(electrons) * y * x, _SYSTEM * largest**2) + nearby, operations
 
 
 @wiener_spread.shape
 def _(
-    electrons: Tensor, psf: Any, illuminant: Any, responses: Any, bands: Any, clipped: Any, matrix: Tensor,
-    *glare: Any, **params: Any,
-) -> Tensor:  # fmt: skip
+    electrons: Tensor,
+    psf: Any,
+    illuminant: Any,
+    responses: Any,
+    bands: Any,
+    clipped: Any,
+    matrix: Tensor,
+    *glare: Any,
+    **params: Any,
+) -> Tensor:
     return blank(len(matrix), *electrons.shape[-2:], dtype=at_least_single(electrons))
 
 
 @spread_by_field.shape
-def _(electrons: Tensor, measured: Any, clipped: Any, matrix: Tensor, *others: Any, **params: Any) -> Tensor:
+def _(
+    electrons: Tensor, measured: Any, clipped: Any, matrix: Tensor, *others: Any, **params: Any
+) -> Tensor:
     return blank(len(matrix), *electrons.shape[-2:], dtype=at_least_single(electrons))
 
 
 @wiener_spread.work
-def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, draws: int = 8, **params: Any) -> tuple[float, float]:
+def _(
+    result: Tensor, electrons: Tensor, psf: Psf, *others: Any, draws: int = 8, **params: Any
+) -> tuple[float, float]:
     told = (*others[:4], *others[5:])  # without the matrix
     memory, operations = wiener.hooks.work(result, electrons, psf, *told, **params)  # type: ignore[misc]
     return 1.5 * memory, draws * operations
@@ -171,9 +236,17 @@ def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, draws: int = 8,
 
 @wiener_problem.shape
 def _(
-    electrons: Tensor, psf: Psf, illuminant: Any, responses: Any, bands: Any, clipped: Any, glare: Any = None,
-    nearby: Any = None, ghosts: Any = None, **params: Any,
-) -> WienerProblem:  # fmt: skip
+    electrons: Tensor,
+    psf: Psf,
+    illuminant: Any,
+    responses: Any,
+    bands: Any,
+    clipped: Any,
+    glare: Any = None,
+    nearby: Any = None,
+    ghosts: Any = None,
+    **params: Any,
+) -> WienerProblem:
     fine = torch.float64 if max(electrons.shape[-2:]) <= PRECISE else at_least_single(electrons)
     doubts = sum(len(other) for other in nearby or ())
     count, frame, one = len(electrons), tuple(electrons.shape), (len(electrons), 1, 1)
@@ -204,7 +277,9 @@ def _(result: FilterFacts, *inputs: Any, **params: Any) -> tuple[float, float]:
 
 
 @informed.work
-def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, width: int = 16, **params: Any) -> tuple[float, float]:
+def _(
+    result: Tensor, electrons: Tensor, psf: Psf, *others: Any, width: int = 16, **params: Any
+) -> tuple[float, float]:
     memory, operations = wiener.hooks.work(result, electrons, psf, *others)  # type: ignore[misc]
     of_layers, layers = _layers(result, width=width)
     return memory + of_layers, operations + layers
@@ -212,7 +287,13 @@ def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, width: int = 16
 
 @unrolled.work
 def _(
-    result: Tensor, electrons: Tensor, psf: Psf, *others: Any, width: int = 16, steps: int = 2, **params: Any
+    result: Tensor,
+    electrons: Tensor,
+    psf: Psf,
+    *others: Any,
+    width: int = 16,
+    steps: int = 2,
+    **params: Any,
 ) -> tuple[float, float]:
     memory, operations = wiener.hooks.work(result, electrons, psf, *others)  # type: ignore[misc]
     of_layers, layers = _layers(result, width=width)
@@ -225,9 +306,14 @@ def _(signal: Any, clipped: Any, psf: Any, bands: Bands, *others: Any, **params:
 
 
 def _descent(electrons: Tensor, psf: Psf, border: float) -> tuple[float, float]:
-    """Return the operations of the steps on all grids but the coarsest, and the largest matrix that speeds them up."""
+    """Return the operations of the steps on all grids but the coarsest, and the largest matrix
+    that speeds them up.
+    """
     channels, *picture = electrons.shape
-    rims = [min(k // 2, max(256, n // 2), n) for n, k in zip(picture, psf.intensity.shape[-2:], strict=True)]
+    rims = [
+        min(k // 2, max(256, n // 2), n)
+        for n, k in zip(picture, psf.intensity.shape[-2:], strict=True)
+    ]
     size = torus((picture[0], picture[1]), bordered((rims[0], rims[1]), border))
     total, largest, steps = 0.0, 0.0, STEPS
     for level in range(halvings((picture[0], picture[1]))):
@@ -245,11 +331,15 @@ def _(
     result: Tensor, electrons: Tensor, psf: Psf, *others: Any, iterations: int = 40, **params: Any
 ) -> tuple[float, float]:
     y, x = _torus(electrons, psf)
-    return 4.0 * len(electrons) * y * x, 4.0 * (iterations + 1) * len(electrons) * transform_operations(y, x)
+    return 4.0 * len(electrons) * y * x, 4.0 * (iterations + 1) * len(
+        electrons
+    ) * transform_operations(y, x)
 
 
 def _torus(picture: Tensor, psf: Psf, border: float = 1.0) -> tuple[int, int]:
-    """Return the size of the transforms that deconvolve a picture, whose border they extend by the PSF."""
+    """Return the size of the transforms that deconvolve a picture, whose border they extend by
+    the PSF.
+    """
     sides = zip(picture.shape[-2:], psf.intensity.shape[-2:], strict=True)
     y, x = (n + math.ceil(border * min(k, 2 * n)) for n, k in sides)
     return y, x
@@ -279,4 +369,6 @@ def _(
     if architecture is None:
         return _layers(result)
     trial, pixels = tried(architecture, parameters, multiple), result[0].numel() / reduce**2
-    return _KEPT * trial.memory * min(pixels, tile**2 if tile else math.inf), _LAYER * trial.operations * pixels
+    return _KEPT * trial.memory * min(
+        pixels, tile**2 if tile else math.inf
+    ), _LAYER * trial.operations * pixels

@@ -14,7 +14,14 @@ from neusee.nodes.input_files import not_finite, once_per_version, refuse_large_
 from neusee.nodes.scene._spectral_exr import exr_header, read_spectral, spectral_channels
 
 Layout = Literal["y x band", "band y x"]
-_TYPES = {"double": "float64", "single": "float32", "logical": "bool", "char": "str", "cell": "O", "struct": "O"}
+_TYPES = {
+    "double": "float64",
+    "single": "float32",
+    "logical": "bool",
+    "char": "str",
+    "cell": "O",
+    "struct": "O",
+}
 _SINGLE = 4  #: bytes of a number of the cube that is made
 
 
@@ -26,7 +33,10 @@ def cube_and_wavelengths(
         cube, known, _ = read_spectral(file)
         return cube, known
     if start is None or stop is None:
-        raise ValueError(f"{file.name} has no wavelengths: give the first and the last wavelength in start and stop")
+        raise ValueError(
+            f"{file.name} has no wavelengths: give the first and the last wavelength in start and"
+            " stop"
+        )
     values = _npy(file) if file.suffix == ".npy" else _mat(file, _cube_name(file, variable))
     scale = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else 1.0
     first = np.moveaxis(values, -1, 0) if layout == "y x band" else values
@@ -41,19 +51,27 @@ def size_and_type(file: Path, variable: str | None) -> tuple[tuple[int, ...], st
     elif file.suffix == ".mat":
         size, kind = _listed(file)[_cube_name(file, variable)]
     else:
-        raise ParameterError("file", f"{file.name} is not a .mat, .npy or .exr file: save the cube in such a file")
+        raise ParameterError(
+            "file", f"{file.name} is not a .mat, .npy or .exr file: save the cube in such a file"
+        )
     if len(size) != 3:
-        raise ParameterError("file", f"{file.name} holds an array of shape {size}: save a cube with three axes")
+        raise ParameterError(
+            "file", f"{file.name} holds an array of shape {size}: save a cube with three axes"
+        )
     if np.dtype(kind).kind not in "uf":
         fix = "save the cube as float, uint8 or uint16"
-        raise ParameterError("file", f"{file.name} holds values of type {kind}, not real numbers of light: {fix}")
+        raise ParameterError(
+            "file", f"{file.name} holds values of type {kind}, not real numbers of light: {fix}"
+        )
     refuse_large_array(file, size)
     return size, kind
 
 
 @once_per_version
 def wrong_values(file: Path, variable: str | None) -> str:
-    """Return a message for a cube that cannot be read or has values that are not finite, else an empty text."""
+    """Return a message for a cube that cannot be read or has values that are not finite, else an
+    empty text.
+    """
     try:
         if file.suffix == ".exr":
             values: Any = read_spectral(file)[0].numpy()
@@ -69,12 +87,16 @@ def wrong_values(file: Path, variable: str | None) -> str:
 
 
 def _numpy_header(file: Path) -> tuple[tuple[int, ...], str]:
-    """Return the shape and the data type in the header of a .npy file, whose data must be as long as stated."""
+    """Return the shape and the data type in the header of a .npy file, whose data must be as
+    long as stated.
+    """
     npy_needs(file, 1.0, _SINGLE)
     try:
         head = np.load(file, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, SyntaxError) as error:
-        raise ParameterError("file", f"{file.name} cannot be read as .npy ({error}): save the cube again") from None
+        raise ParameterError(
+            "file", f"{file.name} cannot be read as .npy ({error}): save the cube again"
+        ) from None
     return head.shape, str(head.dtype)
 
 
@@ -83,7 +105,8 @@ def exr_size(file: Path) -> tuple[int, int]:
     _, names, size = exr_header(file)
     if not spectral_channels(names):
         raise ParameterError(
-            "file", f"{file.name} has the channels {', '.join(names)}: none is spectral, such as T.550,0nm"
+            "file",
+            f"{file.name} has the channels {', '.join(names)}: none is spectral, such as T.550,0nm",
         )
     refuse_large_array(file, (len(names), *size))
     return size
@@ -98,20 +121,28 @@ def _listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
         return {name: (size, _TYPES.get(kind, kind)) for name, size, kind in whosmat(file)}
     except Exception:  # scipy raises many kinds of errors for foreign bytes
         raise ParameterError(
-            "file", f"{file.name} is not a .mat file of version 7 or older: save the cube in MATLAB with -v7"
+            "file",
+            f"{file.name} is not a .mat file of version 7 or older: save the cube in MATLAB"
+            " with -v7",
         ) from None
 
 
 def _cube_name(file: Path, variable: str | None) -> str:
-    """Return the name of the variable of a .mat file that holds the cube: ``variable``, or the only cube."""
+    """Return the name of the variable of a .mat file that holds the cube: ``variable``, or the
+    only cube.
+    """
     variables = _listed(file)
     cubes = [name for name, (size, _) in variables.items() if len(size) == 3]
     if variable in variables:
         return str(variable)
     if variable is None and len(cubes) == 1:
         return cubes[0]
-    problem = f"has no variable {variable!r}" if variable is not None else f"holds {len(cubes)} cubes"
-    raise ParameterError("variable", f"{file.name} {problem}: set variable to one of {', '.join(variables)}")
+    problem = (
+        f"has no variable {variable!r}" if variable is not None else f"holds {len(cubes)} cubes"
+    )
+    raise ParameterError(
+        "variable", f"{file.name} {problem}: set variable to one of {', '.join(variables)}"
+    )
 
 
 def _npy(file: Path) -> NDArray[Any]:

@@ -8,7 +8,13 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.scene._crop_to_frame import enlarged, framed
-from neusee.nodes.scene._cube_files import Layout, cube_and_wavelengths, exr_size, size_and_type, wrong_values
+from neusee.nodes.scene._cube_files import (
+    Layout,
+    cube_and_wavelengths,
+    exr_size,
+    size_and_type,
+    wrong_values,
+)
 from neusee.nodes.spectra._spectral_tables import Table, require_range
 from neusee.nodes.units import DataFile, Shape, Wavelength
 from neusee.nodes.values import Bands
@@ -27,22 +33,30 @@ def hyperspectral(
 ) -> Tensor:
     """Read a spectral cube and interpolate its spectra linearly to the wavelengths of `bands`.
 
-    A spectral OpenEXR carries its wavelengths; .mat (`variable`, or the only cube in the file) and .npy need `start`
-    and `stop`, the first and last of evenly spaced bands. Whole numbers are scaled by their type: 65535 becomes 1.
+    A spectral OpenEXR carries its wavelengths; .mat (`variable`, or the only cube in the file) and
+    .npy need `start` and `stop`, the first and last of evenly spaced bands. Whole numbers are
+    scaled by their type: 65535 becomes 1.
 
-    Shapes: -> (band, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped at the centre).
+    Shapes: -> (band, y, x) float32, the size of the file or `shape` (scaled to cover `shape`,
+            cropped at the centre).
     Units:  reflectance, 1 = white.
-    Error:  linear interpolation: h^2/8 of the curvature, some 1e-3 for paints at 10 nm; exact on the bands of the
-            file. Negative values are clipped.
-    Raises: ParameterError before the run where the file does not fit the parameters, is damaged, or has values that are
-            complex or not finite; ValueError where `bands` leave the range of the file or values are not finite.
+    Error:  linear interpolation: h^2/8 of the curvature, some 1e-3 for paints at 10 nm; exact on
+            the bands of the file. Negative values are clipped.
+    Raises: ParameterError before the run where the file does not fit the parameters, is damaged, or
+            has values that are complex or not finite; ValueError where `bands` leave the range of
+            the file or values are not finite.
     Source: layout of spectral OpenEXR: Fichet, Pacanowski, Wilkie, JCGT 10(3), 2021.
     """
     cube, known = cube_and_wavelengths(file, variable, start, stop, layout)
     require_range(bands.centres, known, f"{file.name} holds")
     if wrong := int((~torch.isfinite(cube)).sum()):
-        raise ValueError(f"{file.name} holds {wrong} values that are not finite: replace NaN and infinity by numbers")
-    mixed = (_interpolation(known, bands.centres).float() @ cube.flatten(1)).reshape(-1, *cube.shape[1:])
+        raise ValueError(
+            f"{file.name} holds {wrong} values that are not finite: replace NaN and infinity by"
+            " numbers"
+        )
+    mixed = (_interpolation(known, bands.centres).float() @ cube.flatten(1)).reshape(
+        -1, *cube.shape[1:]
+    )
     return framed(mixed, shape).clamp_min_(0).to(bands.centres.device)
 
 
@@ -82,11 +96,15 @@ def rows_and_columns(file: Path, variable: str | None, layout: Layout) -> tuple[
 @hyperspectral.check
 def _(result: Tensor, bands: Bands, **params: Any) -> list[Check]:
     most = float(result.max())
-    return [Check(f"reflectance of the scene from {float(result.min()):.3g} to {most:.3g}", most <= 1.5)]
+    return [
+        Check(f"reflectance of the scene from {float(result.min()):.3g} to {most:.3g}", most <= 1.5)
+    ]
 
 
 def _interpolation(known: Tensor, wavelengths: Tensor) -> Tensor:
-    """Return the matrix that interpolates spectra linearly from the ``known`` wavelengths to ``wavelengths``."""
+    """Return the matrix that interpolates spectra linearly from the ``known`` wavelengths to
+    ``wavelengths``.
+    """
     if len(known) == 1:
         return torch.ones(len(wavelengths), 1, dtype=torch.float64)
     return Table(known, torch.eye(len(known), dtype=torch.float64)).at(wavelengths).T

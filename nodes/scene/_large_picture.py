@@ -1,4 +1,6 @@
-"""Linear light of a picture; a large picture is converted and scaled in bands of rows, which need little memory."""
+"""Linear light of a picture; a large picture is converted and scaled in bands of rows, which
+need little memory.
+"""
 
 import math
 from collections.abc import Callable
@@ -14,22 +16,27 @@ from neusee.nodes.units import Shape
 
 _LARGE = 4_000_000  #: pixels above which a picture is converted and scaled in bands
 _BAND = 1 << 20  #: pixels of a band
-_SMALL_BAND = 1 << 17  #: pixels of a band beside a whole picture, so that its conversion adds little to the peak memory
+#: pixels of a band beside a whole picture, so that its conversion adds little to the peak memory
+_SMALL_BAND = 1 << 17
 
 
 class Codes(Protocol):
-    """Code values (y, x, channel) of a picture: an array, or what reads rows of one when they are asked for."""
+    """Code values (y, x, channel) of a picture: an array, or what reads rows of one when they
+    are asked for.
+    """
 
     @property
     def shape(self) -> tuple[int, ...]: ...
     def __getitem__(self, rows: slice, /) -> NDArray[Any]: ...
 
 
-Linear = Callable[[NDArray[Any]], Tensor]  #: from code values (y, x, channel) to linear light (channel, y, x)
+#: from code values (y, x, channel) to linear light (channel, y, x)
+Linear = Callable[[NDArray[Any]], Tensor]
 
 
 def linear_light(codes: Codes, linear: Linear, shape: Shape | None) -> Tensor:
-    """Return linear light (3, y, x) of the code values (y, x, channel) of a picture, scaled and cropped by `framed`.
+    """Return linear light (3, y, x) of the code values (y, x, channel) of a picture, scaled and
+    cropped by `framed`.
 
     For a large picture the result equals that of `framed` within the round-off of float32.
     """
@@ -68,7 +75,9 @@ def _in_bands(codes: Codes, linear: Linear, shape: Shape | None) -> Tensor:
 
 
 def bands_of(size: tuple[int, int], pixels: int | None = None) -> list[slice]:
-    """Return the rows of each band of a picture of ``size`` rows and columns, of at most ``pixels`` pixels a band."""
+    """Return the rows of each band of a picture of ``size`` rows and columns, of at most
+    ``pixels`` pixels a band.
+    """
     step = max(1, (pixels or _BAND) // size[1])
     return [slice(start, start + step) for start in range(0, size[0], step)]
 
@@ -76,7 +85,8 @@ def bands_of(size: tuple[int, int], pixels: int | None = None) -> list[slice]:
 def resampling(old: int, new: int, antialias: bool) -> Any:
     """Return the sparse matrix (new, old) of kornia's bilinear resampling of one axis, float64.
 
-    With ``antialias`` a Gaussian precedes it, mirrored at the edges, of 4 standard deviations in all.
+    With ``antialias`` a Gaussian precedes it, mirrored at the edges, of 4 standard deviations in
+    all.
     """
     from scipy import sparse
 
@@ -95,4 +105,6 @@ def resampling(old: int, new: int, antialias: bool) -> Any:
     values = np.stack([1 - share, share])[..., None] * weights
     mirrored = (old - 1) - np.abs((old - 1) - np.abs(places))
     lines = np.broadcast_to(np.arange(new)[:, None], places.shape)
-    return sparse.coo_matrix((values.ravel(), (lines.ravel(), mirrored.ravel())), (new, old)).tocsr()
+    return sparse.coo_matrix(
+        (values.ravel(), (lines.ravel(), mirrored.ravel())), (new, old)
+    ).tocsr()

@@ -17,7 +17,10 @@ from neusee.nodes.scene._large_picture import Codes, linear_light
 from neusee.nodes.units import DataFile, Shape
 
 _MODES = ("RGB", "L", "P", "1", "I", "I;16", "I;16B")
-_FIX = "convert the file to 8- or 16-bit sRGB: magick {name} -alpha off -colorspace sRGB -depth 16 {stem}.png"
+_FIX = (
+    "convert the file to 8- or 16-bit sRGB: magick {name} -alpha off -colorspace sRGB -depth 16"
+    " {stem}.png"
+)
 _DAMAGED = "{name} is damaged ({error}): copy the file again, or give another picture"
 _ORIENTATION = 0x0112  #: EXIF tag
 _ROTATED = range(5, 9)  #: EXIF orientations that exchange width and height
@@ -25,18 +28,23 @@ _LIGHT = 12  #: bytes of a pixel in linear light
 
 
 @node(rtol=1e-5)
-def photograph(*, file: DataFile, shape: Shape | None = None, crop: DrawnCrop | None = None) -> Tensor:
-    """Read a photograph as linear light: decode the sRGB curve, turn the picture upright, then scale and crop.
+def photograph(
+    *, file: DataFile, shape: Shape | None = None, crop: DrawnCrop | None = None
+) -> Tensor:
+    """Read a photograph as linear light: decode the sRGB curve, turn the picture upright, then
+    scale and crop.
 
-    ``crop`` has a seed and the number of a scene: the part of the photograph that an evaluation with this seed shows in
-    this scene, at full size, in place of the scaled centre.
+    ``crop`` has a seed and the number of a scene: the part of the photograph that an evaluation
+    with this seed shows in this scene, at full size, in place of the scaled centre.
 
-    Shapes: -> (3, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped at the centre).
+    Shapes: -> (3, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped
+            at the centre).
     Units:  linear sRGB, 1 = the white of the file.
-    Error:  half a code value (8 bit: 1.8e-3 near white); the tone curve of the camera is not inverted. Every file is
-            read as sRGB: a note names an embedded colour profile, which is ignored.
-    Raises: ParameterError before the run for another format, for another depth, for transparency, for a damaged file,
-            and for more than 64 million pixels.
+    Error:  half a code value (8 bit: 1.8e-3 near white); the tone curve of the camera is not
+            inverted. Every file is read as sRGB: a note names an embedded colour profile, which is
+            ignored.
+    Raises: ParameterError before the run for another format, for another depth, for transparency,
+            for a damaged file, and for more than 64 million pixels.
     Source: IEC 61966-2-1:1999 (sRGB); EXIF 2.3, tag Orientation.
     """
     if crop is None or shape is None:
@@ -56,17 +64,27 @@ def _(*, file: Path, shape: Shape | None = None, crop: DrawnCrop | None = None) 
 @photograph.preflight
 def _(*, file: Path, shape: Shape | None = None, crop: DrawnCrop | None = None) -> list[str]:
     if crop is not None and shape is None:
-        raise ParameterError("crop", "the part of a photograph has no size: give shape, such as [768, 768]")
+        raise ParameterError(
+            "crop", "the part of a photograph has no size: give shape, such as [768, 768]"
+        )
     profile, turned, size = read_header(file)
     if problem := _damage(file):
         raise ParameterError("file", problem)
-    notes = [f"{file.name}: colour profile {profile!r} is ignored, and the file read as sRGB"] if profile else []
-    notes += [f"{file.name}: picture turned upright by EXIF orientation {turned}"] if turned != 1 else []
+    notes = (
+        [f"{file.name}: colour profile {profile!r} is ignored, and the file read as sRGB"]
+        if profile
+        else []
+    )
+    notes += (
+        [f"{file.name}: picture turned upright by EXIF orientation {turned}"] if turned != 1 else []
+    )
     return notes + enlarged(size, shape)
 
 
 def read_header(file: Path) -> tuple[str, int, tuple[int, int]]:
-    """Return the colour profile, the EXIF orientation, and the numbers of rows and columns of the upright picture."""
+    """Return the colour profile, the EXIF orientation, and the numbers of rows and columns of
+    the upright picture.
+    """
     from PIL import Image, UnidentifiedImageError
 
     refuse_large_picture(file, *_png_size(file))
@@ -78,15 +96,21 @@ def read_header(file: Path) -> tuple[str, int, tuple[int, int]]:
             turned = image.getexif().get(_ORIENTATION, 1)
             return _profile(image), turned, image.size if turned in _ROTATED else image.size[::-1]
     except UnidentifiedImageError:
-        raise ParameterError("file", f"{file} is not a readable picture: give a PNG or JPEG file") from None
+        raise ParameterError(
+            "file", f"{file} is not a readable picture: give a PNG or JPEG file"
+        ) from None
     except Image.DecompressionBombError:
-        raise ParameterError("file", f"{file.name} states more pixels than can be read: reduce the picture") from None
+        raise ParameterError(
+            "file", f"{file.name} states more pixels than can be read: reduce the picture"
+        ) from None
     except (OSError, SyntaxError) as error:
         raise ParameterError("file", _DAMAGED.format(name=file.name, error=error)) from None
 
 
 def _png_size(file: Path) -> tuple[int, int]:
-    """Return the numbers of rows and columns in the first 24 bytes of a PNG file, or (0, 0) for another file."""
+    """Return the numbers of rows and columns in the first 24 bytes of a PNG file, or (0, 0) for
+    another file.
+    """
     head = head_of(file, 24)
     png = head.startswith(b"\x89PNG") and len(head) == 24
     return (int.from_bytes(head[20:24]), int.from_bytes(head[16:20])) if png else (0, 0)
@@ -96,7 +120,8 @@ def _png_size(file: Path) -> tuple[int, int]:
 def _damage(file: Path) -> str:
     """Return a message for a picture that is truncated or damaged, else an empty text.
 
-    The checksums of a PNG are compared. A JPEG is decoded at an eighth of its size, which reads all its data.
+    The checksums of a PNG are compared. A JPEG is decoded at an eighth of its size, which reads all
+    its data.
     """
     from PIL import Image
 
@@ -119,22 +144,32 @@ def _damage(file: Path) -> str:
 def _(result: Tensor, **params: Any) -> list[Check]:
     clipped = float((result >= 1).any(0).float().mean())
     return [
-        Check(f"mean value {float(result.mean()):.3f}, {clipped:.1%} of pixels are saturated", float(result.max()) > 0)
+        Check(
+            f"mean value {float(result.mean()):.3f}, {clipped:.1%} of pixels are saturated",
+            float(result.max()) > 0,
+        )
     ]
 
 
 def _refuse(file: Path, image: Any) -> None:
     fix = _FIX.format(name=file.name, stem=file.stem)
     if image.format not in ("PNG", "JPEG", "MPO"):
-        raise ParameterError("file", f"{file} has the format {image.format}, not PNG or JPEG: {fix}, or use scene.exr")
+        raise ParameterError(
+            "file",
+            f"{file} has the format {image.format}, not PNG or JPEG: {fix}, or use scene.exr",
+        )
     if "transparency" in image.info or image.mode.endswith("A"):
         raise ParameterError("file", f"{file} has transparency, which a scene cannot use: {fix}")
     if image.mode not in _MODES:
-        raise ParameterError("file", f"{file} has pixels of type {image.mode}, not grey or RGB: {fix}")
+        raise ParameterError(
+            "file", f"{file} has pixels of type {image.mode}, not grey or RGB: {fix}"
+        )
 
 
 def _profile(image: Any) -> str:
-    """Return the name of the colour profile embedded in a photograph, or an empty text for sRGB or no profile."""
+    """Return the name of the colour profile embedded in a photograph, or an empty text for sRGB
+    or no profile.
+    """
     from io import BytesIO
 
     from PIL import ImageCms
@@ -142,7 +177,9 @@ def _profile(image: Any) -> str:
     if not image.info.get("icc_profile"):
         return ""
     try:
-        name = ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(BytesIO(image.info["icc_profile"]))).strip()
+        name = ImageCms.getProfileDescription(
+            ImageCms.ImageCmsProfile(BytesIO(image.info["icc_profile"]))
+        ).strip()
     except (OSError, ImageCms.PyCMSError):
         name = "unreadable"
     return "" if "srgb" in name.lower() else name
@@ -159,8 +196,9 @@ def _linear(codes: NDArray[Any]) -> Tensor:
 class _Rows:
     """Code values (y, x, 3) of a decoded picture, copied when rows are asked for.
 
-    A whole copy beside the result adds up to 0.5 GB to the peak of 64 million pixels: the copy itself, and the memory
-    of the decoded picture, which the C library keeps or gives back as it likes.
+    A whole copy beside the result adds up to 0.5 GB to the peak of 64 million pixels: the copy
+    itself, and the memory of the decoded picture, which the C library keeps or gives back as it
+    likes.
     """
 
     def __init__(self, image: Any) -> None:
@@ -180,7 +218,9 @@ def _scaled(codes: Codes) -> Tensor:
     """Return code values (y, x, 3) as (3, y, x) float32 in [0, 1]."""
     codes = codes[:]
     scale = 255.0 if codes.dtype == np.uint8 else 65535.0
-    return torch.from_numpy(np.ascontiguousarray(codes.transpose(2, 0, 1), dtype=np.float32)) / scale
+    return (
+        torch.from_numpy(np.ascontiguousarray(codes.transpose(2, 0, 1), dtype=np.float32)) / scale
+    )
 
 
 def _codes(file: Path) -> Codes:
@@ -207,7 +247,9 @@ def _depth(file: Path) -> int:
 
 
 def _words(file: Path, turned: int) -> NDArray[Any]:
-    """Read a 16-bit RGB PNG file, and turn the picture upright by the EXIF orientation ``turned``."""
+    """Read a 16-bit RGB PNG file, and turn the picture upright by the EXIF orientation
+    ``turned``.
+    """
     from kornia_rs.io import read_image_png_u16
 
     rows, columns = _png_size(file)

@@ -1,8 +1,10 @@
-"""Uncompressed OpenEXR files of one part, written line by line in a few megabytes of memory beside the planes.
+"""Uncompressed OpenEXR files of one part, written line by line in a few megabytes of memory beside
+the planes.
 
-Noise and the tails of a PSF do not compress: ZIP saves 0.7 % of a stack of PSFs, and takes ten times as long as a copy.
-The layout is that of OpenEXR 2 (OpenEXR file layout, 2013, scan line images): a header, the table of the offsets of the
-lines, and for each line its number, its size, and the pixels of one channel after another.
+Noise and the tails of a PSF do not compress: ZIP saves 0.7 % of a stack of PSFs, and takes ten
+times as long as a copy. The layout is that of OpenEXR 2 (OpenEXR file layout, 2013, scan line
+images): a header, the table of the offsets of the lines, and for each line its number, its size,
+and the pixels of one channel after another.
 """
 
 import struct
@@ -20,15 +22,23 @@ _LARGEST_HALF = 65504.0
 _AT_ONCE = 1 << 23  #: bytes of lines that are written together
 
 
-def write_lines(path: Path | str, names: Sequence[str], cube: Tensor, header: Mapping[str, Any], half: bool) -> None:
-    """Write planes (channel, y, x) as float32, or with ``half`` as float16, under the channel names ``names``.
+def write_lines(
+    path: Path | str, names: Sequence[str], cube: Tensor, header: Mapping[str, Any], half: bool
+) -> None:
+    """Write planes (channel, y, x) as float32, or with ``half`` as float16, under the channel names
+    ``names``.
 
-    ``header`` has texts and numbers. Raises: ValueError for ``half`` and a value beyond the range of float16.
+    ``header`` has texts and numbers. Raises: ValueError for ``half`` and a value beyond the range
+    of float16.
     """
     order = sorted(range(len(names)), key=lambda i: names[i].encode())
     planes = [cube[i].detach().cpu().float().numpy() for i in order]
-    if half and any(np.abs(plane).max(initial=0.0, where=np.isfinite(plane)) > _LARGEST_HALF for plane in planes):
-        raise ValueError(f"values beyond {_LARGEST_HALF:.0f} cannot be written as half floats: write float32")
+    if half and any(
+        np.abs(plane).max(initial=0.0, where=np.isfinite(plane)) > _LARGEST_HALF for plane in planes
+    ):
+        raise ValueError(
+            f"values beyond {_LARGEST_HALF:.0f} cannot be written as half floats: write float32"
+        )
     height, width = cube.shape[-2:]
     kind = np.dtype("<f2" if half else "<f4")
     size = len(names) * width * kind.itemsize
@@ -44,7 +54,10 @@ def _write_pixels(file: IO[bytes], planes: Sequence[Any], size: int, kind: Any) 
     height, width = planes[0].shape
     rows = max(1, min(height, _AT_ONCE // (8 + size)))
     lines = np.empty((rows, 8 + size), np.uint8)
-    numbers, pixels = lines[:, :8].view("<i4"), lines[:, 8:].view(kind).reshape(rows, len(planes), width)
+    numbers, pixels = (
+        lines[:, :8].view("<i4"),
+        lines[:, 8:].view(kind).reshape(rows, len(planes), width),
+    )
     numbers[:, 1] = size
     for top in range(0, height, rows):
         count = min(rows, height - top)
@@ -54,10 +67,15 @@ def _write_pixels(file: IO[bytes], planes: Sequence[Any], size: int, kind: Any) 
         file.write(lines[:count].data)
 
 
-def _head(names: Sequence[str], shape: tuple[int, int], header: Mapping[str, Any], half: bool) -> bytes:
+def _head(
+    names: Sequence[str], shape: tuple[int, int], header: Mapping[str, Any], half: bool
+) -> bytes:
     """Return the bytes of an OpenEXR file before its table of offsets."""
     kind, (height, width) = _HALF if half else _FLOAT, shape
-    listed = b"".join(name.encode() + b"\0" + struct.pack("<i4xii", kind, 1, 1) for name in names) + b"\0"
+    listed = (
+        b"".join(name.encode() + b"\0" + struct.pack("<i4xii", kind, 1, 1) for name in names)
+        + b"\0"
+    )
     window = struct.pack("<4i", 0, 0, width - 1, height - 1)
     parts = {
         "channels": ("chlist", listed),
@@ -72,10 +90,17 @@ def _head(names: Sequence[str], shape: tuple[int, int], header: Mapping[str, Any
     }
     longest = max(len(name.encode()) for name in (*names, *parts))
     flags = _VERSION | (_LONG_NAMES if longest > 31 else 0)
-    texts = (f"{name}\0{form}\0".encode() + struct.pack("<i", len(raw)) + raw for name, (form, raw) in parts.items())
+    texts = (
+        f"{name}\0{form}\0".encode() + struct.pack("<i", len(raw)) + raw
+        for name, (form, raw) in parts.items()
+    )
     return struct.pack("<2i", _MAGIC, flags) + b"".join(texts) + b"\0"
 
 
 def _attribute(value: Any) -> tuple[str, bytes]:
     """Return the type and the bytes of an attribute of the header."""
-    return ("float", struct.pack("<f", value)) if isinstance(value, float) else ("string", str(value).encode())
+    return (
+        ("float", struct.pack("<f", value))
+        if isinstance(value, float)
+        else ("string", str(value).encode())
+    )

@@ -1,7 +1,8 @@
 """Spectral OpenEXR files: one channel per wavelength, named as in Fichet et al. (JCGT 10(3), 2021).
 
-Emitted light is ``S0.550,0nm``, reflectance is ``T.550,0nm``. The decimal mark is a comma because a point separates
-layers. Colour-science reads and writes such files only with OpenImageIO, and its import alone takes a second.
+Emitted light is ``S0.550,0nm``, reflectance is ``T.550,0nm``. The decimal mark is a comma because a
+point separates layers. Colour-science reads and writes such files only with OpenImageIO, and its
+import alone takes a second.
 """
 
 import re
@@ -31,8 +32,8 @@ _PREFIX = {
 def exr_parts(file: Path | str) -> Iterator[Any]:
     """Open an OpenEXR file with its pixels; raise ValueError if a part cannot be read to its end.
 
-    For a truncated file, OpenEXR prints a warning to stdout, which would mix with the output of a command, and leaves
-    the part out.
+    For a truncated file, OpenEXR prints a warning to stdout, which would mix with the output of a
+    command, and leaves the part out.
     """
     import OpenEXR
 
@@ -73,15 +74,21 @@ def part_headers(file: Path) -> list[PartHeader]:
 def _part(header: dict[str, Any]) -> PartHeader:
     low, high = ([int(edge) for edge in corner] for corner in header["dataWindow"])
     names = [channel.name for channel in header["channels"]]
-    return PartHeader(str(header.get("name", "")), header, names, (high[1] - low[1] + 1, high[0] - low[0] + 1))
+    return PartHeader(
+        str(header.get("name", "")), header, names, (high[1] - low[1] + 1, high[0] - low[0] + 1)
+    )
 
 
 def exr_header(file: Path) -> tuple[dict[str, Any], list[str], tuple[int, int]]:
-    """Read the header, the channel names, and the numbers of rows and columns of an OpenEXR file with one part."""
+    """Read the header, the channel names, and the numbers of rows and columns of an OpenEXR file
+    with one part.
+    """
     parts = part_headers(file)
     if len(parts) > 1:
         names = ", ".join(part.name for part in parts)
-        raise ParameterError("file", f"{file.name} has {len(parts)} parts ({names}): save one part alone")
+        raise ParameterError(
+            "file", f"{file.name} has {len(parts)} parts ({names}): save one part alone"
+        )
     return parts[0].header, parts[0].channels, parts[0].size
 
 
@@ -94,10 +101,12 @@ def write_spectral(
     header: Mapping[str, Any] | None = None,
     half: bool = False,
 ) -> None:
-    """Write a spectral cube (band, y, x) with its wavelengths in m to an uncompressed OpenEXR file, as float32.
+    """Write a spectral cube (band, y, x) with its wavelengths in m to an uncompressed OpenEXR file,
+    as float32.
 
     With ``half`` the file has float16, half as many bytes, in which values below 6e-8 become zero.
-    Raises: ValueError where cube and wavelengths differ in number, where two bands would get the same name, and where a
+    Raises: ValueError where cube and wavelengths differ in number, where two bands would get the
+            same name, and where a
     value is beyond the range of float16.
     """
     wavelengths = [float(w) for w in centres]
@@ -110,15 +119,19 @@ def write_spectral(
     names = [quantity + "." + f"{w * 1e9:.6f}nm".replace(".", ",") for w in wavelengths]
     if len(set(names)) < len(names):
         raise ValueError(f"bands closer than 1e-6 nm would have equal channel names: {names}")
-    about = {"spectralLayoutVersion": "1.0", **({"emissiveUnits": "W.m^-2"} if kind == "emissive" else {})}
+    about = {
+        "spectralLayoutVersion": "1.0",
+        **({"emissiveUnits": "W.m^-2"} if kind == "emissive" else {}),
+    }
     write_lines(path, names, cube, {**about, **(header or {})}, half)
 
 
 def read_spectral(path: Path | str) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Read a spectral OpenEXR file: the cube (band, y, x), the rising wavelengths (band,) in m, and the header.
+    """Read a spectral OpenEXR file: the cube (band, y, x), the rising wavelengths (band,) in m, and
+    the header.
 
-    The cube is float32, the wavelengths float64. Only the emission is read from a file with both emission and
-    reflectance.
+    The cube is float32, the wavelengths float64. Only the emission is read from a file with both
+    emission and reflectance.
     Raises: ValueError, which lists the channels of the file, where no channel is spectral.
     """
     with exr_parts(path) as opened:
@@ -126,19 +139,27 @@ def read_spectral(path: Path | str) -> tuple[Tensor, Tensor, dict[str, Any]]:
         spectral = spectral_channels(list(channels))
         if not spectral:
             raise ValueError(
-                f"{path} has the channels {', '.join(channels)}: none has a name such as S0.550,0nm or T.550,0nm"
+                f"{path} has the channels {', '.join(channels)}: none has a name such as S0.550,0nm"
+                " or T.550,0nm"
             )
         planes = [np.asarray(channels[name].pixels, dtype=np.float32) for name in spectral.values()]
-    return torch.from_numpy(np.stack(planes)), torch.tensor(list(spectral), dtype=torch.float64), header
+    return (
+        torch.from_numpy(np.stack(planes)),
+        torch.tensor(list(spectral), dtype=torch.float64),
+        header,
+    )
 
 
 def spectral_channels(names: Sequence[str]) -> dict[float, str]:
-    """Return the channel name for each wavelength in m of a spectral OpenEXR file, in rising order of wavelength.
+    """Return the channel name for each wavelength in m of a spectral OpenEXR file, in rising order
+    of wavelength.
 
     Reflectance channels are used only if the file has no emission channels.
     """
     for kind in ("S0", "T"):
-        matches = [m for m in map(_NAME.fullmatch, names) if m and m[1] == kind and m[2] not in ("", ",")]
+        matches = [
+            m for m in map(_NAME.fullmatch, names) if m and m[1] == kind and m[2] not in ("", ",")
+        ]
         if matches:
             return dict(sorted((_wavelength(m), m[0]) for m in matches))
     return {}

@@ -1,8 +1,9 @@
-"""Expected ranges of the results of the sensor nodes, by which a plan foresees what well and converter cut off.
+"""Expected ranges of the results of the sensor nodes, by which a plan foresees what well and
+converter cut off.
 
-Before a run no image is known. Its brightest pixel therefore counts as 1, and irradiance counts in photons of the
-brightest channel per second and square metre: what the rows of an image and the responses of a channel multiply cancels
-between `sensor.level` and `sensor.expose`.
+Before a run no image is known. Its brightest pixel therefore counts as 1, and irradiance counts in
+photons of the brightest channel per second and square metre: what the rows of an image and the
+responses of a channel multiply cancels between `sensor.level` and `sensor.expose`.
 """
 
 import math
@@ -23,12 +24,19 @@ Range = tuple[float, float]
 
 @level.expected_range
 def _(
-    *inputs: Any, strength: float | None, full_well: float, quantum_efficiency: float, pixel_pitch: float,
-    exposure: float, **params: Any,
-) -> Range:  # fmt: skip
+    *inputs: Any,
+    strength: float | None,
+    full_well: float,
+    quantum_efficiency: float,
+    pixel_pitch: float,
+    exposure: float,
+    **params: Any,
+) -> Range:
     if strength is None:
         raise LookupError("the irradiance of a white surface is known with the spectra only")
-    level = strength * photons_that_fill(full_well, quantum_efficiency) / (exposure * pixel_pitch**2)
+    level = (
+        strength * photons_that_fill(full_well, quantum_efficiency) / (exposure * pixel_pitch**2)
+    )
     return level, level
 
 
@@ -69,15 +77,22 @@ def _(
 
 @dark_current.expected_range
 def _(
-    electrons: TensorStats, *, mean: float | ElectronsPerSecond, exposure: float | None, **params: Any
-) -> Range:  # fmt: skip
+    electrons: TensorStats,
+    *,
+    mean: float | ElectronsPerSecond,
+    exposure: float | None,
+    **params: Any,
+) -> Range:
     total = dark_electrons(mean, exposure)
     return electrons.min, electrons.max + total + _SIGMAS * math.sqrt(total)
 
 
 @read_noise.expected_range
 def _(electrons: TensorStats, *, offset: float, read_noise: float, **params: Any) -> Range:
-    return electrons.min + offset - _SIGMAS * read_noise, electrons.max + offset + _SIGMAS * read_noise
+    return (
+        electrons.min + offset - _SIGMAS * read_noise,
+        electrons.max + offset + _SIGMAS * read_noise,
+    )
 
 
 @full_well.expected_range

@@ -12,16 +12,26 @@ from torch import Generator, Tensor
 
 from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
 from neusee.nodes._half_precision import single
-from neusee.nodes.sensor._draw_limits import SURE, amplitude_error, amplitude_error_drawn, chi_square_limit, poisson_rms
+from neusee.nodes.sensor._draw_limits import (
+    SURE,
+    amplitude_error,
+    amplitude_error_drawn,
+    chi_square_limit,
+    poisson_rms,
+)
 from neusee.nodes.sensor._room_for_light import refuse_without_room
 from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.torch_func import transformed
 from neusee.nodes.units import DarkCurrent, Electrons, ElectronsPerSecond, Exposure, Fraction
 
 Distribution = Literal["gaussian", "poisson"]
-_PART = 1 << 15  #: elements; torch splits larger arrays among threads, which is slow on a busy machine
-_DARK = 1e-30  #: e-; smaller numbers count as 0, because the gradient of the square root is unbounded near 0
-_MOST = 5.0  #: largest ratio of a sampled mean of the dark current to the given mean, 8 standard deviations above
+#: elements; torch splits larger arrays among threads, which is slow on a busy machine
+_PART = 1 << 15
+#: e-; smaller numbers count as 0, because the gradient of the square root is unbounded near 0
+_DARK = 1e-30
+#: largest ratio of a sampled mean of the dark current to the given mean, 8 standard deviations
+#: above
+_MOST = 5.0
 Spread = Annotated[float, Field(ge=0, le=100)]
 
 
@@ -39,16 +49,19 @@ def photon_noise(
 ) -> Tensor:
     """Convert photons to electrons and add photon noise.
 
-    With the mean count n in the unit in which the noise is drawn, `additive` gives n + N(c1 n, c2 sqrt(n)), and
-    `literal` gives N(c1 n, c2 sqrt(n)), as the paper prints, with c1 = mean_shift and c2 = spread. `poisson` draws the
-    fluctuation from the Poisson distribution. If the noise is drawn in photons and then multiplied by the efficiency,
-    the noise is too small by a factor of sqrt(efficiency).
+    With the mean count n in the unit in which the noise is drawn, `additive` gives n + N(c1 n, c2
+    sqrt(n)), and `literal` gives N(c1 n, c2 sqrt(n)), as the paper prints, with c1 = mean_shift and
+    c2 = spread. `poisson` draws the fluctuation from the Poisson distribution. If the noise is
+    drawn in photons and then multiplied by the efficiency, the noise is too small by a factor of
+    sqrt(efficiency).
 
     Shapes: photons (..., y, x) -> (..., y, x).
     Units:  photons per exposure; result e-.
-    Error:  the result is clipped at 0, which raises the Gaussian mean by at most 0.1 e-, near 0.4 e-, and by less
-            than 1e-3 e- above 10 e-. Negative photons (round-off of a convolution) count as 0.
-    Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 (variance = mean, in electrons).
+    Error:  the result is clipped at 0, which raises the Gaussian mean by at most 0.1 e-, near 0.4
+            e-, and by less than 1e-3 e- above 10 e-. Negative photons (round-off of a convolution)
+            count as 0.
+    Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 (variance = mean, in
+            electrons).
     """
     kept = mean_shift if mean == "literal" else 1.0 + mean_shift
 
@@ -77,10 +90,11 @@ def _(result: Tensor, photons: Tensor, **params: Any) -> list[Check]:
 
 @photon_noise.propagate_error
 def _(photons: ErrorBound, *, result: TensorStats, **params: Any) -> float:
-    """Return the error bound of the electrons: the error of the mean plus the error of the noise amplitude.
+    """Return the error bound of the electrons: the error of the mean plus the error of the noise
+    amplitude.
 
-    The noise amplitude is the square root of the mean: |sqrt(a) - sqrt(b)| <= sqrt|a - b| and <= |a - b| / sqrt(a).
-    Poisson numbers are drawn anew for another mean, so their error has no bound.
+    The noise amplitude is the square root of the mean: |sqrt(a) - sqrt(b)| <= sqrt|a - b| and <= |a
+    - b| / sqrt(a). Poisson numbers are drawn anew for another mean, so their error has no bound.
     """
     return _electrons_error(photons, amplitude_error, **params)
 
@@ -89,7 +103,9 @@ def _(photons: ErrorBound, *, result: TensorStats, **params: Any) -> float:
 def _(photons: ErrorBound, *, result: TensorStats, **params: Any) -> float:
     """Return the error bound of the electrons of one draw, which one of 10 000 draws exceeds."""
     pixels = max(1, math.prod(result.shape))
-    return _electrons_error(photons, functools.partial(amplitude_error_drawn, pixels=pixels), **params)
+    return _electrons_error(
+        photons, functools.partial(amplitude_error_drawn, pixels=pixels), **params
+    )
 
 
 def _electrons_error(
@@ -114,7 +130,8 @@ def _gaussian(counts: Tensor, rng: Generator) -> Tensor:
     lit = ~(counts <= _DARK)  # True for NaN, so that NaN reaches the result
     if not (counts.requires_grad or transformed()):
         return normal(counts, rng).mul_(counts.where(lit, 0.0).sqrt_())
-    sigma = counts.where(lit, 1.0).sqrt().where(lit, 0.0)  # at 0, the square root has no finite gradient
+    # at 0, the square root has no finite gradient
+    sigma = counts.where(lit, 1.0).sqrt().where(lit, 0.0)
     return sigma * normal(counts, rng)
 
 
@@ -124,13 +141,18 @@ def _poisson(counts: Tensor, rng: Generator) -> Tensor:
 
 
 def _by_parts(compute: Callable[[Tensor], Tensor], whole: Tensor, rng: Generator) -> Tensor:
-    """Apply ``compute`` to parts of a tensor that fit into the CPU cache, with the same result as for the whole.
+    """Apply ``compute`` to parts of a tensor that fit into the CPU cache, with the same result as
+    for the whole.
 
-    The random numbers must not depend on the parts. Torch draws fewer than 16 normal numbers by another method, so no
-    part is that short.
+    The random numbers must not depend on the parts. Torch draws fewer than 16 normal numbers by
+    another method, so no part is that short.
     """
     count = whole.numel()
-    if torch.is_grad_enabled() or {whole.device.type, rng.device.type} != {"cpu"} or count < 2 * _PART:
+    if (
+        torch.is_grad_enabled()
+        or {whole.device.type, rng.device.type} != {"cpu"}
+        or count < 2 * _PART
+    ):
         return compute(whole)
     result, flat = torch.empty(whole.shape, dtype=whole.dtype), whole.reshape(-1)
     ends = [*range(_PART, count - _PART, _PART), count]
@@ -140,7 +162,9 @@ def _by_parts(compute: Callable[[Tensor], Tensor], whole: Tensor, rng: Generator
 
 
 def normal(like: Tensor, rng: Generator) -> Tensor:
-    """Sample standard normal numbers in the shape of ``like``, with equal numbers in every precision."""
+    """Sample standard normal numbers in the shape of ``like``, with equal numbers in every
+    precision.
+    """
     return torch.randn(like.shape, generator=rng, device=rng.device, dtype=torch.float32).to(like)
 
 
@@ -158,12 +182,13 @@ def dark_current(
 
     A mean in e-/s is multiplied by ``exposure``.
 
-    The mean of the distribution is ``mean``, for ``mean_of`` sensor. For ``mean_of`` exposure the mean is sampled once
-    for each exposure from a normal distribution with mean ``mean`` and half of it as standard deviation, as the paper
-    prints of the training; a negative sample counts as 0.
+    The mean of the distribution is ``mean``, for ``mean_of`` sensor. For ``mean_of`` exposure the
+    mean is sampled once for each exposure from a normal distribution with mean ``mean`` and half of
+    it as standard deviation, as the paper prints of the training; a negative sample counts as 0.
 
-    ``full_well`` is used only to decide if the dark current is small enough to leave out: the electrons are compared
-    with the signal up to the well, because a later step cuts off the signal of a laser above the well.
+    ``full_well`` is used only to decide if the dark current is small enough to leave out: the
+    electrons are compared with the signal up to the well, because a later step cuts off the signal
+    of a laser above the well.
 
     Shapes: electrons (..., y, x) -> (..., y, x).
     Units:  e-; mean e- per exposure, or e-/s; exposure s.
@@ -183,22 +208,31 @@ def dark_current(
 
 
 def dark_electrons(mean: float | ElectronsPerSecond, exposure: float | None) -> float:
-    """Return the mean dark electrons of one exposure, from electrons of an exposure or electrons per second.
+    """Return the mean dark electrons of one exposure, from electrons of an exposure or electrons
+    per second.
 
     Raises ParameterError for electrons per second without an exposure.
     """
     if not isinstance(mean, ElectronsPerSecond):
         return mean
     if exposure is None:
-        raise ParameterError("mean", f"{mean.rate:g} e-/s needs the exposure: give `exposure` to the step, or use e-")
+        raise ParameterError(
+            "mean", f"{mean.rate:g} e-/s needs the exposure: give `exposure` to the step, or use e-"
+        )
     return mean.rate * exposure
 
 
 @dark_current.preflight
 def _(
-    *, mean: float | ElectronsPerSecond, exposure: float | None, full_well: float | None = None, **params: object
+    *,
+    mean: float | ElectronsPerSecond,
+    exposure: float | None,
+    full_well: float | None = None,
+    **params: object,
 ) -> list[str]:
-    refuse_without_room(math.inf if full_well is None else full_well, dark=dark_electrons(mean, exposure))
+    refuse_without_room(
+        math.inf if full_well is None else full_well, dark=dark_electrons(mean, exposure)
+    )
     return []
 
 
@@ -238,19 +272,25 @@ def _(
 
 @node()
 def read_noise(
-    electrons: Tensor, *, offset: Electrons, read_noise: Electrons, full_well: Well | None = None, rng: Generator
+    electrons: Tensor,
+    *,
+    offset: Electrons,
+    read_noise: Electrons,
+    full_well: Well | None = None,
+    rng: Generator,
 ) -> Tensor:
     """Add the offset and the Gaussian noise of the sensor amplifier to the electrons of each pixel.
 
     The temporal dark noise of EMVA 1288 includes read noise and dark current:
-    sigma_d**2 = read_noise**2 + mean of the dark current. The dark signal mu_d of EMVA 1288 is offset + mean of the
-    dark current. ``full_well`` has the same meaning as in `sensor.dark_current`.
+    sigma_d**2 = read_noise**2 + mean of the dark current. The dark signal mu_d of EMVA 1288 is
+    offset + mean of the dark current. ``full_well`` has the same meaning as in
+    `sensor.dark_current`.
 
     Shapes: electrons (..., y, x) -> (..., y, x).
     Units:  e-; offset e-, the paper's "mean read noise"; read_noise e- rms.
     Error:  white: row noise and telegraph noise are left out.
-    Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0; Janesick, Photon Transfer, SPIE
-            PM170 (2007).
+    Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0; Janesick, Photon
+            Transfer, SPIE PM170 (2007).
     """
 
     def with_read_noise(part: Tensor) -> Tensor:
@@ -260,20 +300,27 @@ def read_noise(
 
 
 @read_noise.preflight
-def _(*, offset: float, read_noise: float, full_well: float | None = None, **params: object) -> list[str]:
-    refuse_without_room(math.inf if full_well is None else full_well, offset=offset, read_noise=read_noise)
+def _(
+    *, offset: float, read_noise: float, full_well: float | None = None, **params: object
+) -> list[str]:
+    refuse_without_room(
+        math.inf if full_well is None else full_well, offset=offset, read_noise=read_noise
+    )
     return []
 
 
 @read_noise.skip_bound
-def _(electrons: TensorStats, *, offset: float, read_noise: float, full_well: float | None) -> float:
+def _(
+    electrons: TensorStats, *, offset: float, read_noise: float, full_well: float | None
+) -> float:
     return _share(offset, read_noise, electrons, full_well)
 
 
 @read_noise.skip_draw
 def _(electrons: TensorStats, *, offset: float, read_noise: float, **params: Any) -> float:
     pixels, variance = max(1, math.prod(electrons.shape)), read_noise**2
-    sure = SURE + math.log(2.0)  # half of the probability is for the mean of the noise, half for its square
+    # half of the probability is for the mean of the noise, half for its square
+    sure = SURE + math.log(2.0)
     mean = abs(offset) * read_noise * math.sqrt(2.0 * sure / pixels)
     square = chi_square_limit(pixels * variance, variance, sure) / pixels
     usual = math.hypot(offset, read_noise)
@@ -295,14 +342,18 @@ def _(electrons: ErrorBound, **params: Any) -> float:
 
 
 def _share(shift: float, spread: float, electrons: TensorStats, full_well: float | None) -> float:
-    """Return the rms of the added electrons, divided by the largest signal or the full well, whichever is smaller.
+    """Return the rms of the added electrons, divided by the largest signal or the full well,
+    whichever is smaller.
 
-    The largest signal is that of the brightest pixel, or that of the darkest pixel if the counts are below 0. The well
-    alone is not enough, because a dark frame is only noise. The bound is exact for one mean and spread everywhere.
+    The largest signal is that of the brightest pixel, or that of the darkest pixel if the counts
+    are below 0. The well alone is not enough, because a dark frame is only noise. The bound is
+    exact for one mean and spread everywhere.
     """
     added = math.hypot(shift, spread)
     if added == 0:
         return 0.0
-    largest = max(math.hypot(electrons.max + shift, spread), math.hypot(electrons.min + shift, spread))
+    largest = max(
+        math.hypot(electrons.max + shift, spread), math.hypot(electrons.min + shift, spread)
+    )
     weighed = largest if full_well is None else min(largest, full_well)
     return added / weighed if weighed > 0 else math.inf

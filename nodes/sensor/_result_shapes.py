@@ -20,7 +20,9 @@ limits.shape(scalars(Limits))
 
 
 @expose.shape
-def _(irradiance: Tensor | Channels, bands: Bands, responses: Tensor, *level: Any, **params: Any) -> Tensor:
+def _(
+    irradiance: Tensor | Channels, bands: Bands, responses: Tensor, *level: Any, **params: Any
+) -> Tensor:
     image = irradiance.planes if isinstance(irradiance, Channels) else irradiance
     return blank(*image.shape[:-3], len(responses), *image.shape[-2:], dtype=at_least_single(image))
 

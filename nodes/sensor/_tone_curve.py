@@ -1,4 +1,6 @@
-"""Signs in a file that a tone curve was applied: 8 bits, a stated gamma or colour profile, stretched numbers."""
+"""Signs in a file that a tone curve was applied: 8 bits, a stated gamma or colour profile,
+stretched numbers.
+"""
 
 import struct
 from collections.abc import Iterator
@@ -12,16 +14,20 @@ from neusee.nodes.input_size import bytes_of
 
 _BYTE = 8  #: bits of the pictures of displays, whose numbers have a tone curve
 _LINEAR_GAMMA = 100_000  #: value of the chunk gAMA of a PNG that is proportional to the light
-_LINEAR_TRANSFER = 8  #: code point of a linear transfer characteristic in the chunk cICP (ITU-T H.273)
-_TO_SIXTEEN = {257: "stretched", 256: "shifted"}  #: factor by which numbers of 8 bits become numbers of 16
+#: code point of a linear transfer characteristic in the chunk cICP (ITU-T H.273)
+_LINEAR_TRANSFER = 8
+#: factor by which numbers of 8 bits become numbers of 16
+_TO_SIXTEEN = {257: "stretched", 256: "shifted"}
 _ICC_PROFILE = 34675  #: tag of a TIFF file
 _FIRST_DIRECTORY = 4096  #: entries of a TIFF directory that are looked at, at most
 
 
 def tone_curve_sign(file: Path, values: NDArray[Any], depth: int | None, bits: int) -> str:
-    """Return the sign of a tone curve in a picture file as the end of a sentence, or an empty text for none.
+    """Return the sign of a tone curve in a picture file as the end of a sentence, or an empty text
+    for none.
 
-    ``depth`` are the bits of the numbers in the file, or None if it does not state them; ``bits`` those of the sensor.
+    ``depth`` are the bits of the numbers in the file, or None if it does not state them; ``bits``
+    those of the sensor.
     """
     if _BYTE in (depth, bits) or values.dtype.itemsize == 1:
         return "has 8 bits, as pictures with a tone curve (sRGB, gamma 2.2) have"
@@ -44,7 +50,10 @@ def _png_sign(content: bytes) -> str:
         if kind == b"gAMA" and (gamma := struct.unpack(">I", data[:4])[0]) != _LINEAR_GAMMA:
             return f"states a tone curve with the gamma {_LINEAR_GAMMA / max(gamma, 1):.3g}"
         if kind == b"cICP" and data[1] != _LINEAR_TRANSFER:
-            return f"states the transfer characteristic {data[1]} of ITU-T H.273, which is a tone curve"
+            return (
+                f"states the transfer characteristic {data[1]} of ITU-T H.273, which is a tone"
+                " curve"
+            )
         if kind == b"iCCP" and b"linear" not in (name := data.split(b"\0")[0]).lower():
             return f"has the colour profile {name.decode('latin-1')}, which has a tone curve"
     return ""

@@ -1,4 +1,6 @@
-"""Nodes for spectra: spectral bands, illuminants, channel responses, and estimates of spectra from RGB."""
+"""Nodes for spectra: spectral bands, illuminants, channel responses, and estimates of spectra
+from RGB.
+"""
 
 from neusee.nodes.spectra import _result_shapes  # noqa: F401  attaches the shape rules
 from neusee.nodes.spectra._bands import bands, filters, line, mean_wavelength

@@ -16,8 +16,8 @@ from neusee.nodes.units import Count, DataFile
 from neusee.nodes.values import Bands
 
 _COLUMNS = (
-    "write a header such as wavelength (nm),power (mW) for separate lines, or wavelength (nm),power (mW/nm) for a "
-    "spectrum, then two columns"
+    "write a header such as wavelength (nm),power (mW) for separate lines, or wavelength (nm),power"
+    " (mW/nm) for a spectrum, then two columns"
 )
 _PER_LENGTH = re.compile(r"(?:/|per )\s*(?:nm|um|µm|μm|m)\)?$")  #: end of a unit of spectral power
 _LEFT = 1e-3  #: share of the energy of a spectrum that its bands leave out, half of it on each side
@@ -26,18 +26,21 @@ _MANY = 50  #: lines; each of them takes a PSF of its own
 
 @node(rtol=1e-9, before_run=True)
 def line_table(*, file: DataFile, count: Count = 5) -> Bands:
-    """Read the spectrum of a laser from a CSV file: the power of separate lines, or the spectral power.
+    """Read the spectrum of a laser from a CSV file: the power of separate lines, or the spectral
+    power.
 
-    The unit in the header decides. A power, such as ``power (mW)`` or ``share (%)``, belongs to one line, and each row
-    becomes one band; a third column, such as ``fwhm (nm)``, may give the width of each line. A power for each nm, such
-    as ``power (mW/nm)``, is a spectrum, which ``count`` equal bands divide. Only the ratio of the powers counts.
+    The unit in the header decides. A power, such as ``power (mW)`` or ``share (%)``, belongs to one
+    line, and each row becomes one band; a third column, such as ``fwhm (nm)``, may give the width
+    of each line. A power for each nm, such as ``power (mW/nm)``, is a spectrum, which ``count``
+    equal bands divide. Only the ratio of the powers counts.
 
     Shapes: -> centres, widths, weights (band,) float64.
     Units:  centres and widths m; weights are shares of the energy of the laser, with the sum 1.
-    Error:  lines: exact; the shape within the width of a line is left out. spectrum: linear between the rows, each band
-            holds its exact energy; the 1e-3 of the energy furthest out is redistributed over the bands.
-    Raises: ParameterError before the run for a file without such a table, and for a power that is negative or 0
-            everywhere.
+    Error:  lines: exact; the shape within the width of a line is left out. spectrum: linear between
+            the rows, each band holds its exact energy; the 1e-3 of the energy furthest out is
+            redistributed over the bands.
+    Raises: ParameterError before the run for a file without such a table, and for a power that is
+            negative or 0 everywhere.
     Source: by definition.
     """
     laser = laser_table(file)
@@ -53,7 +56,10 @@ def _(*, file: Path, count: int = 5) -> list[str]:
     laser = laser_table(file)
     rows = len(laser.power.wavelengths)
     if laser.widths is not None and rows > _MANY:
-        return [f"{file.name}: each of the {rows} lines takes a PSF of its own: keep the strongest lines to save time"]
+        return [
+            f"{file.name}: each of the {rows} lines takes a PSF of its own: keep the strongest"
+            " lines to save time"
+        ]
     return []
 
 
@@ -64,7 +70,10 @@ def _(result: Bands, *, file: Path, count: int = 5) -> list[Check]:
     lines = Bands(table.wavelengths, table.wavelengths, table.values[0])
     own = _mean(table) if laser.widths is None else mean_wavelength(lines)
     mean, range_ = mean_wavelength(result), float(result.centres.max() - result.centres.min())
-    text = f"{file.name} in {len(result.centres)} bands: mean {mean * 1e9:.6g} nm, {own * 1e9:.6g} nm in the table"
+    text = (
+        f"{file.name} in {len(result.centres)} bands: mean {mean * 1e9:.6g} nm, {own * 1e9:.6g} nm"
+        " in the table"
+    )
     return [Check(text, abs(mean - own) <= 0.1 * range_ + 1e-13)]
 
 
@@ -92,7 +101,8 @@ def _laser_table(file: Path) -> LaserTable:
     spectrum = _PER_LENGTH.search(power.unit) is not None
     if len(others) > (0 if spectrum else 1):
         raise ValueError(
-            f"{file.name} has {len(found.columns) + 1} columns in place of {'2' if spectrum else '2 or 3'}"
+            f"{file.name} has {len(found.columns) + 1} columns in place of"
+            f" {'2' if spectrum else '2 or 3'}"
         )
     found.refuse(found.values < 0, lambda value: f"a laser has no power or width of {value:g}")
     if not found.values[0].any():
@@ -131,7 +141,9 @@ def _reached(table: Table, share: float) -> float:
     whole = _energy(table, first, high)
     for _ in range(60):
         middle = (low + high) / 2
-        low, high = (middle, high) if _energy(table, first, middle) < share * whole else (low, middle)
+        low, high = (
+            (middle, high) if _energy(table, first, middle) < share * whole else (low, middle)
+        )
     return (low + high) / 2
 
 
@@ -142,7 +154,9 @@ def _energy(table: Table, low: float, high: float) -> float:
 
 
 def _mean(table: Table) -> float:
-    """Return the mean wavelength of a spectrum that is linear between its samples, weighted by energy."""
+    """Return the mean wavelength of a spectrum that is linear between its samples, weighted by
+    energy.
+    """
     x, y = table.wavelengths, table.values[0]
     steps = x.diff()
     areas = (y[1:] + y[:-1]) / 2 * steps

@@ -1,7 +1,8 @@
 """MST++, a network that reconstructs 31 bands from RGB in three stages of spectral attention.
 
-The modules have the names of the published network, so that the published checkpoint loads unchanged: 1 619 625
-parameters in 227 tensors. Architecture: Cai et al., CVPRW 2022; reference code caiyuanhao1998/MST-plus-plus (MIT).
+The modules have the names of the published network, so that the published checkpoint loads
+unchanged: 1 619 625 parameters in 227 tensors. Architecture: Cai et al., CVPRW 2022; reference code
+caiyuanhao1998/MST-plus-plus (MIT).
 """
 
 from collections.abc import Iterable
@@ -17,7 +18,9 @@ BANDS = 31
 
 
 class MSTPlusPlus(nn.Module):
-    """The network MST++ from RGB pictures (n, 3, y, x) in [0, 1], of any size, to 31 bands (n, 31, y, x)."""
+    """The network MST++ from RGB pictures (n, 3, y, x) in [0, 1], of any size, to 31 bands (n,
+    31, y, x).
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -33,17 +36,22 @@ class MSTPlusPlus(nn.Module):
 
 
 class Stage(nn.Module):
-    """A stage of MST++: a U-Net with spectral attention, two downsampling steps and a residual connection."""
+    """A stage of MST++: a U-Net with spectral attention, two downsampling steps and a residual
+    connection.
+    """
 
     def __init__(self, dim: int) -> None:
         super().__init__()
         self.embedding = _conv(dim, dim)
         self.encoder_layers = nn.ModuleList(
-            nn.ModuleList([Blocks(d), nn.Conv2d(d, 2 * d, 4, 2, 1, bias=False)]) for d in (dim, 2 * dim)
+            nn.ModuleList([Blocks(d), nn.Conv2d(d, 2 * d, 4, 2, 1, bias=False)])
+            for d in (dim, 2 * dim)
         )
         self.bottleneck = Blocks(4 * dim)
         self.decoder_layers = nn.ModuleList(
-            nn.ModuleList([nn.ConvTranspose2d(2 * d, d, 2, 2), nn.Conv2d(2 * d, d, 1, bias=False), Blocks(d)])
+            nn.ModuleList(
+                [nn.ConvTranspose2d(2 * d, d, 2, 2), nn.Conv2d(2 * d, d, 1, bias=False), Blocks(d)]
+            )
             for d in (2 * dim, dim)
         )
         self.mapping = _conv(dim, dim)
@@ -54,14 +62,18 @@ class Stage(nn.Module):
             skips.append(attend(inner))
             inner = shrink(skips[-1])
         inner = self.bottleneck(inner)
-        for (grow, fuse, attend), skip in zip(_parts(self.decoder_layers), reversed(skips), strict=True):
+        for (grow, fuse, attend), skip in zip(
+            _parts(self.decoder_layers), reversed(skips), strict=True
+        ):
             inner = attend(fuse(torch.cat([grow(inner), skip], 1)))
         result: Tensor = self.mapping(inner) + x
         return result
 
 
 class Blocks(nn.Module):
-    """A transformer block: spectral attention and a feed-forward network, each with a residual connection."""
+    """A transformer block: spectral attention and a feed-forward network, each with a residual
+    connection.
+    """
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -75,7 +87,9 @@ class Blocks(nn.Module):
 
 
 class SpectralAttention(nn.Module):
-    """Self-attention between bands: 31 x 31 weights per head, at a cost that is linear in the number of pixels."""
+    """Self-attention between bands: 31 x 31 weights per head, at a cost that is linear in the
+    number of pixels.
+    """
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -89,15 +103,23 @@ class SpectralAttention(nn.Module):
         shape = x.shape
         pixels = x.flatten(2).transpose(1, 2)
         value = self.to_v(pixels).transpose(1, 2)
-        query, key, heads = (t.unflatten(1, (self.heads, -1)) for t in (*self._across(pixels), value))
+        query, key, heads = (
+            t.unflatten(1, (self.heads, -1)) for t in (*self._across(pixels), value)
+        )
         scores = (key @ query.transpose(-1, -2)) * self.rescale
         mixed = (scores.softmax(-1) @ heads).flatten(1, 2).transpose(1, 2)
-        result: Tensor = self.proj(mixed).transpose(1, 2).reshape(shape) + self.pos_emb(value.reshape(shape))
+        result: Tensor = self.proj(mixed).transpose(1, 2).reshape(shape) + self.pos_emb(
+            value.reshape(shape)
+        )
         return result
 
     def _across(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the queries and keys of the attention, with each band normalised to unit length over all pixels."""
-        query, key = (F.normalize(to(pixels).transpose(1, 2), dim=-1) for to in (self.to_q, self.to_k))
+        """Return the queries and keys of the attention, with each band normalised to unit length
+        over all pixels.
+        """
+        query, key = (
+            F.normalize(to(pixels).transpose(1, 2), dim=-1) for to in (self.to_q, self.to_k)
+        )
         return query, key
 
 
@@ -115,7 +137,9 @@ class Normed(nn.Module):
 
 
 class FeedForward(nn.Module):
-    """A feed-forward network with four times as many hidden channels and a depthwise 3 x 3 convolution."""
+    """A feed-forward network with four times as many hidden channels and a depthwise 3 x 3
+    convolution.
+    """
 
     def __init__(self, dim: int) -> None:
         super().__init__()

@@ -14,9 +14,12 @@ _ROOT = 2e-7  #: relative resolution of a root mean square that is computed from
 
 
 class Source(NamedTuple):
-    """A spectral cube that is read in blocks of pixels, so that the whole cube is never in memory."""
+    """A spectral cube that is read in blocks of pixels, so that the whole cube is never in
+    memory.
+    """
 
-    part: Callable[[slice], Tensor]  #: a block of pixels, (band, pixel) float64, as a copy that may be changed
+    #: a block of pixels, (band, pixel) float64, as a copy that may be changed
+    part: Callable[[slice], Tensor]
     bands: int
     pixels: int
     dtype: torch.dtype  #: of the planes
@@ -26,10 +29,11 @@ class Source(NamedTuple):
 
 
 def few_planes(source: Source, within: float) -> LowRankCube:
-    """Approximate a spectral cube by the fewest principal components that keep the rms error within a bound.
+    """Approximate a spectral cube by the fewest principal components that keep the rms error within
+    a bound.
 
-    The bound ``within`` is relative to the largest element. The planes and the map of errors are flat, with all pixels
-    in one row. Raises ValueError for NaN.
+    The bound ``within`` is relative to the largest element. The planes and the map of errors are
+    flat, with all pixels in one row. Raises ValueError for NaN.
     """
     most, gram = _largest_and_products(source)
     scale = float(most.max())
@@ -40,10 +44,13 @@ def few_planes(source: Source, within: float) -> LowRankCube:
     eps = torch.finfo(source.dtype).eps
     target = max(within, _FLOOR * eps, _ROOT) * scale
     spread = _spread(gram / source.pixels, axes, source.bands, eps) * (scale if scaled else 1.0)
-    count = max(1, next((k for k, left in enumerate(spread) if float(left.max()) <= target), source.bands))
+    count = max(
+        1, next((k for k, left in enumerate(spread) if float(left.max()) <= target), source.bands)
+    )
     planes, last, off = _projected(source, axes[:, :count])
     rest = bound_by_planes(most, planes, axes[:, :count], last)
-    spread = torch.cat([spread[:count], torch.minimum(spread[count], rest[count])[None]])  # no more than was measured
+    # no more than was measured
+    spread = torch.cat([spread[:count], torch.minimum(spread[count], rest[count])[None]])
     return LowRankCube(planes, axes[:, :count], rest, spread, off)
 
 
@@ -61,12 +68,16 @@ def _largest_and_products(source: Source, scale: float = 1.0) -> tuple[Tensor, T
         tops.append(x.abs_().amax(1))
     most = torch.stack(tops).amax(0) * scale
     if gram is None or not bool(torch.isfinite(most).all()):
-        raise ValueError("the cube holds NaN or infinite values: replace these values, or do not compress the cube")
+        raise ValueError(
+            "the cube holds NaN or infinite values: replace these values, or do not compress the"
+            " cube"
+        )
     return most, gram
 
 
 def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Project a spectral cube on the axes of principal components, and return the largest error by band and by pixel.
+    """Project a spectral cube on the axes of principal components, and return the largest error by
+    band and by pixel.
 
     The first returned value holds the basis images, in the precision of the source.
     """
@@ -82,14 +93,17 @@ def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
-    """Return the rms error of each band if a spectral cube is approximated by its first k principal components.
+    """Return the rms error of each band if a spectral cube is approximated by its first k principal
+    components.
 
-    The rows of the result are for k = 0, 1, 2 and so on. The error is that of the omitted components plus the round-off
-    of the basis images. ``power`` holds the mean products of the bands. The round-off of these products counts as part
-    of the error.
+    The rows of the result are for k = 0, 1, 2 and so on. The error is that of the omitted
+    components plus the round-off of the basis images. ``power`` holds the mean products of the
+    bands. The round-off of these products counts as part of the error.
     """
     each = axes.square() * ((power @ axes) * axes).sum(0).clamp_min(0)
-    after = torch.cat([each.flip(1).cumsum(1).flip(1), torch.zeros_like(each[:, :1])], 1)[:, : count + 1].T
+    after = torch.cat([each.flip(1).cumsum(1).flip(1), torch.zeros_like(each[:, :1])], 1)[
+        :, : count + 1
+    ].T
     total = power.diagonal()
     double = 64 * torch.finfo(torch.float64).eps * total.sum()
     planes = torch.arange(count + 1, dtype=total.dtype, device=total.device)[:, None]
@@ -97,12 +111,15 @@ def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
 
 
 def bound_by_planes(most: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -> Tensor:
-    """Return a bound of the largest error of each band if a cube is approximated by its first k principal components.
+    """Return a bound of the largest error of each band if a cube is approximated by its first k
+    principal components.
 
-    The rows of the result are for k = 0, 1, 2 and so on. The errors with no component and with all components are
-    measured. In between, the bound adds the omitted components to the error with all components.
+    The rows of the result are for k = 0, 1, 2 and so on. The errors with no component and with all
+    components are measured. In between, the bound adds the omitted components to the error with all
+    components.
     """
     each = basis.abs() * torch.maximum(planes.amax(1), -planes.amin(1)).double()
-    last = last + 4 * torch.finfo(torch.float64).eps * (most + each.sum(1))  # round-off of the measurement
+    # round-off of the measurement
+    last = last + 4 * torch.finfo(torch.float64).eps * (most + each.sum(1))
     after = each.flip(1).cumsum(1).flip(1).T
     return torch.cat([most[None], last + after[1:], last[None]])

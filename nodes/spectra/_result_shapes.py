@@ -12,7 +12,12 @@ from neusee.nodes.spectra._channel_responses import channel_count, responses, se
 from neusee.nodes.spectra._dead_leaves import _FINE, leaves
 from neusee.nodes.spectra._distinct_band_sums import rows
 from neusee.nodes.spectra._illuminant import illuminant, illuminate
-from neusee.nodes.spectra._linear_lift import lift_lmmse, lift_lmmse_mixture, lift_mallett, lift_mallett_mixture
+from neusee.nodes.spectra._linear_lift import (
+    lift_lmmse,
+    lift_lmmse_mixture,
+    lift_mallett,
+    lift_mallett_mixture,
+)
 from neusee.nodes.spectra._low_rank_cube import compress
 from neusee.nodes.spectra._metamers import metamers
 from neusee.nodes.spectra._mst_lift_node import lift_mst_plus_plus
@@ -28,7 +33,9 @@ def _(bands: Bands, **params: Any) -> Tensor:
 
 @responses.shape
 def _(bands: Bands, *, camera: str | Path = "CIE 1931", **params: Any) -> Tensor:
-    """Return the responses to bands that no channel sees, which a laser must know before the run, or their shape."""
+    """Return the responses to bands that no channel sees, which a laser must know before the
+    run, or their shape.
+    """
     if known(bands.centres) and _beyond(bands, camera):
         found: Tensor = responses(bands, camera=camera, **params)
         return found
@@ -36,7 +43,9 @@ def _(bands: Bands, *, camera: str | Path = "CIE 1931", **params: Any) -> Tensor
 
 
 def _beyond(bands: Bands, camera: str | Path) -> bool:
-    """Return True for the few bands of a laser if some channel may not see them; no table is read for others."""
+    """Return True for the few bands of a laser if some channel may not see them; no table is
+    read for others.
+    """
     low, high = seen_range(camera)
     return len(bands.centres) < _FEW and not low <= float(bands.centres.mean()) * 1e9 <= high
 
@@ -56,7 +65,9 @@ def _cube(rgb: Tensor, bands: Bands, **params: Any) -> Tensor:
 
 
 def _mixture(rgb: Tensor, bands: Bands, **params: Any) -> LowRankCube:
-    """Return the shape of the low-rank form of a linear lift, which has as many planes as the picture has colours."""
+    """Return the shape of the low-rank form of a linear lift, which has as many planes as the
+    picture has colours.
+    """
     return _low_rank(min(len(rgb), len(bands.centres)), len(bands.centres), rgb)
 
 
@@ -75,7 +86,9 @@ lift_mallett_mixture.shape(_mixture)
 
 @compress.shape
 def _(cube: Tensor, **params: Any) -> LowRankCube:
-    """Return the shape for as many planes as a cube can need, because only the values tell how many it needs."""
+    """Return the shape for as many planes as a cube can need, because only the values tell how
+    many it needs.
+    """
     return _low_rank(len(cube), len(cube), cube)
 
 
@@ -103,7 +116,9 @@ def _(result: Tensor, *inputs: Any, **params: Any) -> tuple[float, float]:
 
 @render.shape
 def _(reflectance: Tensor, bands: Bands) -> Tensor:
-    return blank(*reflectance.shape[:-3], 3, *reflectance.shape[-2:], dtype=at_least_single(reflectance))
+    return blank(
+        *reflectance.shape[:-3], 3, *reflectance.shape[-2:], dtype=at_least_single(reflectance)
+    )
 
 
 grain.shape(like_first)

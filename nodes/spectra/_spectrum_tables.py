@@ -1,4 +1,6 @@
-"""CSV files of spectra: a header, wavelengths in nm in the first column, and one further column for each spectrum."""
+"""CSV files of spectra: a header, wavelengths in nm in the first column, and one further column
+for each spectrum.
+"""
 
 from pathlib import Path
 
@@ -13,7 +15,8 @@ Numbers = NDArray[np.float64]
 def csv_spectra(file: Path) -> tuple[Numbers, Numbers]:
     """Read the wavelengths of a CSV file, in nm, and its spectra (spectrum, wavelength).
 
-    Raises ValueError for lines of different length, for a cell that is not a number, and for a file without columns.
+    Raises ValueError for lines of different length, for a cell that is not a number, and for a file
+    without columns.
     """
     rows = [[_number(cell, file, line) for cell in row] for line, row in list(csv_rows(file))[1:]]
     if len({len(row) for row in rows}) > 1:
@@ -25,7 +28,9 @@ def csv_spectra(file: Path) -> tuple[Numbers, Numbers]:
 
 
 def wrong_wavelengths(wavelengths: Numbers, values: Numbers) -> str:
-    """Return the reason why numbers from a file cannot be wavelengths in nm and their spectra, or an empty text."""
+    """Return the reason why numbers from a file cannot be wavelengths in nm and their spectra,
+    or an empty text.
+    """
     if not (np.isfinite(wavelengths).all() and np.isfinite(values).all()):
         return "some of its numbers are NaN or infinite"
     if len(wavelengths) < 2 or not (np.diff(wavelengths) > 0).all() or wavelengths[0] < 100:

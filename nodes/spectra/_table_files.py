@@ -1,6 +1,8 @@
-"""CSV tables of a user: wavelengths in the first column, and a header that names quantity and unit of each column.
+"""CSV tables of a user: wavelengths in the first column, and a header that names quantity and unit
+of each column.
 
-A header is such as ``wavelength (nm),QE (%)``. Lines that begin with ``#`` are comments, such as the source.
+A header is such as ``wavelength (nm),QE (%)``. Lines that begin with ``#`` are comments, such as
+the source.
 """
 
 import math
@@ -55,29 +57,35 @@ class Curves(NamedTuple):
 
     def table(self) -> Table:
         """Return the curves as a table that can be interpolated."""
-        return Table(torch.from_numpy(self.wavelengths.copy()), torch.from_numpy(self.values.copy()))
+        return Table(
+            torch.from_numpy(self.wavelengths.copy()), torch.from_numpy(self.values.copy())
+        )
 
     def place(self, curve: int, row: int) -> str:
         """Return the line and the column of a value, as messages name them."""
         return place(self.file, self.lines[row], curve + 1, self.columns[curve])
 
     def refuse(self, wrong: NDArray[np.bool_], why: Callable[[float], str]) -> None:
-        """Raise ValueError for the first value (curve, row) that is ``wrong``; ``why`` is the message for a value."""
+        """Raise ValueError for the first value (curve, row) that is ``wrong``; ``why`` is the
+        message for a value.
+        """
         if wrong.any():
             row, curve = (int(i) for i in np.argwhere(wrong.T)[0])
             raise ValueError(f"{self.place(curve, row)}: {why(float(self.values[curve, row]))}")
 
 
 def place(file: Path, line: int, column: int, heading: Column) -> str:
-    """Return a place in a table as text, such as ``qe.csv:5, column 2, QE (%)``; columns count from 0."""
+    """Return a place in a table as text, such as ``qe.csv:5, column 2, QE (%)``; columns count
+    from 0.
+    """
     return f"{file.name}:{line}, column {column + 1}, {heading.heading}"
 
 
 def table_rows(file: Path) -> Rows:
     """Read the headings and the numbers of a CSV file.
 
-    Raises ValueError, with line and column, for a file without header, for lines of different length, and for a cell
-    that is not a finite number.
+    Raises ValueError, with line and column, for a file without header, for lines of different
+    length, and for a cell that is not a finite number.
     """
     rows = list(csv_rows(file))
     if not rows:
@@ -85,7 +93,8 @@ def table_rows(file: Path) -> Rows:
     (first, header), body = rows[0], rows[1:]
     if all(_is_number(cell) for cell in header):
         raise ValueError(
-            f"{file.name}:{first}: the first row holds numbers: begin with a header, such as wavelength (nm),QE (%)"
+            f"{file.name}:{first}: the first row holds numbers: begin with a header, such as"
+            " wavelength (nm),QE (%)"
         )
     columns = tuple(_column(cell) for cell in header)
     if not body or len(columns) < 2:
@@ -93,19 +102,26 @@ def table_rows(file: Path) -> Rows:
     for line, row in body:
         if len(row) != len(columns):
             count = f"{len(row)} column{'s' * (len(row) != 1)} in place of {len(columns)}"
-            raise ValueError(f"{file.name}:{line}: {count}, the number of headings: write one number for each heading")
-    numbers = [[_number(file, line, i, columns[i], cell) for i, cell in enumerate(row)] for line, row in body]
+            raise ValueError(
+                f"{file.name}:{line}: {count}, the number of headings: write one number for each"
+                " heading"
+            )
+    numbers = [
+        [_number(file, line, i, columns[i], cell) for i, cell in enumerate(row)]
+        for line, row in body
+    ]
     return Rows(columns, tuple(line for line, _ in body), np.array(numbers, np.float64))
 
 
 def curves(file: Path, units: Sequence[str] | None, assumed: str = "", least: int = 2) -> Curves:
     """Read the curves of a CSV file over the wavelength, whose unit is in the first heading.
 
-    ``units`` are the units that the other columns may have, None for any. A file without any unit has wavelengths in
-    the unit ``assumed``; without such a unit, units are necessary. ``least`` is the least number of rows.
+    ``units`` are the units that the other columns may have, None for any. A file without any unit
+    has wavelengths in the unit ``assumed``; without such a unit, units are necessary. ``least`` is
+    the least number of rows.
 
-    Raises ValueError where `table_rows` does, for a unit that is missing or unknown, and for wavelengths that do not
-    rise or lie outside 100 nm to 20 um.
+    Raises ValueError where `table_rows` does, for a unit that is missing or unknown, and for
+    wavelengths that do not rise or lie outside 100 nm to 20 um.
     """
     rows = table_rows(file)
     first, *others = rows.columns
@@ -121,11 +137,19 @@ def curves(file: Path, units: Sequence[str] | None, assumed: str = "", least: in
         raise ValueError(f"{file.name} holds one wavelength: at least two wavelengths are needed")
     for problem in _wrong_order(file, rows.lines, nm):
         raise ValueError(problem)
-    return Curves(file, tuple(others), rows.lines, rows.values[:, 0] * LENGTHS[unit], rows.values[:, 1:].T.copy())
+    return Curves(
+        file,
+        tuple(others),
+        rows.lines,
+        rows.values[:, 0] * LENGTHS[unit],
+        rows.values[:, 1:].T.copy(),
+    )
 
 
 def refused(parameter: str, form: str, error: Exception) -> ParameterError:
-    """Return the error of a parameter whose file is no table of the needed form, which ``form`` says."""
+    """Return the error of a parameter whose file is no table of the needed form, which ``form``
+    says.
+    """
     return ParameterError(parameter, f"{error}; {form}")
 
 
@@ -174,10 +198,19 @@ def _wrong_order(file: Path, lines: Sequence[int], nm: Numbers) -> Iterator[str]
     """Yield what is wrong with the wavelengths of a file, in nm."""
     for line, before, here in zip(lines[1:], nm, nm[1:], strict=False):
         if here == before:
-            yield f"{file.name}:{line}: {here:g} nm stands there again: keep one row for each wavelength"
+            yield (
+                f"{file.name}:{line}: {here:g} nm stands there again: keep one row for each"
+                " wavelength"
+            )
         elif here < before:
-            yield f"{file.name}:{line}: {here:g} nm follows {before:g} nm: list the wavelengths in rising order"
+            yield (
+                f"{file.name}:{line}: {here:g} nm follows {before:g} nm: list the wavelengths in"
+                " rising order"
+            )
     for line, here in zip(lines, nm, strict=True):
         if not _LEAST <= here * 1e-9 <= _MOST:
-            fix = "check the unit in the header, such as wavelength (um), and give wavelengths from 100 nm to 20 um"
+            fix = (
+                "check the unit in the header, such as wavelength (um), and give wavelengths from"
+                " 100 nm to 20 um"
+            )
             yield f"{file.name}:{line}: the wavelength {here:g} is no light when read in nm: {fix}"

@@ -1,4 +1,6 @@
-"""Convolutions in full float32 leave the settings of the process as they found them, from any number of threads."""
+"""Convolutions in full float32 leave the settings of the process as they found them, from any
+number of threads.
+"""
 
 from concurrent.futures import ThreadPoolExecutor
 from threading import Event, Thread
@@ -16,7 +18,9 @@ ON_CUDA = SimpleNamespace(is_cuda=True)
 
 
 def test_no_thread_on_the_cpu_changes_a_setting():
-    """Each of two threads restored what the other had set, so that TF32 stayed off and every later key was another."""
+    """Each of two threads restored what the other had set, so that TF32 stayed off and every
+    later key was another.
+    """
     a, b = torch.rand(2, 3, 40, 40)
     seen = []
 

@@ -1,4 +1,6 @@
-"""The table of ``recipes/guide/torch_func.md``: every line is run, and what says no must not pass."""
+"""The table of ``recipes/guide/torch_func.md``: every line is run, and what says no must not
+pass.
+"""
 
 import re
 from functools import partial
@@ -15,10 +17,12 @@ from tests.nodes.torch_func_probe import TRANSFORMS, Differs, followed, function
 PAGE = Path(__file__).parents[2] / "recipes" / "guide" / "torch_func.md"
 LINES = re.findall(r"^\| `(\S+)` \|(.*)\|$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
 TABLE = {
-    path: dict(zip(("of", *TRANSFORMS, "why"), map(str.strip, rest.split("|")), strict=True)) for path, rest in LINES
+    path: dict(zip(("of", *TRANSFORMS, "why"), map(str.strip, rest.split("|")), strict=True))
+    for path, rest in LINES
 }
 BY_PATH = {node.path: node for node in NODES}
-pytestmark = pytest.mark.filterwarnings("ignore")  # of fallbacks of vmap, and of what a half-known sensor warns of
+# of fallbacks of vmap, and of what a half-known sensor warns of
+pytestmark = pytest.mark.filterwarnings("ignore")
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +45,9 @@ def test_a_node_without_a_tensor_says_why(path):
 
 
 @pytest.mark.parametrize("path", sorted(set(BY_PATH) - set(NOTHING_TO_FOLLOW)))
-def test_the_line_names_the_tensor_and_gives_a_reason_where_something_does_not_pass(path, every_case):
+def test_the_line_names_the_tensor_and_gives_a_reason_where_something_does_not_pass(
+    path, every_case
+):
     first, *rest = every_case[path].of.split(".")
     name = ".".join([BY_PATH[path].inputs[int(first)] if first.isdecimal() else first, *rest])
     line = TABLE[path]

@@ -37,7 +37,8 @@ def _found(disk: Disk) -> Iterator[Kept]:
 
 
 def make_room(disk: Disk, budget: int | None = None) -> None:
-    """Remove the answers that were not used for longest, until at most `COUNT` of them and `BYTES` are left.
+    """Remove the answers that were not used for longest, until at most `COUNT` of them and `BYTES`
+    are left.
 
     With a ``budget`` of the store in bytes, at most a twentieth of it is left.
     """
@@ -49,17 +50,22 @@ def make_room(disk: Disk, budget: int | None = None) -> None:
 
 
 def sweep(disk: Disk, dry: bool = False, everything: bool = False) -> list[Kept]:
-    """Remove the answers that nobody used for a week, or ``everything``, or only list them if ``dry``; return them."""
+    """Remove the answers that nobody used for a week, or ``everything``, or only list them if
+    ``dry``; return them.
+    """
     old = [each for each in answers(disk) if everything or time.time() - each.used > _WEEK]
     return old if dry else [each for each in old if _remove(disk, each)]
 
 
 def check(disk: Disk) -> tuple[list[Kept], list[Kept]]:
-    """Return the answers that are as written, and those that are not, which are moved to the folder ``bad/``."""
+    """Return the answers that are as written, and those that are not, which are moved to the
+    folder ``bad/``.
+    """
     whole, damaged = [], []
     for each in answers(disk):
         there = read_answer(disk, each.name) is not None
-        if there or os.path.lexists(each.path):  # one of another format or without a signature stays where it is
+        # one of another format or without a signature stays where it is
+        if there or os.path.lexists(each.path):
             whole.append(each)
         else:
             damaged.append(each)

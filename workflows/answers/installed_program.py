@@ -1,4 +1,6 @@
-"""Digest of the program as it is installed: its source files, the packages beside it, and the graphics devices."""
+"""Digest of the program as it is installed: its source files, the packages beside it, and the
+graphics devices.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ def standard_library() -> str:
 
 
 def program_state(root: Path = ROOT) -> ProgramState:
-    """Return the state of the program, with the content of each of its source files; import nothing.
+    """Return the state of the program, with the content of each of its source files; import
+    nothing.
 
     Raises `OSError` if the package is not a folder of files.
     """
@@ -41,7 +44,9 @@ def program_state(root: Path = ROOT) -> ProgramState:
         text.update(b"%s\0%d\0" % (os.fsencode(name), len(content)) + content)
         changed = max(changed, stat.st_mtime_ns, stat.st_ctime_ns)
     text.update(
-        repr([[_importable(folder) for folder in dict.fromkeys(sys.path)], _devices()]).encode(errors="replace")
+        repr([[_importable(folder) for folder in dict.fromkeys(sys.path)], _devices()]).encode(
+            errors="replace"
+        )
     )
     return ProgramState(text.hexdigest(), changed)
 
@@ -70,7 +75,8 @@ def _below(folder: str, above: str = "") -> Iterator[str]:
 
 
 def _importable(folder: str) -> list[tuple[str, int]]:
-    """Return what a folder of the search path can import: installed packages with their time, or files of code.
+    """Return what a folder of the search path can import: installed packages with their time, or
+    files of code.
 
     The folders of Python itself count by the version of Python.
     """
@@ -80,7 +86,11 @@ def _importable(folder: str) -> list[tuple[str, int]]:
         return []
     try:
         with os.scandir(where) as entries:
-            kept = [each for each in entries if (each.name.endswith(_ABOUT) if installed else _is_code(each))]
+            kept = [
+                each
+                for each in entries
+                if (each.name.endswith(_ABOUT) if installed else _is_code(each))
+            ]
             return sorted((each.name, each.stat().st_mtime_ns if installed else 0) for each in kept)
     except OSError as error:
         return [(type(error).__name__, 0)]

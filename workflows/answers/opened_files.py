@@ -1,4 +1,6 @@
-"""Record of the files that this process opens to read and of the folders that it lists, by an audit hook of Python."""
+"""Record of the files that this process opens to read and of the folders that it lists, by an
+audit hook of Python.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ class Opened:
             _listeners.remove(self)
 
     def hear(self, event: str, arguments: tuple[Any, ...]) -> None:
-        """Note one event of Python's audit; a file descriptor in place of a path says nothing new."""
+        """Note one event of Python's audit; a file descriptor in place of a path says nothing
+        new.
+        """
         path = os.curdir if event in _LISTS and arguments[0] is None else arguments[0]
         if not isinstance(path, str | bytes | os.PathLike):
             return
@@ -59,12 +63,18 @@ class Folders:
     """Some folders with all that is below them."""
 
     def __init__(self, roots: Iterable[str | os.PathLike[str]]) -> None:
-        named = (str(each) for root in roots for each in (os.path.abspath(root), os.path.realpath(root)))
+        named = (
+            str(each) for root in roots for each in (os.path.abspath(root), os.path.realpath(root))
+        )
         self._starts = tuple(f"{each.rstrip('/')}/" for each in named)
 
     def __contains__(self, path: object) -> bool:
-        """Return True if a path is one of the folders or below one of them, whatever links lead there."""
-        return any(f"{each}/".startswith(self._starts) for each in (str(path), os.path.realpath(str(path))))
+        """Return True if a path is one of the folders or below one of them, whatever links lead
+        there.
+        """
+        return any(
+            f"{each}/".startswith(self._starts) for each in (str(path), os.path.realpath(str(path)))
+        )
 
 
 def _is_written(mode: Any, flags: Any) -> bool:

@@ -1,7 +1,8 @@
-"""The folder of a run whose results all come from the cache, as an answer keeps it, and written again without torch.
+"""The folder of a run whose results all come from the cache, as an answer keeps it, and written
+again without torch.
 
-The answer keeps the document of the run and its small files; pictures and data files are those of the cache. The page
-is made of the document and the pictures, as `neusee report` makes it.
+The answer keeps the document of the run and its small files; pictures and data files are those of
+the cache. The page is made of the document and the pictures, as `neusee report` makes it.
 """
 
 from __future__ import annotations
@@ -47,30 +48,42 @@ class RunResults(NamedTuple):
     def fields(self) -> dict[str, Any]:
         """Return the fields of the answer of a run.
 
-        Raises `NotRepeatable` for a run that computed a step, missed a number or warned, or whose page is not made of
-        its document and pictures alone.
+        Raises `NotRepeatable` for a run that computed a step, missed a number or warned, or whose
+        page is not made of its document and pictures alone.
         """
         document, folder = self.document, self.folder
-        if {each["state"] for each in document["steps"]} - _SERVED or document["warnings"] or document["missed"]:
+        if (
+            {each["state"] for each in document["steps"]} - _SERVED
+            or document["warnings"]
+            or document["missed"]
+        ):
             raise NotRepeatable("a run that computed a step, warned or missed a number")
         files = {
             name: bytes_of(path, _ANY)
             for path in sorted(folder.rglob("*"))
-            if path.is_file() and (name := path.relative_to(folder).as_posix()) not in (CRATE, PAGE, *self.taken)
+            if path.is_file()
+            and (name := path.relative_to(folder).as_posix()) not in (CRATE, PAGE, *self.taken)
         }
         said = json.loads(files[DOCUMENT])
         made = page(said, _pictures(folder, self.taken))
-        if made.encode() != bytes_of(folder / PAGE, _ANY) or document_text(said).encode() != files[DOCUMENT]:
+        if (
+            made.encode() != bytes_of(folder / PAGE, _ANY)
+            or document_text(said).encode() != files[DOCUMENT]
+        ):
             raise NotRepeatable("the page or the document is not the same when it is written again")
         return {"kind": RUN, "files": files, "stored": taken_from(self.store, self.taken)}
 
 
 def write_run_again(answer: Answer, disk: Disk, seconds: float) -> tuple[Path, dict[str, Any]]:
-    """Write the folder of a run again with the present time and ``seconds``; return its path and its document.
+    """Write the folder of a run again with the present time and ``seconds``; return its path and
+    its document.
 
     Raises `OSError` if the folder cannot be written; no part of it is left then.
     """
-    began, document = datetime.now(UTC).isoformat(timespec="seconds"), json.loads(answer.files[DOCUMENT])
+    began, document = (
+        datetime.now(UTC).isoformat(timespec="seconds"),
+        json.loads(answer.files[DOCUMENT]),
+    )
     document = _of_now(document, seconds)
     with new_run(Path(answer.out), answer.label, answer.key) as folder:
         folder.said = {"began": began} | document
@@ -91,11 +104,21 @@ def said_again(answer: Answer, folder: Path, document: Mapping[str, Any]) -> str
 
 
 def _of_now(document: dict[str, Any], seconds: float) -> dict[str, Any]:
-    """Return the document of a run with the time and the memory of this process, and with the run that it repeats."""
+    """Return the document of a run with the time and the memory of this process, and with the
+    run that it repeats.
+    """
     memory = process_peak()
     now = {"engine": f"{seconds:.3f} s", "peak memory": format_size(memory)}
     facts = [[name, now.get(name, value)] for name, value in document["facts"]]
-    facts.append(["answer", f"that of the run of {document['started']}, all of whose results are still in the cache"])
+    facts.append(
+        [
+            "answer",
+            (
+                f"that of the run of {document['started']}, all of whose results are still in the"
+                " cache"
+            ),
+        ]
+    )
     timing = {**document["timing"], "peak": [document["timing"]["peak"][0], memory]}
     changed = {"started": present_time(), "seconds": seconds, "facts": facts, "timing": timing}
     return {**document, **changed}
@@ -104,4 +127,6 @@ def _of_now(document: dict[str, Any], seconds: float) -> dict[str, Any]:
 def _pictures(folder: Path, taken: Mapping[str, Any]) -> dict[str, bytes]:
     """Return the pictures of a run by name, in the order in which the run added them."""
     names = [name for name in taken if name.startswith(_FIGURES)]
-    return {name[len(_FIGURES) :].removesuffix(".png"): bytes_of(folder / name, _ANY) for name in names}
+    return {
+        name[len(_FIGURES) :].removesuffix(".png"): bytes_of(folder / name, _ANY) for name in names
+    }

@@ -1,4 +1,6 @@
-"""The folder of results of a command as an answer keeps it, with marks for date and seconds, and written again."""
+"""The folder of results of a command as an answer keeps it, with marks for date and seconds, and
+written again.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ class NotRepeatable(ValueError):
 
 
 def kept_files(folder: Path, report: StudyReport) -> dict[str, bytes]:
-    """Return the files of a complete folder of results by name, with marks; the crate is written anew each time.
+    """Return the files of a complete folder of results by name, with marks; the crate is written
+    anew each time.
 
     Raises `NotRepeatable` if the marks do not give the same bytes again.
     """
@@ -53,11 +56,14 @@ def filled(name: str, content: bytes, date: str, seconds: float) -> bytes:
     if name not in _MARKED:
         return content
     content = content.replace(f'"{SECONDS}"'.encode(), repr(seconds).encode())
-    return content.replace(SECONDS.encode(), f"{seconds:.3g}".encode()).replace(DATE.encode(), date.encode())
+    return content.replace(SECONDS.encode(), f"{seconds:.3g}".encode()).replace(
+        DATE.encode(), date.encode()
+    )
 
 
 def write_again(answer: Answer, seconds: float) -> Path:
-    """Write the folder of results of an answer with the present date and the seconds of the command; return its path.
+    """Write the folder of results of an answer with the present date and the seconds of the
+    command; return its path.
 
     Raises `OSError` if the folder cannot be written; no part of it is left then.
     """

@@ -1,7 +1,9 @@
-"""File of a stored answer in the folder ``answers/`` of the cache: sealed as every file there, and never half written.
+"""File of a stored answer in the folder ``answers/`` of the cache: sealed as every file there, and
+never half written.
 
-The first line is the seal, which names the answer; the second line is a JSON object; then follow the files of the
-folder of results. An answer that is damaged, of another format or without the signature that is asked for is missing.
+The first line is the seal, which names the answer; the second line is a JSON object; then follow
+the files of the folder of results. An answer that is damaged, of another format or without the
+signature that is asked for is missing.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ from neusee.workflows.keys.seal import NotRead, seal_file, unseal_file
 from neusee.workflows.store.shared_folder import Disk, read_file
 
 FOLDER, SUFFIX = "answers", ".answer"
-AS_KEPT, RUN = "as kept", "run"  #: kinds of answers: with the files of a folder, and with what a run shows
+#: kinds of answers: with the files of a folder, and with what a run shows
+AS_KEPT, RUN = "as kept", "run"
 MOST = 32 << 20  #: bytes of the largest answer that is kept
 _LABEL = re.compile(r"\w[\w.-]*")
 _FILE = re.compile(r"\w[\w.-]*(/\w[\w.-]*)*")
@@ -36,7 +39,8 @@ class Answer:
     as_json: bool  #: whether the text is JSON
     out: str  #: folder in which the command makes its folder of results
     label: str  #: recipe and kind in the name of this folder
-    key: str  #: of the result, in the name of this folder; empty for a command that writes no folder
+    #: of the result, in the name of this folder; empty for a command that writes no folder
+    key: str
     files: Mapping[str, bytes]  #: of this folder by name, with marks in place of date and seconds
     stored: StoredResults = NOTHING  #: what of the cache the answer rests on
     kind: str = AS_KEPT  #: how the folder is written again
@@ -49,7 +53,9 @@ def answer_path(disk: Disk, name: str) -> str:
 
 
 def read_answer(disk: Disk, name: str) -> Answer | None:
-    """Return the answer ``name``, or None if it is missing, damaged, of another format or not signed."""
+    """Return the answer ``name``, or None if it is missing, damaged, of another format or not
+    signed.
+    """
     path = answer_path(disk, name)
     try:
         return unpacked(name, read_file(path, MOST))
@@ -63,7 +69,8 @@ def read_answer(disk: Disk, name: str) -> Answer | None:
 
 
 def write_answer(disk: Disk, name: str, answer: Answer) -> bool:
-    """Write the answer ``name`` under a temporary name and rename it; return False for one that is too large.
+    """Write the answer ``name`` under a temporary name and rename it; return False for one that is
+    too large.
 
     Raises `OSError` if the folder cannot be written.
     """
@@ -87,7 +94,11 @@ def used(disk: Disk, name: str) -> None:
 
 def packed(name: str, answer: Answer) -> bytes:
     """Return the content of the file of an answer."""
-    fields = {key: value for key, value in vars(answer).items() if key not in ("files", "witnesses", "stored")}
+    fields = {
+        key: value
+        for key, value in vars(answer).items()
+        if key not in ("files", "witnesses", "stored")
+    }
     sizes = [[file, len(content)] for file, content in answer.files.items()]
     rests = {"witnesses": answer.witnesses._asdict(), "stored": answer.stored._asdict()}
     head = json.dumps({**fields, **rests, "files": sizes}).encode()
@@ -98,8 +109,8 @@ def packed(name: str, answer: Answer) -> bytes:
 def unpacked(name: str, raw: bytes) -> Answer:
     """Return the answer in the content of a file.
 
-    Raises `NotRead` for another format version or a missing signature, and `ValueError`, `TypeError`, `KeyError` or
-    `AttributeError` for any other content.
+    Raises `NotRead` for another format version or a missing signature, and `ValueError`,
+    `TypeError`, `KeyError` or `AttributeError` for any other content.
     """
     seal, _, content = raw.partition(b"\n")
     head, _, rest = unseal_file("answer", f"{FOLDER}/{name}", seal, content).partition(b"\n")

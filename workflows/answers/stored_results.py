@@ -1,7 +1,8 @@
-"""Results and files of the cache on which an answer rests, and the comparison with what they are now, without torch.
+"""Results and files of the cache on which an answer rests, and the comparison with what they are
+now, without torch.
 
-A result that was loaded is compared byte by byte, as a run that loads it does; of the others the metadata are compared,
-which hold the size and the checksum of the value, and the size of its file.
+A result that was loaded is compared byte by byte, as a run that loads it does; of the others the
+metadata are compared, which hold the size and the checksum of the value, and the size of its file.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ _FILE = re.compile(r"(files|bands)/[0-9a-z]{2}/\w[\w.-]*")
 class StoredResults(NamedTuple):
     """What of a cache an answer rests on; by default nothing."""
 
-    results: Mapping[str, str] = {}  #: by key: digest of the metadata, or an empty text for a result that was missing
+    #: by key: digest of the metadata, or an empty text for a result that was missing
+    results: Mapping[str, str] = {}
     loaded: tuple[str, ...] = ()  #: keys of the results whose values were loaded
     files: Mapping[str, str] = {}  #: by path in the cache: digest of a band, a picture or an export
     taken: Mapping[str, str] = {}  #: by name in the folder of results: the path in the cache
@@ -42,13 +44,17 @@ NOTHING = StoredResults()
 
 
 def taken_from(store: Store, taken: Mapping[str, Path]) -> StoredResults:
-    """Return what a process has asked of a store so far, and the stored files that it took into a folder of results.
+    """Return what a process has asked of a store so far, and the stored files that it took into a
+    folder of results.
 
-    Raises `Unsettled` for a file that is not in the store, and `OSError` for one that cannot be read.
+    Raises `Unsettled` for a file that is not in the store, and `OSError` for one that cannot be
+    read.
     """
     asked, loaded = store.asked(), sorted(store.loaded())
     paths = {name: os.path.relpath(path, store.root) for name, path in taken.items()}
-    bands = (f"bands/{name[:2]}/{name}" for key in loaded for name in metadata.bands(asked[key] or {}))
+    bands = (
+        f"bands/{name[:2]}/{name}" for key in loaded for name in metadata.bands(asked[key] or {})
+    )
     used = sorted({*paths.values(), *bands})
     if outside := [path for path in used if not _FILE.fullmatch(path)]:
         raise Unsettled(f"{outside[0]} is not in the folders of a store")
@@ -58,14 +64,18 @@ def taken_from(store: Store, taken: Mapping[str, Path]) -> StoredResults:
 
 
 def still_there(disk: Disk, then: StoredResults) -> bool:
-    """Return True if every result is as it was and every file has the same content; change nothing in the cache."""
+    """Return True if every result is as it was and every file has the same content; change
+    nothing in the cache.
+    """
     small = SmallResults(disk)
     try:
         found = {key: _about(disk, small, key) for key in then.results}
         return (
             all(_said(found[key]) == digest for key, digest in then.results.items())
             and all(_is_whole(disk, found[key]) for key in then.loaded)
-            and all(_digest(f"{disk.folder}/{path}") == digest for path, digest in then.files.items())
+            and all(
+                _digest(f"{disk.folder}/{path}") == digest for path, digest in then.files.items()
+            )
         )
     except (*UNREADABLE, Unsettled):
         return False
@@ -85,11 +95,16 @@ def checked(fields: Mapping[str, Any]) -> StoredResults:
     found = StoredResults(**{**fields, "loaded": tuple(fields.get("loaded", ()))})
     if not all(isinstance(each, dict) for each in (found.results, found.files, found.taken)):
         raise ValueError("a field of the answer is not of its type")
-    names = [(_KEY, [*found.results, *found.loaded]), (_FILE, [*found.files, *found.taken.values()])]
+    names = [
+        (_KEY, [*found.results, *found.loaded]),
+        (_FILE, [*found.files, *found.taken.values()]),
+    ]
     if any(not form.fullmatch(name) for form, many in names for name in many):
         raise ValueError("the answer names what is no result and no file of a cache")
     digests = [*found.results.values(), *found.files.values()]
-    if not all(isinstance(text, str) for text in digests) or not {*found.taken.values()} <= {*found.files}:
+    if not all(isinstance(text, str) for text in digests) or not {*found.taken.values()} <= {
+        *found.files
+    }:
         raise ValueError("a field of the answer is not of its type")
     if not {*found.loaded} <= {*found.results}:
         raise ValueError("a result was loaded and is not named")
@@ -97,7 +112,9 @@ def checked(fields: Mapping[str, Any]) -> StoredResults:
 
 
 def _about(disk: Disk, small: SmallResults, key: str) -> Metadata | None:
-    """Return the metadata of a result as a store finds them, without moving a damaged result away."""
+    """Return the metadata of a result as a store finds them, without moving a damaged result
+    away.
+    """
     about = small.find(key)
     return about if is_kept(about) else metadata.find(disk, key) or about
 
@@ -109,7 +126,9 @@ def _said(about: Metadata | None) -> str:
 
 
 def _is_whole(disk: Disk, about: Metadata | None) -> bool:
-    """Return True if the file of a value has the checksum in the metadata, or with a secret the signed digest."""
+    """Return True if the file of a value has the checksum in the metadata, or with a secret the
+    signed digest.
+    """
     if not is_kept(about):
         return False
     payload = about.get("payload")

@@ -1,4 +1,6 @@
-"""Name of a stored answer: the digest of the command as typed and of the process in which it runs."""
+"""Name of a stored answer: the digest of the command as typed and of the process in which it
+runs.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +10,8 @@ from collections.abc import Mapping, Sequence
 
 from neusee.workflows.keys.cache_key import digest
 
-#: variables of a login or a terminal window that no program of this house reads; the working folder counts by itself,
-#: and the secret of the cache by the signature of each answer
+#: variables of a login or a terminal window that no program of this house reads; the working folder
+#: counts by itself, and the secret of the cache by the signature of each answer
 IGNORED = frozenset(
     {
         "NEUSEE_CACHE_SECRET",
@@ -31,12 +33,21 @@ IGNORED = frozenset(
 
 
 def command_name(words: Sequence[str], terminal: Sequence[object]) -> str:
-    """Return the name of the answer to a command; ``terminal`` says how wide the terminal is and what it shows.
+    """Return the name of the answer to a command; ``terminal`` says how wide the terminal is and
+    what it shows.
 
-    The name depends on the words, the working folder, all variables of the environment but `IGNORED`, the terminal,
-    Python with its options and search path, and the machine. Answers of another form have other names.
+    The name depends on the words, the working folder, all variables of the environment but
+    `IGNORED`, the terminal, Python with its options and search path, and the machine. Answers of
+    another form have other names.
     """
-    python = [sys.version, sys.executable, list(sys.flags), list(sys.warnoptions), dict(sys._xoptions), sys.path]
+    python = [
+        sys.version,
+        sys.executable,
+        list(sys.flags),
+        list(sys.warnoptions),
+        dict(sys._xoptions),
+        sys.path,
+    ]
     place = [os.getcwd(), sorted(_decisive(os.environ).items()), list(os.uname()), os.cpu_count()]
     return digest("answer 2", list(words), list(terminal), python, place)
 

@@ -10,7 +10,9 @@ from typing import NamedTuple
 
 
 class Unsettled(ValueError):
-    """Error for a file or folder that may have changed while the command ran, or that cannot be compared later."""
+    """Error for a file or folder that may have changed while the command ran, or that cannot be
+    compared later.
+    """
 
 
 class Witnesses(NamedTuple):
@@ -18,12 +20,15 @@ class Witnesses(NamedTuple):
 
     files: dict[str, str]  #: by path: digest of the content
     absent: list[str]  #: paths at which a file was wanted, and where there was none
-    recipes: dict[str, str]  #: by folder in which recipes and options are looked for: digest of their names
+    #: by folder in which recipes and options are looked for: digest of their names
+    recipes: dict[str, str]
     listed: dict[str, str]  #: by another folder that was listed: digest of all names in it
 
 
 class Listing(NamedTuple):
-    """The names in a folder, and when the folder last changed (ns); 0 for a folder that is missing."""
+    """The names in a folder, and when the folder last changed (ns); 0 for a folder that is
+    missing.
+    """
 
     names: list[str]
     changed: int
@@ -39,12 +44,18 @@ def listing(folder: str) -> Listing:
 
 
 def witnesses_of(
-    files: Iterable[str], recipes: Iterable[str], listed: Mapping[str, Listing], before: int, made: str | None = None
+    files: Iterable[str],
+    recipes: Iterable[str],
+    listed: Mapping[str, Listing],
+    before: int,
+    made: str | None = None,
 ) -> Witnesses:
-    """Return witnesses for these paths as they are now; a path without a file is a witness of its absence.
+    """Return witnesses for these paths as they are now; a path without a file is a witness of its
+    absence.
 
-    ``made`` is a folder that the command itself may have made: as a new name in a listed folder it is no change.
-    Raises `Unsettled` for what changed after the time ``before`` (ns), and for a folder in place of a file.
+    ``made`` is a folder that the command itself may have made: as a new name in a listed folder it
+    is no change. Raises `Unsettled` for what changed after the time ``before`` (ns), and for a
+    folder in place of a file.
     """
     for folder, then in listed.items():
         own = os.path.relpath(made, folder).partition(os.sep)[0] if made else ""
@@ -61,7 +72,9 @@ def witnesses_of(
         except OSError as error:
             raise Unsettled(f"{path} cannot be read: {error}") from None
     names = {folder: _digest(recipe_names(folder)) for folder in sorted(set(recipes))}
-    return Witnesses(found, absent, names, {folder: _digest(all_names(folder)) for folder in sorted(listed)})
+    return Witnesses(
+        found, absent, names, {folder: _digest(all_names(folder)) for folder in sorted(listed)}
+    )
 
 
 def hold(witnesses: Witnesses) -> bool:
@@ -69,8 +82,13 @@ def hold(witnesses: Witnesses) -> bool:
     try:
         return (
             not any(map(os.path.lexists, witnesses.absent))
-            and all(_digest(recipe_names(folder)) == digest for folder, digest in witnesses.recipes.items())
-            and all(_digest(all_names(folder)) == digest for folder, digest in witnesses.listed.items())
+            and all(
+                _digest(recipe_names(folder)) == digest
+                for folder, digest in witnesses.recipes.items()
+            )
+            and all(
+                _digest(all_names(folder)) == digest for folder, digest in witnesses.listed.items()
+            )
             and all(file_digest(path) == digest for path, digest in witnesses.files.items())
         )
     except (OSError, Unsettled):
@@ -80,7 +98,8 @@ def hold(witnesses: Witnesses) -> bool:
 def file_digest(path: str, before: int | None = None) -> str:
     """Return the digest of the content of a file; never wait for a pipe in its place.
 
-    Raises `Unsettled` for what is no file, and for a file that changed after the time ``before`` (ns).
+    Raises `Unsettled` for what is no file, and for a file that changed after the time ``before``
+    (ns).
     """
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
         about = os.fstat(file.fileno())
@@ -94,7 +113,9 @@ def file_digest(path: str, before: int | None = None) -> str:
 
 
 def recipe_names(folder: str) -> list[str]:
-    """Return the names of the recipes in a folder, and of the options in its groups, as far as they are files."""
+    """Return the names of the recipes in a folder, and of the options in its groups, as far as
+    they are files.
+    """
     return sorted(_yaml_in(folder, groups=True))
 
 
@@ -124,4 +145,6 @@ def _blake() -> hashlib.blake2b:
 
 
 def _digest(names: list[str]) -> str:
-    return hashlib.blake2b("\0".join(names).encode(errors="surrogateescape"), digest_size=16).hexdigest()
+    return hashlib.blake2b(
+        "\0".join(names).encode(errors="surrogateescape"), digest_size=16
+    ).hexdigest()

@@ -1,4 +1,6 @@
-"""The uncertainty budget of each parameter of a calibration, whose sources add up to what the calibration states."""
+"""The uncertainty budget of each parameter of a calibration, whose sources add up to what the
+calibration states.
+"""
 
 from __future__ import annotations
 
@@ -38,17 +40,21 @@ _STEP = 1e-4  #: standard deviations of the prior, step of a derivative
 
 
 class _Estimate(NamedTuple):
-    """What is stated of a parameter, and the standard uncertainty that its posterior and its models give."""
+    """What is stated of a parameter, and the standard uncertainty that its posterior and its
+    models give.
+    """
 
     value: float
     posterior: float  #: of the mean of two models, before any widening
-    model: float | None  #: half the distance of two models of the response; None where there is one model
+    #: half the distance of two models of the response; None where there is one model
+    model: float | None
 
 
 def budgets(result: CalibrationResult, laboratory: Laboratory) -> list[Budget]:
     """Return the uncertainty budget of each parameter of which the calibration states a value.
 
-    The variance of the posterior is split among the sources of the levels' scatter by the linear law of propagation.
+    The variance of the posterior is split among the sources of the levels' scatter by the linear
+    law of propagation.
     """
     rows = [row for row in result.rows() if row.kind == "estimate"]
     shares = _shares(result)
@@ -79,7 +85,9 @@ def _of_posterior(
 ) -> Iterator[Contribution]:
     for source, share in shares.items():
         kind, nu = ("B", math.inf) if source == _PRIOR else ("A", freedom.get(source, math.inf))
-        yield Contribution(source, kind, "normal", found.posterior * math.sqrt(share), unit, 1.0, nu)  # type: ignore[arg-type]
+        yield Contribution(
+            source, kind, "normal", found.posterior * math.sqrt(share), unit, 1.0, nu
+        )  # type: ignore[arg-type]
 
 
 def _of_model(name: str, found: _Estimate, unit: str) -> Contribution:
@@ -106,7 +114,9 @@ def _estimate(result: CalibrationResult, row: ParameterEstimate) -> _Estimate:
         return _Estimate(row.mean, result.unwidened[row.name], None)
     model = models[row.name]
     linear = row.name in result.problem.coordinates.linear
-    pairs = [_centre_and_width(each.value, each.low, each.high, linear) for each in model.models[-2:]]
+    pairs = [
+        _centre_and_width(each.value, each.low, each.high, linear) for each in model.models[-2:]
+    ]
     (fewer, narrow), (more, wide) = pairs[0], pairs[-1]
     scale = 1.0 if linear else model.stated.value
     apart = abs(fewer - more) / 2
@@ -129,14 +139,18 @@ def _shares(result: CalibrationResult) -> dict[str, dict[str, float]]:
         found = camera_sources(problem.levels, {**result.params, **values})
     z = torch.from_numpy(problem.whitened(mode.theta))
     return {
-        name: {(_PRIOR if source == "prior" else source): share for source, share in
-               variance_shares(slopes, found, torch.from_numpy(along)).items()}
+        name: {
+            (_PRIOR if source == "prior" else source): share
+            for source, share in variance_shares(slopes, found, torch.from_numpy(along)).items()
+        }
         for name, along in _derivatives(result, z.numpy()).items()
-    }  # fmt: skip
+    }
 
 
 def _derivatives(result: CalibrationResult, z: FloatArray) -> dict[str, FloatArray]:
-    """Return the derivative (free,) of each parameter per standard deviation of each prior, at the mode."""
+    """Return the derivative (free,) of each parameter per standard deviation of each prior, at
+    the mode.
+    """
     coordinates = result.problem.coordinates
     step = _STEP * np.eye(len(z))
     high, low = (coordinates.from_whitened(torch.from_numpy(z + sign * step)) for sign in (1, -1))

@@ -1,4 +1,6 @@
-"""The pictures of a calibration: photon-transfer curve, rings about a source, and traces of the chains."""
+"""The pictures of a calibration: photon-transfer curve, rings about a source, and traces of the
+chains.
+"""
 
 from __future__ import annotations
 
@@ -29,18 +31,27 @@ def transfer(
     other: str,
     means: FloatArray | None = None,
 ) -> Any:
-    """Draw the photon-transfer curve, and the deviation of each light level from the posterior's prediction.
+    """Draw the photon-transfer curve, and the deviation of each light level from the posterior's
+    prediction.
 
-    ``measured`` (2, level) has mean and variance, and ``predicted`` (2, draw, level) mean and variance of a repeated
-    measurement. ``whole`` (level,) is False for levels without a prediction, which the label ``other`` describes.
-    ``means`` (level,) are the deviations of the means from the light in standard deviations, if the light is uncertain.
+    ``measured`` (2, level) has mean and variance, and ``predicted`` (2, draw, level) mean and
+    variance of a repeated measurement. ``whole`` (level,) is False for levels without a prediction,
+    which the label ``other`` describes. ``means`` (level,) are the deviations of the means from the
+    light in standard deviations, if the light is uncertain.
     """
     rows = 2 if means is None else 3
-    figure, axes = canvas(9.0, 4.8 + 1.2 * rows, rows, 1, sharex=True, height_ratios=(2.2, *(rows - 1) * (1.0,)))
+    figure, axes = canvas(
+        9.0, 4.8 + 1.2 * rows, rows, 1, sharex=True, height_ratios=(2.2, *(rows - 1) * (1.0,))
+    )
     above = axes[0, 0]
     order = np.flatnonzero(whole)[np.argsort(predicted[0].mean(0)[whole])]
-    mean, (low, middle, high) = predicted[0].mean(0)[order], np.percentile(predicted[1], _BAND, axis=0)[:, order]
-    above.fill_between(mean, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %")
+    mean, (low, middle, high) = (
+        predicted[0].mean(0)[order],
+        np.percentile(predicted[1], _BAND, axis=0)[:, order],
+    )
+    above.fill_between(
+        mean, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %"
+    )
     above.plot(mean, middle, color=BLUE, linewidth=1.2, label="predicted, median")
     lowest = max(_LEAST, 0.5 * float(min([*measured[1, whole], *middle], default=_LEAST)))
     for at, style in (
@@ -48,8 +59,12 @@ def transfer(
         (~whole, {**_CLIPPED, "label": other}),
     ):
         if at.any():
-            above.plot(measured[0, at], measured[1, at].clip(lowest), linestyle="", markersize=5, **style)
-    above.set(xscale="log", yscale="log", ylabel="temporal variance (DN²)", title="Photon-transfer curve")
+            above.plot(
+                measured[0, at], measured[1, at].clip(lowest), linestyle="", markersize=5, **style
+            )
+    above.set(
+        xscale="log", yscale="log", ylabel="temporal variance (DN²)", title="Photon-transfer curve"
+    )
     above.set_ylim(bottom=lowest / 2)  # a clipped level does not stretch the axis
     above.legend(loc="upper left")
     distance = (measured[1, whole] - predicted[1].mean(0)[whole]) / predicted[1].std(0)[whole]
@@ -61,7 +76,9 @@ def transfer(
 
 
 def _distances(ax: Any, at: FloatArray, distance: FloatArray, label: str) -> None:
-    """Draw distances from a prediction in standard deviations, over a band of two standard deviations."""
+    """Draw distances from a prediction in standard deviations, over a band of two standard
+    deviations.
+    """
     ax.axhspan(-2, 2, color=BLUE, alpha=0.12, linewidth=0)
     ax.axhline(0, color=BLUE, linewidth=1.0)
     ax.plot(at, distance, "o", color=BLACK, markersize=5)
@@ -71,27 +88,38 @@ def _distances(ax: Any, at: FloatArray, distance: FloatArray, label: str) -> Non
 
 @drawn
 def rings(
-    radius: FloatArray, cut: FloatArray, measured: FloatArray, predicted: FloatArray, variance: FloatArray
+    radius: FloatArray,
+    cut: FloatArray,
+    measured: FloatArray,
+    predicted: FloatArray,
+    variance: FloatArray,
 ) -> Any:
-    """Draw the signal of the rings about an overexposed source over the radius, and its deviation from the prediction.
+    """Draw the signal of the rings about an overexposed source over the radius, and its deviation
+    from the prediction.
 
-    ``measured`` (ring,) and ``predicted`` and ``variance`` (draw, ring) are electrons of a pixel and their squares;
-    ``cut`` (cut,) are the radii of the rings that are cut off.
+    ``measured`` (ring,) and ``predicted`` and ``variance`` (draw, ring) are electrons of a pixel
+    and their squares; ``cut`` (cut,) are the radii of the rings that are cut off.
     """
     figure, axes = canvas(9.0, 7.2, 2, 1, sharex=True, height_ratios=(2.2, 1.0))
     above, below = axes[0, 0], axes[1, 0]
     low, middle, high = np.percentile(predicted, _BAND, axis=0)
-    above.fill_between(radius, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %")
+    above.fill_between(
+        radius, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %"
+    )
     above.plot(radius, middle, color=BLUE, linewidth=1.2, label="predicted, median")
     seen = measured > 0
     above.plot(radius[seen], measured[seen], "o", color=BLACK, markersize=4, label="measured")
     if len(cut):
         ends = float(cut.min()) - 0.5, float(cut.max()) + 0.5  # a ring is one pixel wide
         above.axvspan(*ends, color=VERMILION, alpha=0.3, linewidth=0, label="cut off")
-    above.set(xscale="log", yscale="log", ylabel="signal (e- of a pixel)", title="Rings about the source")
+    above.set(
+        xscale="log", yscale="log", ylabel="signal (e- of a pixel)", title="Rings about the source"
+    )
     above.legend(loc="lower left")
     width = np.sqrt(predicted.var(0) + variance.mean(0))
-    _distances(below, radius, (measured - predicted.mean(0)) / width, "distance in sd\nof the prediction")
+    _distances(
+        below, radius, (measured - predicted.mean(0)) / width, "distance in sd\nof the prediction"
+    )
     below.set_xlabel("distance from the source (pixels)")
     below.xaxis.set_major_formatter("{x:g}")
     below.xaxis.set_minor_formatter("{x:g}")
@@ -100,13 +128,17 @@ def rings(
 
 @drawn
 def traces(draws: FloatArray, labels: Sequence[str]) -> Any:
-    """Draw a trace plot of each coordinate: the median and the middle 90 % of the walkers of each ensemble."""
+    """Draw a trace plot of each coordinate: the median and the middle 90 % of the walkers of
+    each ensemble.
+    """
     count = len(labels)
     figure, axes = canvas(9.0, 1.35 * count + 0.5, count, 1, sharex=True)
     every = max(1, draws.shape[1] // _POINTS)
     for i, label in enumerate(labels):
         ax = axes[i, 0]
-        for ensemble, colour in zip(draws[:, ::every, :, i], (BLUE, ORANGE, "#009E73", VERMILION), strict=False):
+        for ensemble, colour in zip(
+            draws[:, ::every, :, i], (BLUE, ORANGE, "#009E73", VERMILION), strict=False
+        ):
             low, middle, high = np.percentile(ensemble, _BAND, axis=1)
             steps = np.arange(len(middle)) * every
             ax.fill_between(steps, low, high, color=colour, alpha=0.12, linewidth=0)

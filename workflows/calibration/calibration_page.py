@@ -1,4 +1,6 @@
-"""The page of a calibration: parameters with intervals or limits, identifiability, checks and pictures."""
+"""The page of a calibration: parameters with intervals or limits, identifiability, checks and
+pictures.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,12 @@ from neusee.workflows.calibration.laboratory import RELATIVE, stated
 from neusee.workflows.calibration.level_misfit import is_camera
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.calibration.model_spread import IntervalEstimate, ModelSpread
-from neusee.workflows.calibration.picture_sections import chains_section, corner_section, curve_section, words
+from neusee.workflows.calibration.picture_sections import (
+    chains_section,
+    corner_section,
+    curve_section,
+    words,
+)
 from neusee.workflows.calibration.posterior_checks import Check, count_failures
 from neusee.workflows.calibration.posterior_mode import LaplaceFit
 from neusee.workflows.calibration.standard_fit import Comparison, comparisons, least_squares_section
@@ -41,7 +48,9 @@ _PURE = ("quantum_efficiency", "spread", "scatter", "lamp", "bend", "twist", "l"
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """The posterior of one parameter: mean, standard deviation and interval, compared with the recipe's own value."""
+    """The posterior of one parameter: mean, standard deviation and interval, compared with the
+    recipe's own value.
+    """
 
     name: str
     unit: str
@@ -56,24 +65,33 @@ class ParameterEstimate:
 
     @property
     def text(self) -> str:
-        """Return the estimate or limit of a parameter as text with its unit, or say that the frames give neither."""
+        """Return the estimate or limit of a parameter as text with its unit, or say that the
+        frames give neither.
+        """
         if self.kind == "estimate":
             return f"{with_uncertainty(self.mean, self.sd)} {self.unit}".rstrip()
         if self.kind == "none":
             return KINDS["none"]
         if self.kind == "between":
-            return f"{self.low:.3g} to {self.high:.3g} {self.unit}".rstrip() + " (90 %, depends on the prior)"
+            return (
+                f"{self.low:.3g} to {self.high:.3g} {self.unit}".rstrip()
+                + " (90 %, depends on the prior)"
+            )
         limit = f"below {self.high:.3g}" if self.kind == "upper" else f"above {self.low:.3g}"
         return f"{limit} {self.unit}".rstrip() + " (95 %, depends on the prior)"
 
     def end(self, which: Literal["low", "high"]) -> str:
-        """Return the 5 % or the 95 % end of the interval as text, or a dash where only the prior gives it."""
+        """Return the 5 % or the 95 % end of the interval as text, or a dash where only the prior
+        gives it.
+        """
         return "–" if which in NOT_TOLD[self.kind] else f"{getattr(self, which):.6g}"
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """The results of a calibration: posterior mode, identifiability, Markov chains, checks and camera responses."""
+    """The results of a calibration: posterior mode, identifiability, Markov chains, checks and
+    camera responses.
+    """
 
     problem: SensorPosterior
     mode: LaplaceFit
@@ -82,7 +100,8 @@ class CalibrationResult:
     checks: Sequence[Check]
     models: Sequence[ModelSpread] = ()  #: of a camera of unknown response
     frames: Sequence[FrameTest] = ()  #: the tests of the frames
-    walk: Chains | None = None  #: the draws of the walkers, where `chains` also has what the frames may hide
+    #: the draws of the walkers, where `chains` also has what the frames may hide
+    walk: Chains | None = None
     budgets: Sequence[Budget] = ()  #: the uncertainty budgets of the estimates
 
     @cached_property
@@ -106,7 +125,9 @@ class CalibrationResult:
     @cached_property
     def unwidened(self) -> Mapping[str, float]:
         """Return the standard deviation of each parameter in the draws of the walkers."""
-        return {name: float(x.std()) for name, x in self.problem.parameters(self.walked.draws).items()}
+        return {
+            name: float(x.std()) for name, x in self.problem.parameters(self.walked.draws).items()
+        }
 
     @property
     def params(self) -> Mapping[str, Any]:
@@ -132,12 +153,16 @@ class CalibrationResult:
 
 
 def unit_of(name: str, params: Mapping[str, Any]) -> str:
-    """Return the unit of a parameter of the likelihood: `calibrate.density`, `.camera` or `.stray_light`."""
+    """Return the unit of a parameter of the likelihood: `calibrate.density`, `.camera` or
+    `.stray_light`.
+    """
     if name == "gain":
         return "DN/e-"
     if name == "dark_current":
         return f"e- in {params['dark_exposure']:g} s"
-    return {"dark_signal": "DN", "drift": "DN", "b0": "1/sr", **dict.fromkeys(_PURE, "")}.get(name, "e-")
+    return {"dark_signal": "DN", "drift": "DN", "b0": "1/sr", **dict.fromkeys(_PURE, "")}.get(
+        name, "e-"
+    )
 
 
 def banner(result: CalibrationResult) -> str:
@@ -150,14 +175,22 @@ def banner(result: CalibrationResult) -> str:
 
 
 def lead(result: CalibrationResult) -> str:
-    """Return the opening of a calibration's page: estimates, values to report, and undetermined parameters."""
+    """Return the opening of a calibration's page: estimates, values to report, and undetermined
+    parameters.
+    """
     values = [f"{words(row.name)} {row.text}" for row in result.rows()]
     stated = [f"{words(m.name)} {_between(m.stated)}" for m in estimated_models(result)]
     return "\n\n".join(
         f"{opening}{'; '.join(parts)}."
         for opening, parts in (
             ("", values),
-            ("To be stated, with 90 % intervals that include the difference between models of the response: ", stated),
+            (
+                (
+                    "To be stated, with 90 % intervals that include the difference between models"
+                    " of the response: "
+                ),
+                stated,
+            ),
             ("Not determined by these frames: ", result.identifiability.directions),
         )
         if parts
@@ -165,18 +198,28 @@ def lead(result: CalibrationResult) -> str:
 
 
 def estimated_models(result: CalibrationResult) -> list[ModelSpread]:
-    """Return the models of the response for each parameter that the frames determine; others have no value."""
-    return [model for model in result.models if result.identifiability.kinds[model.name] == "estimate"]
+    """Return the models of the response for each parameter that the frames determine; others
+    have no value.
+    """
+    return [
+        model for model in result.models if result.identifiability.kinds[model.name] == "estimate"
+    ]
 
 
 def sections(result: CalibrationResult) -> list[Section]:
-    """Return the sections of a calibration's page: parameters, checks, identifiability and pictures."""
+    """Return the sections of a calibration's page: parameters, checks, identifiability and
+    pictures.
+    """
     models = (_models,) if result.models else ()
     frames = (_frames,) if result.frames else ()
     standard = (_standard,) if result.problem.measured is not None else ()
     parts = (_checks, *frames, _not_determined, curve_section, corner_section, chains_section)
     budget = budget_sections(result.budgets, stated(result.problem.recipe), result.budget_picture)
-    return [*(part(result) for part in (_parameters, *standard, *models)), *budget, *(part(result) for part in parts)]
+    return [
+        *(part(result) for part in (_parameters, *standard, *models)),
+        *budget,
+        *(part(result) for part in parts),
+    ]
 
 
 def _standard(result: CalibrationResult) -> Section:
@@ -189,29 +232,53 @@ def _frames(result: CalibrationResult) -> Section:
 
 
 def _parameters(result: CalibrationResult) -> Section:
-    text = """A value is given only if the posterior is less than a third as wide as the prior. Otherwise there is a
-        limit, which depends on the prior, and a dash stands for an end that only the prior gives. The last columns
-        show the share of the draws below the recipe's own value,
-        and the width of the posterior divided by the width of the prior."""
-    columns = ("parameter", "posterior", "5 %", "95 %", "unit", "recipe", "draws below it", "width / prior")
+    text = """A value is given only if the posterior is less than a third as wide as the prior.
+        Otherwise there is a limit, which depends on the prior, and a dash stands for an end that
+        only the prior gives. The last columns show the share of the draws below the recipe's own
+        value, and the width of the posterior divided by the width of the prior."""
+    columns = (
+        "parameter",
+        "posterior",
+        "5 %",
+        "95 %",
+        "unit",
+        "recipe",
+        "draws below it",
+        "width / prior",
+    )
     estimates = result.rows()
     rows = [
-        (words(r.name), r.text, r.end("low"), r.end("high"), r.unit, f"{r.nominal:.6g}", r.share, r.narrower)
+        (
+            words(r.name),
+            r.text,
+            r.end("low"),
+            r.end("high"),
+            r.unit,
+            f"{r.nominal:.6g}",
+            r.share,
+            r.narrower,
+        )
         for r in estimates
     ]
     marks: dict[tuple[int, int], Mark] = {
-        (i, 6): "pass" if 0.005 <= r.share <= 0.995 else "warn" for i, r in enumerate(estimates) if r.kind == "estimate"
+        (i, 6): "pass" if 0.005 <= r.share <= 0.995 else "warn"
+        for i, r in enumerate(estimates)
+        if r.kind == "estimate"
     }
     return Section(
-        "The lens" if isinstance(result.problem.levels, Rings) else "The sensor", text, columns, rows, marks=marks
+        "The lens" if isinstance(result.problem.levels, Rings) else "The sensor",
+        text,
+        columns,
+        rows,
+        marks=marks,
     )
 
 
 def _models(result: CalibrationResult) -> Section:
-    text = """The posterior with a linear response, and with responses of one and of two more terms, each with its 90 %
-        interval. The stated value is the mean of the two models with the most terms. The stated standard deviation is
-        the larger one of both models and half the distance of both values, added in quadrature. The interval of a
-        single model is too narrow."""
+    text = """The posterior with a linear response, and with responses of one and of two more terms,
+        each with its 90 % interval. The stated value is the mean of the two models with the most
+        terms. The stated standard deviation is the larger one of both models and half the distance
+        of both values, added in quadrature. The interval of a single model is too narrow."""
     columns = (
         "parameter",
         *(f"{n} term{'s' * (n != 1)}" for n in range(len(result.models[0].models))),
@@ -231,17 +298,26 @@ def _between(interval: IntervalEstimate) -> str:
 
 def _checks(result: CalibrationResult) -> Section:
     rows = [(check.name, check.found, check.bar, check.mark) for check in result.checks]
-    marks: dict[tuple[int, int], Mark] = {(i, 3): check.mark for i, check in enumerate(result.checks)}
+    marks: dict[tuple[int, int], Mark] = {
+        (i, 3): check.mark for i, check in enumerate(result.checks)
+    }
     count = count_failures(result.checks)
     text = f"{count} fail: the posterior is not fit for use." if count else "No check fails."
     return Section("Checks", text, ("check", "found", "bar", "holds"), rows, marks=marks)
 
 
 def _not_determined(result: CalibrationResult) -> Section:
-    text = """Singular values of the derivatives of the levels per standard deviation of the prior, computed before any
-        sampling. In a direction below 3 the prior constrains the parameters more than the frames do."""
+    text = """Singular values of the derivatives of the levels per standard deviation of the prior,
+        computed before any sampling. In a direction below 3 the prior constrains the parameters
+        more than the frames do."""
     strengths = result.identifiability.strengths
     directions = [line for line in result.identifiability.directions if line != RELATIVE]
-    rows = list(zip(strengths, [""] * (len(strengths) - len(directions)) + [*directions], strict=True))
-    marks: dict[tuple[int, int], Mark] = {(i, 0): "warn" if text else "pass" for i, (_, text) in enumerate(rows)}
-    return Section("What the levels determine", text, ("strength", "not determined"), rows, marks=marks)
+    rows = list(
+        zip(strengths, [""] * (len(strengths) - len(directions)) + [*directions], strict=True)
+    )
+    marks: dict[tuple[int, int], Mark] = {
+        (i, 0): "warn" if text else "pass" for i, (_, text) in enumerate(rows)
+    }
+    return Section(
+        "What the levels determine", text, ("strength", "not determined"), rows, marks=marks
+    )

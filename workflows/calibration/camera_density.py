@@ -1,4 +1,6 @@
-"""A density of all parameters of a camera: a mixture of the widths of its noise, and of all others given the widths."""
+"""A density of all parameters of a camera: a mixture of the widths of its noise, and of all
+others given the widths.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ if TYPE_CHECKING:
 
     from neusee.workflows.calibration.log_posterior import FloatArray
 
-    Law = tuple[FloatArray, ...]  #: the numbers of a distribution, each for every set of widths (draw, ...)
+    #: the numbers of a distribution, each for every set of widths (draw, ...)
+    Law = tuple[FloatArray, ...]
 
 
 class Others(Protocol):
@@ -29,12 +32,16 @@ class Others(Protocol):
         """Return samples (draw, free) with the given ``widths`` and their ``law``."""
 
     def log_density(self, samples: FloatArray, law: Law) -> FloatArray:
-        """Return the log density of the other parameters at ``samples`` given the widths, up to a constant."""
+        """Return the log density of the other parameters at ``samples`` given the widths, up to
+        a constant.
+        """
 
 
 @dataclass(frozen=True)
 class CameraDensity:
-    """A density of all parameters: a mixture of the widths, and the distribution of all others given the widths."""
+    """A density of all parameters: a mixture of the widths, and the distribution of all others
+    given the widths.
+    """
 
     widths: Density
     others: Others
@@ -47,12 +54,18 @@ class CameraDensity:
     def log_density(self, samples: FloatArray) -> FloatArray:
         """Return the logarithm of the density at samples (draw, free), up to a constant."""
         widths = samples[:, self.others.at]
-        return self.widths.log_density(widths) + self.others.log_density(samples, self.others.law(widths))
+        return self.widths.log_density(widths) + self.others.log_density(
+            samples, self.others.law(widths)
+        )
 
     def propose(self, own: FloatArray, rng: Random) -> tuple[FloatArray, FloatArray]:
-        """Return new samples like ``own`` (draw, free), and the logarithm of the density at ``own`` over that there."""
+        """Return new samples like ``own`` (draw, free), and the logarithm of the density at
+        ``own`` over that there.
+        """
         widths = np.concatenate([own[:, self.others.at], self.widths.draw(len(own), rng)])
         law, here, there = self.others.law(widths), slice(None, len(own)), slice(len(own), None)
         drawn = self.others.draw(widths[there], tuple(part[there] for part in law), rng)
-        log = self.widths.log_density(widths) + self.others.log_density(np.concatenate([own, drawn]), law)
+        log = self.widths.log_density(widths) + self.others.log_density(
+            np.concatenate([own, drawn]), law
+        )
         return drawn, log[here] - log[there]

@@ -1,7 +1,8 @@
-"""A corner plot: the draws of each parameter, and of every pair of parameters, in a triangle of panels.
+"""A corner plot: the draws of each parameter, and of every pair of parameters, in a triangle of
+panels.
 
-The package `corner` draws the same picture; it makes all panels of the square and hides half, which takes three times
-as long for ten parameters.
+The package `corner` draws the same picture; it makes all panels of the square and hides half, which
+takes three times as long for ten parameters.
 """
 
 from __future__ import annotations
@@ -19,10 +20,13 @@ if TYPE_CHECKING:
 
 _PAGE = 11.4  #: inches, the width of the page at 100 pixels an inch
 _WIDEST = 13  #: characters of a line of a label
-_NEARLY_ALL = (0.005, 0.995)  #: quantiles, so that a single draw does not squeeze a panel of the corner plot
+#: quantiles, so that a single draw does not squeeze a panel of the corner plot
+_NEARLY_ALL = (0.005, 0.995)
 _BINS = 20  #: of each side of a panel
-_LEVELS = 1 - np.exp(-0.5 * np.array([0.5, 1.0, 1.5, 2.0]) ** 2)  #: shares of the draws inside the contours
-_SIZE, _LEFT, _GAP = 1.75, 0.9, 0.06  #: inches of a panel, of the margin with the labels, and between panels
+#: shares of the draws inside the contours
+_LEVELS = 1 - np.exp(-0.5 * np.array([0.5, 1.0, 1.5, 2.0]) ** 2)
+#: inches of a panel, of the margin with the labels, and between panels
+_SIZE, _LEFT, _GAP = 1.75, 0.9, 0.06
 
 
 @drawn
@@ -40,14 +44,30 @@ def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -
     for row in range(count):
         for column in range(row + 1):
             left, low = _LEFT + _SIZE * column, _LEFT + _SIZE * (count - 1 - row)
-            ax = figure.add_axes((left / size, low / size, (_SIZE - _GAP) / size, (_SIZE - _GAP) / size))
-            _panel(ax, draws[:, [column, row]], [ranges[column], ranges[row]], (nominal[column], nominal[row]))
-            _labelled(ax, names[column] if row == count - 1 else "", names[row] if column == 0 < row else "", text)
+            ax = figure.add_axes(
+                (left / size, low / size, (_SIZE - _GAP) / size, (_SIZE - _GAP) / size)
+            )
+            _panel(
+                ax,
+                draws[:, [column, row]],
+                [ranges[column], ranges[row]],
+                (nominal[column], nominal[row]),
+            )
+            _labelled(
+                ax,
+                names[column] if row == count - 1 else "",
+                names[row] if column == 0 < row else "",
+                text,
+            )
     return figure
 
 
-def _panel(ax: Any, pair: FloatArray, ends: Sequence[tuple[float, float]], own: tuple[float, float]) -> None:
-    """Draw the histogram of one parameter, or the histogram of two with its contours, and the recipe's own values."""
+def _panel(
+    ax: Any, pair: FloatArray, ends: Sequence[tuple[float, float]], own: tuple[float, float]
+) -> None:
+    """Draw the histogram of one parameter, or the histogram of two with its contours, and the
+    recipe's own values.
+    """
     ax.grid(False)
     ax.set_xlim(ends[0])
     ax.axvline(own[0], color=ORANGE, linewidth=1.0)
@@ -56,7 +76,9 @@ def _panel(ax: Any, pair: FloatArray, ends: Sequence[tuple[float, float]], own: 
         ax.set(yticks=[], ylim=(0, None))
         return
     counts, x, y = np.histogram2d(pair[:, 0], pair[:, 1], _BINS, np.array(ends))
-    ax.imshow(counts.T, origin="lower", extent=(*ends[0], *ends[1]), aspect="auto", cmap="Blues", vmin=0)
+    ax.imshow(
+        counts.T, origin="lower", extent=(*ends[0], *ends[1]), aspect="auto", cmap="Blues", vmin=0
+    )
     heights = _heights(counts)
     if len(heights):
         middle = [0.5 * (edges[1:] + edges[:-1]) for edges in (x, y)]
@@ -66,7 +88,9 @@ def _panel(ax: Any, pair: FloatArray, ends: Sequence[tuple[float, float]], own: 
 
 
 def _heights(counts: FloatArray) -> FloatArray:
-    """Return the counts of a cell above which the shares `_LEVELS` of all draws lie, rising and different."""
+    """Return the counts of a cell above which the shares `_LEVELS` of all draws lie, rising and
+    different.
+    """
     rising = np.sort(counts.ravel())[::-1]
     at = np.searchsorted(np.cumsum(rising), _LEVELS * rising.sum())
     heights = np.unique(rising[at.clip(max=len(rising) - 1)])
@@ -93,13 +117,21 @@ def _wrapped(label: str) -> str:
 
 
 def _ranges(draws: FloatArray, nominal: Sequence[float]) -> list[tuple[float, float]]:
-    """Return the range of each parameter in the corner plot: nearly all draws, and the recipe's value if among them."""
+    """Return the range of each parameter in the corner plot: nearly all draws, and the recipe's
+    value if among them.
+    """
     ends = np.quantile(draws, _NEARLY_ALL, axis=0).T
     rim = 0.1 * (ends[:, 1] - ends[:, 0])
-    shown = np.column_stack([ends[:, 0] - rim, ends[:, 1] + rim]).clip(draws.min(0)[:, None], draws.max(0)[:, None])
+    shown = np.column_stack([ends[:, 0] - rim, ends[:, 1] + rim]).clip(
+        draws.min(0)[:, None], draws.max(0)[:, None]
+    )
     own = np.asarray(nominal)
     inside = (own >= draws.min(0)) & (own <= draws.max(0))
     low, high = (
-        np.where(inside, which(shown[:, i], own), shown[:, i]) for i, which in ((0, np.minimum), (1, np.maximum))
+        np.where(inside, which(shown[:, i], own), shown[:, i])
+        for i, which in ((0, np.minimum), (1, np.maximum))
     )
-    return [(float(a), float(b)) if b > a else (float(a) - 0.5, float(a) + 0.5) for a, b in zip(low, high, strict=True)]
+    return [
+        (float(a), float(b)) if b > a else (float(a) - 0.5, float(a) + 0.5)
+        for a, b in zip(low, high, strict=True)
+    ]

@@ -1,8 +1,10 @@
-"""Sampling of a sensor's posterior with emcee: four ensembles of walkers, until the chains are long enough.
+"""Sampling of a sensor's posterior with emcee: four ensembles of walkers, until the chains are long
+enough.
 
-Only this file and `ensembles` import emcee. After each round all draws are written in emcee's HDF5 format, behind a
-seal in the first bytes, which HDF5 leaves to its users. A killed run continues from the last round and gives the same
-draws, to the last bit, as a run that never stopped. Chains whose file has no right seal start anew.
+Only this file and `ensembles` import emcee. After each round all draws are written in emcee's HDF5
+format, behind a seal in the first bytes, which HDF5 leaves to its users. A killed run continues
+from the last round and gives the same draws, to the last bit, as a run that never stopped. Chains
+whose file has no right seal start anew.
 """
 
 from __future__ import annotations
@@ -32,8 +34,10 @@ if TYPE_CHECKING:
 
 ENSEMBLES = 4
 STRANDED = 20.0  #: nats by which the median of a stranded walker lies below that of all walkers
-_FIRST, _GROWTH, _LONGEST = 250, 1.25, 32_000  #: steps of the first round; growth by round; most steps
-_TAUS, _CHANGE = 50.0, 0.01  #: least length of a chain in tau, and the largest change of tau in its last round
+#: steps of the first round; growth by round; most steps
+_FIRST, _GROWTH, _LONGEST = 250, 1.25, 32_000
+#: least length of a chain in tau, and the largest change of tau in its last round
+_TAUS, _CHANGE = 50.0, 0.01
 _SURELY = 100.0  #: length of a chain in tau at which any change of tau is allowed
 _BESIDE = 5.0  #: nats for each parameter by which a starting point may lie below the mode
 _SEAL = 512  #: bytes of the seal in front of the draws
@@ -59,13 +63,15 @@ class Chains:
 
 
 def move(name: str) -> Any:
-    """Return emcee's move with the name ``de`` or ``stretch``; raise `ValueError` for any other name."""
+    """Return emcee's move with the name ``de`` or ``stretch``; raise `ValueError` for any other
+    name.
+    """
     if name in _MOVES:
         return _MOVES[name]()
     if "snooker" in name.lower():
         raise ValueError(
-            "DESnookerMove of emcee up to 3.1.6 draws from a distribution that is 18 % too narrow (emcee's pull "
-            "request 531 corrects it): use de or stretch"
+            "DESnookerMove of emcee up to 3.1.6 draws from a distribution that is 18 % too narrow"
+            " (emcee's pull request 531 corrects it): use de or stretch"
         )
     raise ValueError(f"unknown move {name!r}: write de or stretch")
 
@@ -82,13 +88,17 @@ def sample(
     progress: Progress = silent,
     guide: Guide | None = None,
 ) -> Chains:
-    """Sample until each chain is 50 autocorrelation times long and the effective sample size is at least ``wanted``.
+    """Sample until each chain is 50 autocorrelation times long and the effective sample size is at
+    least ``wanted``.
 
-    ``file`` keeps the draws; if the file exists, the chains continue from its last step. With a ``guide`` the walkers
-    start at its samples, and most of their proposals are from its density.
+    ``file`` keeps the draws; if the file exists, the chains continue from its last step. With a
+    ``guide`` the walkers start at its samples, and most of their proposals are from its density.
     """
     moves = GuidedMove(move(how), guide.density) if guide else move(how)
-    runs = [start_ensemble(problem, mode, file, index, seed, walkers, moves, guide) for index in range(ENSEMBLES)]
+    runs = [
+        start_ensemble(problem, mode, file, index, seed, walkers, moves, guide)
+        for index in range(ENSEMBLES)
+    ]
     before, steps = _round(min(run.iteration for run in runs))
     tau_before, kept = _longest_time(runs, before) if before else np.inf, True
     while True:
@@ -96,11 +106,15 @@ def sample(
         kept = _keep(file, [run.backend for run in runs], progress if kept else silent)
         tau = _longest_time(runs)
         change = abs(tau - tau_before) / tau
-        long = steps >= (_TAUS + _BURN) * tau and (change < _CHANGE or steps >= (_SURELY + _BURN) * tau)
+        long = steps >= (_TAUS + _BURN) * tau and (
+            change < _CHANGE or steps >= (_SURELY + _BURN) * tau
+        )
         chains = _gathered(runs, tau, steps, long)
         size = chains.flat.shape[0] / tau
         ends = (long and size >= wanted) or steps >= _LONGEST
-        needed = steps if ends else max(int(_GROWTH * steps), _steps_needed(steps, tau, size, wanted))
+        needed = (
+            steps if ends else max(int(_GROWTH * steps), _steps_needed(steps, tau, size, wanted))
+        )
         where = f"{steps} of about {needed} steps of {ENSEMBLES} x {walkers} walkers"
         progress(f"{where}: tau {tau:.1f}, effective sample size {size:.0f}")
         if ends:
@@ -109,7 +123,9 @@ def sample(
 
 
 def _steps_needed(steps: int, tau: float, size: float, wanted: int) -> int:
-    """Return how many steps the chains need in all, if autocorrelation time and rate of draws stay as they are."""
+    """Return how many steps the chains need in all, if autocorrelation time and rate of draws
+    stay as they are.
+    """
     return min(int(max((_TAUS + _BURN) * tau, steps * wanted / max(size, 1.0))), _LONGEST)
 
 
@@ -118,7 +134,9 @@ def _longest_time(runs: Sequence[Walk], steps: int | None = None) -> float:
 
 
 def _round(iteration: int) -> tuple[int, int]:
-    """Return the numbers of steps at which two successive rounds of sampling end, before and after ``iteration``."""
+    """Return the numbers of steps at which two successive rounds of sampling end, before and
+    after ``iteration``.
+    """
     before, steps = 0, _FIRST
     while steps < iteration:
         before, steps = steps, int(_GROWTH * steps)
@@ -135,7 +153,9 @@ def start_ensemble(
     moves: Any,
     guide: Guide | None = None,
 ) -> Walk:
-    """Return an ensemble that continues the draws in ``file``, or starts near the mode or at samples of the guide."""
+    """Return an ensemble that continues the draws in ``file``, or starts near the mode or at
+    samples of the guide.
+    """
     dimensions = len(problem.names)
     backend = _read(file, index)
     if backend is not None and backend.shape == (walkers, dimensions):
@@ -150,8 +170,12 @@ def start_ensemble(
     return Walk(backend, moves, random, start)
 
 
-def _alive(problem: SensorPosterior, mode: LaplaceFit, walkers: int, rng: np.random.Generator) -> FloatArray:
-    """Return starting points (walker, parameter) near the posterior mode, where the posterior is not almost zero."""
+def _alive(
+    problem: SensorPosterior, mode: LaplaceFit, walkers: int, rng: np.random.Generator
+) -> FloatArray:
+    """Return starting points (walker, parameter) near the posterior mode, where the posterior is
+    not almost zero.
+    """
     points = np.empty((0, len(mode.theta)))
     for _ in range(50):
         drawn = mode.draw(4 * walkers, rng)
@@ -160,19 +184,24 @@ def _alive(problem: SensorPosterior, mode: LaplaceFit, walkers: int, rng: np.ran
         if len(points) >= walkers:
             return points[:walkers]
     raise ValueError(
-        "samples around the mode have almost no posterior density, so no chain can start there: give narrower priors"
+        "samples around the mode have almost no posterior density, so no chain can start there:"
+        " give narrower priors"
     )
 
 
 def autocorrelation_time(chain: FloatArray) -> float:
-    """Return the longest autocorrelation time of the coordinates in a chain (step, walker, parameter)."""
+    """Return the longest autocorrelation time of the coordinates in a chain (step, walker,
+    parameter).
+    """
     with np.errstate(invalid="ignore"):
         tau = float(np.max(emcee.autocorr.integrated_time(chain, tol=0, has_walkers=True)))
     return tau if np.isfinite(tau) else float(len(chain))  # NaN for walkers that never move
 
 
 def stranded(log: FloatArray) -> int:
-    """Return the number of walkers whose log posterior ``log`` (..., step, walker) is far below that of the others."""
+    """Return the number of walkers whose log posterior ``log`` (..., step, walker) is far below
+    that of the others.
+    """
     middle = np.median(log, -2)
     return int((middle < np.median(middle) - STRANDED).sum())
 
@@ -186,7 +215,8 @@ def _gathered(runs: Sequence[Walk], tau: float, steps: int, long: bool) -> Chain
 
 
 def _read(file: Path, index: int) -> Any:
-    """Read the draws of an ensemble into a backend in memory; return None if the file cannot be read or trusted.
+    """Read the draws of an ensemble into a backend in memory; return None if the file cannot be
+    read or trusted.
 
     A copy is read, because the file may be replaced after its signature was compared.
     """
@@ -218,12 +248,21 @@ def _unpacked(file: Path, index: int) -> Any:
 def _is_whole(memory: Any) -> bool:
     """Return True if draws and log densities of every step are there and are numbers."""
     steps = memory.iteration
-    shapes = memory.chain.shape == (steps, *memory.shape) and memory.log_prob.shape == (steps, memory.shape[0])
-    return steps > 0 and shapes and bool(np.isfinite(memory.chain).all() and np.isfinite(memory.log_prob).all())
+    shapes = memory.chain.shape == (steps, *memory.shape) and memory.log_prob.shape == (
+        steps,
+        memory.shape[0],
+    )
+    return (
+        steps > 0
+        and shapes
+        and bool(np.isfinite(memory.chain).all() and np.isfinite(memory.log_prob).all())
+    )
 
 
 def _keep(file: Path, backends: Sequence[Any], progress: Progress) -> bool:
-    """Write the draws to a file; if this fails, for example on a full disk, report the error and return False."""
+    """Write the draws to a file; if this fails, for example on a full disk, report the error and
+    return False.
+    """
     try:
         _write(file, backends)
     except (OSError, RuntimeError) as error:  # h5py raises both
@@ -235,7 +274,8 @@ def _keep(file: Path, backends: Sequence[Any], progress: Progress) -> bool:
 def _write(file: Path, backends: Sequence[Any]) -> None:
     """Write the draws of all ensembles to one file with an atomic rename.
 
-    HDF5 writes to a temporary folder first, because after an error of the disk it can no longer close its file.
+    HDF5 writes to a temporary folder first, because after an error of the disk it can no longer
+    close its file.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_suffix(f".{os.getpid()}.part")

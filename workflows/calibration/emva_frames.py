@@ -33,7 +33,8 @@ from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 
 Release = Literal["4", "3"]
-_STEADY = 3.1  #: release of EMVA 1288 since which the variance in time excludes the difference of means
+#: release of EMVA 1288 since which the variance in time excludes the difference of means
+_STEADY = 3.1
 #: what the standard wants to be told of the operating point
 OPERATING_POINT = {
     "camera": "camera",
@@ -70,7 +71,8 @@ class EmvaFrames(NamedTuple):
 def descriptor_recipe(file: Path, changes: Sequence[str] = ()) -> Recipe:
     """Return the recipe of a sheet of the measurement that an EMVA 1288 descriptor file describes.
 
-    Raises: ValueError for a descriptor or an image that is missing or cannot be read, `RecipeError` with all mistakes
+    Raises: ValueError for a descriptor or an image that is missing or cannot be read, `RecipeError`
+            with all mistakes
     of ``changes``.
     """
     refuse_descriptor(file)
@@ -83,10 +85,12 @@ def descriptor_recipe(file: Path, changes: Sequence[str] = ()) -> Recipe:
 
 
 def frames_of_recipe(recipe: Recipe, store: Store, release: Release | None = None) -> EmvaFrames:
-    """Return levels with the variance in time, and the dark and the lit series, of a recipe that reads frames.
+    """Return levels with the variance in time, and the dark and the lit series, of a recipe that
+    reads frames.
 
-    In release 4 the variance of a level excludes the difference of the means of its frames; in 3 it includes it. By
-    default the release is that which the descriptor states, and 4 where no descriptor states one.
+    In release 4 the variance of a level excludes the difference of the means of its frames; in 3 it
+    includes it. By default the release is that which the descriptor states, and 4 where no
+    descriptor states one.
     Raises: ValueError for a recipe that reads neither frames, a descriptor nor a table.
     """
     steps = {path: [s for s in recipe.steps.values() if s.node.path == path] for path in _READERS}
@@ -102,25 +106,36 @@ def frames_of_recipe(recipe: Recipe, store: Store, release: Release | None = Non
         dark = found.variance[found.photons == 0]
         tests = [coarse(float(dark.min()), exact=False)] if len(dark) else []
         return EmvaFrames(found, Nonuniformity(None, None), 2, tests)
-    raise ValueError(f"{recipe.name} has no step of the nodes {', '.join(_READERS)}, so that it has no frames of a "
-                     "sheet of EMVA 1288: give a descriptor, or a recipe as in `neusee run calibrate`")  # fmt: skip
+    raise ValueError(
+        f"{recipe.name} has no step of the nodes {', '.join(_READERS)}, so that it has no frames "
+        "of a "
+        "sheet of EMVA 1288: give a descriptor, or a recipe as in `neusee run calibrate`"
+    )
 
 
 _READERS = ("calibrate.descriptor", "calibrate.reduce", "calibrate.table")
 _FITTED = 0.7  #: share of saturation up to which the sheet fits its lines
-_SCATTER: dict[Release, Any] = {"4": "steady", "3": "temporal"}  #: parameter of the nodes that reduce frames
+#: parameter of the nodes that reduce frames
+_SCATTER: dict[Release, Any] = {"4": "steady", "3": "temporal"}
 
 
 def _described(step: Step, scatter: Any) -> EmvaFrames:
     files = step.params["file"]
     found = descriptor(file=files, scatter=scatter)
     series = [spatial_series(*each) for each in descriptor_series(files)]
-    stacks = (Stack(name, light, time, scatter, frames) for name, light, time, frames in descriptor_frames(files))
-    return EmvaFrames(found, _nearest_half(series, found), 2, inspect_frames(stacks, False, _FITTED))
+    stacks = (
+        Stack(name, light, time, scatter, frames)
+        for name, light, time, frames in descriptor_frames(files)
+    )
+    return EmvaFrames(
+        found, _nearest_half(series, found), 2, inspect_frames(stacks, False, _FITTED)
+    )
 
 
 def _reduced(recipe: Recipe, store: Store, steps: Sequence[Step], scatter: Any) -> EmvaFrames:
-    """Return levels and series of the steps that reduce frames; the levels of most frames are the series."""
+    """Return levels and series of the steps that reduce frames; the levels of most frames are
+    the series.
+    """
     parts, counts = [], []
     for step in steps:
         frames = _frames(recipe, store, step)
@@ -145,7 +160,9 @@ def _frames(recipe: Recipe, store: Store, step: Step) -> Any:
 
 
 def _nearest_half(series: Sequence[SpatialSeries], found: Levels) -> Nonuniformity:
-    return _pair(series[i] for i in _dark_and_half([(s.photons, s.exposure) for s in series], found))
+    return _pair(
+        series[i] for i in _dark_and_half([(s.photons, s.exposure) for s in series], found)
+    )
 
 
 def _pair(series: Iterator[SpatialSeries]) -> Nonuniformity:
@@ -157,7 +174,8 @@ def _pair(series: Iterator[SpatialSeries]) -> Nonuniformity:
 
 
 def _dark_and_half(light: Sequence[tuple[float, float]], found: Levels) -> list[int]:
-    """Return the indices of the dark and of the lit series nearest to half of saturation, with one exposure if can be.
+    """Return the indices of the dark and of the lit series nearest to half of saturation, with one
+    exposure if can be.
 
     ``light`` has photons and exposure of each series.
     """

@@ -18,14 +18,16 @@ _A4 = (8.27, 11.69)  #: inches
 
 
 def pdf(sheet: EmvaSheet, title: str, lines: list[str], budgets: Sequence[Budget] = ()) -> bytes:
-    """Return a PDF: the summary of the sheet on its first page, and the pictures on the pages after it.
+    """Return a PDF: the summary of the sheet on its first page, and the pictures on the pages after
+    it.
 
     ``budgets`` have the expanded uncertainty of each quantity with a value.
     """
     from matplotlib.backends.backend_pdf import PdfPages
 
     out = io.BytesIO()
-    about = {"Title": title, "Creator": "neusee", "CreationDate": None}  # equal frames give equal bytes
+    # equal frames give equal bytes
+    about = {"Title": title, "Creator": "neusee", "CreationDate": None}
     with styled(), PdfPages(out, metadata=about) as pages:
         pages.savefig(_summary(sheet, title, lines, {b.key: b for b in budgets}))
         for draw in emva_figures.PICTURES.values():
@@ -37,17 +39,27 @@ def pdf(sheet: EmvaSheet, title: str, lines: list[str], budgets: Sequence[Budget
 
 
 def _summary(sheet: EmvaSheet, title: str, lines: list[str], budgets: Mapping[str, Budget]) -> Any:
-    """Return a page of A4 with title, what is told of the camera, and the table of all quantities."""
+    """Return a page of A4 with title, what is told of the camera, and the table of all
+    quantities.
+    """
     figure, axes = canvas(*_A4, 2, 1, height_ratios=(0.25, 1.0))
     figure.get_layout_engine().set(rect=(0.07, 0.04, 0.86, 0.92))
     for ax in axes[:, 0]:
         ax.set_axis_off()
-    axes[0, 0].text(0, 1, title, fontsize=14, fontweight="bold", va="top", transform=axes[0, 0].transAxes)
+    axes[0, 0].text(
+        0, 1, title, fontsize=14, fontweight="bold", va="top", transform=axes[0, 0].transAxes
+    )
     shown = "\n".join(part for text in lines for part in textwrap.wrap(text, _LINE))
-    axes[0, 0].text(0, 0.86, shown, fontsize=9, va="top", linespacing=1.4, transform=axes[0, 0].transAxes)
+    axes[0, 0].text(
+        0, 0.86, shown, fontsize=9, va="top", linespacing=1.4, transform=axes[0, 0].transAxes
+    )
     rows = [(q.symbol, q.name, q.text, _expanded(budgets.get(q.key))) for q in sheet.quantities]
     table = axes[1, 0].table(
-        rows, colLabels=_COLUMNS, colWidths=(0.22, 0.46, 0.2, 0.12), cellLoc="left", loc="upper center"
+        rows,
+        colLabels=_COLUMNS,
+        colWidths=(0.22, 0.46, 0.2, 0.12),
+        cellLoc="left",
+        loc="upper center",
     )
     table.auto_set_font_size(False)
     table.set_fontsize(9)
@@ -58,7 +70,9 @@ def _summary(sheet: EmvaSheet, title: str, lines: list[str], budgets: Mapping[st
 
 
 def _expanded(budget: Budget | None) -> str:
-    """Return the expanded uncertainty in the unit of the value as text; + says that a source is not stated."""
+    """Return the expanded uncertainty in the unit of the value as text; + says that a source is
+    not stated.
+    """
     if budget is None:
         return "–"
     return two_digits(budget.expanded) + " +" * bool(budget.missing)

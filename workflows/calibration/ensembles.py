@@ -1,8 +1,9 @@
-"""Ensembles of walkers that advance together, so that one call evaluates the proposals of all ensembles.
+"""Ensembles of walkers that advance together, so that one call evaluates the proposals of all
+ensembles.
 
-Each ensemble has emcee's moves and its own random stream. The draws are exactly those of emcee's `EnsembleSampler`,
-which evaluates one ensemble after another in a loop over walkers. A likelihood of few numbers takes as long for one
-ensemble as for four, and less time than the loop of emcee.
+Each ensemble has emcee's moves and its own random stream. The draws are exactly those of emcee's
+`EnsembleSampler`, which evaluates one ensemble after another in a loop over walkers. A likelihood
+of few numbers takes as long for one ensemble as for four, and less time than the loop of emcee.
 """
 
 from __future__ import annotations
@@ -16,14 +17,19 @@ import numpy as np
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import FloatArray
 
-Weigh = Callable[["FloatArray"], "FloatArray"]  #: returns the log density (walker,) at (walker, free), never NaN
+#: returns the log density (walker,) at (walker, free), never NaN
+Weigh = Callable[["FloatArray"], "FloatArray"]
 
 
 class Walk:
     """An ensemble of walkers, with the draws, the move and the random stream of the ensemble."""
 
     def __init__(
-        self, backend: Any, move: Any, random: np.random.RandomState, initial_theta: FloatArray | None
+        self,
+        backend: Any,
+        move: Any,
+        random: np.random.RandomState,
+        initial_theta: FloatArray | None,
     ) -> None:
         self.backend = backend  #: emcee's backend in memory, with all steps so far
         self.move, self.random = move, random
@@ -35,7 +41,9 @@ class Walk:
         return int(self.backend.iteration)
 
     def prepare(self, steps: int, weigh: Weigh) -> None:
-        """Reserve memory for ``steps`` more steps of the walkers, and load their state after the last step."""
+        """Reserve memory for ``steps`` more steps of the walkers, and load their state after the
+        last step.
+        """
         if self.initial_theta is not None and self.iteration == 0:
             self._state = emcee.State(self.initial_theta.copy(), log_prob=weigh(self.initial_theta))
         else:
@@ -43,7 +51,9 @@ class Walk:
         self.backend.grow(steps, None)
 
     def begin_step(self) -> None:
-        """Split the walkers into parts for one step; the proposals for each part depend on the other parts."""
+        """Split the walkers into parts for one step; the proposals for each part depend on the
+        other parts.
+        """
         self.random.random_sample()  # emcee draws one of several moves with this number
         self.move.setup(self._state.coords)
         self._part = np.arange(len(self._state.coords)) % self.move.nsplits
@@ -73,12 +83,16 @@ class Walk:
         self.backend.save_step(self._state, self._accepted)
 
     def rest(self) -> None:
-        """Store the state of the random stream, so that a later run can continue from this state."""
+        """Store the state of the random stream, so that a later run can continue from this
+        state.
+        """
         self.backend.random_state = self.random.get_state()
 
 
 def walk_until(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
-    """Advance the ensembles until each has ``steps`` steps; ensembles with the fewest steps go first."""
+    """Advance the ensembles until each has ``steps`` steps; ensembles with the fewest steps go
+    first.
+    """
     while (now := min(walk.iteration for walk in walks)) < steps:
         behind = [walk for walk in walks if walk.iteration == now]
         until = min([steps, *(walk.iteration for walk in walks if walk.iteration > now)])

@@ -1,4 +1,6 @@
-"""Tests of the frames of a calibration before any likelihood, and what follows from these tests for the posterior."""
+"""Tests of the frames of a calibration before any likelihood, and what follows from these tests
+for the posterior.
+"""
 
 from __future__ import annotations
 
@@ -32,15 +34,22 @@ from neusee.workflows.store.result_store import Store
 if TYPE_CHECKING:
     from neusee.workflows.calibration.emcee_sampler import Chains
 
-_MARKS: dict[str, Mark] = {"passed": "pass", "modelled": "pass", "widened": "warn", "refused": "fail"}
+_MARKS: dict[str, Mark] = {
+    "passed": "pass",
+    "modelled": "pass",
+    "widened": "warn",
+    "refused": "fail",
+}
 _NOISES = ("read_noise", "temporal_dark_noise")
-_IN_ELECTRONS = (*_NOISES, "offset", "dark_current", "full_well", "quantum_efficiency")  #: inversely to the gain
+#: inversely to the gain
+_IN_ELECTRONS = (*_NOISES, "offset", "dark_current", "full_well", "quantum_efficiency")
 _SMALL = 1e-5  #: relative error below which no interval is widened
 _LIKELIHOODS = ("calibrate.density", "calibrate.camera", "calibrate.stray_light")
 
 
 def inspect_recipe(recipe: Recipe, store: Store) -> list[FrameTest]:
-    """Return the tests of the frames that the likelihood of a recipe describes; none for a picture of a point source.
+    """Return the tests of the frames that the likelihood of a recipe describes; none for a picture
+    of a point source.
 
     Of a table of moments only the dark noise is tested.
     """
@@ -58,7 +67,9 @@ def inspect_recipe(recipe: Recipe, store: Store) -> list[FrameTest]:
 
 
 def _share(weighing: Step, steps: Sequence[Step]) -> float | None:
-    """Return the share of saturation above which the likelihood leaves levels out, or None if it uses all levels."""
+    """Return the share of saturation above which the likelihood leaves levels out, or None if it
+    uses all levels.
+    """
     reduced = next((step for step in steps if step.node.path == "calibrate.sufficient"), weighing)
     share = reduced.params.get("share")
     return None if share is None else float(share)
@@ -85,15 +96,21 @@ def _stacks(recipe: Recipe, store: Store, steps: Sequence[Step]) -> Iterator[Sta
                 yield Stack(name, photons, exposure, scatter, frames)
 
 
-def frames_and_mask(recipe: Recipe, store: Store, step: Step) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Return the frames that a step of `calibrate.reduce` receives, and the mask of its hot pixels if it has one."""
+def frames_and_mask(
+    recipe: Recipe, store: Store, step: Step
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Return the frames that a step of `calibrate.reduce` receives, and the mask of its hot
+    pixels if it has one.
+    """
     source, mask = str(step.wires["frames"]), step.wires.get("mask")
     values = run(recipe, store, (source, str(mask)) if mask else (source,)).values
     return values[source], values[str(mask)] if mask else None
 
 
 def lines(tests: Sequence[FrameTest]) -> Iterator[str]:
-    """Yield a line for each test of frames that has something to say, and one for all that passed."""
+    """Yield a line for each test of frames that has something to say, and one for all that
+    passed.
+    """
     passed = [test for test in tests if test.verdict == "passed"]
     for test in tests:
         if test.verdict != "passed":
@@ -103,7 +120,9 @@ def lines(tests: Sequence[FrameTest]) -> Iterator[str]:
 
 
 def frame_checks(tests: Sequence[FrameTest], given: bool = True) -> list[Check]:
-    """Return each test of frames as a check of the posterior, which fails if the frames are refused."""
+    """Return each test of frames as a check of the posterior, which fails if the frames are
+    refused.
+    """
     found = [Check(t.name, f"{t.verdict}: {t.sentence}", _bar(t), _MARKS[t.verdict]) for t in tests]
     if len(tests) < 2 and given:
         text = "only moments are given: noise, patterns and numbers of the frames are not tested"
@@ -112,13 +131,18 @@ def frame_checks(tests: Sequence[FrameTest], given: bool = True) -> list[Check]:
 
 
 def hidden_checks(tests: Sequence[FrameTest], may_hide: Container[str]) -> list[Check]:
-    """Return what faults that the frames have or may hide leave open, as a check that cannot fail."""
+    """Return what faults that the frames have or may hide leave open, as a check that cannot
+    fail.
+    """
     hidden = hidden_faults(tests, may_hide)
     if not hidden:
         return []
     words = [f"{name} by {100 * size:.2g} %" for name, size in open_errors(hidden).items() if size]
     faults = " and ".join(sorted({fault.fault for fault in hidden}))
-    bar = "more pixels hide less; a fault that the camera cannot have is `none` in the step of the priors"
+    bar = (
+        "more pixels hide less; a fault that the camera cannot have is `none` in the step of the"
+        " priors"
+    )
     text = f"{' and '.join(words)}, which the frames show or may hide; nothing is corrected"
     return [Check(f"intervals include {faults}", text, bar, "pass")]
 
@@ -132,27 +156,42 @@ def data_check(pairs: float) -> Check:
     text = f"{pairs:.3g} pairs of pixels in the lit levels of the fit"
     enough = pairs >= CLEAN_PAIRS
     if not enough:
-        text += ": intervals are wider than by statistics alone, because so few may hide mixing and lag"
+        text += (
+            ": intervals are wider than by statistics alone, because so few may hide mixing and lag"
+        )
     bar = f"at least {CLEAN_PAIRS:.2g}, such as 10 levels of 2 frames of {side} x {side} pixels"
     return Check("the frames are numerous enough", text, bar, "pass" if enough else "warn")
 
 
 def _bar(test: FrameTest) -> str:
-    return f"{abs(test.number):.3g}, {'at least' if test.limit < 0 else 'at most'} {abs(test.limit):.3g}"
+    return (
+        f"{abs(test.number):.3g}, {'at least' if test.limit < 0 else 'at most'}"
+        f" {abs(test.limit):.3g}"
+    )
 
 
 def frame_section(tests: Sequence[FrameTest]) -> Section:
     """Return the section of a calibration's page with the tests of its frames."""
-    text = """Each test asks if the frames are such as the likelihood describes. Modelled: the likelihood describes it.
-        Widened: the intervals include the error that may follow, and no value is corrected. Refused: the error may
-        exceed 2 %, or is unknown. Only levels that the fit uses are tested.
-        Numbers and limits of noise and patterns are in standard deviations of chance; all tests together fail for
-        frames without fault in less than 2 % of all measurements."""
+    text = """Each test asks if the frames are such as the likelihood describes. Modelled: the
+        likelihood describes it. Widened: the intervals include the error that may follow, and no
+        value is corrected. Refused: the error may exceed 2 %, or is unknown. Only levels that the
+        fit uses are tested. Numbers and limits of noise and patterns are in standard deviations of
+        chance; all tests together fail for frames without fault in less than 2 % of all
+        measurements."""
     if len(tests) < 2:
-        text = "Only moments are given, so that noise, patterns and numbers of the frames are not tested."
+        text = (
+            "Only moments are given, so that noise, patterns and numbers of the frames are not"
+            " tested."
+        )
     rows = [(t.name, abs(t.number), abs(t.limit), t.verdict, t.sentence) for t in tests]
     marks: dict[tuple[int, int], Mark] = {(i, 3): _MARKS[t.verdict] for i, t in enumerate(tests)}
-    return Section("The frames", text, ("test", "number", "limit", "verdict", "what it says"), rows, marks=marks)
+    return Section(
+        "The frames",
+        text,
+        ("test", "number", "limit", "verdict", "what it says"),
+        rows,
+        marks=marks,
+    )
 
 
 def as_rows(tests: Iterable[FrameTest]) -> list[dict[str, Any]]:
@@ -161,18 +200,30 @@ def as_rows(tests: Iterable[FrameTest]) -> list[dict[str, Any]]:
 
 
 def hidden_faults(tests: Iterable[FrameTest], may_hide: Container[str]) -> list[Hidden]:
-    """Return the faults that change gain and noise: those that a test found, and those that ``may_hide`` from it."""
-    return [h for test in tests for h in test.hidden if test.verdict != "passed" or h.fault in may_hide]
+    """Return the faults that change gain and noise: those that a test found, and those that
+    ``may_hide`` from it.
+    """
+    return [
+        h for test in tests for h in test.hidden if test.verdict != "passed" or h.fault in may_hide
+    ]
 
 
 def relative_shifts(tests: Iterable[FrameTest]) -> dict[str, float]:
-    """Return the relative standard deviations of gain and of dark noise in DN that the tests of frames leave open."""
+    """Return the relative standard deviations of gain and of dark noise in DN that the tests of
+    frames leave open.
+    """
     tests = list(tests)
-    return {name: math.hypot(*(t.shifts.get(name, 0.0) for t in tests), 0.0) for name in ("gain", "noise")}
+    return {
+        name: math.hypot(*(t.shifts.get(name, 0.0) for t in tests), 0.0)
+        for name in ("gain", "noise")
+    }
 
 
-def widened(problem: SensorPosterior, chains: Chains, tests: Sequence[FrameTest], seed: int) -> Chains:
-    """Return the draws of a posterior with the errors that frames leave open, as independent normal draws.
+def widened(
+    problem: SensorPosterior, chains: Chains, tests: Sequence[FrameTest], seed: int
+) -> Chains:
+    """Return the draws of a posterior with the errors that frames leave open, as independent normal
+    draws.
 
     An error of the gain changes all values in electrons inversely. No mean is changed.
     """
@@ -181,7 +232,9 @@ def widened(problem: SensorPosterior, chains: Chains, tests: Sequence[FrameTest]
         return chains
     generator = torch.Generator().manual_seed(seed)
     normal = torch.randn(2, chains.log.size, generator=generator, dtype=torch.float64)
-    gain, noise = (errors[n] * x.view(chains.log.shape) for n, x in zip(("gain", "noise"), normal, strict=True))
+    gain, noise = (
+        errors[n] * x.view(chains.log.shape) for n, x in zip(("gain", "noise"), normal, strict=True)
+    )
     values = problem.parameters(chains.draws)
     if "gain" in values:
         values["gain"] = values["gain"] * gain.exp()
@@ -195,11 +248,16 @@ def widened_models(
 ) -> list[ModelSpread]:
     """Return the intervals to report with the errors that the frames leave open."""
     errors = errors_of_parameters(tests, may_hide)
-    return [replace(m, stated=wider(m.stated, errors[m.name])) if m.name in errors else m for m in models]
+    return [
+        replace(m, stated=wider(m.stated, errors[m.name])) if m.name in errors else m
+        for m in models
+    ]
 
 
 def open_by_tests(tests: Iterable[FrameTest], may_hide: Container[str]) -> dict[str, float]:
-    """Return the relative standard deviations of gain and of dark noise in DN that tests and hidden faults leave."""
+    """Return the relative standard deviations of gain and of dark noise in DN that tests and
+    hidden faults leave.
+    """
     tests = list(tests)
     hidden, shifts = open_errors(hidden_faults(tests, may_hide)), relative_shifts(tests)
     return {name: math.hypot(hidden[name], shifts[name]) for name in ("gain", "noise")}
@@ -217,6 +275,9 @@ def wider(interval: IntervalEstimate, shift: float) -> IntervalEstimate:
     if shift < _SMALL:
         return interval
     factors = [
-        math.exp(math.hypot(math.log(interval.value / end), Z_90 * shift)) for end in (interval.low, interval.high)
+        math.exp(math.hypot(math.log(interval.value / end), Z_90 * shift))
+        for end in (interval.low, interval.high)
     ]
-    return IntervalEstimate(interval.value, interval.value / factors[0], interval.value * factors[1])
+    return IntervalEstimate(
+        interval.value, interval.value / factors[0], interval.value * factors[1]
+    )

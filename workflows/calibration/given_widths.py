@@ -1,8 +1,10 @@
-"""A density like the posterior of a real camera, whose noise has widths that are parameters themselves.
+"""A density like the posterior of a real camera, whose noise has widths that are parameters
+themselves.
 
-The widths come from a mixture. Given the widths, the model is nearly a weighted least-squares fit, so that all other
-parameters are nearly normal, with a mean and a covariance that follow from the widths. A normal density or a mixture
-of all parameters together cannot follow how a wide drift makes the dark signal uncertain.
+The widths come from a mixture. Given the widths, the model is nearly a weighted least-squares fit,
+so that all other parameters are nearly normal, with a mean and a covariance that follow from the
+widths. A normal density or a mixture of all parameters together cannot follow how a wide drift
+makes the dark signal uncertain.
 """
 
 from __future__ import annotations
@@ -20,20 +22,26 @@ if TYPE_CHECKING:
     from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
 _TAIL = 20.0  #: degrees of freedom of the other parameters, given the widths
-_NONE, _MORE = -20.0, 5.0  #: changes of the logarithm of a width, so that it counts for nothing, or for all
+#: changes of the logarithm of a width, so that it counts for nothing, or for all
+_NONE, _MORE = -20.0, 5.0
 _FARTHEST = 60.0  #: largest logarithm of a ratio of variances, so that a precision stays a number
 
 
 class GivenWidths:
-    """The distribution of all other parameters of a camera given the widths of its noise, linear about the mode."""
+    """The distribution of all other parameters of a camera given the widths of its noise, linear
+    about the mode.
+    """
 
     def __init__(self, problem: SensorPosterior, mode: LaplaceFit) -> None:
         self.theta = mode.theta
-        self.at = np.array([name in problem.coordinates.widths for name in problem.names])  #: (free,) True for a width
+        #: (free,) True for a width
+        self.at = np.array([name in problem.coordinates.widths for name in problem.names])
         middle = problem.whitened(mode.theta[None])[0]
         steps = problem.whitened(mode.theta + np.eye(len(mode.theta))) - middle
-        self.middle = middle[~self.at]  #: (other,) the mode in standard deviations of the prior, from its middle
-        self.unit = 1 / steps.diagonal()[~self.at]  #: (other,) coordinates of one standard deviation of the prior
+        #: (other,) the mode in standard deviations of the prior, from its middle
+        self.middle = middle[~self.at]
+        #: (other,) coordinates of one standard deviation of the prior
+        self.unit = 1 / steps.diagonal()[~self.at]
         away, _ = _parts(problem.likelihood(mode.theta[None]).scaled.numpy())
         slopes = _parts(mode.scaled_slopes.T)[0].T[:, ~self.at]
         self._pull = slopes * away[0][:, None]
@@ -41,13 +49,17 @@ class GivenWidths:
         self._squares = (slopes[:, :, None] * slopes[:, None]).reshape(len(slopes), -1)
 
     def law(self, widths: FloatArray) -> Law:
-        """Return mean (draw, other) and root of the precision (draw, other, other), in units of the prior."""
+        """Return mean (draw, other) and root of the precision (draw, other, other), in units of
+        the prior.
+        """
         slope, precision = self.information(widths)
         step: FloatArray = np.linalg.solve(precision, slope[..., None])[..., 0].astype(np.float64)
         return step, np.linalg.cholesky(precision).astype(np.float64)
 
     def information(self, widths: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return slope (draw, other) of the log density at the mode, and precision (draw, other, other)."""
+        """Return slope (draw, other) of the log density at the mode, and precision (draw, other,
+        other).
+        """
         squares = np.exp((2 * (widths - self.theta[self.at])).clip(-_FARTHEST, _FARTHEST))
         weight = 1 / (self._noise + squares @ self._shares)
         others = self._pull.shape[1]
@@ -55,7 +67,8 @@ class GivenWidths:
         return -(weight @ self._pull + self.middle), precision
 
     def _variances(self, problem: SensorPosterior) -> tuple[FloatArray, FloatArray]:
-        """Return the part of the variance of each residual that no width adds, and the part (width, residual) of each.
+        """Return the part of the variance of each residual that no width adds, and the part (width,
+        residual) of each.
 
         The variance is that at the mode, 1, and is linear in the square of each width.
         """
@@ -77,21 +90,31 @@ class GivenWidths:
         return samples
 
     def log_density(self, samples: FloatArray, law: Law) -> FloatArray:
-        """Return the log density of the other parameters at ``samples`` given the widths, up to a constant."""
+        """Return the log density of the other parameters at ``samples`` given the widths, up to
+        a constant.
+        """
         step, root = law
         away = (samples[:, ~self.at] - self.theta[~self.at]) / self.unit - step
         return student_density(away, root) - float(np.log(np.abs(self.unit)).sum())
 
 
 def draw_student(root: FloatArray, rng: Random) -> FloatArray:
-    """Return distances (draw, other) from the mean, with the ``root`` (draw, other, other) of their precision."""
-    normal = rng.standard_normal(root.shape[:2]) / np.sqrt(rng.chisquare(_TAIL, (len(root), 1)) / _TAIL)
-    away: FloatArray = np.linalg.solve(np.swapaxes(root, 1, 2), normal[..., None])[..., 0].astype(np.float64)
+    """Return distances (draw, other) from the mean, with the ``root`` (draw, other, other) of
+    their precision.
+    """
+    normal = rng.standard_normal(root.shape[:2]) / np.sqrt(
+        rng.chisquare(_TAIL, (len(root), 1)) / _TAIL
+    )
+    away: FloatArray = np.linalg.solve(np.swapaxes(root, 1, 2), normal[..., None])[..., 0].astype(
+        np.float64
+    )
     return away
 
 
 def student_density(away: FloatArray, root: FloatArray) -> FloatArray:
-    """Return the log density at distances from the mean, up to the constant that `Mixture` leaves out too."""
+    """Return the log density at distances from the mean, up to the constant that `Mixture`
+    leaves out too.
+    """
     half, others = 0.5 * _TAIL, away.shape[1]
     square = (np.einsum("nij,ni->nj", root, away) ** 2).sum(1)
     level = math.lgamma(half + 0.5 * others) - math.lgamma(half) - 0.5 * others * math.log(_TAIL)
@@ -101,6 +124,8 @@ def student_density(away: FloatArray, root: FloatArray) -> FloatArray:
 
 
 def _parts(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (..., residual) and logarithms of their widths from the rows of the likelihood of a camera."""
+    """Return residuals (..., residual) and logarithms of their widths from the rows of the
+    likelihood of a camera.
+    """
     variance, narrow, mean, width = np.split(rows, 4, axis=-1)
     return np.concatenate([variance, mean], -1), np.concatenate([narrow, width], -1)

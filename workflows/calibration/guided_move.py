@@ -1,4 +1,6 @@
-"""A move of walkers that also proposes places from a density like the posterior, whatever the walkers' own places."""
+"""A move of walkers that also proposes places from a density like the posterior, whatever the
+walkers' own places.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +18,11 @@ _SHARE = 0.8  #: of the proposals that come from the density
 
 
 class GuidedMove:
-    """A move of emcee that proposes some of the new places from a density, by which walkers also change modes.
+    """A move of emcee that proposes some of the new places from a density, by which walkers also
+    change modes.
 
-    Each proposal has the factor of Metropolis and Hastings, so that the chains have the posterior as their limit,
-    however well or badly the density agrees with it.
+    Each proposal has the factor of Metropolis and Hastings, so that the chains have the posterior
+    as their limit, however well or badly the density agrees with it.
     """
 
     def __init__(self, move: Any, density: Density) -> None:
@@ -33,7 +36,9 @@ class GuidedMove:
     def get_proposal(
         self, own: FloatArray, others: Sequence[FloatArray], random: np.random.RandomState
     ) -> tuple[FloatArray, FloatArray]:
-        """Return proposed places (walker, free), and the logarithm of the factor of each in its acceptance."""
+        """Return proposed places (walker, free), and the logarithm of the factor of each in its
+        acceptance.
+        """
         proposed, factors = self.move.get_proposal(own, others, random)
         drawn, ratio = self.density.propose(own, random)
         guided = random.random_sample(len(own)) < _SHARE

@@ -1,4 +1,6 @@
-"""Importance sampling of a posterior, with a proposal density that is fitted to the posterior in several rounds."""
+"""Importance sampling of a posterior, with a proposal density that is fitted to the posterior in
+several rounds.
+"""
 
 from __future__ import annotations
 
@@ -19,22 +21,31 @@ _LEAST = 0.02  #: least effective sample fraction
 
 
 class Guide(NamedTuple):
-    """A density like a posterior, and importance samples of the posterior that are drawn from it."""
+    """A density like a posterior, and importance samples of the posterior that are drawn from
+    it.
+    """
 
     density: Density
     samples: FloatArray  #: (draw, free)
     log: FloatArray  #: (draw,) logarithm of posterior density over this density
 
     def starts(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Return ``count`` different samples, drawn by their weights, at which walkers can start."""
+        """Return ``count`` different samples, drawn by their weights, at which walkers can
+        start.
+        """
         weight = weights(self.log)
-        chosen = rng.choice(len(weight), size=count, p=weight, replace=int((weight > 0).sum()) < count)
+        chosen = rng.choice(
+            len(weight), size=count, p=weight, replace=int((weight > 0).sum()) < count
+        )
         starts: FloatArray = self.samples[chosen]
         return starts
 
 
-def draw_samples(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Return importance samples, and for each sample the logarithm of posterior density over proposal density.
+def draw_samples(
+    problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return importance samples, and for each sample the logarithm of posterior density over
+    proposal density.
 
     Raises: `ValueError` if the effective sample size stays too small.
     """
@@ -45,7 +56,8 @@ def draw_samples(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Gene
 def draw_guide(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator) -> Guide:
     """Return a density like the posterior, and importance samples from it.
 
-    The density starts at the mode; where the posterior may be long and bent, at particles that come from the prior.
+    The density starts at the mode; where the posterior may be long and bent, at particles that come
+    from the prior.
     Raises: `ValueError` if the effective sample size stays too small.
     """
     fit = fit_mixture if problem.coordinates.bent else fit_about_mode
@@ -57,8 +69,9 @@ def draw_guide(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Genera
 def _refuse_few(problem: SensorPosterior, fraction: float) -> None:
     if fraction < _LEAST:
         raise ValueError(
-            f"{DRAWS} draws of {', '.join(problem.names)} have an effective sample size of {fraction * DRAWS:.0f}: "
-            "hold the parameters that the levels do not determine at fixed values"
+            f"{DRAWS} draws of {', '.join(problem.names)} have an effective sample size of"
+            f" {fraction * DRAWS:.0f}: hold the parameters that the levels do not determine at"
+            " fixed values"
         )
 
 

@@ -10,7 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neusee.nodes.calibrate import CameraCoordinates, Coordinates, Likelihood, Rings, ScatterCoordinates, Sufficient
+from neusee.nodes.calibrate import (
+    CameraCoordinates,
+    Coordinates,
+    Likelihood,
+    Rings,
+    ScatterCoordinates,
+    Sufficient,
+)
 from neusee.nodes.values import Levels
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.local_executor import one_thread
@@ -24,9 +31,12 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-_Function = Callable[[Mapping[str, Any]], dict[str, Any]]  #: from parameters to the likelihood by step name
+#: from parameters to the likelihood by step name
+_Function = Callable[[Mapping[str, Any]], dict[str, Any]]
 #: from the node of the likelihood to the node of the prior and the class of the coordinates
-_KINDS: dict[str, tuple[str, type[Coordinates] | type[CameraCoordinates] | type[ScatterCoordinates]]] = {
+_KINDS: dict[
+    str, tuple[str, type[Coordinates] | type[CameraCoordinates] | type[ScatterCoordinates]]
+] = {
     "calibrate.density": ("calibrate.prior", Coordinates),
     "calibrate.camera": ("calibrate.camera_prior", CameraCoordinates),
     "calibrate.stray_light": ("calibrate.stray_prior", ScatterCoordinates),
@@ -35,7 +45,9 @@ _KINDS: dict[str, tuple[str, type[Coordinates] | type[CameraCoordinates] | type[
 
 @dataclass(frozen=True)
 class SensorPosterior:
-    """The posterior of the sensor of a recipe; a sample has one coordinate for each free parameter."""
+    """The posterior of the sensor of a recipe; a sample has one coordinate for each free
+    parameter.
+    """
 
     recipe: Recipe
     step: str  #: name of the step that computes the likelihood
@@ -44,11 +56,14 @@ class SensorPosterior:
     levels: Sufficient | Levels | Rings  #: the data that the likelihood describes
     weigh: _Function
     weigh_in_full: _Function  #: also returns deviances and derivatives
-    measured: Levels | None = None  #: the statistics of all frames, from which `levels` follow; None for a lens
+    #: the statistics of all frames, from which `levels` follow; None for a lens
+    measured: Levels | None = None
 
     @classmethod
     def of(cls, recipe: Recipe, store: Store) -> SensorPosterior:
-        """Return the posterior of a recipe; raise `ValueError` unless the recipe has one likelihood and one prior."""
+        """Return the posterior of a recipe; raise `ValueError` unless the recipe has one
+        likelihood and one prior.
+        """
         density = only_step(recipe, *_KINDS)
         prior_node, kind = _KINDS[density.node.path]
         prior = only_step(recipe, prior_node)
@@ -71,7 +86,16 @@ class SensorPosterior:
 
         key = digest(*(done.keys[step.name] for step in (density, prior)))
         measured = done[whole] if isinstance(done[whole], Levels) else None
-        return cls(recipe, density.name, key, coordinates, done[source], function(quick), function(density), measured)
+        return cls(
+            recipe,
+            density.name,
+            key,
+            coordinates,
+            done[source],
+            function(quick),
+            function(density),
+            measured,
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -79,7 +103,9 @@ class SensorPosterior:
         return self.coordinates.names
 
     def parameters(self, samples: FloatArray) -> dict[str, Tensor]:
-        """Convert sampler coordinates (..., free parameter) to parameter values by name, each of shape (...)."""
+        """Convert sampler coordinates (..., free parameter) to parameter values by name, each of
+        shape (...).
+        """
         return self.coordinates.parameters(torch.from_numpy(np.ascontiguousarray(samples)))
 
     def theta(self, parameters: Mapping[str, float | Tensor]) -> FloatArray:
@@ -88,21 +114,33 @@ class SensorPosterior:
         return coordinates
 
     def likelihood(self, samples: FloatArray) -> Likelihood:
-        """Return the likelihood of the measured light levels at samples (walker, free parameter)."""
+        """Return the likelihood of the measured light levels at samples (walker, free
+        parameter).
+        """
         with torch.no_grad(), one_thread():
-            likelihood: Likelihood = self.weigh_in_full(self._named(self.parameters(samples)))[self.step]
+            likelihood: Likelihood = self.weigh_in_full(self._named(self.parameters(samples)))[
+                self.step
+            ]
         return likelihood
 
     def log_posterior(self, samples: FloatArray) -> FloatArray:
-        """Return the log posterior density at samples (walker, free parameter), up to a constant."""
+        """Return the log posterior density at samples (walker, free parameter), up to a
+        constant.
+        """
         with torch.no_grad(), one_thread():
             parameters = self.parameters(samples)
-            total = self.weigh(self._named(parameters))[self.step].log + self.coordinates.log_prior(parameters)
-        log: FloatArray = total.nan_to_num(nan=-torch.inf, posinf=-torch.inf, neginf=-torch.inf).numpy()
+            total = self.weigh(self._named(parameters))[self.step].log + self.coordinates.log_prior(
+                parameters
+            )
+        log: FloatArray = total.nan_to_num(
+            nan=-torch.inf, posinf=-torch.inf, neginf=-torch.inf
+        ).numpy()
         return log
 
     def whitened(self, samples: FloatArray) -> FloatArray:
-        """Convert samples to distances from the middle of the prior, in standard deviations of the prior."""
+        """Convert samples to distances from the middle of the prior, in standard deviations of
+        the prior.
+        """
         whitened: FloatArray = self.coordinates.whitened(self.parameters(samples)).numpy()
         return whitened
 
@@ -111,13 +149,16 @@ class SensorPosterior:
 
 
 def only_step(recipe: Recipe, *paths: str) -> Step:
-    """Return the only step whose node is in ``paths``; raise `ValueError` if there is no such step or more than one."""
+    """Return the only step whose node is in ``paths``; raise `ValueError` if there is no such
+    step or more than one.
+    """
     steps = [step for step in recipe.steps.values() if step.node.path in paths]
     if len(steps) != 1:
         count = f"{len(steps)} steps" if steps else "no step"
         names = " or ".join(filter(None, (", ".join(paths[:-1]), paths[-1])))
         raise ValueError(
-            f"{recipe.name} has {count} of the node {names}, but a calibration needs exactly one: see "
-            "`neusee run calibrate`, `neusee run calibrate_camera` and `neusee run calibrate_stray_light`"
+            f"{recipe.name} has {count} of the node {names}, but a calibration needs exactly one:"
+            " see `neusee run calibrate`, `neusee run calibrate_camera` and `neusee run"
+            " calibrate_stray_light`"
         )
     return steps[0]

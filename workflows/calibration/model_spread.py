@@ -1,4 +1,6 @@
-"""Parameter intervals for a camera of unknown response, from posteriors with several models of the response."""
+"""Parameter intervals for a camera of unknown response, from posteriors with several models of
+the response.
+"""
 
 from __future__ import annotations
 
@@ -33,10 +35,13 @@ class IntervalEstimate:
 
 @dataclass(frozen=True)
 class ModelSpread:
-    """The posterior of one parameter with each model of the camera's response, and the interval to report."""
+    """The posterior of one parameter with each model of the camera's response, and the interval
+    to report.
+    """
 
     name: str
-    models: tuple[IntervalEstimate, ...]  #: the posterior with 0, 1, 2 terms of the response, as far as they are free
+    #: the posterior with 0, 1, 2 terms of the response, as far as they are free
+    models: tuple[IntervalEstimate, ...]
     stated: IntervalEstimate
 
 
@@ -44,24 +49,30 @@ _Posterior = dict[str, tuple[float, float]]  #: mean and standard deviation of e
 
 
 def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpread]:
-    """Return the posterior with each model of the camera's response and the interval to report, for each parameter.
+    """Return the posterior with each model of the camera's response and the interval to report, for
+    each parameter.
 
-    The stated value is the mean of the two models with the most terms. The stated width is the standard deviation of
-    this mean (`width_of_mean`) and half the distance of both values, added in quadrature.
+    The stated value is the mean of the two models with the most terms. The stated width is the
+    standard deviation of this mean (`width_of_mean`) and half the distance of both values, added in
+    quadrature.
 
-    One model is not enough. For 36 simulated cameras a response with 1 million pixels a level, cubic by 5 % at 4095 DN,
-    the 90 % interval of two terms contained the true gain in 44 % of all cases. Models weighted by their probability at
-    the mode were no better, because the best of several wrong models takes all weight. For a power of 6 the share was
-    81 %. Half the distance of all three models contained the true gain in 94 % and more, but with twice the standard
-    deviation (1.7 % to 1.0 %; for a linear bend 1.1 % to 0.24 %), because the straight line counts although the levels
-    have refuted it. The mean of two models contained the true gain in 94 % and more, for a linear camera too.
+    One model is not enough. For 36 simulated cameras a response with 1 million pixels a level,
+    cubic by 5 % at 4095 DN, the 90 % interval of two terms contained the true gain in 44 % of all
+    cases. Models weighted by their probability at the mode were no better, because the best of
+    several wrong models takes all weight. For a power of 6 the share was 81 %. Half the distance of
+    all three models contained the true gain in 94 % and more, but with twice the standard deviation
+    (1.7 % to 1.0 %; for a linear bend 1.1 % to 0.24 %), because the straight line counts although
+    the levels have refuted it. The mean of two models contained the true gain in 94 % and more, for
+    a linear camera too.
 
-    Raises: `ValueError` if there are too few levels, no mode is found, or the effective sample size is too small.
+    Raises: `ValueError` if there are too few levels, no mode is found, or the effective sample size
+            is too small.
     """
     full = SensorPosterior.of(recipe, store)
     if not isinstance(full.levels, Levels):
         raise ValueError(
-            f"the likelihood of {recipe.name} assumes identical pixels: use the node calibrate.camera instead"
+            f"the likelihood of {recipe.name} assumes identical pixels: use the node"
+            " calibrate.camera instead"
         )
     terms = [name for name in TERMS if name in full.names]
     _check_levels(full, full.levels, terms)
@@ -73,23 +84,26 @@ def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpr
 
 
 def _check_levels(problem: SensorPosterior, levels: Levels, terms: list[str]) -> None:
-    """Raise `ValueError` if too few lit levels exist to tell the non-linear response ``terms`` from lamp drift.
+    """Raise `ValueError` if too few lit levels exist to tell the non-linear response ``terms`` from
+    lamp drift.
 
-    For 60 simulated cameras and two terms, 90 % intervals contained the truth in 93 % with 4 lit levels, and in
-    58 % with 2 lit levels.
+    For 60 simulated cameras and two terms, 90 % intervals contained the truth in 93 % with 4 lit
+    levels, and in 58 % with 2 lit levels.
     """
     used = problem.likelihood(initial_theta(problem)[None]).degrees_of_freedom > 0
     lit = len(set(levels.photons[used & (levels.photons > 0)].tolist()))
     if lit < len(terms) + 2:
         raise ValueError(
-            f"{lit} lit levels do not separate a response of {len(terms)} terms from a drifting lamp: "
-            f"give {len(terms) + 2} or more levels of different light below saturation, or "
-            f"fix {' and '.join(terms[max(0, lit - 2) :])} at 0"
+            f"{lit} lit levels do not separate a response of {len(terms)} terms from a drifting"
+            f" lamp: give {len(terms) + 2} or more levels of different light below saturation, or"
+            f" fix {' and '.join(terms[max(0, lit - 2) :])} at 0"
         )
 
 
 def _without(recipe: Recipe, weighing: str, terms: list[str]) -> Recipe:
-    """Return the recipe with the response ``terms`` fixed at zero in the prior and the likelihood step ``weighing``."""
+    """Return the recipe with the response ``terms`` fixed at zero in the prior and the
+    likelihood step ``weighing``.
+    """
     steps = dict(recipe.steps)
     for name, step in steps.items():
         if step.node.path == "calibrate.camera_prior":
@@ -102,7 +116,9 @@ def _without(recipe: Recipe, weighing: str, terms: list[str]) -> Recipe:
 def _posterior(problem: SensorPosterior, rng: np.random.Generator) -> _Posterior:
     mode = search_mode(problem)
     if not mode.settled:
-        raise ValueError(f"no posterior mode of {', '.join(problem.names)} was found: give narrower priors")
+        raise ValueError(
+            f"no posterior mode of {', '.join(problem.names)} was found: give narrower priors"
+        )
     samples, log = draw_samples(problem, mode, rng)
     weight = weights(log)
     centre = weight @ samples
@@ -115,16 +131,20 @@ def _spread(name: str, problem: SensorPosterior, posteriors: list[_Posterior]) -
     models = [posterior[name] for posterior in posteriors]
     (low, narrow), (high, wide) = models[-2:] if len(models) > 1 else models * 2
     middle, width = 0.5 * (low + high), math.hypot(width_of_mean(narrow, wide), 0.5 * (high - low))
-    return ModelSpread(name, tuple(_interval(*model, linear) for model in models), _interval(middle, width, linear))
+    return ModelSpread(
+        name, tuple(_interval(*model, linear) for model in models), _interval(middle, width, linear)
+    )
 
 
 def width_of_mean(fewer: float, more: float) -> float:
-    """Return the standard deviation of the mean of the values that two nested models give for the same levels.
+    """Return the standard deviation of the mean of the values that two nested models give for the
+    same levels.
 
-    ``fewer`` and ``more`` are the widths of the posteriors with fewer and with more terms. An efficient estimate and
-    its difference to any other unbiased estimate of the same data are independent, so that the difference has the
-    variance more^2 - fewer^2, and the mean has fewer^2 and a quarter of that. The wider posterior alone was too wide:
-    for 24 simulated cameras the errors of the gain scatter by 0.68 of it, and by 0.82 of what is stated now.
+    ``fewer`` and ``more`` are the widths of the posteriors with fewer and with more terms. An
+    efficient estimate and its difference to any other unbiased estimate of the same data are
+    independent, so that the difference has the variance more^2 - fewer^2, and the mean has fewer^2
+    and a quarter of that. The wider posterior alone was too wide: for 24 simulated cameras the
+    errors of the gain scatter by 0.68 of it, and by 0.82 of what is stated now.
 
     Source: Hausman, Econometrica 46, 1251 (1978), for the variance of the difference.
     """

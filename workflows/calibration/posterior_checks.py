@@ -1,4 +1,6 @@
-"""Statistical checks of a posterior: chains, mode, importance sampling, and fit of the model to the levels."""
+"""Statistical checks of a posterior: chains, mode, importance sampling, and fit of the model to
+the levels.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +28,10 @@ _NEVER = -1e6  #: log weight of an impossible sample
 _RHAT, _INDEPENDENT, _ACCEPTED = 1.01, 1000.0, (0.1, 0.7)
 _TAIL, _SD, _MEAN, _BELOW = 0.5, 0.05, 0.1, 2.0
 _WEIGHTED = 0.1  #: least effective share of weighted draws
-_SLOW, _SMOOTH = 8, 5e-3  #: slowest waves over the rings, and probability below which chance does not explain them
-_SURPRISE = 3.5  #: standard deviations of its prior by which a mean may lie from the middle of the prior
+#: slowest waves over the rings, and probability below which chance does not explain them
+_SLOW, _SMOOTH = 8, 5e-3
+#: standard deviations of its prior by which a mean may lie from the middle of the prior
+_SURPRISE = 3.5
 _LUCK = 4.0  #: standard errors by which the widths of two samples may differ
 
 
@@ -43,7 +47,9 @@ class Check:
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """The deviance of all light levels, and the probability that chance alone gives a deviance at least as large."""
+    """The deviance of all light levels, and the probability that chance alone gives a deviance
+    at least as large.
+    """
 
     deviance: float
     freedom: float  #: degrees of freedom
@@ -75,20 +81,26 @@ class ImportanceSamples:
         return sd
 
     def doubt(self, like: FloatArray) -> FloatArray:
-        """Return the relative standard error of each standard deviation, with the kurtosis of the draws ``like``."""
+        """Return the relative standard error of each standard deviation, with the kurtosis of
+        the draws ``like``.
+        """
         z = (like - like.mean(0)) / like.std(0)
         error: FloatArray = np.sqrt(((z**4).mean(0) - 1) * (self.weights**2).sum() / 4)
         return error
 
 
 def arviz() -> Any:
-    """Import and return ArviZ; raise `ImportError` with the command that installs ArviZ if the import fails."""
+    """Import and return ArviZ; raise `ImportError` with the command that installs ArviZ if the
+    import fails.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # ArviZ warns of its next version
             import arviz as library
     except ImportError:
-        raise ImportError('calibration needs arviz and h5py: pip install "neusee[calibrate]"') from None
+        raise ImportError(
+            'calibration needs arviz and h5py: pip install "neusee[calibrate]"'
+        ) from None
     return library
 
 
@@ -103,10 +115,19 @@ def importance_samples(problem: SensorPosterior, mode: LaplaceFit, seed: int) ->
 
 
 def checks(
-    problem: SensorPosterior, mode: LaplaceFit, identifiability: Identifiability, chains: Chains, law: ImportanceSamples
+    problem: SensorPosterior,
+    mode: LaplaceFit,
+    identifiability: Identifiability,
+    chains: Chains,
+    law: ImportanceSamples,
 ) -> list[Check]:
-    """Run all checks of a posterior and return the results; if a check fails, the posterior is not fit for use."""
-    peak, data = _of_peak(problem, mode, identifiability, chains, law), _of_data(problem, mode, identifiability, law)
+    """Run all checks of a posterior and return the results; if a check fails, the posterior is
+    not fit for use.
+    """
+    peak, data = (
+        _of_peak(problem, mode, identifiability, chains, law),
+        _of_data(problem, mode, identifiability, law),
+    )
     return [*_of_chains(chains), *peak, *data]
 
 
@@ -123,35 +144,71 @@ def _of_chains(chains: Chains) -> Iterator[Check]:
     coordinates = np.moveaxis(chains.draws, -1, 0)
     rhat = max(map(_rhat, coordinates))
     yield Check("ensembles agree", f"R-hat {rhat:.4f}", f"at most {_RHAT}", _mark(rhat <= _RHAT))
-    bulk, tail = (min(_effective_sample_size(draws, part) for draws in coordinates) for part in ("bulk", "tail"))
-    size, enough = f"effective sample size {bulk:.0f}, {tail:.0f} in the tails", min(bulk, tail) >= _INDEPENDENT
-    yield Check("draws are numerous enough", size, f"each at least {_INDEPENDENT:.0f} draws", _mark(enough))
+    bulk, tail = (
+        min(_effective_sample_size(draws, part) for draws in coordinates)
+        for part in ("bulk", "tail")
+    )
+    size, enough = (
+        f"effective sample size {bulk:.0f}, {tail:.0f} in the tails",
+        min(bulk, tail) >= _INDEPENDENT,
+    )
+    yield Check(
+        "draws are numerous enough", size, f"each at least {_INDEPENDENT:.0f} draws", _mark(enough)
+    )
     low, high = _ACCEPTED
     well = low <= chains.accepted <= high
     yield Check(
-        "moves are accepted", f"{chains.accepted:.0%} of the moves", f"{low:.0%} to {high:.0%}", _mark(well, "warn")
+        "moves are accepted",
+        f"{chains.accepted:.0%} of the moves",
+        f"{low:.0%} to {high:.0%}",
+        _mark(well, "warn"),
     )
-    lost = emcee_sampler.stranded(chains.log)  # R-hat cannot see stranded walkers that all ensembles have
-    text = f"{lost} of {chains.log.shape[0] * chains.log.shape[2]} lie {emcee_sampler.STRANDED:.0f} nats below the rest"
+    # R-hat cannot see stranded walkers that all ensembles have
+    lost = emcee_sampler.stranded(chains.log)
+    text = (
+        f"{lost} of {chains.log.shape[0] * chains.log.shape[2]} lie {emcee_sampler.STRANDED:.0f}"
+        " nats below the rest"
+    )
     yield Check("no walker is stranded", text, "none", _mark(lost == 0))
 
 
 def _of_peak(
-    problem: SensorPosterior, mode: LaplaceFit, identifiability: Identifiability, chains: Chains, law: ImportanceSamples
+    problem: SensorPosterior,
+    mode: LaplaceFit,
+    identifiability: Identifiability,
+    chains: Chains,
+    law: ImportanceSamples,
 ) -> Iterator[Check]:
     search = "settled" if mode.settled else "the search stopped"
     yield Check("the search found the mode", search, "settled", _mark(mode.settled))
     below = mode.log - float(chains.log.max())
     distance = f"{abs(below):.2g} nats {'below' if below > 0 else 'above'} the mode"
-    yield Check("the best draw is near the mode", distance, f"within {_BELOW:.0f} nats", _mark(abs(below) <= _BELOW))
+    yield Check(
+        "the best draw is near the mode",
+        distance,
+        f"within {_BELOW:.0f} nats",
+        _mark(abs(below) <= _BELOW),
+    )
     bent = problem.coordinates.bent
-    at = [i for i, name in enumerate(problem.names) if bent or identifiability.kinds[name] == "estimate"]
+    at = [
+        i
+        for i, name in enumerate(problem.names)
+        if bent or identifiability.kinds[name] == "estimate"
+    ]
     if not at:
         return
     if bent:
         size = 1 / float((law.weights**2).sum())
-        text, least = f"effective sample size {size:.0f} of {len(law.weights)}", _WEIGHTED * len(law.weights)
-        yield Check("weighted draws are numerous enough", text, f"at least {least:.0f}", _mark(size >= least, "warn"))
+        text, least = (
+            f"effective sample size {size:.0f} of {len(law.weights)}",
+            _WEIGHTED * len(law.weights),
+        )
+        yield Check(
+            "weighted draws are numerous enough",
+            text,
+            f"at least {least:.0f}",
+            _mark(size >= least, "warn"),
+        )
     sd, mean = law.sd()[at], law.mean()[at]
     flat = chains.flat[:, at]
     apart, off = np.abs(flat.std(0) / sd - 1), np.max(np.abs(flat.mean(0) - mean) / sd)
@@ -161,18 +218,31 @@ def _of_peak(
     bar = f"{allowed[worst]:.0%} and {_MEAN} sd, where k-hat is below {_TAIL}"
     agrees = bool((apart <= allowed).all()) and off <= _MEAN
     yield Check(
-        "importance sampling agrees with the chains", text, bar, _mark(agrees, "fail" if law.tail < _TAIL else "warn")
+        "importance sampling agrees with the chains",
+        text,
+        bar,
+        _mark(agrees, "fail" if law.tail < _TAIL else "warn"),
     )
 
 
 def _of_data(
-    problem: SensorPosterior, mode: LaplaceFit, identifiability: Identifiability, law: ImportanceSamples
+    problem: SensorPosterior,
+    mode: LaplaceFit,
+    identifiability: Identifiability,
+    law: ImportanceSamples,
 ) -> Iterator[Check]:
     look = problem.likelihood(mode.theta[None])
     if float(look.degrees_of_freedom.sum()) > len(identifiability.estimated):
         fit = goodness_of_fit(look, len(identifiability.estimated))
-        text = f"deviance {fit.deviance:.1f} of {fit.freedom:.0f} degrees of freedom, p = {fit.p:.2g}"
-        yield Check("the model of the sensor fits the levels", text, f"a p-value above {MISFIT}", _mark(fit.good))
+        text = (
+            f"deviance {fit.deviance:.1f} of {fit.freedom:.0f} degrees of freedom, p = {fit.p:.2g}"
+        )
+        yield Check(
+            "the model of the sensor fits the levels",
+            text,
+            f"a p-value above {MISFIT}",
+            _mark(fit.good),
+        )
     if is_camera(problem):
         for found in misfits(problem, law.samples, law.weights, mode.theta):
             yield Check(found.name, found.found, found.bar, _mark(found.good))
@@ -202,18 +272,22 @@ def _of_rings(problem: SensorPosterior, law: ImportanceSamples, guide: Guide) ->
     )
     middle = law.weights @ problem.whitened(guide.samples)
     worst = int(np.abs(middle).argmax())
-    text = f"{problem.names[worst].replace('_', ' ')} {middle[worst]:+.1f} sd of its prior from the middle"
+    text = (
+        f"{problem.names[worst].replace('_', ' ')} {middle[worst]:+.1f} sd of its prior from the"
+        " middle"
+    )
     surprised = abs(float(middle[worst])) > _SURPRISE
     bar = f"each mean within {_SURPRISE} sd; else prior and picture contradict each other"
     yield Check("the priors agree with the picture", text, bar, _mark(not surprised, "warn"))
 
 
 def slow_waves(deviation: FloatArray) -> tuple[float, float]:
-    """Return the strength of slow waves in the deviations of rings, and the probability that chance alone gives it.
+    """Return the strength of slow waves in the deviations of rings, and the probability that chance
+    alone gives it.
 
-    ``deviation`` (ring,) is in standard deviations. A wrong model deviates over many rings in one direction, even
-    where the relative scatter of the rings is free and takes up all that the model lacks. The strength is the sum of
-    squares of the slowest components of a cosine transform.
+    ``deviation`` (ring,) is in standard deviations. A wrong model deviates over many rings in one
+    direction, even where the relative scatter of the rings is free and takes up all that the model
+    lacks. The strength is the sum of squares of the slowest components of a cosine transform.
     """
     from scipy.fft import dct
     from scipy.special import chdtrc
@@ -223,20 +297,33 @@ def slow_waves(deviation: FloatArray) -> tuple[float, float]:
 
 
 def goodness_of_fit(likelihood: Likelihood, free: int = 0) -> GoodnessOfFit:
-    """Return the goodness of fit of one sensor with ``free`` parameters that were fitted to the same light levels.
+    """Return the goodness of fit of one sensor with ``free`` parameters that were fitted to the
+    same light levels.
 
-    Raises: `ValueError` for a likelihood without deviances, for several sensors, and for no degree of freedom.
+    Raises: `ValueError` for a likelihood without deviances, for several sensors, and for no degree
+            of freedom.
     """
     from scipy.special import chdtrc
 
     if not len(likelihood.degrees_of_freedom):
-        raise ValueError("the likelihood has no deviances: set told: true in the step of the likelihood")
+        raise ValueError(
+            "the likelihood has no deviances: set told: true in the step of the likelihood"
+        )
     if likelihood.deviance.numel() != len(likelihood.degrees_of_freedom):
         shape = tuple(likelihood.deviance.shape)
-        raise ValueError(f"deviances of shape {shape} belong to several sensors: compute the likelihood of one sensor")
-    deviance, freedom = float(likelihood.deviance.sum()), float(likelihood.degrees_of_freedom.sum()) - free
+        raise ValueError(
+            f"deviances of shape {shape} belong to several sensors: compute the likelihood of one"
+            " sensor"
+        )
+    deviance, freedom = (
+        float(likelihood.deviance.sum()),
+        float(likelihood.degrees_of_freedom.sum()) - free,
+    )
     if freedom <= 0:
-        raise ValueError(f"{freedom + free:.0f} measured numbers cannot test {free} free parameters: give more levels")
+        raise ValueError(
+            f"{freedom + free:.0f} measured numbers cannot test {free} free parameters: give more"
+            " levels"
+        )
     return GoodnessOfFit(deviance, freedom, float(chdtrc(freedom, deviance)))
 
 
@@ -245,12 +332,16 @@ def _mark(good: bool, else_: Mark = "fail") -> Mark:
 
 
 def _rhat(draws: FloatArray) -> float:
-    """Return R-hat of draws (ensemble, step, walker); an ensemble is one chain, because its walkers are correlated."""
+    """Return R-hat of draws (ensemble, step, walker); an ensemble is one chain, because its
+    walkers are correlated.
+    """
     return float(arviz().rhat(draws.reshape(len(draws), -1)))
 
 
 def _effective_sample_size(draws: FloatArray, part: str) -> float:
-    """Return the effective sample size of draws (ensemble, step, walker) in the ``bulk`` or in the ``tail``."""
+    """Return the effective sample size of draws (ensemble, step, walker) in the ``bulk`` or in
+    the ``tail``.
+    """
     chains = draws.transpose(0, 2, 1).reshape(-1, draws.shape[1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # short chains fail by their effective sample size

@@ -18,7 +18,8 @@ _PARTICLES, _BESIDE = 1000, 200  #: particles, and draws about the mode
 _FAR = 40.0  #: nats below the best point at which a particle is lost in a mode that does not count
 _PARTS = 14  #: components that are fitted
 _TAIL = 6.0  #: degrees of freedom of each component, where the mixture has no others
-_ROUNDS, _STEPS, _TRIED = 16, 8, 2000  #: most fits, steps of each fit, samples on which a fit is tried
+#: most fits, steps of each fit, samples on which a fit is tried
+_ROUNDS, _STEPS, _TRIED = 16, 8, 2000
 _SOFT, _ENOUGH = 0.3, 0.4  #: effective sample fractions: to fit the next mixture, to stop
 _BROAD, _WIDER = 0.05, 2.0  #: share and width of one broad component, which bounds the weights
 _BORROWED = 0.03  #: share of samples whose covariance in all is added to that of the components
@@ -38,7 +39,9 @@ class Density(Protocol):
         """Return the logarithm of the density at samples (draw, free), up to a constant."""
 
     def propose(self, own: FloatArray, rng: Random) -> tuple[FloatArray, FloatArray]:
-        """Return new samples like ``own`` (draw, free), and the logarithm of the density at ``own`` over that there."""
+        """Return new samples like ``own`` (draw, free), and the logarithm of the density at
+        ``own`` over that there.
+        """
 
 
 @dataclass(frozen=True)
@@ -62,15 +65,21 @@ class Mixture:
     def log_density(self, samples: FloatArray) -> FloatArray:
         """Return the logarithm of the density at samples (draw, free), up to a constant."""
         power = 0.5 * (self.tails + self.centres.shape[1])
-        return log_sum(self._levels + self._constants - power * np.log1p(self._squares(samples) / self.tails))
+        return log_sum(
+            self._levels + self._constants - power * np.log1p(self._squares(samples) / self.tails)
+        )
 
     def propose(self, own: FloatArray, rng: Random) -> tuple[FloatArray, FloatArray]:
-        """Return new samples like ``own`` (draw, free), and the logarithm of the density at ``own`` over that there."""
+        """Return new samples like ``own`` (draw, free), and the logarithm of the density at
+        ``own`` over that there.
+        """
         drawn = self.draw(len(own), rng)
         return drawn, self.log_density(own) - self.log_density(drawn)
 
     def normal_shares(self, samples: FloatArray) -> FloatArray:
-        """Return the share (draw, component) of each component in the density of normal components at samples."""
+        """Return the share (draw, component) of each component in the density of normal
+        components at samples.
+        """
         logs = self._levels - 0.5 * self._squares(samples)
         shares: FloatArray = np.exp(logs - log_sum(logs)[:, None])
         return shares
@@ -83,11 +92,15 @@ class Mixture:
 
     @cached_property
     def _constants(self) -> FloatArray:
-        """Return what the degrees of freedom of each component add to its log density at the centre."""
+        """Return what the degrees of freedom of each component add to its log density at the
+        centre.
+        """
         from scipy.special import gammaln
 
         half, free = 0.5 * np.asarray(self.tails), self.centres.shape[1]
-        constants: FloatArray = gammaln(half + 0.5 * free) - gammaln(half) - 0.5 * free * np.log(2 * half)
+        constants: FloatArray = (
+            gammaln(half + 0.5 * free) - gammaln(half) - 0.5 * free * np.log(2 * half)
+        )
         return constants
 
     @cached_property
@@ -95,7 +108,9 @@ class Mixture:
         return np.linalg.inv(self.roots).astype(np.float64)
 
     def _squares(self, samples: FloatArray) -> FloatArray:
-        """Return the squared distance (draw, component) from each centre, in widths of the component."""
+        """Return the squared distance (draw, component) from each centre, in widths of the
+        component.
+        """
         away = self._inverses @ (samples.T[None] - self.centres[:, :, None])
         squares: FloatArray = (away**2).sum(1).T
         return squares
@@ -104,12 +119,14 @@ class Mixture:
 def fit_mixture(
     problem: SensorPosterior, mode: LaplaceFit, count: int, rng: np.random.Generator
 ) -> tuple[Mixture, FloatArray, FloatArray]:
-    """Return a mixture like the posterior, samples of it (count, free), and the log of posterior over mixture of each.
+    """Return a mixture like the posterior, samples of it (count, free), and the log of posterior
+    over mixture of each.
 
-    A first mixture is fitted to particles and to draws about the mode, and stays a half of every further one, because
-    a part of the posterior that has no samples is missed without a sign in the weights. The other half is fitted to
-    weighted samples, again and again. The mixture with the largest effective sample size is kept, and new samples are
-    drawn from it, whose own effective sample size the caller must check.
+    A first mixture is fitted to particles and to draws about the mode, and stays a half of every
+    further one, because a part of the posterior that has no samples is missed without a sign in the
+    weights. The other half is fitted to weighted samples, again and again. The mixture with the
+    largest effective sample size is kept, and new samples are drawn from it, whose own effective
+    sample size the caller must check.
     """
     points = _start(problem, mode, rng)
     first = mixture = kept = _fitted(points, np.full(len(points), 1 / len(points)), rng)
@@ -128,7 +145,9 @@ def fit_mixture(
 def _joined(one: Mixture, other: Mixture) -> Mixture:
     """Return the mixture of two mixtures in equal parts."""
     shares = 0.5 * np.concatenate([one.shares, other.shares])
-    centres, roots = (np.concatenate([a, b]) for a, b in ((one.centres, other.centres), (one.roots, other.roots)))
+    centres, roots = (
+        np.concatenate([a, b]) for a, b in ((one.centres, other.centres), (one.roots, other.roots))
+    )
     return Mixture(shares, centres, roots)
 
 
@@ -141,19 +160,28 @@ def weighed(
 
 
 def _start(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator) -> FloatArray:
-    """Return particles and draws about the mode (point, free), without those that are lost far below the best."""
+    """Return particles and draws about the mode (point, free), without those that are lost far
+    below the best.
+    """
     places, logs = follow_posterior(problem, _PARTICLES, rng)
     beside = mode.draw(_BESIDE, rng)
-    places, logs = np.concatenate([places, beside]), np.concatenate([logs, problem.log_posterior(beside)])
+    places, logs = (
+        np.concatenate([places, beside]),
+        np.concatenate([logs, problem.log_posterior(beside)]),
+    )
     return places[logs > max(float(logs.max()), mode.log) - _FAR]
 
 
 def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -> Mixture:
-    """Return the mixture that expectation and maximisation find for weighted samples, and a broad component."""
+    """Return the mixture that expectation and maximisation find for weighted samples, and a
+    broad component.
+    """
     centre, whole = moments(samples, weight)
     root = np.linalg.cholesky(firm(whole))
     at = _apart(np.linalg.solve(root, (samples - centre).T).T, weight, rng)
-    found = Mixture(np.full(_PARTS, 1 / _PARTS), samples[at], np.repeat(0.5 * root[None], _PARTS, 0))
+    found = Mixture(
+        np.full(_PARTS, 1 / _PARTS), samples[at], np.repeat(0.5 * root[None], _PARTS, 0)
+    )
     for _ in range(_STEPS):
         parts = weight[:, None] * found.normal_shares(samples)
         found = maximised(samples, parts, whole)
@@ -165,7 +193,9 @@ def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -
 
 
 def _apart(places: FloatArray, weight: FloatArray, rng: np.random.Generator) -> list[int]:
-    """Return the numbers of samples to start the components from: every second one is far from those before."""
+    """Return the numbers of samples to start the components from: every second one is far from
+    those before.
+    """
     pool = rng.choice(len(places), size=4 * _PARTICLES // 10, p=weight)
     chosen, away = [int(pool[0])], ((places[pool] - places[pool[0]]) ** 2).sum(1)
     for number in range(1, _PARTS):
@@ -175,10 +205,14 @@ def _apart(places: FloatArray, weight: FloatArray, rng: np.random.Generator) -> 
     return chosen
 
 
-def maximised(samples: FloatArray, parts: FloatArray, whole: FloatArray, borrowed: float = _BORROWED) -> Mixture:
-    """Return the mixture of normal components with the moments of samples, by their shares ``parts``.
+def maximised(
+    samples: FloatArray, parts: FloatArray, whole: FloatArray, borrowed: float = _BORROWED
+) -> Mixture:
+    """Return the mixture of normal components with the moments of samples, by their shares
+    ``parts``.
 
-    ``borrowed`` is the share of samples with the covariance ``whole`` that is added to all components together.
+    ``borrowed`` is the share of samples with the covariance ``whole`` that is added to all
+    components together.
     """
     shares = parts.sum(0)
     centres = parts.T @ samples / shares.clip(1e-300)[:, None]
@@ -211,7 +245,9 @@ def uniform(count: int, rng: Random) -> FloatArray:
 
 
 def softened(log: FloatArray) -> FloatArray:
-    """Return ``log`` times the largest factor, up to 1, whose weights leave enough effective samples for a fit."""
+    """Return ``log`` times the largest factor, up to 1, whose weights leave enough effective
+    samples for a fit.
+    """
     if effective(log) >= _SOFT:
         return log
     low, high = 1e-12, 1.0
@@ -222,7 +258,9 @@ def softened(log: FloatArray) -> FloatArray:
 
 
 def effective(log: FloatArray) -> float:
-    """Return the effective sample size of weights with the logarithms ``log``, divided by their number."""
+    """Return the effective sample size of weights with the logarithms ``log``, divided by their
+    number.
+    """
     return float(1 / (normalised(log) ** 2).sum() / len(log))
 
 

@@ -17,7 +17,12 @@ from neusee.workflows.calibration.budget_page import (
     budget_rows,
     budget_sections,
 )
-from neusee.workflows.calibration.emva_frames import OPERATING_POINT, EmvaFrames, Release, frames_of_recipe
+from neusee.workflows.calibration.emva_frames import (
+    OPERATING_POINT,
+    EmvaFrames,
+    Release,
+    frames_of_recipe,
+)
 from neusee.workflows.calibration.emva_page import (
     banner,
     group_of,
@@ -35,7 +40,10 @@ from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.study_folder import StudyReport, StudyRun, as_json
 from neusee.workflows.store.result_store import Store
 
-_PLUS = "U is the expanded uncertainty; + says that a source of it is not stated, which budget.json names."
+_PLUS = (
+    "U is the expanded uncertainty; + says that a source of it is not stated, which budget.json"
+    " names."
+)
 _MORE = " The files `budget.json` and `budget.csv` have the budgets of all quantities with a value."
 _COLUMNS = ("section", "key", "symbol", "quantity", "bound", "value", "unit", "reason")
 _TRANSFER = ("photons", "exposure", "mean", "variance", "mean_dark", "variance_dark")
@@ -51,12 +59,15 @@ def write_sheet(
     relative: bool = False,
     state: Sequence[str] = (),
 ) -> Path:
-    """Write the EMVA 1288 sheet of the frames of a recipe: page, PDF, JSON, CSV and pictures; return the folder.
+    """Write the EMVA 1288 sheet of the frames of a recipe: page, PDF, JSON, CSV and pictures;
+    return the folder.
 
-    ``release`` says whose variance in time is taken; by default that which the descriptor states, otherwise release 4.
-    With ``relative`` the photons of the recipe are known up to a factor, and nothing in photons is stated. ``state``
-    has what is told of the operating point, such as ``temperature=25 °C``.
-    Raises: ValueError for a recipe without frames, without dark frames or without two lit levels, and for a wrong
+    ``release`` says whose variance in time is taken; by default that which the descriptor states,
+    otherwise release 4. With ``relative`` the photons of the recipe are known up to a factor, and
+    nothing in photons is stated. ``state`` has what is told of the operating point, such as
+    ``temperature=25 °C``.
+    Raises: ValueError for a recipe without frames, without dark frames or without two lit levels,
+            and for a wrong
     statement.
     """
     study_run, told = StudyRun("sheet", recipe, command), operating_point(state, stated(recipe))
@@ -69,13 +80,17 @@ def write_sheet(
     return study_run.write(runs, digest(document["quantities"]), document, report, "emva1288")
 
 
-def _document(sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any], chosen: bool) -> dict[str, Any]:
+def _document(
+    sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any], chosen: bool
+) -> dict[str, Any]:
     """Return the content of ``emva1288.json``; ``chosen`` is True if the user chose the release."""
     return {
         "standard": "EMVA 1288, release 4.0 Linear",
         "temporal variance": temporal_variance(frames, chosen),
         "fails": banner(sheet, frames.tests),
-        "quantities": {q.key: {"section": group_of(q, sheet), **asdict(q)} for q in sheet.quantities},
+        "quantities": {
+            q.key: {"section": group_of(q, sheet), **asdict(q)} for q in sheet.quantities
+        },
         "operating point": dict(told),
         "frames": as_rows(frames.tests),
         "demands": [each._asdict() for each in requirements(sheet, frames, told)],
@@ -95,7 +110,10 @@ def _report(
     named = [budget for budget in budgets if budget.key in BUDGETED]
     budget = {"budget": budget_picture(named)} if named else {}
     traced = budget_sections(named, stated(recipe), budget.get("budget"), _MORE)
-    summary = [f"{name}: {'not stated' if told[key] is None else told[key]}" for key, name in OPERATING_POINT.items()]
+    summary = [
+        f"{name}: {'not stated' if told[key] is None else told[key]}"
+        for key, name in OPERATING_POINT.items()
+    ]
     summary += [document["temporal variance"], _PLUS, document["fails"]]
     return StudyReport(
         title,

@@ -1,4 +1,6 @@
-"""The least squares of EMVA 1288 beside the posterior: a section of the page, and a check that both agree."""
+"""The least squares of EMVA 1288 beside the posterior: a section of the page, and a check that
+both agree.
+"""
 
 from __future__ import annotations
 
@@ -21,31 +23,38 @@ QUANTITIES = {
     "read_noise": ("temporal_dark_noise", "temporal dark noise \u03c3_d"),
     "temporal_dark_noise": ("temporal_dark_noise", "temporal dark noise \u03c3_d"),
 }
-_APART = 3.0  #: combined standard deviations between the posterior and its least squares, above which it is refused
-_TEXT = """The fit of the standard, of lines through the origin up to 70 % of saturation, on the same frames.
-    Its error is that of the noise alone. It knows neither a bent response nor the uncertainty of the lamp, so that the
-    two need not agree. The column of the posterior's own line is the same fit on the levels that the
-    posterior predicts, bend and all: these two must agree. The last column is their difference over the combined
-    standard deviation. Only quantities that the frames determine are compared."""
+#: combined standard deviations between the posterior and its least squares, above which it is
+#: refused
+_APART = 3.0
+_TEXT = """The fit of the standard, of lines through the origin up to 70 % of saturation, on the
+    same frames. Its error is that of the noise alone. It knows neither a bent response nor the
+    uncertainty of the lamp, so that the two need not agree. The column of the posterior's own line
+    is the same fit on the levels that the posterior predicts, bend and all: these two must agree.
+    The last column is their difference over the combined standard deviation. Only quantities that
+    the frames determine are compared."""
 
 
 class Comparison(NamedTuple):
-    """A quantity by the standard's least squares, and by the same fit on the levels that the posterior predicts."""
+    """A quantity by the standard's least squares, and by the same fit on the levels that the
+    posterior predicts.
+    """
 
     name: str
     value: float
     error: float  #: standard error of `value` by noise alone
-    predicted: float  #: by the fit on the predicted levels; the value of the posterior where nothing predicts levels
+    #: by the fit on the predicted levels; the value of the posterior where nothing predicts levels
+    predicted: float
     apart: float  #: difference over the combined standard deviation
 
 
 def comparisons(
     measured: Levels, estimates: Sequence[ParameterEstimate], camera: Mapping[str, Any] | None
 ) -> list[Comparison]:
-    """Return the comparison of each quantity that the frames determine; none where the standard's fit is impossible.
+    """Return the comparison of each quantity that the frames determine; none where the standard's
+    fit is impossible.
 
-    ``measured`` are the statistics of the frames, ``estimates`` the rows of the posterior, and ``camera`` the
-    parameters of `calibrate.camera`, or None for another likelihood.
+    ``measured`` are the statistics of the frames, ``estimates`` the rows of the posterior, and
+    ``camera`` the parameters of `calibrate.camera`, or None for another likelihood.
     """
     rows = [row for row in estimates if row.name in QUANTITIES and row.kind == "estimate"]
     try:
@@ -57,39 +66,65 @@ def comparisons(
 
 
 def agreement(found: Sequence[Comparison]) -> list[Check]:
-    """Return if posterior and least squares agree, as a check that refuses the posterior; none without a comparison."""
+    """Return if posterior and least squares agree, as a check that refuses the posterior; none
+    without a comparison.
+    """
     if not found:
         return []
     worst = max(found, key=lambda one: abs(one.apart))
     label = QUANTITIES[worst.name][1]
-    text = f"{label}: least squares {worst.value:.5g}, by the posterior {worst.predicted:.5g}, {worst.apart:+.1f} sd"
+    text = (
+        f"{label}: least squares {worst.value:.5g}, by the posterior {worst.predicted:.5g},"
+        f" {worst.apart:+.1f} sd"
+    )
     good = abs(worst.apart) <= _APART
     if not good:
         text += ": refused, one of them is wrong, and the frames do not say which"
     mark: Mark = "pass" if good else "fail"
-    return [Check("the posterior agrees with its least squares", text, f"within {_APART:.0f} combined sd", mark)]
+    return [
+        Check(
+            "the posterior agrees with its least squares",
+            text,
+            f"within {_APART:.0f} combined sd",
+            mark,
+        )
+    ]
 
 
 def least_squares_section(
     measured: Levels, estimates: Sequence[ParameterEstimate], found: Sequence[Comparison]
 ) -> Section:
-    """Return the comparison of the standard's least squares with the posterior, or the reason why there is none.
+    """Return the comparison of the standard's least squares with the posterior, or the reason why
+    there is none.
 
-    A parameter of which the posterior is no estimate has no row: the standard's value would rest on what the frames do
-    not tell.
+    A parameter of which the posterior is no estimate has no row: the standard's value would rest on
+    what the frames do not tell.
     """
     heading = "Beside the least squares of EMVA 1288"
     rows = {row.name: row for row in estimates if row.name in QUANTITIES and row.kind == "estimate"}
     if not rows:
-        return Section(heading, "The frames determine none of the quantities that the standard fits.")
+        return Section(
+            heading, "The frames determine none of the quantities that the standard fits."
+        )
     if not found:
         return Section(heading, f"The standard's fit is not possible: {_reason(measured)}.")
-    columns = ("quantity", "least squares", "posterior's own line", "posterior", "unit", "difference / sd")
-    return Section(heading, _TEXT, columns, [_row(rows[comparison.name], comparison) for comparison in found])
+    columns = (
+        "quantity",
+        "least squares",
+        "posterior's own line",
+        "posterior",
+        "unit",
+        "difference / sd",
+    )
+    return Section(
+        heading, _TEXT, columns, [_row(rows[comparison.name], comparison) for comparison in found]
+    )
 
 
 def compared(found: Sequence[Comparison]) -> Mapping[str, Mapping[str, float]]:
-    """Return value and standard error of the standard's fit for each parameter that the section compares."""
+    """Return value and standard error of the standard's fit for each parameter that the section
+    compares.
+    """
     return {one.name: {"value": one.value, "error": one.error} for one in found}
 
 

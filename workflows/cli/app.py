@@ -1,4 +1,6 @@
-"""The entry point of the command line: ``neusee --help`` works without typer, and an error is printed as one line."""
+"""The entry point of the command line: ``neusee --help`` works without typer, and an error is
+printed as one line.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +12,23 @@ from io import TextIOWrapper
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.cli.command_list import BAD, COLUMNS, DONE, FAILED, INTERRUPTED, REPEATED, TYPED, help_page
+from neusee.workflows.cli.command_list import (
+    BAD,
+    COLUMNS,
+    DONE,
+    FAILED,
+    INTERRUPTED,
+    REPEATED,
+    TYPED,
+    help_page,
+)
 from neusee.workflows.cli.interrupt_signal import Interrupts, said, say_stopped
 
 if TYPE_CHECKING:
     import typer
 
-app: typer.Typer  #: the program with the options of all commands, built when a caller first reads the name
+#: the program with the options of all commands, built when a caller first reads the name
+app: typer.Typer
 
 
 def __getattr__(name: str) -> Any:
@@ -28,18 +40,22 @@ def __getattr__(name: str) -> Any:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit; print an error as one line, or with ``--debug`` as a traceback."""
+    """Run the command line and exit; print an error as one line, or with ``--debug`` as a
+    traceback.
+    """
     interrupts = Interrupts()
     if arguments is None:  # else a caller inside Python, whose signals and garbage are its own
         interrupts.watch()
-        gc.disable()  # a search for garbage among imported modules takes a tenth of the start-up time
+        # a search for garbage among imported modules takes a tenth of the start-up time
+        gc.disable()
     arguments = sys.argv[1:] if arguments is None else arguments
     TYPED[:] = arguments
     said.clear()
     _print_any_character()
     try:
         code = _run(arguments)
-        if code == INTERRUPTED or (interrupts.came and code != DONE):  # typer, too, ends at an interrupt
+        # typer, too, ends at an interrupt
+        if code == INTERRUPTED or (interrupts.came and code != DONE):
             code = _stopped()
     except BrokenPipeError:
         sys.stderr.close()
@@ -55,7 +71,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _print_any_character() -> None:
-    """Print characters that the terminal lacks, such as µ on one of ASCII, as escapes in place of an error."""
+    """Print characters that the terminal lacks, such as µ on one of ASCII, as escapes in place
+    of an error.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -68,7 +86,11 @@ def _stopped() -> int:
 
 def _run(arguments: list[str]) -> int:
     completes = "_NEUSEE_COMPLETE" in os.environ
-    if arguments in (["--help"], ["-h"]) and not completes and get_terminal_size().columns >= COLUMNS:
+    if (
+        arguments in (["--help"], ["-h"])
+        and not completes
+        and get_terminal_size().columns >= COLUMNS
+    ):
         print(help_page())
         return DONE
     if not completes and arguments[:1] and arguments[0] in REPEATED:

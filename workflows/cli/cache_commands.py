@@ -1,4 +1,6 @@
-"""The commands of ``neusee cache``: ls, verify, gc, pin, unpin and why, and the lines that they print."""
+"""The commands of ``neusee cache``: ls, verify, gc, pin, unpin and why, and the lines that they
+print.
+"""
 
 from __future__ import annotations
 
@@ -24,18 +26,25 @@ if TYPE_CHECKING:
 _PAGE = 50  #: results that `ls` shows
 _HEAD = ("date", "bytes", "seconds", "step", "recipe", "key", "")
 
-cache = typer.Typer(help="List, check, remove and keep stored results.", no_args_is_help=True, rich_markup_mode=None)
+cache = typer.Typer(
+    help="List, check, remove and keep stored results.", no_args_is_help=True, rich_markup_mode=None
+)
 
-Key = Annotated[str, typer.Argument(metavar="KEY", help="The first digits of a key, as `cache ls` shows them.")]
+Key = Annotated[
+    str, typer.Argument(metavar="KEY", help="The first digits of a key, as `cache ls` shows them.")
+]
 
 
 @cache.command("ls")
 def ls(
-    whole: Annotated[bool, typer.Option("--all", help="List every stored result, the newest last.")] = False,
+    whole: Annotated[
+        bool, typer.Option("--all", help="List every stored result, the newest last.")
+    ] = False,
 ) -> None:
     """List the newest stored results.
 
-    For each result: when it was computed, its bytes and seconds, its step and the recipe that first needed it.
+    For each result: when it was computed, its bytes and seconds, its step and the recipe that first
+    needed it.
     """
     for line in ls_lines(the_store(), whole):
         print(line)
@@ -55,12 +64,17 @@ def verify() -> None:
 
 @cache.command("gc")
 def gc(
-    budget: Annotated[str, typer.Option("--budget", help="Largest size of the cache, such as 20 GB.")] = "",
-    dry: Annotated[bool, typer.Option("--dry-run", help="Say what would be removed, and remove nothing.")] = False,
+    budget: Annotated[
+        str, typer.Option("--budget", help="Largest size of the cache, such as 20 GB.")
+    ] = "",
+    dry: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be removed, and remove nothing.")
+    ] = False,
 ) -> None:
     """Remove files that belong to no stored result, and results beyond a budget.
 
-    Beyond the budget, the results that save the fewest seconds for each byte are removed first. Pinned results stay.
+    Beyond the budget, the results that save the fewest seconds for each byte are removed first.
+    Pinned results stay.
     """
     with failing(ValueError, before="--budget: "):
         say(gc_lines(the_store(), budget or None, dry))
@@ -92,14 +106,16 @@ def why(key: Key) -> None:
         say(why_key_lines(the_store(), key))
 
 
-# --- what the commands print ------------------------------------------------------------------------------------------
+# --- what the commands print ----------------------------------------------------------------------
 
 
 def ls_lines(store: Store, whole: bool = False) -> Iterator[str]:
-    """Yield a line for each cached result with its date, bytes, seconds, step, recipe and key, the newest last.
+    """Yield a line for each cached result with its date, bytes, seconds, step, recipe and key, the
+    newest last.
 
-    Without ``whole``, these are the newest 50. In a long journal their number and bytes are those that it tells, so
-    that the time does not grow with each result. Of each result, one short text is held in memory.
+    Without ``whole``, these are the newest 50. In a long journal their number and bytes are those
+    that it tells, so that the time does not grow with each result. Of each result, one short text
+    is held in memory.
     """
     pins = store.pinned()
     if whole or not store.journal.is_long():
@@ -123,7 +139,9 @@ def ls_lines(store: Store, whole: bool = False) -> Iterator[str]:
 
 
 def _every_row(store: Store, pins: set[str]) -> tuple[list[str], int, int]:
-    """Return the row of each result in order of time, the number of stored values and their bytes."""
+    """Return the row of each result in order of time, the number of stored values and their
+    bytes.
+    """
     rows, kept, size = list[str](), 0, 0
     for key, about in store.entries():
         rows.append("\0".join(_row(key, about, key in pins)))
@@ -133,7 +151,9 @@ def _every_row(store: Store, pins: set[str]) -> tuple[list[str], int, int]:
 
 
 def _newest_rows(store: Store, pins: set[str]) -> list[str]:
-    """Return the rows of the newest results of the journal that still have metadata, in order of time."""
+    """Return the rows of the newest results of the journal that still have metadata, in order of
+    time.
+    """
     newest = dict.fromkeys(row["key"] for row in reversed(store.journal.latest()))
     found = ((key, store.about(key)) for key in newest)
     some = itertools.islice(((key, about) for key, about in found if about is not None), _PAGE)
@@ -150,11 +170,15 @@ def _aligned(rows: Sequence[str]) -> Iterator[str]:
     for row in rows:
         widths = [*map(max, widths, map(len, row.split("\0")))]
     for line in ("\0".join(_HEAD), *rows) if rows else ():
-        yield "  ".join(f"{cell:<{width}}" for cell, width in zip(line.split("\0"), widths, strict=True)).rstrip()
+        yield "  ".join(
+            f"{cell:<{width}}" for cell, width in zip(line.split("\0"), widths, strict=True)
+        ).rstrip()
 
 
 def verify_lines(store: Store) -> tuple[list[str], int]:
-    """Read every result in the cache; return a line for each damaged result, and the number of damaged results."""
+    """Read every result in the cache; return a line for each damaged result, and the number of
+    damaged results.
+    """
     from neusee.workflows.store.derived_files import DerivedFiles
 
     files = DerivedFiles(store)
@@ -167,24 +191,38 @@ def verify_lines(store: Store) -> tuple[list[str], int]:
         elif is_kept(about):
             sizes.append(_size(about))
     answers, broken = answer_upkeep.check(store.disk)
-    damaged += [f"{each.name}  the answer of a command, which is not what was written" for each in broken]
-    last = f"{_count(len(sizes), 'result')}, {format_size(sum(sizes))}{_answers_text(answers)}, as written"
+    damaged += [
+        f"{each.name}  the answer of a command, which is not what was written" for each in broken
+    ]
+    last = (
+        f"{_count(len(sizes), 'result')}, {format_size(sum(sizes))}{_answers_text(answers)}, as"
+        " written"
+    )
     if damaged:
-        last += f"; {len(damaged)} damaged, put aside in {store.root / 'bad'}: the next run computes those it needs"
+        last += (
+            f"; {len(damaged)} damaged, put aside in {store.root / 'bad'}: the next run computes"
+            " those it needs"
+        )
     return [*damaged, last], len(damaged)
 
 
 def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list[str]:
-    """Remove files that belong to no cached result, and cached values beyond ``budget``; return the lines to print.
+    """Remove files that belong to no cached result, and cached values beyond ``budget``; return the
+    lines to print.
 
     Raises `ValueError` for a budget that is not a size.
     """
     swept = store.gc(None if budget is None else parse_size(budget), dry)
-    full = budget is not None and swept.left + sum(map(_bytes, answer_upkeep.answers(store.disk))) > parse_size(budget)
+    full = budget is not None and swept.left + sum(
+        map(_bytes, answer_upkeep.answers(store.disk))
+    ) > parse_size(budget)
     old = answer_upkeep.sweep(store.disk, dry, everything=full)
     abouts = ((key, store.about(key)) for key in swept.evicted)  # the receipts of what went
     rows = [[*_row(key, about, False)[1:4], key[:8]] for key, about in abouts if about is not None]
-    went = f"{_count(len(swept.evicted), 'value')} and {_count(swept.orphans, 'file')} that belonged to no result"
+    went = (
+        f"{_count(len(swept.evicted), 'value')} and {_count(swept.orphans, 'file')} that belonged"
+        " to no result"
+    )
     freed, left = format_size(swept.freed), format_size(swept.left)
     last = f"{went} {'would go' if dry else 'went'}: {freed}; {left} stay in {store.root}"
     refused = f"{_count(len(swept.refused), 'value')} of other users could not be removed"
@@ -194,22 +232,37 @@ def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list
 
 
 def pin_lines(store: Store, prefix: str, pin: bool = True) -> list[str]:
-    """Pin or unpin the cached value whose key begins with ``prefix``; raise `ValueError` for no or several matches."""
+    """Pin or unpin the cached value whose key begins with ``prefix``; raise `ValueError` for no
+    or several matches.
+    """
     keys = {key for key, about in store.entries() if is_kept(about)} if pin else store.pinned()
     named = sorted(key for key in keys if key.startswith(prefix.lower()))
     if len(named) != 1:
         what = "value" if pin else "pinned value"
-        few = f"it matches {', '.join(key[:12] for key in named[:5])}" if named else "it matches no key"
-        raise ValueError(f"{prefix!r} must be the start of the key of one {what}: {few} (`neusee cache ls` lists keys)")
+        few = (
+            f"it matches {', '.join(key[:12] for key in named[:5])}"
+            if named
+            else "it matches no key"
+        )
+        raise ValueError(
+            f"{prefix!r} must be the start of the key of one {what}: {few} (`neusee cache ls` lists"
+            " keys)"
+        )
     (store.pin if pin else store.unpin)(named[0])
     step = (store.about(named[0]) or {}).get("step") or "a value that is not here"
     return [f"{'pinned' if pin else 'no longer pinned'}: {named[0]}  {step}"]
 
 
 def _picture_problem(files: DerivedFiles, key: str, about: dict[str, Any]) -> str:
-    """Check the file of a stored picture; if the file is damaged, move the file away and return the problem as text."""
+    """Check the file of a stored picture; if the file is damaged, move the file away and return
+    the problem as text.
+    """
     name = about.get("file")
-    if not name or not is_kept(about) or files.find(key, os.path.basename(name)[len(key) :]) is not None:
+    if (
+        not name
+        or not is_kept(about)
+        or files.find(key, os.path.basename(name)[len(key) :]) is not None
+    ):
         return ""
     problem = f"its file {name} is not what was written"
     files.store.put_aside(key, ValueError(problem))
@@ -217,9 +270,20 @@ def _picture_problem(files: DerivedFiles, key: str, about: dict[str, Any]) -> st
 
 
 def _row(key: str, about: dict[str, Any], pinned: bool) -> list[str]:
-    took, date = f"{about.get('seconds') or 0.0:.3f}", str(about.get("date") or "")[:19].replace("T", " ")
+    took, date = (
+        f"{about.get('seconds') or 0.0:.3f}",
+        str(about.get("date") or "")[:19].replace("T", " "),
+    )
     mark = "pinned" if pinned else "" if is_kept(about) else "receipt"
-    return [date, format_size(_size(about)), took, about.get("step") or "", about.get("recipe") or "", key[:8], mark]
+    return [
+        date,
+        format_size(_size(about)),
+        took,
+        about.get("step") or "",
+        about.get("recipe") or "",
+        key[:8],
+        mark,
+    ]
 
 
 def _size(about: dict[str, Any]) -> int:
@@ -229,7 +293,9 @@ def _size(about: dict[str, Any]) -> int:
 
 
 def _answers_text(answers: Sequence[answer_upkeep.Kept]) -> str:
-    """Return how many stored answers there are and their bytes, after a comma, or an empty text without answers."""
+    """Return how many stored answers there are and their bytes, after a comma, or an empty text
+    without answers.
+    """
     size = format_size(sum(map(_bytes, answers)))
     return f", {_count(len(answers), 'answer')} of commands of {size}" if answers else ""
 

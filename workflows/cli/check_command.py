@@ -26,15 +26,18 @@ _MARKS = {True: "ok", False: "FAIL", None: "-"}
 
 
 def check(
-    place: Annotated[str, typer.Argument(help="A file, a folder or a module with nodes, or a node: optics.psf.")],
+    place: Annotated[
+        str, typer.Argument(help="A file, a folder or a module with nodes, or a node: optics.psf.")
+    ],
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
     """Check whether nodes keep what the nodes of neusee keep.
 
-    Docstring, annotations, hooks, what a cache key covers; on the example of each node: the reference, gradients
-    against finite differences, bands, bounds and shapes, and the same call in a process with other surroundings. A
-    network class of yours is called on small pictures. The exit code is 3 if a rule fails. Runs the code.
+    Docstring, annotations, hooks, what a cache key covers; on the example of each node: the
+    reference, gradients against finite differences, bands, bounds and shapes, and the same call in
+    a process with other surroundings. A network class of yours is called on small pictures. The
+    exit code is 3 if a rule fails. Runs the code.
     """
     from neusee.workflows.contract.elsewhere_client import elsewhere
 
@@ -44,19 +47,30 @@ def check(
 
         found = check_all(nodes, networks, process)
     if as_json:
-        say([json.dumps({name: [asdict(f) for f in findings] for name, findings in found.items()}, indent=1)])
+        say(
+            [
+                json.dumps(
+                    {name: [asdict(f) for f in findings] for name, findings in found.items()},
+                    indent=1,
+                )
+            ]
+        )
     for name, findings in found.items() if not as_json else ():
         say([name, *(f"  {_MARKS[f.ok]:<4}  {f.rule:<11}  {f.text}" for f in findings), ""])
     failed = sum(f.ok is False for findings in found.values() for f in findings)
     if not as_json:
-        end = f"{failed} rule{'s fail' if failed > 1 else ' fails'}" if failed else "every rule holds"
+        end = (
+            f"{failed} rule{'s fail' if failed > 1 else ' fails'}" if failed else "every rule holds"
+        )
         say([f"{_count(len(nodes), len(networks))}: {end}"])
     raise typer.Exit(MISSED if failed else DONE)
 
 
 def _is_of_neusee(place: str) -> bool:
     """Return True for a node or a family of neusee, without an import of them."""
-    return (files("neusee") / "nodes" / place.partition(".")[0]).is_dir() and not place.endswith(".py")
+    return (files("neusee") / "nodes" / place.partition(".")[0]).is_dir() and not place.endswith(
+        ".py"
+    )
 
 
 def _installed(family: str) -> ModuleType | None:
@@ -70,7 +84,9 @@ def _installed(family: str) -> ModuleType | None:
 
 
 def _is_module(place: str) -> bool:
-    """Return True if a name with dots is that of a module, such as ``mylab.nodes``, and not of a node."""
+    """Return True if a name with dots is that of a module, such as ``mylab.nodes``, and not of a
+    node.
+    """
     try:
         return find_spec(place) is not None
     except ImportError:
@@ -79,14 +95,25 @@ def _is_module(place: str) -> bool:
 
 def _count(nodes: int, networks: int) -> str:
     """Return the numbers of nodes and networks as text, such as ``2 nodes and 1 network``."""
-    counts = [(nodes, "node")] * (nodes > 0 or not networks) + [(networks, "network")] * (networks > 0)
+    counts = [(nodes, "node")] * (nodes > 0 or not networks) + [(networks, "network")] * (
+        networks > 0
+    )
     return " and ".join(f"{count} {what}{'s' * (count != 1)}" for count, what in counts)
 
 
 def _found(place: str) -> tuple[dict[str, Node], dict[str, type[nn.Module]]]:
-    """Return the nodes and the network classes at a place by name; raise `LookupError` if there are none."""
+    """Return the nodes and the network classes at a place by name; raise `LookupError` if there
+    are none.
+    """
     from neusee.workflows.contract.network_contract import whole_networks
-    from neusee.workflows.recipe.node_families import find_node, import_own, installed_as, is_known, nodes_of, own_nodes
+    from neusee.workflows.recipe.node_families import (
+        find_node,
+        import_own,
+        installed_as,
+        is_known,
+        nodes_of,
+        own_nodes,
+    )
 
     family = place.partition(".")[0]
     if not place.endswith(".py") and "/" not in place and is_known(family):

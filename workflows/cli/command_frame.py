@@ -1,4 +1,6 @@
-"""Functions that all commands use to read a recipe, check options, print lines and report errors."""
+"""Functions that all commands use to read a recipe, check options, print lines and report
+errors.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +23,13 @@ if TYPE_CHECKING:
 
 DEFAULT = "first_light"
 _MOST = 100  #: lines of an error that are printed
-_NEW_OBJECTS = 10_000  #: containers that are new, after which Python searches for garbage; 700 at first
+#: containers that are new, after which Python searches for garbage; 700 at first
+_NEW_OBJECTS = 10_000
 
 
 def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int]:
-    """Return the recipe, by default `first_light`, and the changes in the arguments, and the first change's number.
+    """Return the recipe, by default `first_light`, and the changes in the arguments, and the first
+    change's number.
 
     ``before`` is the number of arguments that stand before ``words`` on the command line.
     """
@@ -39,13 +43,17 @@ def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int
 
 
 def split_frames(words: list[str]) -> tuple[list[str], list[str], int]:
-    """Return the files and the changes in the arguments of a command, and the number of the first change.
+    """Return the files and the changes in the arguments of a command, and the number of the first
+    change.
 
     A file may have the sign = in its name if it exists.
     """
     from pathlib import Path
 
-    count = next((n for n, word in enumerate(words) if _is_change(word) and not Path(word).exists()), len(words))
+    count = next(
+        (n for n, word in enumerate(words) if _is_change(word) and not Path(word).exists()),
+        len(words),
+    )
     frames, changes = words[:count], words[count:]
     for number, word in enumerate(changes):
         if not _is_change(word):
@@ -56,7 +64,9 @@ def split_frames(words: list[str]) -> tuple[list[str], list[str], int]:
 
 
 def _fix(words: list[str], number: int) -> str:
-    """Return how to write the word at ``number``, which is not a change and often the rest of a value with a space."""
+    """Return how to write the word at ``number``, which is not a change and often the rest of a
+    value with a space.
+    """
     if number == 0:
         return "write key=value, +key=value or ~key"
     rest = itertools.takewhile(lambda word: not _is_change(word), words[number:])
@@ -69,17 +79,23 @@ def _is_change(word: str) -> bool:
 
 
 def search_for_garbage() -> None:
-    """Let Python search for garbage from here on, but not among what was imported; the program begins without.
+    """Let Python search for garbage from here on, but not among what was imported; the program
+    begins without.
 
-    The searches are rare, because packages that are imported later make many objects and hardly any garbage.
+    The searches are rare, because packages that are imported later make many objects and hardly any
+    garbage.
     """
     gc.freeze()
     gc.set_threshold(_NEW_OBJECTS)
     gc.enable()
 
 
-def load(words: list[str] | None, *command: str, before: int = 0, exact: bool = False) -> tuple[Recipe, list[str]]:
-    """Return the recipe that the arguments ``words`` name and change, and the command line that runs this recipe."""
+def load(
+    words: list[str] | None, *command: str, before: int = 0, exact: bool = False
+) -> tuple[Recipe, list[str]]:
+    """Return the recipe that the arguments ``words`` name and change, and the command line that
+    runs this recipe.
+    """
     name, changes, first = split(words, before)
     from neusee.workflows.recipe.loading import load as read
 
@@ -92,14 +108,20 @@ def load(words: list[str] | None, *command: str, before: int = 0, exact: bool = 
 
 @contextmanager
 def refusing() -> Iterator[None]:
-    """Print every mistake of a recipe and end the command if the ``with`` block raises `RecipeError`."""
+    """Print every mistake of a recipe and end the command if the ``with`` block raises
+    `RecipeError`.
+    """
     from neusee.workflows.graph.diagnostics import RecipeError
 
     try:
         yield
     except RecipeError as error:
         count = len(error.diagnostics)
-        fail("\n".join([*_first_lines(str(error)), f"{count} problem{'s' * (count > 1)}, nothing was run"]))
+        fail(
+            "\n".join(
+                [*_first_lines(str(error)), f"{count} problem{'s' * (count > 1)}, nothing was run"]
+            )
+        )
 
 
 def _first_lines(text: str) -> list[str]:
@@ -111,7 +133,9 @@ def _first_lines(text: str) -> list[str]:
 
 @contextmanager
 def failing(*errors: type[Exception], code: int = BAD, before: str = "") -> Iterator[None]:
-    """If the ``with`` block raises one of ``errors``, print ``before`` and the error, and exit with ``code``."""
+    """If the ``with`` block raises one of ``errors``, print ``before`` and the error, and exit
+    with ``code``.
+    """
     try:
         yield
     except errors as error:
@@ -129,7 +153,9 @@ class _ForResult:
 
 
 def keep_for_result(context: typer.Context) -> None:
-    """Keep stdout for what `say` prints: what own code prints goes to stderr until the command ends."""
+    """Keep stdout for what `say` prints: what own code prints goes to stderr until the command
+    ends.
+    """
     if not isinstance(sys.stdout, _ForResult):
         context.with_resource(redirect_stdout(cast(TextIO, _ForResult(sys.stdout))))
 
@@ -137,7 +163,12 @@ def keep_for_result(context: typer.Context) -> None:
 def say(lines: list[str]) -> None:
     """Print lines to stdout."""
     stream = sys.stdout
-    print(*lines, sep="\n", file=stream.result if isinstance(stream, _ForResult) else stream, flush=True)
+    print(
+        *lines,
+        sep="\n",
+        file=stream.result if isinstance(stream, _ForResult) else stream,
+        flush=True,
+    )
 
 
 def say_line(line: str) -> None:
@@ -154,7 +185,9 @@ def fail(message: str, code: int = BAD) -> NoReturn:
 
 
 def the_store() -> Store:
-    """Open the result store that the environment variable ``NEUSEE_CACHE`` names, or the default store."""
+    """Open the result store that the environment variable ``NEUSEE_CACHE`` names, or the default
+    store.
+    """
     from neusee.workflows.store.remote_store import open_store
 
     with failing(ValueError, ModuleNotFoundError, before="NEUSEE_CACHE: "):

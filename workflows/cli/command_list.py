@@ -1,4 +1,6 @@
-"""The names of all commands, the exit codes, and the page of ``neusee --help``, all without an import of typer."""
+"""The names of all commands, the exit codes, and the page of ``neusee --help``, all without an
+import of typer.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ EXIT_CODES = (
     "3 expected numbers missed, a check of a calibration failed, or damaged results found."
 )
 
-#: from the name of each command to the module that defines the command, and to the first line of the command's help
+#: from the name of each command to the module that defines the command, and to the first line of
+#: the command's help
 COMMANDS = {
     "run": ("recipe_commands", "Run a recipe and write its report."),
     "validate": ("recipe_commands", "Check a recipe without running it."),
@@ -44,28 +47,43 @@ COMMANDS = {
     "study": ("study_commands", "Study how accurate, stable and certain a recipe's numbers are."),
     "cache": ("cache_commands", "List, check, remove and keep stored results."),
 }
-REPEATED = frozenset({"config", "plan", "run", "safety", "validate", "why"})  #: commands whose answer is stored
+#: commands whose answer is stored
+REPEATED = frozenset({"config", "plan", "run", "safety", "validate", "why"})
 _OPTIONS = {
     "--version": "Show the version and exit.",
     "--no-code": "Refuse recipes that name code; also after a command.",
     "--install-completion": "Install completion for the current shell.",
-    "--show-completion": "Show completion for the current shell, to copy it or customize the installation.",
+    "--show-completion": (
+        "Show completion for the current shell, to copy it or customize the installation."
+    ),
     "-h, --help": "Show this message and exit.",
 }
 COLUMNS = 80  #: width of the widest page of help that typer prints
 
 
 def help_page() -> str:
-    """Return the page of ``neusee --help`` as typer prints that page on a terminal of 80 columns or more."""
+    """Return the page of ``neusee --help`` as typer prints that page on a terminal of 80 columns
+    or more.
+    """
     summary, exit_codes = (_filled("  ", text, "  ") for text in (SUMMARY, EXIT_CODES))
     commands = {name: text for name, (_, text) in COMMANDS.items()}
     usage = "Usage: neusee [OPTIONS] COMMAND [ARGS]..."
-    return "\n\n".join([usage, summary, f"Options:\n{_list(_OPTIONS)}", f"Commands:\n{_list(commands)}", exit_codes])
+    return "\n\n".join(
+        [
+            usage,
+            summary,
+            f"Options:\n{_list(_OPTIONS)}",
+            f"Commands:\n{_list(commands)}",
+            exit_codes,
+        ]
+    )
 
 
 def _list(texts: Mapping[str, str]) -> str:
     indent = max(map(len, texts)) + 4
-    return "\n".join(_filled(f"  {name}".ljust(indent), text, " " * indent) for name, text in texts.items())
+    return "\n".join(
+        _filled(f"  {name}".ljust(indent), text, " " * indent) for name, text in texts.items()
+    )
 
 
 def _filled(before: str, text: str, indent: str) -> str:

@@ -19,7 +19,12 @@ def compare(
     left: Annotated[str, typer.Argument(help=_RUN)],
     right: Annotated[str, typer.Argument(help=_RUN)],
     fail_above: Annotated[
-        float, typer.Option("--fail-above", min=0.0, help="Exit with code 3 if a number differs by more, relatively.")
+        float,
+        typer.Option(
+            "--fail-above",
+            min=0.0,
+            help="Exit with code 3 if a number differs by more, relatively.",
+        ),
     ] = float("inf"),
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -28,9 +33,10 @@ def compare(
 ) -> None:
     """Compare two runs: numbers, pictures, recipe and code.
 
-    The environment is compared too, and nothing is computed again. The page shows the pictures side by side with
-    their difference. The exit code is 0 also where the runs differ, unless --fail-above says what may differ at
-    most; a number that only one run has differs by more than any limit.
+    The environment is compared too, and nothing is computed again. The page shows the pictures side
+    by side with their difference. The exit code is 0 also where the runs differ, unless
+    --fail-above says what may differ at most; a number that only one run has differs by more than
+    any limit.
     """
     from neusee.workflows.comparison.run_record import NotComparable, read_record
 
@@ -46,4 +52,7 @@ def compare(
         say([str(page)] if quiet else [*comparison_text.lines(found), "", f"page   {page}"])
     if found.largest > fail_above:
         worst = max(found.numbers, key=lambda each: each.relative)
-        fail(f"{worst.name} differs by {found.largest:.3g} relatively, more than {fail_above:g}", MISSED)
+        fail(
+            f"{worst.name} differs by {found.largest:.3g} relatively, more than {fail_above:g}",
+            MISSED,
+        )

@@ -23,25 +23,43 @@ from neusee.workflows.cli.command_options import (
 from neusee.workflows.cli.interruption import kept_in, resumable, say_folder
 
 Pipelines = Annotated[
-    str | None, typer.Option("--pipelines", help="MASK[@file]+RESTORER[@weights], …; none restores nothing.")
+    str | None,
+    typer.Option("--pipelines", help="MASK[@file]+RESTORER[@weights], …; none restores nothing."),
 ]
-Strengths = Annotated[str, typer.Option("--strengths", help="Strengths of the laser, multiples of saturation.")]
+Strengths = Annotated[
+    str, typer.Option("--strengths", help="Strengths of the laser, multiples of saturation.")
+]
 Reference = Annotated[
-    str, typer.Option("--reference", help="Pipeline that the others are compared with; by default the first.")
+    str,
+    typer.Option(
+        "--reference", help="Pipeline that the others are compared with; by default the first."
+    ),
 ]
 EqualPeak = Annotated[
     float | None,
-    typer.Option("--equal-protection", help="Peak of a laser to which filters and stops bring each pipeline, 0 to 1."),
+    typer.Option(
+        "--equal-protection",
+        help="Peak of a laser to which filters and stops bring each pipeline, 0 to 1.",
+    ),
 ]
-Scenes = Annotated[int | None, typer.Option("--scenes", min=1, max=1_000_000, help="Number of scenes, else 20.")]
-Small = Annotated[int, typer.Option("--small", min=11, max=100_000, help="Shorter side of the reduced pictures.")]
-By = Annotated[str | None, typer.Option("--by", help="What brings it there: best (stop and filter), filter or stop.")]
+Scenes = Annotated[
+    int | None, typer.Option("--scenes", min=1, max=1_000_000, help="Number of scenes, else 20.")
+]
+Small = Annotated[
+    int, typer.Option("--small", min=11, max=100_000, help="Shorter side of the reduced pictures.")
+]
+By = Annotated[
+    str | None,
+    typer.Option("--by", help="What brings it there: best (stop and filter), filter or stop."),
+]
 
 
 def evaluate(
     words: Words = None,
     pipelines: Pipelines = None,
-    data: Annotated[str, typer.Option("--data", help="Folder of photographs; else the recipe's own scene.")] = "",
+    data: Annotated[
+        str, typer.Option("--data", help="Folder of photographs; else the recipe's own scene.")
+    ] = "",
     scenes: Scenes = None,
     strengths: Strengths = "0,1e1,1e2,1e3,1e4,1e5,1e6",
     small: Small = 256,
@@ -56,15 +74,22 @@ def evaluate(
 ) -> None:
     """Compare masks and restorers on the same scenes and lasers.
 
-    A pipeline is a mask and a restorer. Every pipeline sees the same scenes, lasers and noise. The page has L1, PSNR
-    and SSIM with 95 % confidence intervals, suppression by wavelength (LSR, BSR), the contrast that is left, and the
-    bound that no mask can pass. With --equal-protection each pipeline gets the filter and the stop that bring its peak
-    to one share of the plain lens's. Values that the recipe gives as distributions are drawn for each scene. Options
-    that are not given are those of the recipe's block evaluate. Run the same command again to continue.
+    A pipeline is a mask and a restorer. Every pipeline sees the same scenes, lasers and noise. The
+    page has L1, PSNR and SSIM with 95 % confidence intervals, suppression by wavelength (LSR, BSR),
+    the contrast that is left, and the bound that no mask can pass. With --equal-protection each
+    pipeline gets the filter and the stop that bring its peak to one share of the plain lens's.
+    Values that the recipe gives as distributions are drawn for each scene. Options that are not
+    given are those of the recipe's block evaluate. Run the same command again to continue.
     """
     name, changes, _ = split(words)
     check_device(device)
-    options = {"data": data, "scenes": scenes, "strengths": strengths, "small": small, "reference": reference}
+    options = {
+        "data": data,
+        "scenes": scenes,
+        "strengths": strengths,
+        "small": small,
+        "reference": reference,
+    }
     shared = {"pipelines": pipelines, "equal-protection": equal_protection, "by": by}
     folder = _evaluate(
         name,

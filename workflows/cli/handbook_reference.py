@@ -1,4 +1,6 @@
-"""The pages of the handbook that the program writes about itself: nodes, commands, the recipe language and Python."""
+"""The pages of the handbook that the program writes about itself: nodes, commands, the recipe
+language and Python.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ if TYPE_CHECKING:
 
 
 def reference_pages(recipes: Path) -> dict[str, str]:
-    """Return every page of the reference by its path; ``recipes`` is the folder of the packaged recipes."""
+    """Return every page of the reference by its path; ``recipes`` is the folder of the packaged
+    recipes.
+    """
     return {
         "reference/nodes.md": nodes_page(),
         **family_pages(uses_of_nodes(recipes)),
@@ -36,14 +40,16 @@ def reference_pages(recipes: Path) -> dict[str, str]:
     }
 
 
-# --- nodes ------------------------------------------------------------------------------------------------------------
+# --- nodes ----------------------------------------------------------------------------------------
 
 
 def uses_of_nodes(recipes: Path) -> dict[str, list[str]]:
     """Return the packaged files with a step of a node, by the name of the node."""
     uses: dict[str, list[str]] = defaultdict(list)
     for path in sorted(recipes.rglob("*.yaml")):
-        for name in dict.fromkeys(re.findall(r"\bnode: ([\w.]+)", path.read_text(encoding="utf-8"))):
+        for name in dict.fromkeys(
+            re.findall(r"\bnode: ([\w.]+)", path.read_text(encoding="utf-8"))
+        ):
             uses[name].append(str(path.relative_to(recipes)))
     return uses
 
@@ -53,11 +59,17 @@ def nodes_page() -> str:
     lines = [
         "# Nodes",
         "",
-        "A node is the function that computes one step. `neusee nodes optics.psf` explains one on the terminal.",
+        (
+            "A node is the function that computes one step. `neusee nodes optics.psf` explains one"
+            " on the terminal."
+        ),
     ]
     for family, names in groupby(dict(all_nodes()).items(), lambda each: each[0].partition(".")[0]):
         rows = [
-            [f"[`{name}`](nodes/{family}.md#{_anchor(name)})", escaped(first_sentence(node.__doc__))]
+            [
+                f"[`{name}`](nodes/{family}.md#{_anchor(name)})",
+                escaped(first_sentence(node.__doc__)),
+            ]
             for name, node in names
         ]
         lines += [
@@ -70,7 +82,9 @@ def nodes_page() -> str:
 
 
 def family_pages(uses: Mapping[str, list[str]]) -> dict[str, str]:
-    """Return a page for each family of nodes: formulas, sources, errors, inputs and parameters of each node."""
+    """Return a page for each family of nodes: formulas, sources, errors, inputs and parameters
+    of each node.
+    """
     pages = {}
     for family, names in groupby(dict(all_nodes()).items(), lambda each: each[0].partition(".")[0]):
         lines = [f"# {family}", "", f"{escaped(first_sentence(family_title(family)))}.", ""]
@@ -84,15 +98,29 @@ def _anchor(name: str) -> str:
 
 
 def _node(name: str, node: Node, files: list[str]) -> Iterator[str]:
-    yield from (f"## {name} {{ #{_anchor(name)} }}", "", *prose(inspect.cleandoc(node.__doc__ or "")), "")
+    yield from (
+        f"## {name} {{ #{_anchor(name)} }}",
+        "",
+        *prose(inspect.cleandoc(node.__doc__ or "")),
+        "",
+    )
     inputs = [f"`{each}`{' (optional)' if each in node.optional else ''}" for each in node.inputs]
     yield from (f"**Inputs:** {', '.join(inputs) or 'none'}.", "")
-    rows = [[f"`{parameter}`", *map(escaped, words.rsplit("; ", 1))] for parameter, words in parameter_rows(node)]
-    yield from (*(table(["parameter", "value", ""], rows) if rows else ["**Parameters:** none."]), "")
-    yield from (f"**Written in:** {', '.join(f'`{file}`' for file in files) or 'no packaged recipe'}.", "")
+    rows = [
+        [f"`{parameter}`", *map(escaped, words.rsplit("; ", 1))]
+        for parameter, words in parameter_rows(node)
+    ]
+    yield from (
+        *(table(["parameter", "value", ""], rows) if rows else ["**Parameters:** none."]),
+        "",
+    )
+    yield from (
+        f"**Written in:** {', '.join(f'`{file}`' for file in files) or 'no packaged recipe'}.",
+        "",
+    )
 
 
-# --- commands ---------------------------------------------------------------------------------------------------------
+# --- commands -------------------------------------------------------------------------------------
 
 
 def commands_page() -> str:
@@ -102,7 +130,10 @@ def commands_page() -> str:
     lines = [
         "# Options of all commands",
         "",
-        f"What `--help` prints, for every command. [Commands](../commands.md) has examples. {EXIT_CODES}",
+        (
+            "What `--help` prints, for every command. [Commands](../commands.md) has examples."
+            f" {EXIT_CODES}"
+        ),
         "",
         *_command(whole, context, 1),
     ]
@@ -115,7 +146,10 @@ def _command(command: Any, context: typer.Context, level: int) -> Iterator[str]:
         usage = " ".join([context.command_path, *command.collect_usage_pieces(context)])
         text = inspect.cleandoc(command.help or "")
         yield from (f"{'#' * level} {context.command_path}", "", f"`{usage}`", "", *prose(text))
-    rows = [[_spelled(each), escaped(getattr(each, "help", None) or ""), _default(each)] for each in command.params]
+    rows = [
+        [_spelled(each), escaped(getattr(each, "help", None) or ""), _default(each)]
+        for each in command.params
+    ]
     yield from (*(table(["", "meaning", "default"], rows) if rows else ()), "")
     for name in command.list_commands(context) if hasattr(command, "list_commands") else ():
         inner = command.get_command(context, name)

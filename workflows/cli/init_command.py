@@ -11,7 +11,8 @@ import typer
 from neusee.workflows.cli.command_frame import fail, failing, say
 from neusee.workflows.cli.command_options import Debug
 
-#: for each file of a project: the start from which it is written, and the name that stands for NAME in the start
+#: for each file of a project: the start from which it is written, and the name that stands for NAME
+#: in the start
 FILES: dict[str, tuple[str, str]] = {
     "README.md": ("project/README.md.txt", ""),
     ".gitignore": ("project/gitignore.txt", ""),
@@ -23,7 +24,12 @@ FILES: dict[str, tuple[str, str]] = {
     "nodes/test_blooming.py": ("test_node.py.txt", "blooming"),
     "tests/test_my_camera.py": ("project/test_my_camera.py.txt", ""),
 }
-NEXT = ("neusee validate my_camera.yaml", "neusee run my_camera.yaml", "neusee check nodes/blooming.py", "pytest")
+NEXT = (
+    "neusee validate my_camera.yaml",
+    "neusee run my_camera.yaml",
+    "neusee check nodes/blooming.py",
+    "pytest",
+)
 
 
 def init(
@@ -34,15 +40,22 @@ def init(
 ) -> None:
     """Make a folder for recipes, groups and nodes of your own.
 
-    The folder holds a recipe, a sensor, a node, tests, a README and a .gitignore. The recipe runs as it is. No file is
-    replaced.
+    The folder holds a recipe, a sensor, a node, tests, a README and a .gitignore. The recipe runs
+    as it is. No file is replaced.
     """
     above = [path for path in (folder, *folder.parents) if path.exists()]
     if above and not above[0].is_dir():
-        fail(f"{above[0]} is a file, so that no project can be made in {folder}: name another folder")
-    if there := [name for name in FILES if (folder / name).exists() or (folder / name).is_symlink()]:
+        fail(
+            f"{above[0]} is a file, so that no project can be made in {folder}: name another folder"
+        )
+    if there := [
+        name for name in FILES if (folder / name).exists() or (folder / name).is_symlink()
+    ]:
         where = "here" if folder == Path() else f"in {folder}"
-        fail(f"{', '.join(there)}: there is such a file {where} already, and none is replaced: name an empty folder")
+        fail(
+            f"{', '.join(there)}: there is such a file {where} already, and none is replaced: name"
+            " an empty folder"
+        )
     with failing(OSError):
         for name, (start, called) in FILES.items():
             text = (files("neusee.workflows.cli") / "starts" / start).read_text(encoding="utf-8")
@@ -50,4 +63,12 @@ def init(
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text.replace("NAME", called) if called else text, encoding="utf-8")
     place = [] if folder == Path() else [f"  cd {folder}"]
-    say([*(f"written  {folder / name}" for name in FILES), "", "next", *place, *(f"  {command}" for command in NEXT)])
+    say(
+        [
+            *(f"written  {folder / name}" for name in FILES),
+            "",
+            "next",
+            *place,
+            *(f"  {command}" for command in NEXT),
+        ]
+    )

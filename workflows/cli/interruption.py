@@ -1,4 +1,6 @@
-"""What a command prints if it is stopped, or if its results cannot be written: what is kept, and how to go on."""
+"""What a command prints if it is stopped, or if its results cannot be written: what is kept, and
+how to go on.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,8 @@ def typed_command() -> str:
 
 @contextmanager
 def resumable(kept: Callable[[], str]) -> Iterator[None]:
-    """If the ``with`` block is stopped by Ctrl-C or by an error of a file, say what is ``kept`` and how to go on.
+    """If the ``with`` block is stopped by Ctrl-C or by an error of a file, say what is ``kept`` and
+    how to go on.
 
     The exit code is 130 after Ctrl-C, and 1 after an error of a file.
     """
@@ -45,14 +48,18 @@ def resumable(kept: Callable[[], str]) -> Iterator[None]:
 
 
 def kept_in(store: Store, what: str) -> str:
-    """Return a clause that says that ``what`` is kept in the cache, or why the cache keeps nothing."""
+    """Return a clause that says that ``what`` is kept in the cache, or why the cache keeps
+    nothing.
+    """
     if store.failure:
         return f"nothing is kept, because the cache {store.root} cannot be written"
     return f"{what} kept in the cache {store.root}"
 
 
 def kept_training(out: Path, recipe: str) -> str:
-    """Return a clause that says up to which iteration the newest checkpoint keeps a training of ``recipe``."""
+    """Return a clause that says up to which iteration the newest checkpoint keeps a training of
+    ``recipe``.
+    """
     from neusee.workflows.training.loop.checkpoint import StateFile
 
     states = [*out.glob(f"{recipe}_*/state.pt"), *out.glob(f"{recipe}_*/mask.state")]
@@ -68,22 +75,30 @@ def kept_training(out: Path, recipe: str) -> str:
 
 
 def say_json(document: dict[str, Any]) -> None:
-    """Print the result of a command as one JSON object on one line of stdout; a number that is not finite is null."""
+    """Print the result of a command as one JSON object on one line of stdout; a number that is
+    not finite is null.
+    """
     say([json_line(document)])
 
 
 def say_folder(folder: Path, as_json: bool, *more: str) -> None:
-    """Print the path of the page in a folder of results, or the page's document and the files ``more`` as JSON."""
+    """Print the path of the page in a folder of results, or the page's document and the files
+    ``more`` as JSON.
+    """
     page = str(folder / "report.html")
     if not as_json:
         return say([page])
     files = ("provenance.json", *more)
     found = [json.loads(text_of(folder / name)) for name in files]
-    say_json({"report": page, **{name: value for document in found for name, value in document.items()}})
+    say_json(
+        {"report": page, **{name: value for document in found for name, value in document.items()}}
+    )
 
 
 def print_warning(message: Warning | str, *where: object, **more: object) -> None:
-    """Print a warning as one line on stderr, in place of Python's form, which shows a line of source code."""
+    """Print a warning as one line on stderr, in place of Python's form, which shows a line of
+    source code.
+    """
     from neusee.workflows.cli.repetition import doubt_answer
     from neusee.workflows.graph.diagnostics import visible
 

@@ -29,7 +29,11 @@ KINDS: dict[str, tuple[dict[str, str], tuple[str, ...]]] = {
         ("neusee check NAME.py", "neusee train train_NAME.yaml", "pytest test_NAME.py"),
     ),
     "mask": (
-        {"NAME.py": "mask.py.txt", "doe/NAME.yaml": "mask.yaml.txt", "test_NAME.py": "test_mask.py.txt"},
+        {
+            "NAME.py": "mask.py.txt",
+            "doe/NAME.yaml": "mask.yaml.txt",
+            "test_NAME.py": "test_mask.py.txt",
+        },
         ("neusee check NAME.py", "neusee run first_light doe=NAME", "pytest test_NAME.py"),
     ),
     "recipe": (
@@ -79,11 +83,21 @@ def new(
             path.write_text(text.replace("NAME", name), encoding="utf-8")
     place = [] if folder == Path() else [f"  cd {folder}"]
     written = [f"written  {path}" for path in paths]
-    say([*written, "", "next", *place, *(f"  {command.replace('NAME', name)}" for command in commands)])
+    say(
+        [
+            *written,
+            "",
+            "next",
+            *place,
+            *(f"  {command.replace('NAME', name)}" for command in commands),
+        ]
+    )
 
 
 def _taken(name: str) -> str:
-    """Return what has the name of a new module already: a family of neusee or a module elsewhere; no text if none."""
+    """Return what has the name of a new module already: a family of neusee or a module
+    elsewhere; no text if none.
+    """
     if (files("neusee") / "nodes" / name).is_dir():
         return f"the family {name} of neusee"
     try:

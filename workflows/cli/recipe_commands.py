@@ -1,4 +1,6 @@
-"""The commands for one recipe or one run of a recipe: run, validate, plan, why, config and report."""
+"""The commands for one recipe or one run of a recipe: run, validate, plan, why, config and
+report.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, say_line, the_store
+from neusee.workflows.cli.command_frame import (
+    fail,
+    failing,
+    load,
+    refusing,
+    say,
+    say_line,
+    the_store,
+)
 from neusee.workflows.cli.command_list import FAILED, MISSED
 from neusee.workflows.cli.command_options import (
     AsJson,
@@ -38,15 +48,26 @@ if TYPE_CHECKING:
 
 Rerun = Annotated[
     list[str] | None,
-    typer.Option("--rerun", metavar="STEP", help="Compute this step, and all that follow, though stored; repeatable."),
+    typer.Option(
+        "--rerun",
+        metavar="STEP",
+        help="Compute this step, and all that follow, though stored; repeatable.",
+    ),
 ]
 Where = Annotated[
     str,
-    typer.Option("--executor", help="Who computes: local, dask:4 (workers), slurm:4 (jobs), or tcp://scheduler:8786."),
+    typer.Option(
+        "--executor",
+        help="Who computes: local, dask:4 (workers), slurm:4 (jobs), or tcp://scheduler:8786.",
+    ),
 ]
 Job = Annotated[
     list[str] | None,
-    typer.Option("--job", metavar="NAME=VALUE", help="What a job of SLURM asks for: queue=gpu, cores=4; repeatable."),
+    typer.Option(
+        "--job",
+        metavar="NAME=VALUE",
+        help="What a job of SLURM asks for: queue=gpu, cores=4; repeatable.",
+    ),
 ]
 
 
@@ -65,8 +86,9 @@ def run(
 ) -> None:
     """Run a recipe and write its report.
 
-    Steps whose results are in the cache are not computed again. Without a name the recipe is first_light. The folder
-    of results holds report.html, the numbers, the pictures and the recipe with every final value.
+    Steps whose results are in the cache are not computed again. Without a name the recipe is
+    first_light. The folder of results holds report.html, the numbers, the pictures and the recipe
+    with every final value.
     """
     check_executor(executor, job or [])
     with within_memory(memory) as limit:
@@ -82,15 +104,27 @@ def run(
     store = the_store()
     predicted = _predicted(recipe, store, device, limit, executor == "local", silent)
     cheaper = with_substitutions(recipe, contents.wanted(recipe))
-    table = console.RunTable(cheaper, contents.steps_of(cheaper), console.mode_for(silent), predicted)
+    table = console.RunTable(
+        cheaper, contents.steps_of(cheaper), console.mode_for(silent), predicted
+    )
     with (
-        resumable(lambda: kept_in(store, f"{table.finished} steps are finished, and results that take time are")),
-        executor_of(executor, store, job or [], lambda line: None if silent else say_line(line)) as cluster,
+        resumable(
+            lambda: kept_in(
+                store, f"{table.finished} steps are finished, and results that take time are"
+            )
+        ),
+        executor_of(
+            executor, store, job or [], lambda line: None if silent else say_line(line)
+        ) as cluster,
         table,
     ):
-        done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit, rerun or [])
+        done = simulate(
+            cheaper, store, out, command, device, table.watch, cluster, limit, rerun or []
+        )
     hints = [] if silent else commands_to_try(recipe, command[2 : -1 if exact else None], _loads)
-    _say_briefly(done, as_json) if silent else say(console.closing(done.document, str(done.page), hints))
+    _say_briefly(done, as_json) if silent else say(
+        console.closing(done.document, str(done.page), hints)
+    )
     if done.document["missed"]:
         raise typer.Exit(MISSED)
     if executor == "local" and not rerun:
@@ -118,7 +152,9 @@ def _check_rerun(recipe: Recipe, names: Sequence[str]) -> None:
         fail(f"--rerun: {error}")
 
 
-def _text(before: Sequence[str], done: Simulation, hints: Sequence[str]) -> Callable[[str, str], str]:
+def _text(
+    before: Sequence[str], done: Simulation, hints: Sequence[str]
+) -> Callable[[str, str], str]:
     """Return a function from the folder and the seconds of a run to all that the run has printed.
 
     Without ``hints`` that is the path of the page alone.
@@ -133,7 +169,9 @@ def _text(before: Sequence[str], done: Simulation, hints: Sequence[str]) -> Call
 
 
 def _say_briefly(done: Simulation, as_json: bool) -> None:
-    """Print the path of the page of a run, or its document as JSON, and the warnings of the run on stderr."""
+    """Print the path of the page of a run, or its document as JSON, and the warnings of the run
+    on stderr.
+    """
     if as_json:
         say_json({"report": str(done.page), **done.document})
     else:
@@ -145,9 +183,11 @@ def _say_briefly(done: Simulation, as_json: bool) -> None:
 def _predicted(
     recipe: Recipe, store: Store, device: str, memory: int | None, local: bool, silent: bool
 ) -> dict[str, float]:
-    """Print how long a run will take, and return the predicted seconds of each step, as far as they are known.
+    """Print how long a run will take, and return the predicted seconds of each step, as far as they
+    are known.
 
-    A run on this machine ends before any step if the limit of memory, or the memory that is free, is too small.
+    A run on this machine ends before any step if the limit of memory, or the memory that is free,
+    is too small.
     """
     from neusee.workflows.explain.run_forecast import lanes_for, planned
     from neusee.workflows.report.console import forecast_line
@@ -159,7 +199,9 @@ def _predicted(
         fail(f"{'memory' if memory is None else '--memory'}: {plan.refused}; nothing was run")
     slots = plan.schedule.slots if plan.schedule else ()
     unknown = sum(not estimate.known for estimate in plan.expected.values())
-    line = forecast_line(plan.schedule.makespan if plan.schedule else 0.0, len(plan.expected), unknown)
+    line = forecast_line(
+        plan.schedule.makespan if plan.schedule else 0.0, len(plan.expected), unknown
+    )
     if line and not silent:
         say([line])
     return {slot.task: slot.end - slot.start for slot in slots if plan.expected[slot.task].known}
@@ -200,15 +242,18 @@ def plan(
     memory: Memory = "",
     exact: Exact = False,
     devices: Annotated[
-        str, typer.Option("--devices", help="Simulate these machines: a YAML file, or the example eight_a100.")
+        str,
+        typer.Option(
+            "--devices", help="Simulate these machines: a YAML file, or the example eight_a100."
+        ),
     ] = "",
 ) -> None:
     """Show which steps a run would compute, where and for how long.
 
-    Nothing is computed. Bytes follow from the shape of each result; seconds and memory from laws of each node that
-    were measured, and from earlier runs on this machine, each with its range. A guess for a node without a
-    measurement is marked and counts at its upper end. With --devices the run is simulated on machines that you do
-    not have: makespan, utilisation and critical path.
+    Nothing is computed. Bytes follow from the shape of each result; seconds and memory from laws of
+    each node that were measured, and from earlier runs on this machine, each with its range. A
+    guess for a node without a measurement is marked and counts at its upper end. With --devices the
+    run is simulated on machines that you do not have: makespan, utilisation and critical path.
     """
     with within_memory(memory) as limit:
         recipe, command = load(words, "plan", exact=exact)
@@ -218,10 +263,16 @@ def plan(
     store = the_store()
     if devices:
         with refusing():
-            found = run_forecast.Forecast(run_forecast.simulated_lines(recipe, store, devices), [], {}, False)
+            found = run_forecast.Forecast(
+                run_forecast.simulated_lines(recipe, store, devices), [], {}, False
+            )
     else:
         found = run_forecast.forecast(recipe, store, device, limit)
-    text = json_line({"command": shlex.join(command), **asdict(found)}) if as_json else "\n".join(found.lines)
+    text = (
+        json_line({"command": shlex.join(command), **asdict(found)})
+        if as_json
+        else "\n".join(found.lines)
+    )
     if found.totals.get("steps") == 0 and not found.refused:
         say_and_keep(text, recipe, store, found.totals["memory_of_report"] or 0.0)
     else:
@@ -262,8 +313,12 @@ def config(words: Words = None, debug: Debug = False) -> None:
 
 
 def report(
-    folder: Annotated[str, typer.Argument(metavar="RUN_FOLDER", help="A run's folder, or `latest`.")] = "latest",
-    out: Annotated[Path, typer.Option("--out", help="Folder that holds the folders of runs.")] = Path("runs"),
+    folder: Annotated[
+        str, typer.Argument(metavar="RUN_FOLDER", help="A run's folder, or `latest`.")
+    ] = "latest",
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder that holds the folders of runs.")
+    ] = Path("runs"),
     debug: Debug = False,
 ) -> None:
     """Write the page of a run again from stored results."""

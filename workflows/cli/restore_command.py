@@ -1,4 +1,6 @@
-"""The command ``neusee restore``: the scene from a frame that somebody took, and what is not known of it."""
+"""The command ``neusee restore``: the scene from a frame that somebody took, and what is not
+known of it.
+"""
 
 from __future__ import annotations
 
@@ -40,9 +42,15 @@ Frames = Annotated[
 
 def restore(
     words: Frames,
-    camera: Annotated[str, typer.Option("--camera", help="Recipe of the camera, or file of its sensor group.")],
-    mask: Annotated[str, typer.Option("--mask", help="Mask: an option of the group doe, or a height-map file.")] = "",
-    psf: Annotated[str, typer.Option("--psf", help="Folder of frames of point sources: measure the PSF.")] = "",
+    camera: Annotated[
+        str, typer.Option("--camera", help="Recipe of the camera, or file of its sensor group.")
+    ],
+    mask: Annotated[
+        str, typer.Option("--mask", help="Mask: an option of the group doe, or a height-map file.")
+    ] = "",
+    psf: Annotated[
+        str, typer.Option("--psf", help="Folder of frames of point sources: measure the PSF.")
+    ] = "",
     quiet: Quiet = False,
     as_json: AsJson = False,
     debug: Debug = False,
@@ -52,10 +60,11 @@ def restore(
 ) -> None:
     """Restore the scene from frames that a camera took.
 
-    A frame has the digital numbers of the sensor in three channels, without a tone curve: PNG or TIFF of 8 or 16 bits,
-    OpenEXR or .npy. Of the recipe --camera the lens, mask, sensor and illuminant count, not the scene and the laser.
-    With --psf, the PSF by field is measured from frames of point sources, and its error enters the uncertainty.
-    The page has the picture, the uncertainty of each pixel, and what is invented because pixels were saturated.
+    A frame has the digital numbers of the sensor in three channels, without a tone curve: PNG or
+    TIFF of 8 or 16 bits, OpenEXR or .npy. Of the recipe --camera the lens, mask, sensor and
+    illuminant count, not the scene and the laser. With --psf, the PSF by field is measured from
+    frames of point sources, and its error enters the uncertainty. The page has the picture, the
+    uncertainty of each pixel, and what is invented because pixels were saturated.
     """
     frames, changes, first = split_frames(words)
     check_device(device)
@@ -78,7 +87,12 @@ def restore(
 
 
 def _restored(
-    recipe: Recipe, store: Store, out: Path, command: list[str], place: tuple[str, int | None], silent: bool
+    recipe: Recipe,
+    store: Store,
+    out: Path,
+    command: list[str],
+    place: tuple[str, int | None],
+    silent: bool,
 ) -> Simulation:
     """Run the recipe of a frame, with the lines of its steps unless the command is silent."""
     from neusee.workflows.explain.run_forecast import lanes_for, planned
@@ -93,7 +107,9 @@ def _restored(
     if not silent:
         say(console.opening(recipe, shlex.join(command[1:])))
     cheaper = with_substitutions(recipe, contents.wanted(recipe))
-    with console.RunTable(cheaper, contents.steps_of(cheaper), console.mode_for(silent), {}) as table:
+    with console.RunTable(
+        cheaper, contents.steps_of(cheaper), console.mode_for(silent), {}
+    ) as table:
         return simulate(cheaper, store, out, command, device, table.watch, None, limit)
 
 

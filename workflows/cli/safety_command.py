@@ -1,4 +1,6 @@
-"""The command ``neusee safety``: is the sensor damaged or dazzled by a laser, and from which distance?"""
+"""The command ``neusee safety``: is the sensor damaged or dazzled by a laser, and from which
+distance?
+"""
 
 from __future__ import annotations
 
@@ -20,9 +22,10 @@ def safety(
 ) -> None:
     """Estimate damage and dazzle by a laser, and the distances.
 
-    The recipe needs a block `safety` and a laser in watts: see safety_pointer. The page has the limits of the
-    sensor with their sources, the distances where the laser exceeds them, behind the plain lens, a mask, a grey
-    filter and a smaller stop, and the limit of the eye beside them. It is an estimate, no certificate.
+    The recipe needs a block `safety` and a laser in watts: see safety_pointer. The page has the
+    limits of the sensor with their sources, the distances where the laser exceeds them, behind the
+    plain lens, a mask, a grey filter and a smaller stop, and the limit of the eye beside them. It
+    is an estimate, no certificate.
     """
     recipe, command = load(words, "safety")
     store = the_store()

@@ -1,4 +1,6 @@
-"""The commands of ``neusee study``: accuracy, stability, leave-out, calibration, uncertainty and protection."""
+"""The commands of ``neusee study``: accuracy, stability, leave-out, calibration, uncertainty and
+protection.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,9 @@ class Points(StrEnum):
 
 
 class Light(StrEnum):
-    """The choices of ``--light``: what of a laser harms the sensor, and so must be equal behind all rivals."""
+    """The choices of ``--light``: what of a laser harms the sensor, and so must be equal behind
+    all rivals.
+    """
 
     PULSE = "pulse"
     CONTINUOUS = "continuous"
@@ -62,7 +66,10 @@ class Light(StrEnum):
 def accuracy(
     words: Words = None,
     seeds: Annotated[
-        int, typer.Option("--seeds", min=1, max=1_000_000, help="Number of noise draws for the error bars.")
+        int,
+        typer.Option(
+            "--seeds", min=1, max=1_000_000, help="Number of noise draws for the error bars."
+        ),
     ] = 3,
     quick: Annotated[bool, typer.Option("--quick", help="Use fewer points.")] = False,
     quiet: Quiet = False,
@@ -72,7 +79,8 @@ def accuracy(
 ) -> None:
     """Plot the error of a recipe and of each step against the run time.
 
-    The tolerances and the settings of accuracy are varied; the page names the cheapest setting for each error.
+    The tolerances and the settings of accuracy are varied; the page names the cheapest setting for
+    each error.
     """
     _run("accuracy", words, quiet, as_json, out, seeds=seeds, quick=quick)
 
@@ -87,8 +95,8 @@ def stability(
 ) -> None:
     """Compare the steps of a recipe with float64 in stiff and extreme cases.
 
-    Values and gradients are compared: each case passes, warns or fails with its number. The exit code is 1 if
-    a case fails.
+    Values and gradients are compared: each case passes, warns or fails with its number. The exit
+    code is 1 if a case fails.
     """
     _run("stability", words, quiet, as_json, out)
 
@@ -103,8 +111,9 @@ def leave_out(
 ) -> None:
     """Measure the effect and the saved time of each omitted step.
 
-    Each omitted step is computed in full as well. The page has the stated bound, the measured change and the
-    seconds saved, and what simpler scenes cost. The exit code is 1 if a change exceeds its bound.
+    Each omitted step is computed in full as well. The page has the stated bound, the measured
+    change and the seconds saved, and what simpler scenes cost. The exit code is 1 if a change
+    exceeds its bound.
     """
     _run("leave-out", words, quiet, as_json, out)
 
@@ -113,7 +122,10 @@ def leave_out(
 def calibration(
     words: Words = None,
     simulations: Annotated[
-        int, typer.Option("--simulations", min=20, max=10_000_000, help="Number of sensors drawn from the prior.")
+        int,
+        typer.Option(
+            "--simulations", min=20, max=10_000_000, help="Number of sensors drawn from the prior."
+        ),
     ] = 200,
     move: Annotated[Move, typer.Option("--move", help="Move of the walkers.")] = Move.DE,
     quiet: Quiet = False,
@@ -123,9 +135,9 @@ def calibration(
 ) -> None:
     """Test the calibration on simulated sensors.
 
-    Sensors are drawn from the prior, their frames are simulated, and the truth is ranked among draws from each
-    posterior (simulation-based calibration, SBC). The page also shows the effect of doubling the width of each prior.
-    The exit code is 1 if ranks or coverage are wrong.
+    Sensors are drawn from the prior, their frames are simulated, and the truth is ranked among
+    draws from each posterior (simulation-based calibration, SBC). The page also shows the effect of
+    doubling the width of each prior. The exit code is 1 if ranks or coverage are wrong.
     """
     _run("calibration", words, quiet, as_json, out, simulations=simulations, move=move.value)
 
@@ -135,20 +147,35 @@ def uncertainty(
     words: Words = None,
     error: Annotated[
         float,
-        typer.Option("--error", min=1e-3, max=1.0, help="Relative error of each standard deviation at which to stop."),
+        typer.Option(
+            "--error",
+            min=1e-3,
+            max=1.0,
+            help="Relative error of each standard deviation at which to stop.",
+        ),
     ] = 0.05,
-    most: Annotated[int, typer.Option("--most", min=64, max=10_000_000, help="Largest number of draws.")] = 1000,
+    most: Annotated[
+        int, typer.Option("--most", min=64, max=10_000_000, help="Largest number of draws.")
+    ] = 1000,
     points: Annotated[
-        Points, typer.Option("--points", help="Independent draws, or a Sobol sequence, which needs fewer.")
+        Points,
+        typer.Option("--points", help="Independent draws, or a Sobol sequence, which needs fewer."),
     ] = Points.DRAWS,
     until: Annotated[
         list[str] | None,
-        typer.Option("--until", metavar="NAME", help="Output or quantity that decides when to stop; may be repeated."),
+        typer.Option(
+            "--until",
+            metavar="NAME",
+            help="Output or quantity that decides when to stop; may be repeated.",
+        ),
     ] = None,
     workers: Annotated[
         int,
         typer.Option(
-            "--workers", min=0, max=10_000, help="Number of draws computed at the same time; 0: by free processors."
+            "--workers",
+            min=0,
+            max=10_000,
+            help="Number of draws computed at the same time; 0: by free processors.",
         ),
     ] = 0,
     device: OneDevice = "cpu",
@@ -159,12 +186,18 @@ def uncertainty(
 ) -> None:
     """Propagate uncertain values to the outputs.
 
-    Uncertain are values given as distributions, such as "normal(1 e-, 0.1 e-)", and those of a `posterior`. Draws
-    go on until each standard deviation, or each that --until names, is known to --error; the page says which input
-    causes the scatter. Run the same command again to continue.
+    Uncertain are values given as distributions, such as "normal(1 e-, 0.1 e-)", and those of a
+    `posterior`. Draws go on until each standard deviation, or each that --until names, is known to
+    --error; the page says which input causes the scatter. Run the same command again to continue.
     """
     check_device(device)
-    how: dict[str, Any] = {"error": error, "most": most, "points": points.value, "workers": workers, "device": device}
+    how: dict[str, Any] = {
+        "error": error,
+        "most": most,
+        "points": points.value,
+        "workers": workers,
+        "device": device,
+    }
     how["until"] = tuple(until or ())
     _run("uncertainty", words, quiet, as_json, out, _refuse_unknown_until, **how)
 
@@ -182,17 +215,32 @@ def protection(
         ),
     ] = 12,
     bands: Annotated[
-        int, typer.Option("--bands", min=1, max=100_000, help="Number of bands of the scene; the laser may have all.")
+        int,
+        typer.Option(
+            "--bands",
+            min=1,
+            max=100_000,
+            help="Number of bands of the scene; the laser may have all.",
+        ),
     ] = 7,
     light: Annotated[
-        Light, typer.Option("--light", help="Equal peak for a pulse, or equal heat for continuous light.")
+        Light,
+        typer.Option("--light", help="Equal peak for a pulse, or equal heat for continuous light."),
     ] = Light.PULSE,
-    size: Annotated[float, typer.Option("--size", min=5.0, max=1e5, help="Height of the targets in pixels.")] = 14.0,
+    size: Annotated[
+        float, typer.Option("--size", min=5.0, max=1e5, help="Height of the targets in pixels.")
+    ] = 14.0,
     prnu: Annotated[
-        float, typer.Option("--prnu", min=0.0, max=1.0, help="Relative spread of the sensitivity of pixels.")
+        float,
+        typer.Option(
+            "--prnu", min=0.0, max=1.0, help="Relative spread of the sensitivity of pixels."
+        ),
     ] = 0.01,
     residual: Annotated[
-        float, typer.Option("--residual", min=0.0, max=1.0, help="Share of the glare that is subtracted wrongly.")
+        float,
+        typer.Option(
+            "--residual", min=0.0, max=1.0, help="Share of the glare that is subtracted wrongly."
+        ),
     ] = 0.02,
     quiet: Quiet = False,
     as_json: AsJson = False,
@@ -201,8 +249,9 @@ def protection(
 ) -> None:
     """Compare a mask with a grey filter and a smaller stop of equal protection.
 
-    For a quiet frame and under attack: error of the filtered picture, information, NEQ, and detection of details, over
-    scene light and protection, with the bounds of every mask. The page begins with a paragraph to quote.
+    For a quiet frame and under attack: error of the filtered picture, information, NEQ, and
+    detection of details, over scene light and protection, with the bounds of every mask. The page
+    begins with a paragraph to quote.
     """
     how: dict[str, Any] = {"draws": draws, "bands": bands, "light": light.value, "size": size}
     how |= {"prnu": prnu, "residual": residual}
@@ -214,7 +263,10 @@ def _refuse_unknown_until(recipe: Recipe, options: dict[str, Any]) -> None:
     for name in options["until"]:
         outputs = {output.partition("[")[0] for output in recipe.outputs}
         if name.partition("[")[0].partition(".")[0] not in outputs:
-            fail(f"--until {name}: no output of {recipe.name} has this name; {nearest(name, outputs)}")
+            fail(
+                f"--until {name}: no output of {recipe.name} has this name;"
+                f" {nearest(name, outputs)}"
+            )
 
 
 def _any_recipe(recipe: Recipe, options: dict[str, Any]) -> None:
@@ -240,8 +292,15 @@ def _run(
     command += option_words(options)
     progress = progress_lines(quiet or as_json)
     kept = resumable(lambda: kept_in(store, "the parts that are finished are"))
-    with kept, failing(RunError, ImportError, code=FAILED), failing(ValueError, code=BAD), refusing():
-        folder = verbs.study(recipe, kind=kind, store=store, out=out, command=command, progress=progress, **options)
+    with (
+        kept,
+        failing(RunError, ImportError, code=FAILED),
+        failing(ValueError, code=BAD),
+        refusing(),
+    ):
+        folder = verbs.study(
+            recipe, kind=kind, store=store, out=out, command=command, progress=progress, **options
+        )
     say_folder(folder, as_json)
     if count := count_failures(folder):
         fail(f"{count} do not hold: see {folder / 'report.html'}", FAILED)

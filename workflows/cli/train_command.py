@@ -40,10 +40,16 @@ class Stages(StrEnum):
     MASK = "mask"
 
 
-_STAGES = "1: mask and network; 2: network alone; both: 1, then 2; mask: mask alone, without images."
-_MESH = "DATAxBAND processes of torchrun: 4x2, four groups that share the bands by two; else all share the data."
+_STAGES = (
+    "1: mask and network; 2: network alone; both: 1, then 2; mask: mask alone, without images."
+)
+_MESH = (
+    "DATAxBAND processes of torchrun: 4x2, four groups that share the bands by two; else all share"
+    " the data."
+)
 _LINES = 10  #: lines of progress for a stage, outside a terminal
-_NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.MASK: (0,)}  #: the `stages` that `verbs.train` takes
+#: the `stages` that `verbs.train` takes
+_NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.MASK: (0,)}
 
 
 def train(
@@ -58,30 +64,41 @@ def train(
 ) -> None:
     """Train the mask of a recipe and its restoring network.
 
-    Pictures come from the folder `train.photographs`; the paper trains in two stages. With --stage mask the mask is
-    designed without images, as `train.mask` says; --stage 2 then trains the network behind that mask. The recipe
-    `train_lift` trains a network from RGB to spectra instead. Without a name the recipe is train_small. Run the same
-    command again to continue a training that was stopped.
+    Pictures come from the folder `train.photographs`; the paper trains in two stages. With --stage
+    mask the mask is designed without images, as `train.mask` says; --stage 2 then trains the
+    network behind that mask. The recipe `train_lift` trains a network from RGB to spectra instead.
+    Without a name the recipe is train_small. Run the same command again to continue a training that
+    was stopped.
 
-    Several processes share one training: torchrun --nproc-per-node 8 --no-python neusee train RECIPE --device cuda
-    --mesh 4x2.
+    Several processes share one training: torchrun --nproc-per-node 8 --no-python neusee train
+    RECIPE --device cuda --mesh 4x2.
     """
     recipe, command = load(words or ["train_small"], "train")
     if recipe.lifting is not None:
         if stage is not Stages.BOTH or mesh:
-            fail(f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage and --mesh out")
+            fail(
+                f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage"
+                " and --mesh out"
+            )
         check_device(device)
         return _lift(recipe, command, out, device, quiet, as_json)
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
-    from neusee.workflows.training.parallel.process_mesh import MeshError, device_here, joined, processes
+    from neusee.workflows.training.parallel.process_mesh import (
+        MeshError,
+        device_here,
+        joined,
+        processes,
+    )
 
     device, (rank, world) = device_here(device), processes()
     check_device(device)
     silent, who = quiet or as_json or rank > 0, f"process {rank}: " if world > 1 else ""
     stages = _NUMBERS.get(stage, recipe.training.learnt if recipe.training else ())
     command += ["--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
-    lengths = {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
+    lengths = (
+        {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
+    )
     with (
         resumable(lambda: kept_training(out, recipe.name)),
         failing(RunError, ValueError, ArithmeticError, code=FAILED, before=who),
@@ -90,8 +107,17 @@ def train(
         joined(mesh, device) as processes_here,
         _loss_bar(silent, lengths) as watch,
     ):
-        folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(silent),
-                             command=command, stages=stages, watch=watch, mesh=processes_here)  # fmt: skip
+        folder = verbs.train(
+            recipe,
+            store=the_store(),
+            device=device,
+            out=out,
+            progress=progress_lines(silent),
+            command=command,
+            stages=stages,
+            watch=watch,
+            mesh=processes_here,
+        )
     if rank == 0:
         _say_results(folder, as_json, [] if silent else _next(folder, stage))
 
@@ -105,7 +131,9 @@ def _say_results(folder: Path, as_json: bool, lines: list[str]) -> None:
     say_json({"folder": str(folder), **found})
 
 
-def _lift(recipe: Recipe, command: list[str], out: Path, device: str, quiet: bool, as_json: bool) -> None:
+def _lift(
+    recipe: Recipe, command: list[str], out: Path, device: str, quiet: bool, as_json: bool
+) -> None:
     """Train the network of a recipe that reconstructs spectra from RGB."""
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
@@ -118,11 +146,24 @@ def _lift(recipe: Recipe, command: list[str], out: Path, device: str, quiet: boo
         refusing(),
         _loss_bar(silent, lengths) as watch,
     ):
-        folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(silent),
-                             command=command, watch=watch)  # fmt: skip
+        folder = verbs.train(
+            recipe,
+            store=the_store(),
+            device=device,
+            out=out,
+            progress=progress_lines(silent),
+            command=command,
+            watch=watch,
+        )
     weights = folder / "mst_plus_plus.safetensors"
-    again = shlex.join(["neusee", "run", "first_light", "lift=mst_plus_plus", f"lift.weights={weights}"])
-    lines = [f"weights: {weights}", f"curves:  {folder / 'curves.png'}", f"judged:  {folder / 'training.json'}"]
+    again = shlex.join(
+        ["neusee", "run", "first_light", "lift=mst_plus_plus", f"lift.weights={weights}"]
+    )
+    lines = [
+        f"weights: {weights}",
+        f"curves:  {folder / 'curves.png'}",
+        f"judged:  {folder / 'training.json'}",
+    ]
     _say_results(folder, as_json, [] if silent else [*lines, f"next:    {again}"])
 
 
@@ -137,27 +178,46 @@ def _next(folder: Path, stage: Stages) -> list[str]:
 
 
 @contextmanager
-def _loss_bar(quiet: bool, lengths: Mapping[int, int]) -> Iterator[Callable[[int, int, Mapping[str, float]], None]]:
-    """Show a progress bar on a terminal, and a line for each tenth of a stage elsewhere; yield a function for both.
+def _loss_bar(
+    quiet: bool, lengths: Mapping[int, int]
+) -> Iterator[Callable[[int, int, Mapping[str, float]], None]]:
+    """Show a progress bar on a terminal, and a line for each tenth of a stage elsewhere; yield a
+    function for both.
 
     The function shows the losses of an iteration.
     """
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
     console = Console(stderr=True)
     hidden = quiet or not console.is_terminal
     bar = Progress(*columns, TextColumn("{task.fields[losses]}"), console=console, disable=hidden)
     lines = ProgressLines(quiet)
-    tasks = {s: bar.add_task(f"stage {s}" if s else "lift", total=n, losses="") for s, n in lengths.items()}
+    tasks = {
+        s: bar.add_task(f"stage {s}" if s else "lift", total=n, losses="")
+        for s, n in lengths.items()
+    }
 
     def watch(stage: int, done: int, losses: Mapping[str, float]) -> None:
         names = [name for name in ("LSR", "L1", "critics", "MRAE", "RMSE") if name in losses]
         text = " ".join(f"{name} {losses[name]:.3g}" for name in names)
         bar.update(tasks[stage], completed=done, losses=text)
         if bar.disable and not quiet and done % max(1, lengths[stage] // _LINES) == 0:
-            lines(f"{f'stage {stage}, ' if stage else ''}iteration {done} of {lengths[stage]}: {text}")
+            lines(
+                f"{f'stage {stage}, ' if stage else ''}iteration {done} of {lengths[stage]}: {text}"
+            )
 
     with bar:
         yield watch

@@ -1,4 +1,6 @@
-"""The typer program: its options and its commands; a command is imported only if the command line names it."""
+"""The typer program: its options and its commands; a command is imported only if the command
+line names it.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,10 @@ def _print_version(wanted: bool) -> None:
 
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", help="Show the version and exit.", callback=_print_version, is_eager=True)
+        bool,
+        typer.Option(
+            "--version", help="Show the version and exit.", callback=_print_version, is_eager=True
+        ),
     ] = False,
     no_code: Annotated[
         bool, typer.Option(NO_CODE, help="Refuse recipes that name code; also after a command.")
@@ -34,7 +39,9 @@ def _options(
 
 
 def program(names: Collection[str] = tuple(COMMANDS)) -> typer.Typer:
-    """Return the program with the options of the commands ``names``, and one line of help for every other command."""
+    """Return the program with the options of the commands ``names``, and one line of help for
+    every other command.
+    """
     app = typer.Typer(
         name="neusee",
         help=SUMMARY,
@@ -70,6 +77,11 @@ def run_program(arguments: list[str], completes: bool) -> int:
         os.environ["NEUSEE_NO_CODE"] = "1"
         arguments = [argument for argument in arguments if argument != NO_CODE]
     try:
-        return program(COMMANDS if completes else arguments)(arguments, standalone_mode=False, prog_name="neusee") or 0
+        return (
+            program(COMMANDS if completes else arguments)(
+                arguments, standalone_mode=False, prog_name="neusee"
+            )
+            or 0
+        )
     except typer.Abort:
         raise KeyboardInterrupt from None

@@ -1,4 +1,6 @@
-"""Comparison of two runs: everything that differs, and the folder with its page, table and pictures."""
+"""Comparison of two runs: everything that differs, and the folder with its page, table and
+pictures.
+"""
 
 from __future__ import annotations
 
@@ -37,12 +39,16 @@ class RunComparison:
 
     @property
     def largest(self) -> float:
-        """Return the largest relative difference of a number of both runs; infinite if one run lacks a number."""
+        """Return the largest relative difference of a number of both runs; infinite if one run
+        lacks a number.
+        """
         return max((each.relative for each in self.numbers), default=0.0)
 
 
 def compare(left: RunRecord, right: RunRecord) -> RunComparison:
-    """Return everything that differs between two runs; raise `NotComparable` for a damaged picture or data file."""
+    """Return everything that differs between two runs; raise `NotComparable` for a damaged
+    picture or data file.
+    """
     began = timestamp()
     return RunComparison(
         left,
@@ -67,8 +73,15 @@ def document(found: RunComparison) -> dict[str, Any]:
         "right": str(found.right.folder),
         "largest": found.largest,
         "numbers": [
-            {"name": n.name, "index": n.index, "left": n.left, "right": n.right, "difference": n.difference,
-             "relative": n.relative} for n in found.numbers
+            {
+                "name": n.name,
+                "index": n.index,
+                "left": n.left,
+                "right": n.right,
+                "difference": n.difference,
+                "relative": n.relative,
+            }
+            for n in found.numbers
         ],
         "recipe": [asdict(each) for each in found.recipe],
         "code": found.code,
@@ -77,14 +90,18 @@ def document(found: RunComparison) -> dict[str, Any]:
         "figures": [_of_file(each) for each in found.figures],
         "data": [_of_file(each) for each in found.data],
         "missing": found.missing,
-    }  # fmt: skip
+    }
 
 
 def write_comparison(found: RunComparison, out: Path, command: Sequence[str]) -> Path:
-    """Write the folder ``out/comparisons/<date>_<recipe>_<key>/`` of a comparison, and return its path."""
+    """Write the folder ``out/comparisons/<date>_<recipe>_<key>/`` of a comparison, and return
+    its path.
+    """
     content = document(found)
     names = list(dict.fromkeys(side.document.recipe for side in (found.left, found.right)))
-    with new_run(out / "comparisons", "_and_".join(names), digest(content["left"], content["right"])) as folder:
+    with new_run(
+        out / "comparisons", "_and_".join(names), digest(content["left"], content["right"])
+    ) as folder:
         about = {
             "study": "compare",
             "recipe": names[0],

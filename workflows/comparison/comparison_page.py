@@ -1,4 +1,6 @@
-"""The page of a comparison of two runs: numbers, pictures, recipe, code and environment, in this order."""
+"""The page of a comparison of two runs: numbers, pictures, recipe, code and environment, in this
+order.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,13 @@ def report(found: RunComparison) -> StudyReport:
     """Return the page of a comparison with its pictures and its table of numbers."""
     rows = [[n.name, n.index, n.left, n.right, n.difference, n.relative] for n in found.numbers]
     drawings = [each for each in (*found.figures, *found.data) if each.drawing]
-    sections = [_results(found), _numbers(found), *map(_drawing, drawings), _files(found), *_causes(found)]
+    sections = [
+        _results(found),
+        _numbers(found),
+        *map(_drawing, drawings),
+        _files(found),
+        *_causes(found),
+    ]
     return StudyReport(
         f"{found.left.name} and {found.right.name}",
         "\n\n".join([" ".join(summary(found)), _runs(found)]),
@@ -34,17 +42,28 @@ def report(found: RunComparison) -> StudyReport:
 
 def summary(found: RunComparison) -> list[str]:
     """Return sentences that count what differs between two runs."""
-    drawn, data = ([each for each in files if each.state != "same"] for files in (found.figures, found.data))
-    code = "The left or the right folder records no digests of code." if found.code is None else (
-        f"{_counted(len(found.code), 'difference')} in the code." if found.code else "The code is the same."
-    )  # fmt: skip
+    drawn, data = (
+        [each for each in files if each.state != "same"] for files in (found.figures, found.data)
+    )
+    code = (
+        "The left or the right folder records no digests of code."
+        if found.code is None
+        else (
+            f"{_counted(len(found.code), 'difference')} in the code."
+            if found.code
+            else "The code is the same."
+        )
+    )
     return [
         *_compared(found.numbers),
         f"{len(drawn)} of {_counted(len(found.figures), 'picture')} differ.",
         f"{len(data)} of {_counted(len(found.data), 'data file')} and tensors differ.",
-        f"{_counted(len(found.recipe), 'value')} of the recipe differ{'s' * (len(found.recipe) == 1)}."
-        if found.recipe
-        else "The recipe is the same.",
+        (
+            f"{_counted(len(found.recipe), 'value')} of the recipe"
+            f" differ{'s' * (len(found.recipe) == 1)}."
+            if found.recipe
+            else "The recipe is the same."
+        ),
         code,
     ]
 
@@ -54,16 +73,29 @@ def _compared(numbers: Sequence[NumberDifference]) -> list[str]:
     both = [each for each in numbers if each.left is not None and each.right is not None]
     differ = [each for each in both if each.relative > 0]
     counted = _counted(len(both), "number")
-    said = f"{len(differ)} of {counted} differ{_by(differ)}." if differ else f"All {counted} are the same."
-    alone = {"left": sum(each.right is None for each in numbers), "right": sum(each.left is None for each in numbers)}
+    said = (
+        f"{len(differ)} of {counted} differ{_by(differ)}."
+        if differ
+        else f"All {counted} are the same."
+    )
+    alone = {
+        "left": sum(each.right is None for each in numbers),
+        "right": sum(each.left is None for each in numbers),
+    }
     return [
         *([said] if both or not numbers else ["The runs have no number in common."]),
-        *(f"Only the {side} run has {_counted(count, 'further number')}." for side, count in alone.items() if count),
+        *(
+            f"Only the {side} run has {_counted(count, 'further number')}."
+            for side, count in alone.items()
+            if count
+        ),
     ]
 
 
 def difference_text(each: NumberDifference) -> list[str]:
-    """Return name, index, both sides, difference and relative difference of a number as cells of a table."""
+    """Return name, index, both sides, difference and relative difference of a number as cells of
+    a table.
+    """
     sides = [_NONE if side is None else f"{side:.6g}" for side in (each.left, each.right)]
     change = _NONE if each.difference is None else f"{each.difference:+.3g}"
     return [each.name, str(each.index), *sides, change, _relative(each.relative)]
@@ -84,7 +116,12 @@ def _counted(count: int, word: str) -> str:
 
 def _runs(found: RunComparison) -> str:
     sides = (("Left", found.left), ("right", found.right))
-    return "; ".join(f"{word}: `{run.document.command}`, {run.document.started}" for word, run in sides) + "."
+    return (
+        "; ".join(
+            f"{word}: `{run.document.command}`, {run.document.started}" for word, run in sides
+        )
+        + "."
+    )
 
 
 def _results(found: RunComparison) -> Section:
@@ -95,15 +132,22 @@ def _results(found: RunComparison) -> Section:
 
 def _numbers(found: RunComparison) -> Section:
     differ = largest(found.numbers)
-    text = """Each result with a number that differs; of several numbers, such as one for each band, the one with the
-        largest relative difference. Relative means: divided by the larger of both. `numbers.csv` has all numbers."""
+    text = """Each result with a number that differs; of several numbers, such as one for each band,
+        the one with the largest relative difference. Relative means: divided by the larger of both.
+        `numbers.csv` has all numbers."""
     if not differ:
         text = "Every number of both runs is the same. `numbers.csv` has all numbers."
-    return Section("Numbers", text, _COLUMNS if differ else (), [difference_text(each) for each in differ])
+    return Section(
+        "Numbers", text, _COLUMNS if differ else (), [difference_text(each) for each in differ]
+    )
 
 
 def _drawing(each: FileDifference) -> Section:
-    said = f"Root mean square difference {each.rms:.3g}." if each.rms is not None else f"{each.state}.".capitalize()
+    said = (
+        f"Root mean square difference {each.rms:.3g}."
+        if each.rms is not None
+        else f"{each.state}.".capitalize()
+    )
     scale = f" Largest value of both {each.scale:.4g}." if each.scale not in (None, 255.0) else ""
     return Section(each.name, said + scale, picture=each.drawing)
 
@@ -111,8 +155,8 @@ def _drawing(each: FileDifference) -> Section:
 def _files(found: RunComparison) -> Section:
     files = [*found.figures, *found.data]
     rows = [[each.name, each.state, each.largest, each.rms, each.scale] for each in files]
-    text = """Differences of figures are in levels of 0 to 255, those of data files in the unit of the file. Figures of
-        times and of the graph are not compared."""
+    text = """Differences of figures are in levels of 0 to 255, those of data files in the unit of
+        the file. Figures of times and of the graph are not compared."""
     lines = _sentences(found.missing)
     columns = ("file", "state", "largest difference", "root mean square", "largest value")
     return Section("Files", f"{text}\n\n{lines}" if lines else text, columns if rows else (), rows)
@@ -123,26 +167,51 @@ def _causes(found: RunComparison) -> list[Section]:
         _table("Recipe", "The final values of both recipes", found.recipe, sources=True),
         Section(
             "Code",
-            "The folder of a run of an earlier version records no digests of code, so that the code is not compared."
-            if found.code is None
-            else "What differs in the code of the nodes, by module and definition."
-            if found.code
-            else "The code of every common node is the same.",
+            (
+                "The folder of a run of an earlier version records no digests of code, so that the"
+                " code is not compared."
+                if found.code is None
+                else (
+                    "What differs in the code of the nodes, by module and definition."
+                    if found.code
+                    else "The code of every common node is the same."
+                )
+            ),
             ("difference",) if found.code else (),
             [[line] for line in found.code or ()],
         ),
-        Section("Steps", _sentences(found.steps) or "Both runs have the same steps with the same cache keys."),
+        Section(
+            "Steps",
+            _sentences(found.steps) or "Both runs have the same steps with the same cache keys.",
+        ),
         _table("Environment", "Command, device, machine and versions", found.environment),
     ]
 
 
-def _table(heading: str, what: str, rows: Iterable[ValueDifference], sources: bool = False) -> Section:
+def _table(
+    heading: str, what: str, rows: Iterable[ValueDifference], sources: bool = False
+) -> Section:
     cells: list[list[Any]] = [
-        [each.name, each.left or _NONE, each.right or _NONE,
-         *([each.left_source or _NONE, each.right_source or _NONE] if sources else [])] for each in rows
-    ]  # fmt: skip
-    columns = ("name", "left", "right", *(("left written in", "right written in") if sources else ()))
-    return Section(heading, f"{what} {'that differ' if cells else 'are the same'}.", columns if cells else (), cells)
+        [
+            each.name,
+            each.left or _NONE,
+            each.right or _NONE,
+            *([each.left_source or _NONE, each.right_source or _NONE] if sources else []),
+        ]
+        for each in rows
+    ]
+    columns = (
+        "name",
+        "left",
+        "right",
+        *(("left written in", "right written in") if sources else ()),
+    )
+    return Section(
+        heading,
+        f"{what} {'that differ' if cells else 'are the same'}.",
+        columns if cells else (),
+        cells,
+    )
 
 
 def _sentences(lines: list[str]) -> str:

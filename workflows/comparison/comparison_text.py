@@ -50,4 +50,7 @@ def _value(each: ValueDifference) -> str:
 def _file(each: FileDifference) -> str:
     if each.largest is None:
         return f"{each.name}: {each.state}"
-    return f"{each.name}: differs by at most {each.largest:.4g}, where the largest value is {each.scale:.4g}"
+    return (
+        f"{each.name}: differs by at most {each.largest:.4g}, where the largest value is"
+        f" {each.scale:.4g}"
+    )

@@ -30,7 +30,9 @@ class NumberDifference:
 
     @property
     def difference(self) -> float | None:
-        """Return right minus left, 0 for equal numbers (also infinite or NaN ones), None where one is missing."""
+        """Return right minus left, 0 for equal numbers (also infinite or NaN ones), None where
+        one is missing.
+        """
         if self.left is None or self.right is None:
             return None
         if self.left == self.right or (math.isnan(self.left) and math.isnan(self.right)):
@@ -39,18 +41,24 @@ class NumberDifference:
 
     @property
     def relative(self) -> float:
-        """Return the difference relative to the larger number of both, without sign; infinite where none is defined."""
+        """Return the difference relative to the larger number of both, without sign; infinite
+        where none is defined.
+        """
         difference = self.difference
         if difference == 0:
             return 0.0
         if difference is None or not math.isfinite(difference):
             return math.inf
-        return abs(difference) / max(abs(side) for side in (self.left, self.right) if side is not None)
+        return abs(difference) / max(
+            abs(side) for side in (self.left, self.right) if side is not None
+        )
 
 
 @dataclass(frozen=True)
 class ValueDifference:
-    """One entry that differs, with its text in both runs and its sources; an empty text stands for no entry."""
+    """One entry that differs, with its text in both runs and its sources; an empty text stands
+    for no entry.
+    """
 
     name: str
     left: str
@@ -61,48 +69,69 @@ class ValueDifference:
 
 def numbers(left: RunRecord, right: RunRecord) -> list[NumberDifference]:
     """Return every number of two runs, in the order of the first run and then of the second."""
-    sides = [{(s, f, i): math.nan if x is None else x for s, f, i, x in r.document.metrics} for r in (left, right)]
+    sides = [
+        {(s, f, i): math.nan if x is None else x for s, f, i, x in r.document.metrics}
+        for r in (left, right)
+    ]
     names = dict.fromkeys([*sides[0], *sides[1]])
     return [NumberDifference(*name, sides[0].get(name), sides[1].get(name)) for name in names]
 
 
 def largest(found: list[NumberDifference]) -> list[NumberDifference]:
-    """Return, for each result that differs, its number with the largest relative difference; the largest first."""
+    """Return, for each result that differs, its number with the largest relative difference; the
+    largest first.
+    """
     worst: dict[str, NumberDifference] = {}
     for each in found:
-        if each.relative > 0 and (each.name not in worst or each.relative > worst[each.name].relative):
+        if each.relative > 0 and (
+            each.name not in worst or each.relative > worst[each.name].relative
+        ):
             worst[each.name] = each
     return sorted(worst.values(), key=lambda each: -each.relative)
 
 
 def table(left: RunRecord, right: RunRecord) -> tuple[list[str], list[list[str]]]:
-    """Return the result tables of two runs as one table, whose rows are the rows of both runs in turn."""
+    """Return the result tables of two runs as one table, whose rows are the rows of both runs in
+    turn.
+    """
     sides = [record.document.table for record in (left, right)]
     columns = list(dict.fromkeys([*sides[0].columns, *sides[1].columns]))
     names = dict.fromkeys(str(row.get("name", "")) for side in sides for row in side.rows)
     rows = []
     for name in names:
         for side, word in zip(sides, ("left", "right"), strict=True):
-            cells = next((dict(zip(side.columns, r.get("cells", []), strict=False)) for r in side.rows
-                          if r.get("name") == name), None)  # fmt: skip
+            cells = next(
+                (
+                    dict(zip(side.columns, r.get("cells", []), strict=False))
+                    for r in side.rows
+                    if r.get("name") == name
+                ),
+                None,
+            )
             if cells is not None:
                 rows.append([name, word, *(str(cells.get(column, "")) for column in columns)])
     return ["", "run", *columns], rows
 
 
 def recipe(left: RunRecord, right: RunRecord) -> list[ValueDifference]:
-    """Return the final values that differ between two recipes, each with the places where it was written."""
+    """Return the final values that differ between two recipes, each with the places where it was
+    written.
+    """
     found = []
     for name in dict.fromkeys([*left.values, *right.values]):
         sides = [record.values.get(name) for record in (left, right)]
         texts = [side.text if side else "" for side in sides]
         if texts[0] != texts[1]:
-            found.append(ValueDifference(name, *texts, *(side.source if side else "" for side in sides)))
+            found.append(
+                ValueDifference(name, *texts, *(side.source if side else "" for side in sides))
+            )
     return found
 
 
 def code(left: RunRecord, right: RunRecord) -> list[str] | None:
-    """Return one line for each node whose code differs and for each changed definition; None without digests."""
+    """Return one line for each node whose code differs and for each changed definition; None
+    without digests.
+    """
     if left.code is None or right.code is None:
         return None
     one, other = left.code.nodes, right.code.nodes
@@ -121,7 +150,11 @@ def environment(left: RunRecord, right: RunRecord) -> list[ValueDifference]:
         each |= {"command": document.command}
     for each, record in zip(facts, (left, right), strict=True):
         parts = record.code.parts if record.code else {}
-        packages = {name.removeprefix(_PACKAGE): _release(p) for name, p in parts.items() if name.startswith(_PACKAGE)}
+        packages = {
+            name.removeprefix(_PACKAGE): _release(p)
+            for name, p in parts.items()
+            if name.startswith(_PACKAGE)
+        }
         settings = parts.get(_SETTINGS, {})
         each |= {name: version for name, version in packages.items() if name not in each} | settings
     names = dict.fromkeys([*facts[0], *facts[1]])
@@ -130,12 +163,21 @@ def environment(left: RunRecord, right: RunRecord) -> list[ValueDifference]:
 
 
 def steps(left: RunRecord, right: RunRecord) -> list[str]:
-    """Return lines that count the steps with other cache keys, and name the steps that only one run has."""
+    """Return lines that count the steps with other cache keys, and name the steps that only one
+    run has.
+    """
     one, other = ({row.step: row.key for row in r.document.steps} for r in (left, right))
     both = one.keys() & other.keys()
     differ = [name for name in one if name in both and one[name] != other[name]]
-    lines = [f"{len(differ)} of {len(both)} common steps have another cache key: {_listed(differ)}"] if differ else []
-    return [*lines, *(f"only the {side} run has the step {name}" for side, name in _only(one, other))]
+    lines = (
+        [f"{len(differ)} of {len(both)} common steps have another cache key: {_listed(differ)}"]
+        if differ
+        else []
+    )
+    return [
+        *lines,
+        *(f"only the {side} run has the step {name}" for side, name in _only(one, other)),
+    ]
 
 
 def _release(package: Mapping[str, str]) -> str:
@@ -149,7 +191,8 @@ def _definitions(
 ) -> Iterator[str]:
     """Yield one line for each definition of a module, or declared file, that differs.
 
-    With ``whole``, also for each module that only one run uses, which means little if their nodes are not the same.
+    With ``whole``, also for each module that only one run uses, which means little if their nodes
+    are not the same.
     """
     for module in sorted(left.keys() | right.keys()):
         if module in (_SETTINGS, _PYTHON) or module.startswith(_PACKAGE):
@@ -163,7 +206,9 @@ def _definitions(
             if old != new and left.get(name) == right.get(name):
                 yield f"a value that {name} holds differs: a constant, a table or a default"
         else:
-            labels = sorted(label for label in old.keys() | new.keys() if old.get(label) != new.get(label))
+            labels = sorted(
+                label for label in old.keys() | new.keys() if old.get(label) != new.get(label)
+            )
             yield from (f"{module}: {label} {_how(old, new, label)}" for label in labels)
 
 

@@ -1,4 +1,6 @@
-"""Differences between the pictures and data files of two runs, and drawings of both sides with their difference."""
+"""Differences between the pictures and data files of two runs, and drawings of both sides with
+their difference.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from neusee.workflows.comparison.run_record import NotComparable
 from neusee.workflows.keys.regular_file import refuse_other_than_file
 from neusee.workflows.report.figures.style import canvas, drawn, picture
 
-_TIMES = frozenset({"timeline", "graph", "error_time"})  #: figures of one run's times and states, which are no results
+#: figures of one run's times and states, which are no results
+_TIMES = frozenset({"timeline", "graph", "error_time"})
 _COLOURS = 4  #: channels of a data file that is drawn as a picture
 _WIDE = 1.7  #: width over height, above which the two sides stand one above the other
 _BROKEN = "the file is damaged: run the recipe again"
@@ -20,11 +23,14 @@ _BROKEN = "the file is damaged: run the recipe again"
 
 @dataclass(frozen=True)
 class FileDifference:
-    """The difference between a file of one run and the file of the same name of another run, and a drawing of both."""
+    """The difference between a file of one run and the file of the same name of another run, and
+    a drawing of both.
+    """
 
     name: str
     state: str  #: "same", "differs", or why the contents cannot be subtracted
-    largest: float | None = None  #: largest absolute difference, in the unit of the file or in levels of 0 to 255
+    #: largest absolute difference, in the unit of the file or in levels of 0 to 255
+    largest: float | None = None
     rms: float | None = None  #: root mean square of the difference
     scale: float | None = None  #: largest absolute value of both files
     drawing: bytes | None = None  #: PNG
@@ -32,12 +38,17 @@ class FileDifference:
 
 def figures(left: Path, right: Path) -> list[FileDifference]:
     """Return the difference of each figure that both runs have, apart from figures of times."""
-    names = [name for name in _common(left / "figures", right / "figures", ".png") if Path(name).stem not in _TIMES]
+    names = [
+        name
+        for name in _common(left / "figures", right / "figures", ".png")
+        if Path(name).stem not in _TIMES
+    ]
     return [_figure(name, left / "figures" / name, right / "figures" / name) for name in names]
 
 
 def data_files(left: Path, right: Path) -> list[FileDifference]:
-    """Return the difference of each data file that both runs have: each EXR file and each tensor of a safetensors file.
+    """Return the difference of each data file that both runs have: each EXR file and each tensor of
+    a safetensors file.
 
     Only the bytes of other files are compared.
     """
@@ -60,8 +71,16 @@ def only_one_has(left: Path, right: Path) -> list[str]:
     lines = []
     for folder in ("figures", "data"):
         here, there = _names(left / folder), _names(right / folder)
-        lines += [f"only the left run has {folder}/{name}" for name in sorted(here - there) if _counts(name)]
-        lines += [f"only the right run has {folder}/{name}" for name in sorted(there - here) if _counts(name)]
+        lines += [
+            f"only the left run has {folder}/{name}"
+            for name in sorted(here - there)
+            if _counts(name)
+        ]
+        lines += [
+            f"only the right run has {folder}/{name}"
+            for name in sorted(there - here)
+            if _counts(name)
+        ]
     return lines
 
 
@@ -86,7 +105,9 @@ def _figure(name: str, left: Path, right: Path) -> FileDifference:
     one, other = _levels(left), _levels(right)
     if one.shape != other.shape:
         sizes = " and ".join(f"{x.shape[1]} x {x.shape[0]}" for x in (one, other))
-        return FileDifference(name, f"drawn in two sizes, {sizes} pixels", drawing=drawing(one, other, None, ""))
+        return FileDifference(
+            name, f"drawn in two sizes, {sizes} pixels", drawing=drawing(one, other, None, "")
+        )
     change = np.abs(one.astype(np.int16) - other).max(-1)
     largest = int(change.max())
     if not largest:
@@ -148,7 +169,9 @@ def _form(channels: Mapping[str, Any]) -> str:
 
 
 def _viewed(image: Any, names: list[str]) -> Any:
-    """Return channels as RGB for the screen: in the order R, G, B, else grey, with the gamma of a screen."""
+    """Return channels as RGB for the screen: in the order R, G, B, else grey, with the gamma of
+    a screen.
+    """
     import numpy as np
 
     order = [names.index(c) for c in "RGB"] if {"R", "G", "B"} <= set(names) else [0, 0, 0]
@@ -156,7 +179,9 @@ def _viewed(image: Any, names: list[str]) -> Any:
 
 
 def _tensors(name: str, left: Path, right: Path) -> Iterator[FileDifference]:
-    """Yield the difference of each tensor with several elements; the numbers of a run have the others."""
+    """Yield the difference of each tensor with several elements; the numbers of a run have the
+    others.
+    """
     one, other = _loaded(left), _loaded(right)
     for key in dict.fromkeys([*one, *other]):
         title = f"{name}: {key}"
@@ -165,7 +190,9 @@ def _tensors(name: str, left: Path, right: Path) -> Iterator[FileDifference]:
         if key not in one or key not in other:
             yield FileDifference(title, f"only the {'left' if key in one else 'right'} run has it")
         elif one[key].shape != other[key].shape:
-            yield FileDifference(title, f"differs in shape: {tuple(one[key].shape)} and {tuple(other[key].shape)}")
+            yield FileDifference(
+                title, f"differs in shape: {tuple(one[key].shape)} and {tuple(other[key].shape)}"
+            )
         else:
             yield _numbers(title, one[key], other[key])
 
@@ -184,40 +211,62 @@ def _loaded(path: Path) -> dict[str, Any]:
 
 
 def _numbers(name: str, one: Any, other: Any) -> FileDifference:
-    """Return the largest and the root mean square difference of two arrays; equal and paired NaN values differ by 0."""
+    """Return the largest and the root mean square difference of two arrays; equal and paired NaN
+    values differ by 0.
+    """
     import numpy as np
 
     with np.errstate(invalid="ignore"):
-        change = np.where((one == other) | (np.isnan(one) & np.isnan(other)), 0.0, np.abs(one - other))
+        change = np.where(
+            (one == other) | (np.isnan(one) & np.isnan(other)), 0.0, np.abs(one - other)
+        )
     if not change.size or not change.any():
         return FileDifference(name, "same")
     if not np.isfinite(change).all():
         places = int((~np.isfinite(change)).sum())
-        return FileDifference(name, f"differs, with NaN or infinity in one run alone at {places} places")
+        return FileDifference(
+            name, f"differs, with NaN or infinity in one run alone at {places} places"
+        )
     scale = float(max(np.nanmax(np.abs(x)) for x in (one, other)))
-    return FileDifference(name, "differs", float(change.max()), float(np.sqrt(np.mean(change**2))), scale)
+    return FileDifference(
+        name, "differs", float(change.max()), float(np.sqrt(np.mean(change**2))), scale
+    )
 
 
 @drawn
 def drawing(left: Any, right: Any, change: Any, title: str) -> Any:
-    """Draw two pictures side by side, or one above the other if they are wide, and their difference behind them."""
+    """Draw two pictures side by side, or one above the other if they are wide, and their
+    difference behind them.
+    """
     height, width = left.shape[:2]
     panels = 2 if change is None else 3
     wide = width / height > _WIDE
-    long, rows, columns = 9.6 * min(1.0, height / width) + 0.5, panels if wide else 1, 1 if wide else panels
-    figure, axes = canvas(9.6 if wide else 3.7 * panels + 0.5, panels * long if wide else 4.2, rows, columns)
+    long, rows, columns = (
+        9.6 * min(1.0, height / width) + 0.5,
+        panels if wide else 1,
+        1 if wide else panels,
+    )
+    figure, axes = canvas(
+        9.6 if wide else 3.7 * panels + 0.5, panels * long if wide else 4.2, rows, columns
+    )
     places = axes.ravel()
     for place, image, name in zip(places, (left, right), ("left", "right"), strict=False):
         picture(place, image, name, interpolation="antialiased")
     if change is not None:
         top = _upper_end(change)
-        shown = picture(places[2], change, title, cmap="magma", vmin=0.0, vmax=top, interpolation="antialiased")
-        figure.colorbar(shown, ax=places[2], shrink=0.8, extend="max" if change.max() > top else "neither")
+        shown = picture(
+            places[2], change, title, cmap="magma", vmin=0.0, vmax=top, interpolation="antialiased"
+        )
+        figure.colorbar(
+            shown, ax=places[2], shrink=0.8, extend="max" if change.max() > top else "neither"
+        )
     return figure
 
 
 def _upper_end(change: Any) -> float:
-    """Return the upper end of the colours of a difference: 99.5 % of the pixels that differ are below."""
+    """Return the upper end of the colours of a difference: 99.5 % of the pixels that differ are
+    below.
+    """
     import numpy as np
 
     return float(np.percentile(change[change > 0], 99.5))

@@ -28,18 +28,26 @@ def check_docstring(node: Node) -> Iterator[Finding]:
             faults.append(f"one line must begin with {word}")
     if "Raises:" not in text and _raises(node):
         faults.append("the function raises an error, so one line must begin with Raises:")
-    yield Finding("docstring", not faults, "; ".join(faults) or "one sentence, shapes, units, error and source")
+    yield Finding(
+        "docstring",
+        not faults,
+        "; ".join(faults) or "one sentence, shapes, units, error and source",
+    )
 
 
 def check_signature(node: Node) -> Iterator[Finding]:
-    """Find whether every argument and the result are annotated, and the parameters can be validated."""
+    """Find whether every argument and the result are annotated, and the parameters can be
+    validated.
+    """
     try:
         names = inspect.signature(node.fn).parameters
         bare = [name for name in names if name not in node.hints and name != "rng"]
         bare += [] if "return" in node.hints else ["the result"]
         fields = [] if bare else list(node.params.model_fields)
     except Exception as error:
-        yield Finding("signature", False, f"an annotation cannot be read: {type(error).__name__}: {error}")
+        yield Finding(
+            "signature", False, f"an annotation cannot be read: {type(error).__name__}: {error}"
+        )
         return
     count = f"{len(fields)} parameter{'s' * (len(fields) != 1)}"
     text = f"without an annotation: {', '.join(bare)}" if bare else f"{count}, all annotated"

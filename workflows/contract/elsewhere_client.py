@@ -35,7 +35,9 @@ class NotStartedError(RuntimeError):
 
 
 class Elsewhere:
-    """A process with some of the other surroundings; it imports torch while the caller does other things."""
+    """A process with some of the other surroundings; it imports torch while the caller does
+    other things.
+    """
 
     def __init__(self, others: Others, changes: frozenset[Surrounding]) -> None:
         self.others, self._fresh = others, changes & FRESH
@@ -49,7 +51,8 @@ class Elsewhere:
     def outcomes(self, asked: Asked) -> list[Outcome]:
         """Return the outcome of each call, made in a fork of the process; raise `NotStartedError`.
 
-        After a call that ends its fork, or that does not end, the other calls are made in another one.
+        After a call that ends its fork, or that does not end, the other calls are made in another
+        one.
         """
         found: list[Outcome] = []
         while len(found) < len(asked.calls):
@@ -69,7 +72,15 @@ class Elsewhere:
         quiet = subprocess.DEVNULL
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-P", *["-O"] * sys.flags.optimize, "-c", _SCRIPT, str(theirs.fileno()), *path],
+                [
+                    sys.executable,
+                    "-P",
+                    *["-O"] * sys.flags.optimize,
+                    "-c",
+                    _SCRIPT,
+                    str(theirs.fileno()),
+                    *path,
+                ],
                 stdin=quiet,
                 stdout=quiet,
                 stderr=quiet,
@@ -113,9 +124,11 @@ class Elsewhere:
 
 @contextmanager
 def elsewhere(early: bool = True) -> Iterator[Callable[[], Elsewhere]]:
-    """Give a function that returns a process in which all surroundings are changed, and end the process at last.
+    """Give a function that returns a process in which all surroundings are changed, and end the
+    process at last.
 
-    The process starts with the ``with`` block if ``early``, so that it imports torch beside this process.
+    The process starts with the ``with`` block if ``early``, so that it imports torch beside this
+    process.
     """
     begun = list[Elsewhere]()
 

@@ -1,4 +1,6 @@
-"""What runs in a process with other surroundings: its forks import the modules of the calls, and send the outcomes."""
+"""What runs in a process with other surroundings: its forks import the modules of the calls, and
+send the outcomes.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +22,17 @@ from neusee.nodes.own_modules import import_missing
 from neusee.workflows.contract.outcomes import Outcome, failed, outcome_of
 from neusee.workflows.contract.surroundings import Settings
 
-_LONGEST = 600  #: s of a call after which its process ends: the one that asked, which waits less, has died
+#: s of a call after which its process ends: the one that asked, which waits less, has died
+_LONGEST = 600
 _SIDE = 64  #: of the matrices of unrelated work
 _errors: list[object] = [None]  #: what NumPy does at an error, as this process has set it last
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """The calls that a process makes, each pickled as a function without arguments, with the module of its code."""
+    """The calls that a process makes, each pickled as a function without arguments, with the
+    module of its code.
+    """
 
     settings: Settings
     files: tuple[str, ...]  #: files and folders of the user to import
@@ -37,7 +42,8 @@ class Asked:
 def serve(pipe: int) -> None:
     """Answer what is asked through a pipe, given by its number, until its other end is closed.
 
-    Each answer comes from a fork, which has imported no code of the user before, and ends with its exit code.
+    Each answer comes from a fork, which has imported no code of the user before, and ends with its
+    exit code.
     """
     fork = multiprocessing.get_context("fork")
     with Connection(pipe) as connection:
@@ -75,7 +81,9 @@ def _called(asked: Asked, module: str, pickled: bytes) -> Outcome:
 
 
 def _settle(settings: Settings) -> None:
-    """Change what is set once: the folder, variables, the zone, the locale, the threads of torch."""
+    """Change what is set once: the folder, variables, the zone, the locale, the threads of
+    torch.
+    """
     for name, value in settings.variables.items():
         if value is None:
             os.environ.pop(name, None)
@@ -91,20 +99,27 @@ def _settle(settings: Settings) -> None:
 
 
 def _disturb(settings: Settings) -> None:
-    """Change what other code changes between two calls: other work, states of generators, errors of NumPy."""
+    """Change what other code changes between two calls: other work, states of generators, errors
+    of NumPy.
+    """
     if settings.has_other_work:
         _work()
     if settings.has_other_states:
         torch.manual_seed(4711)
         np.random.seed(4711)
         random.seed(4711)
-    if settings.has_other_errors and np.geterr() != _errors[0]:  # so that a second time does not change it back
-        np.seterr(**{name: "ignore" if what == "raise" else "raise" for name, what in np.geterr().items()})
+    # so that a second time does not change it back
+    if settings.has_other_errors and np.geterr() != _errors[0]:
+        np.seterr(
+            **{name: "ignore" if what == "raise" else "raise" for name, what in np.geterr().items()}
+        )
         _errors[0] = np.geterr()
 
 
 def _work() -> None:
-    """Do what other steps may have done before: numbers, and settings of libraries that code of others changes."""
+    """Do what other steps may have done before: numbers, and settings of libraries that code of
+    others changes.
+    """
     x = torch.full((_SIDE, _SIDE), 3.0)
     torch.fft.fft2(x @ x).abs().sort()
     np.linalg.svd(np.full((_SIDE, _SIDE), 7.0))

@@ -1,4 +1,6 @@
-"""Rule on surroundings: the same call in other processes, of which everything around the call is changed."""
+"""Rule on surroundings: the same call in other processes, of which everything around the call is
+changed.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +16,23 @@ from neusee.workflows.contract.elsewhere_client import Elsewhere, NotStartedErro
 from neusee.workflows.contract.elsewhere_process import Asked
 from neusee.workflows.contract.finding import Finding
 from neusee.workflows.contract.outcomes import Difference, Outcome, difference, outcome_of
-from neusee.workflows.contract.surroundings import FRESH, HASH, THREADS, VARIABLES, WORK, Others, Surrounding
+from neusee.workflows.contract.surroundings import (
+    FRESH,
+    HASH,
+    THREADS,
+    VARIABLES,
+    WORK,
+    Others,
+    Surrounding,
+)
 
 RULE = "elsewhere"
-_MORE_SEEDS = 3  #: hash seeds that are tried where two gave the same order: a set of two words has only two orders
-_UNSTEADY = "two processes in the same surroundings differ, so draw from the argument rng and read no clock:"
+#: hash seeds that are tried where two gave the same order: a set of two words has only two orders
+_MORE_SEEDS = 3
+_UNSTEADY = (
+    "two processes in the same surroundings differ, so draw from the argument rng and read no"
+    " clock:"
+)
 
 Changes = frozenset[Surrounding]
 Found = dict[str, Outcome]  #: by the name of the call
@@ -47,21 +61,28 @@ class Trial:
             try:
                 self._pickled[each.name] = pickle.dumps(each.function)
             except Exception as error:
-                text = f"not tried: its example cannot be sent to another process: {type(error).__name__}: {error}"
+                text = (
+                    "not tried: its example cannot be sent to another process:"
+                    f" {type(error).__name__}: {error}"
+                )
                 self.findings[each.name] = Finding(RULE, None, text)
         self._tried = {each.name: each for each in tried if each.name in self._pickled}
         self._here: Found = {}
         self._processes = dict[Changes, Elsewhere]()  # by what only a new process can have
 
     def compare(self, first: Elsewhere) -> None:
-        """Find what differs in the process ``first``, in which all is changed, and then what decides it."""
+        """Find what differs in the process ``first``, in which all is changed, and then what
+        decides it.
+        """
         with ExitStack() as self._stack:
             self._compare(first)
 
     def _compare(self, first: Elsewhere) -> None:
         away = self._outcomes(first, frozenset(self.others.changed()))
         self._leave_out_ends([name for name, outcome in away.items() if outcome.is_end])
-        self._here = {name: outcome_of(each.function, each.module) for name, each in self._tried.items()}
+        self._here = {
+            name: outcome_of(each.function, each.module) for name, each in self._tried.items()
+        }
         open_names = list[str]()
         for name, here in self._here.items():
             if here.failure:
@@ -74,39 +95,55 @@ class Trial:
         self._settle_others([name for name in open_names if name not in self.findings])
 
     def ends(self, name: str) -> bool:
-        """Return True if a call ends its process also in the same surroundings, so that it is not made here."""
+        """Return True if a call ends its process also in the same surroundings, so that it is
+        not made here.
+        """
         return name not in self._here and name in self._pickled
 
-    # --- processes ----------------------------------------------------------------------------------------------------
+    # --- processes --------------------------------------------------------------------------------
 
-    def _outcomes(self, process: Elsewhere, changes: Changes, others: Others | None = None) -> Found:
-        """Return the outcome of each call in a process, in the other order where other work is changed."""
+    def _outcomes(
+        self, process: Elsewhere, changes: Changes, others: Others | None = None
+    ) -> Found:
+        """Return the outcome of each call in a process, in the other order where other work is
+        changed.
+        """
         names = [*self._tried]
         if WORK in changes:
             names.reverse()
-        declared = {name: value for each in self._tried.values() for name, value in each.declared.items()}
+        declared = {
+            name: value for each in self._tried.values() for name, value in each.declared.items()
+        }
         settings = (others or self.others).settings(changes, Path(process.folder.name), declared)
         calls = tuple((self._tried[name].module, self._pickled[name]) for name in names)
         return dict(zip(names, process.outcomes(Asked(settings, own_files(), calls)), strict=True))
 
     def _each(self, *sets: Iterable[Surrounding]) -> list[Found]:
-        """Return the outcomes for each set of changes; the processes that they need start at the same time."""
+        """Return the outcomes for each set of changes; the processes that they need start at the
+        same time.
+        """
         changes = [frozenset(each) for each in sets]
         for each in changes:
             if each & FRESH not in self._processes:
-                self._processes[each & FRESH] = self._stack.enter_context(closing(Elsewhere(self.others, each)))
+                self._processes[each & FRESH] = self._stack.enter_context(
+                    closing(Elsewhere(self.others, each))
+                )
         return [self._outcomes(self._processes[each & FRESH], each) for each in changes]
 
-    # --- what decides -------------------------------------------------------------------------------------------------
+    # --- what decides -----------------------------------------------------------------------------
 
     def _leave_out_ends(self, names: list[str]) -> None:
-        """Find whether calls that ended their process end it in the same surroundings; these are not made here."""
+        """Find whether calls that ended their process end it in the same surroundings; these are
+        not made here.
+        """
         if not names:
             return
         [same] = self._each(())
         for name in names:
             if same[name].is_end:
-                self._fail(name, f"the call {same[name].failure}; the rules on values were not tried")
+                self._fail(
+                    name, f"the call {same[name].failure}; the rules on values were not tried"
+                )
                 del self._tried[name]
 
     def _settle_rounding(self, names: list[str], away: Found) -> None:
@@ -129,11 +166,19 @@ class Trial:
             return
         changed = self.others.changed()
         same, *singles = self._each((), *([each] for each in changed))
-        unsteady = {name: one for name in names if (one := self._difference(name, same[name], self._here[name]))}
+        unsteady = {
+            name: one
+            for name in names
+            if (one := self._difference(name, same[name], self._here[name]))
+        }
         again = self._each(())[0] if unsteady else same
         for name in names:
             if found := self._difference(name, again[name], same[name]):
-                self._fail(name, f"{_UNSTEADY} {found.text}; other surroundings were not compared", found.place)
+                self._fail(
+                    name,
+                    f"{_UNSTEADY} {found.text}; other surroundings were not compared",
+                    found.place,
+                )
                 continue
             for surrounding, outcomes in zip(changed, singles, strict=True):
                 found = self._difference(name, outcomes[name], same[name])
@@ -143,12 +188,16 @@ class Trial:
         self._settle_hidden([name for name in names if name not in self.findings], same, unsteady)
 
     def _deciding(self, name: str, same: Found) -> list[str]:
-        """Return the variables of the environment without any of which a result differs, by halving."""
+        """Return the variables of the environment without any of which a result differs, by
+        halving.
+        """
         process = self._processes[frozenset()]
         todo, deciding = [self.others.variables], list[str]()
         while todo:
             few = todo.pop()
-            found = self._outcomes(process, frozenset({VARIABLES}), replace(self.others, variables=few))
+            found = self._outcomes(
+                process, frozenset({VARIABLES}), replace(self.others, variables=few)
+            )
             if not few or not self._difference(name, found[name], same[name]):
                 continue
             if len(few) == 1:
@@ -157,7 +206,9 @@ class Trial:
                 todo += [few[: len(few) // 2], few[len(few) // 2 :]]
         return sorted(deciding)
 
-    def _settle_hidden(self, names: list[str], same: Found, unsteady: Mapping[str, Difference]) -> None:
+    def _settle_hidden(
+        self, names: list[str], same: Found, unsteady: Mapping[str, Difference]
+    ) -> None:
         """Say what decides where no surrounding that was changed alone does."""
         if not names:
             return
@@ -173,24 +224,37 @@ class Trial:
             if name in self.findings:
                 continue
             if name in unsteady:
-                found_text = f"in a process that has done nothing else, {unsteady[name].text}: {WORK.fix}"
+                found_text = (
+                    f"in a process that has done nothing else, {unsteady[name].text}: {WORK.fix}"
+                )
                 self._fail(name, found_text, unsteady[name].place)
             else:
-                self._fail(name, f"with all of these changed together, but none alone: {self.others.said()}")
+                self._fail(
+                    name,
+                    f"with all of these changed together, but none alone: {self.others.said()}",
+                )
 
-    # --- words --------------------------------------------------------------------------------------------------------
+    # --- words ------------------------------------------------------------------------------------
 
     def _difference(self, name: str, found: Outcome, wanted: Outcome) -> Difference | None:
         return difference(found, wanted, self._tried[name].rtol)
 
     def _say_same(self, name: str, rounding: float = 0.0) -> None:
         count = len(self.others.changed()) - (rounding > 0)
-        text = f"the same bits in {count} changed surroundings: {self.others.said(without_threads=rounding > 0)}"
+        text = (
+            f"the same bits in {count} changed surroundings:"
+            f" {self.others.said(without_threads=rounding > 0)}"
+        )
         if rounding:
-            text += f"; equal to rounding with {self.others.in_threads()} ({rounding:.1g} of the largest value)"
+            text += (
+                f"; equal to rounding with {self.others.in_threads()} ({rounding:.1g} of the"
+                " largest value)"
+            )
         self.findings[name] = Finding(RULE, True, f"{text}; the clock was not changed")
 
-    def _fail_in(self, name: str, surrounding: Surrounding, found: Difference, variables: Sequence[str] = ()) -> None:
+    def _fail_in(
+        self, name: str, surrounding: Surrounding, found: Difference, variables: Sequence[str] = ()
+    ) -> None:
         differs = self.others.differs(surrounding, variables)
         fix = surrounding.fix.replace("NAME", variables[0]) if variables else surrounding.fix
         self._fail(name, f"{differs} {found.text}: {fix}", found.place)
@@ -198,11 +262,16 @@ class Trial:
     def _fail(self, name: str, text: str, place: str = "") -> None:
         """Add a sentence on a call; several surroundings make several sentences."""
         before = f"{self.findings[name].text}; " if name in self.findings else ""
-        self.findings[name] = Finding(RULE, False, f"{before}{place or self._tried[name].place}: {text}")
+        self.findings[name] = Finding(
+            RULE, False, f"{before}{place or self._tried[name].place}: {text}"
+        )
 
 
-def check_elsewhere(tried: Sequence[Tried], process: Callable[[], Elsewhere]) -> tuple[dict[str, Finding], set[str]]:
-    """Return what was found on each call, by name, and the names of those that may not be called here.
+def check_elsewhere(
+    tried: Sequence[Tried], process: Callable[[], Elsewhere]
+) -> tuple[dict[str, Finding], set[str]]:
+    """Return what was found on each call, by name, and the names of those that may not be called
+    here.
 
     ``process`` returns a process in which all surroundings are changed.
     """

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """The outcome of a rule, such as ``Finding("reference", False, "off by 3e-3, more than rtol = 1e-5")``."""
+    """The outcome of a rule, such as ``Finding("reference", False, "off by 3e-3, more than rtol
+    = 1e-5")``.
+    """
 
     rule: str
     ok: bool | None  #: None if the node leaves out what would be good to have

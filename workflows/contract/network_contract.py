@@ -25,13 +25,17 @@ _SIDE = 32  #: pixels of a picture, at least
 
 
 def whole_networks(module: ModuleType) -> dict[str, type[nn.Module]]:
-    """Return the network classes of a module by name, without those that other definitions of their file use."""
+    """Return the network classes of a module by name, without those that other definitions of
+    their file use.
+    """
     classes = network_classes(module)
     used: set[str] = set()
     for name in {value.__module__ for value in classes.values()}:
         for item in ast.parse(inspect.getsource(sys.modules[name])).body:
             own = getattr(item, "name", "")
-            used |= {part.id for part in ast.walk(item) if isinstance(part, ast.Name) and part.id != own}
+            used |= {
+                part.id for part in ast.walk(item) if isinstance(part, ast.Name) and part.id != own
+            }
     return {name: value for name, value in classes.items() if name not in used}
 
 
@@ -42,7 +46,10 @@ def check_network(name: str, network: type[nn.Module]) -> list[Finding]:
     try:
         make(0)
     except ParameterError as error:
-        return [*found, Finding("arguments", False, f"{error}: give each argument a default, for this check")]
+        return [
+            *found,
+            Finding("arguments", False, f"{error}: give each argument a default, for this check"),
+        ]
     found.append(Finding("arguments", True, "the class builds with its defaults"))
     for rule in (_check_picture, _check_double, _check_weights, _check_gradient):
         found += _guarded(rule, make)
@@ -60,14 +67,20 @@ def _check_docstring(network: type[nn.Module]) -> Iterator[Finding]:
     """Find whether the class has a docstring of its own that begins with a sentence."""
     first = (vars(network).get("__doc__") or "").strip().partition("\n")[0]
     ok = first[:1].isupper() and first.endswith(".")
-    yield Finding("docstring", ok, "one sentence" if ok else "begin the class with one sentence that ends with a stop")
+    yield Finding(
+        "docstring",
+        ok,
+        "one sentence" if ok else "begin the class with one sentence that ends with a stop",
+    )
 
 
 def _check_key(network: type[nn.Module]) -> Iterator[Finding]:
     """Find whether a cache key can follow the code of the class."""
     with tempfile.TemporaryDirectory() as folder:
         try:
-            Code(Path(folder) / "code.json").of(restore.network, ((network.__module__, network.__qualname__),))
+            Code(Path(folder) / "code.json").of(
+                restore.network, ((network.__module__, network.__qualname__),)
+            )
         except LookupError as error:
             yield Finding("key", False, str(error.args[0]))
         else:
@@ -75,11 +88,17 @@ def _check_key(network: type[nn.Module]) -> Iterator[Finding]:
 
 
 def _check_picture(make: Make) -> Iterator[Finding]:
-    """Find whether a picture gives one of the same sizes, finite, the same twice, and the input is left alone."""
+    """Find whether a picture gives one of the same sizes, finite, the same twice, and the input
+    is left alone.
+    """
     net = make(0)
     trial = try_network(net)
     cost = f"{trial.operations:.3g} operations and {trial.memory:.3g} bytes a pixel"
-    yield Finding("picture", True, f"same sizes, finite, same twice, input as before; sides by {net.multiple}; {cost}")
+    yield Finding(
+        "picture",
+        True,
+        f"same sizes, finite, same twice, input as before; sides by {net.multiple}; {cost}",
+    )
 
 
 def _check_double(make: Make) -> Iterator[Finding]:
@@ -89,14 +108,19 @@ def _check_double(make: Make) -> Iterator[Finding]:
 
 
 def _check_weights(make: Make) -> Iterator[Finding]:
-    """Find whether the weights of one network make another one, built with other random numbers, equal to it."""
+    """Find whether the weights of one network make another one, built with other random numbers,
+    equal to it.
+    """
     one, other = make(1).eval(), make(2).eval()
     other.inner.load_state_dict(one.inner.state_dict())
     picture = _picture()
     with torch.no_grad():
         same = torch.equal(one(picture), other(picture))
     text = "a file of weights holds all that the network has drawn"
-    wrong = "two networks with the same weights differ: register each drawn tensor as a parameter or a buffer"
+    wrong = (
+        "two networks with the same weights differ: register each drawn tensor as a parameter or a"
+        " buffer"
+    )
     yield Finding("weights", same, text if same else wrong)
 
 
@@ -111,11 +135,15 @@ def _check_gradient(make: Make) -> Iterator[Finding]:
         yield Finding("gradient", False, "the class has no parameters: there is nothing to train")
         return
     unused = [name for name, grad in trained.items() if grad is None]
-    wrong = [name for name, grad in trained.items() if grad is not None and not grad.isfinite().all()]
+    wrong = [
+        name for name, grad in trained.items() if grad is not None and not grad.isfinite().all()
+    ]
     if wrong:
         yield Finding("gradient", False, f"the gradient of {wrong[0]} is not finite")
     elif unused:
-        yield Finding("gradient", False, f"{unused[0]} has no gradient: the result does not depend on it")
+        yield Finding(
+            "gradient", False, f"{unused[0]} has no gradient: the result does not depend on it"
+        )
     else:
         yield Finding("gradient", True, f"finite for each of {len(trained)} parameters")
 

@@ -37,9 +37,15 @@ def check_reach(call: Call) -> Iterator[Finding]:
         return
     _, taints = call_observed(call.result, own)
     for taint in taints:
-        yield Finding("reach", False, f"{WORDS[taint.kind]} {taint.what}, which the key does not cover: {taint.fix}")
+        yield Finding(
+            "reach",
+            False,
+            f"{WORDS[taint.kind]} {taint.what}, which the key does not cover: {taint.fix}",
+        )
     if not taints:
-        yield Finding("reach", True, "this call reached no file, process, network or chance beyond its key")
+        yield Finding(
+            "reach", True, "this call reached no file, process, network or chance beyond its key"
+        )
 
 
 _OF_VALUES: tuple[Callable[[Call], Iterator[Finding]], ...] = (
@@ -54,10 +60,11 @@ _OF_VALUES: tuple[Callable[[Call], Iterator[Finding]], ...] = (
 
 
 def check_node(node: Node, example: Mapping[str, Any] | None = None) -> list[Finding]:
-    """Return what each rule of the contract found; a rule that does not concern the node finds nothing.
+    """Return what each rule of the contract found; a rule that does not concern the node finds
+    nothing.
 
-    ``example`` has the inputs and parameters of one call by name, parameters as a recipe writes them or in SI; by
-    default it is what the node's hook ``example`` returns.
+    ``example`` has the inputs and parameters of one call by name, parameters as a recipe writes
+    them or in SI; by default it is what the node's hook ``example`` returns.
     """
     call = example_call(node, example)
     return [*check_words(node), *([call] if isinstance(call, Finding) else check_values(call))]
@@ -88,17 +95,29 @@ def example_call(node: Node, example: Mapping[str, Any] | None = None) -> Call |
     """Return the call of the example, or the finding that there is none or that it is wrong."""
     if example is None and node.hooks.example is None:
         name = node.fn.__name__
-        return Finding("example", False, f"none: attach a function with @{name}.example that returns its arguments")
+        return Finding(
+            "example",
+            False,
+            f"none: attach a function with @{name}.example that returns its arguments",
+        )
     try:
         validated = node.params
     except Exception:
-        return Finding("example", False, "not tried: the parameters cannot be validated, see the rule signature")
+        return Finding(
+            "example",
+            False,
+            "not tried: the parameters cannot be validated, see the rule signature",
+        )
     try:
-        given = dict(node.hooks.example() if example is None and node.hooks.example else example or {})
+        given = dict(
+            node.hooks.example() if example is None and node.hooks.example else example or {}
+        )
     except Exception as error:
         return Finding("example", False, f"the example raises {type(error).__name__}: {error}")
     inputs = [given.pop(name, None) for name in node.inputs]
-    missing = [n for n, v in zip(node.inputs, inputs, strict=True) if v is None and n not in node.optional]
+    missing = [
+        n for n, v in zip(node.inputs, inputs, strict=True) if v is None and n not in node.optional
+    ]
     if missing:
         return Finding("example", False, f"lacks the inputs {', '.join(missing)}")
     try:

@@ -1,4 +1,6 @@
-"""What a call gave, in a form that another process can compare: its parts, an error, or an end without either."""
+"""What a call gave, in a form that another process can compare: its parts, an error, or an end
+without either.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,9 @@ def outcome_of(function: Callable[[], Any], module: str) -> Outcome:
 def failed(error: BaseException, module: str) -> Outcome:
     """Return the outcome of a call of code of a module that raised an error."""
     text = " ".join(str(error).split())
-    return Outcome(failure=f"raises {type(error).__name__}: {text}".rstrip(": "), place=_place(error, module))
+    return Outcome(
+        failure=f"raises {type(error).__name__}: {text}".rstrip(": "), place=_place(error, module)
+    )
 
 
 def difference(found: Outcome, wanted: Outcome, rtol: float) -> Difference | None:
@@ -62,7 +66,10 @@ def difference(found: Outcome, wanted: Outcome, rtol: float) -> Difference | Non
     names = [[name for name, _ in outcome.parts] for outcome in (found, wanted)]
     if names[0] != names[1]:
         return Difference("the result has other parts, or in another order")
-    each = [_of_part(*part, there[1], rtol) for part, there in zip(found.parts, wanted.parts, strict=True)]
+    each = [
+        _of_part(*part, there[1], rtol)
+        for part, there in zip(found.parts, wanted.parts, strict=True)
+    ]
     return max((one for one in each if one), key=lambda one: one.size, default=None)
 
 
@@ -70,7 +77,9 @@ def _of_part(name: str, found: Any, wanted: Any, rtol: float) -> Difference | No
     """Return how one part of a result differs; None if it does not."""
     what = f"the result{name}"
     if not isinstance(found, Tensor) or not isinstance(wanted, Tensor):
-        same = type(found) is type(wanted) and (found == wanted or (found != found and wanted != wanted))
+        same = type(found) is type(wanted) and (
+            found == wanted or (found != found and wanted != wanted)
+        )
         return None if same else Difference(f"{what} is {_short(found)} and not {_short(wanted)}")
     if found.shape != wanted.shape or found.dtype != wanted.dtype:
         return Difference(f"{what} is {_kind(found)} and not {_kind(wanted)}")
@@ -79,12 +88,21 @@ def _of_part(name: str, found: Any, wanted: Any, rtol: float) -> Difference | No
     size = off_by(found, wanted)
     if not size < float("inf"):
         return Difference(f"{what} has NaN or infinite values at other places")
-    eps = torch.finfo(wanted.dtype).eps if wanted.is_floating_point() or wanted.is_complex() else 0.0
-    return Difference(f"{what} differs by {size:.2g} of its largest value", "", size, size <= max(rtol, _EPS * eps))
+    eps = (
+        torch.finfo(wanted.dtype).eps if wanted.is_floating_point() or wanted.is_complex() else 0.0
+    )
+    return Difference(
+        f"{what} differs by {size:.2g} of its largest value",
+        "",
+        size,
+        size <= max(rtol, _EPS * eps),
+    )
 
 
 def _parts(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield every tensor and every plain value in a result, with its place; of anything else the type alone."""
+    """Yield every tensor and every plain value in a result, with its place; of anything else the
+    type alone.
+    """
     if isinstance(value, Tensor):
         yield name, value.detach().cpu()
     elif isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
@@ -101,14 +119,21 @@ def _parts(name: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _items(value: Any) -> list[tuple[str, Any]] | None:
-    """Return what a value holds, each with its place in it; None for a value that holds nothing that is known."""
+    """Return what a value holds, each with its place in it; None for a value that holds nothing
+    that is known.
+    """
     if isinstance(value, dict):
         return [(f"[{key!r}]", item) for key, item in value.items()]
     if isinstance(value, tuple | list):
         fields = getattr(value, "_fields", None)
-        return [(f".{fields[number]}" if fields else f"[{number}]", item) for number, item in enumerate(value)]
+        return [
+            (f".{fields[number]}" if fields else f"[{number}]", item)
+            for number, item in enumerate(value)
+        ]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return [(f".{field.name}", getattr(value, field.name)) for field in dataclasses.fields(value)]
+        return [
+            (f".{field.name}", getattr(value, field.name)) for field in dataclasses.fields(value)
+        ]
     return None
 
 

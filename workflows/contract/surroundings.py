@@ -26,7 +26,8 @@ class Surrounding:
 FOLDER = Surrounding(
     "folder",
     "in another working folder",
-    'take the file as a parameter of type DataFile, or write depends=["table.csv"] for a file beside the module',
+    'take the file as a parameter of type DataFile, or write depends=["table.csv"] for a file'
+    " beside the module",
 )
 LOCALE = Surrounding(
     "locale",
@@ -56,7 +57,8 @@ RANDOM = Surrounding(
 WORK = Surrounding(
     "order of work",
     "after other work in the process",
-    "keep nothing in the module from one call to the next, and set in the node what a library remembers",
+    "keep nothing in the module from one call to the next, and set in the node what a library"
+    " remembers",
 )
 ERRORS = Surrounding(
     "np.seterr",
@@ -78,13 +80,30 @@ MEMORY = Surrounding(
     "where new memory has other bits",
     "fill all that torch.empty or np.empty gives, or write zeros",
 )
-#: those of a new process of Python; the others change in a fork of one, before it imports code of the user
+#: those of a new process of Python; the others change in a fork of one, before it imports code of
+#: the user
 FRESH = frozenset({LOCALE, HASH, THREADS, MEMORY})
 ALL = (FOLDER, LOCALE, HASH, THREADS, ZONE, RANDOM, WORK, ERRORS, HOME, VARIABLES, MEMORY)
 
 ZONE_ELSEWHERE = "NSC-13:45"  #: a zone that needs no table: UTC and 13 h 45 min
 #: languages that write 1,5; Turkish first, whose i is another letter
-_LANGUAGES = ("tr_", "de_", "fr_", "es_", "it_", "nl_", "pt_", "pl_", "sv_", "da_", "fi_", "nb_", "cs_", "ru_", "uk_")
+_LANGUAGES = (
+    "tr_",
+    "de_",
+    "fr_",
+    "es_",
+    "it_",
+    "nl_",
+    "pt_",
+    "pl_",
+    "sv_",
+    "da_",
+    "fi_",
+    "nb_",
+    "cs_",
+    "ru_",
+    "uk_",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,12 +134,18 @@ class Others:
         return tuple(each for each in ALL if self._can_change(each))
 
     def differs(self, surrounding: Surrounding, variables: Sequence[str] = ()) -> str:
-        """Return in which surrounding a result differs; ``variables`` of the environment decide it."""
+        """Return in which surrounding a result differs; ``variables`` of the environment decide
+        it.
+        """
         return surrounding.differs.format(
             locale=self.locale,
             threads=self.in_threads(),
             threads_here=self.threads_here,
-            names=f"variable{'s' * (len(variables) > 1)} {', '.join(variables)}" if variables else "variables",
+            names=(
+                f"variable{'s' * (len(variables) > 1)} {', '.join(variables)}"
+                if variables
+                else "variables"
+            ),
         )
 
     def in_threads(self) -> str:
@@ -132,16 +157,27 @@ class Others:
         words = {
             LOCALE: f"locale ({self.locale})",
             THREADS: self.in_threads(),
-            VARIABLES: f"{len(self.variables)} environment variable{'s' * (len(self.variables) != 1)} left out",
+            VARIABLES: (
+                f"{len(self.variables)} environment variable{'s' * (len(self.variables) != 1)}"
+                " left out"
+            ),
         }
         changed = [each for each in self.changed() if not (without_threads and each is THREADS)]
         text = ", ".join(words.get(each, each.name) for each in changed)
         return text if self.locale else f"{text}; locale not changed: no other is installed"
 
-    def environment(self, changes: frozenset[Surrounding], environ: Mapping[str, str]) -> dict[str, str]:
-        """Return the environment of a new process of Python with those of ``changes`` that only a new one can have."""
-        given = {**environ, "PYTHONHASHSEED": str(self.hash_seed + 1 if HASH in changes else self.hash_seed)}
-        given.setdefault("XDG_CACHE_HOME", os.path.join(os.path.expanduser("~"), ".cache"))  # of compiled programs
+    def environment(
+        self, changes: frozenset[Surrounding], environ: Mapping[str, str]
+    ) -> dict[str, str]:
+        """Return the environment of a new process of Python with those of ``changes`` that only
+        a new one can have.
+        """
+        given = {
+            **environ,
+            "PYTHONHASHSEED": str(self.hash_seed + 1 if HASH in changes else self.hash_seed),
+        }
+        # of compiled programs
+        given.setdefault("XDG_CACHE_HOME", os.path.join(os.path.expanduser("~"), ".cache"))
         if LOCALE in changes:
             given = {name: value for name, value in given.items() if name not in OF_LANGUAGES}
             given |= {"LC_ALL": self.locale, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
@@ -151,15 +187,22 @@ class Others:
             given["MALLOC_PERTURB_"] = "165"  # the library of C fills what it gives and takes
         return given
 
-    def settings(self, changes: frozenset[Surrounding], folder: Path, declared: Mapping[str, str]) -> Settings:
-        """Return what a fork changes; ``folder`` is empty, and variables that are ``declared`` stay."""
+    def settings(
+        self, changes: frozenset[Surrounding], folder: Path, declared: Mapping[str, str]
+    ) -> Settings:
+        """Return what a fork changes; ``folder`` is empty, and variables that are ``declared``
+        stay.
+        """
         variables = dict[str, str | None]()
         if VARIABLES in changes:
             variables |= dict.fromkeys(name for name in self.variables if name not in declared)
         if ZONE in changes:
             variables["TZ"] = ZONE_ELSEWHERE
         if HOME in changes:
-            variables |= {"HOME": str(folder), **dict.fromkeys(("USER", "LOGNAME", "USERNAME"), "somebody")}
+            variables |= {
+                "HOME": str(folder),
+                **dict.fromkeys(("USER", "LOGNAME", "USERNAME"), "somebody"),
+            }
         return Settings(
             folder=str(folder) if FOLDER in changes else "",
             variables={name: value for name, value in variables.items() if name not in declared},
@@ -171,7 +214,13 @@ class Others:
         )
 
     def _can_change(self, each: Surrounding) -> bool:
-        return bool(self.locale) if each is LOCALE else bool(self.variables) if each is VARIABLES else True
+        return (
+            bool(self.locale)
+            if each is LOCALE
+            else bool(self.variables)
+            if each is VARIABLES
+            else True
+        )
 
 
 def others(environ: Mapping[str, str]) -> Others:
@@ -192,29 +241,43 @@ def others(environ: Mapping[str, str]) -> Others:
 def installed_locales(environ: Mapping[str, str]) -> list[str]:
     """Return the names of the locales of this machine; none where it cannot say them."""
     try:
-        done = subprocess.run(["locale", "-a"], capture_output=True, text=True, check=False, errors="replace")
+        done = subprocess.run(
+            ["locale", "-a"], capture_output=True, text=True, check=False, errors="replace"
+        )
         names = done.stdout.split()
     except OSError:
         names = []
     own = [Path(folder) for folder in environ.get("LOCPATH", "").split(":") if folder]
-    return names + [path.name for folder in own if folder.is_dir() for path in sorted(folder.iterdir())]
+    return names + [
+        path.name for folder in own if folder.is_dir() for path in sorted(folder.iterdir())
+    ]
 
 
 def other_locale(now: str, names: Iterable[str], environ: Mapping[str, str]) -> str:
-    """Return a locale that is not ``now``: one with a decimal comma and other letters than UTF-8 if there is one.
+    """Return a locale that is not ``now``: one with a decimal comma and other letters than UTF-8 if
+    there is one.
 
     The locale C, in which a text is ASCII, is the last choice. No text if there is no other.
     """
 
     def rank(name: str) -> tuple[int, bool, str]:
-        language = next((number for number, each in enumerate(_LANGUAGES) if name.startswith(each)), len(_LANGUAGES))
+        language = next(
+            (number for number, each in enumerate(_LANGUAGES) if name.startswith(each)),
+            len(_LANGUAGES),
+        )
         return language, _is_utf8(name), name
 
     plain = ("C", "POSIX")
-    found = sorted((n for n in names if n.split(".")[0] not in plain and _same(n) != _same(now)), key=rank)
+    found = sorted(
+        (n for n in names if n.split(".")[0] not in plain and _same(n) != _same(now)), key=rank
+    )
     if found:
         return found[0]
-    is_ascii = now in plain and environ.get("PYTHONUTF8") == "0" and environ.get("PYTHONCOERCECLOCALE") == "0"
+    is_ascii = (
+        now in plain
+        and environ.get("PYTHONUTF8") == "0"
+        and environ.get("PYTHONCOERCECLOCALE") == "0"
+    )
     return "C" if "C" in names and not is_ascii else ""
 
 

@@ -1,4 +1,6 @@
-"""Calls of nodes and networks as another process makes them: pickled, with full paths, and with what keys cover."""
+"""Calls of nodes and networks as another process makes them: pickled, with full paths, and with
+what keys cover.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,12 @@ _VARIABLE = "env:"  #: begins the declaration of a variable of the environment
 
 
 def node_call(name: str, call: Call) -> Tried:
-    """Return the call of a node's example; files of its parameters are named by their full paths."""
-    full = Call(call.node, call.inputs, {key: _with_full_paths(value) for key, value in call.params.items()})
+    """Return the call of a node's example; files of its parameters are named by their full
+    paths.
+    """
+    full = Call(
+        call.node, call.inputs, {key: _with_full_paths(value) for key, value in call.params.items()}
+    )
     return _tried(name, call.node.fn, call.node.rtol, full.result, call.node.depends)
 
 
@@ -35,7 +41,9 @@ def network_call(name: str, network: type[nn.Module]) -> Tried:
     return _tried(name, network, rtol, partial(_on_a_picture, Architecture(name, network)), ())
 
 
-def _tried(name: str, code: Any, rtol: float, function: Callable[[], Any], depends: tuple[str, ...]) -> Tried:
+def _tried(
+    name: str, code: Any, rtol: float, function: Callable[[], Any], depends: tuple[str, ...]
+) -> Tried:
     module = code.__module__
     variables = [*depends, *_declarations(module)]
     names = {entry.removeprefix(_VARIABLE) for entry in variables if entry.startswith(_VARIABLE)}

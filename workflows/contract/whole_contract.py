@@ -17,12 +17,14 @@ from neusee.workflows.contract.value_rules import Call
 
 
 def check_all(
-    nodes: Mapping[str, Node], networks: Mapping[str, type[nn.Module]], process: Callable[[], Elsewhere]
+    nodes: Mapping[str, Node],
+    networks: Mapping[str, type[nn.Module]],
+    process: Callable[[], Elsewhere],
 ) -> dict[str, list[Finding]]:
     """Return what each rule found on each node and network, by name.
 
-    ``process`` returns a process in which all surroundings are changed. A call that ends this process would end the
-    check, so each is made there first.
+    ``process`` returns a process in which all surroundings are changed. A call that ends this
+    process would end the check, so each is made there first.
     """
     found = {name: check_words(node) for name, node in nodes.items()}
     calls = {name: example_call(node) for name, node in nodes.items()}
@@ -30,7 +32,9 @@ def check_all(
     tried += [network_call(name, network) for name, network in networks.items()]
     away, ending = check_elsewhere(tried, process)
     for name, call in calls.items():
-        found[name] += [call] if isinstance(call, Finding) else [] if name in ending else check_values(call)
+        found[name] += (
+            [call] if isinstance(call, Finding) else [] if name in ending else check_values(call)
+        )
     for name, network in networks.items():
         found[name] = [] if name in ending else check_network(name, network)
     for name, finding in away.items():

@@ -1,8 +1,10 @@
-"""Results stored by wavelength band: if one of 31 bands has changed, only this band is computed and written.
+"""Results stored by wavelength band: if one of 31 bands has changed, only this band is computed and
+written.
 
-A node that declares its bands computes each band to the same bits whatever the other bands are. Each band therefore has
-its own key, a digest of this band of the inputs and of everything else that determines the band. The store keeps the
-band of the result as a blob with this key as name. Hashing the inputs is cheap, because every input is read only once.
+A node that declares its bands computes each band to the same bits whatever the other bands are.
+Each band therefore has its own key, a digest of this band of the inputs and of everything else that
+determines the band. The store keeps the band of the result as a blob with this key as name. Hashing
+the inputs is cheap, because every input is read only once.
 """
 
 from __future__ import annotations
@@ -31,11 +33,15 @@ _TRIES = 3  #: attempts that may find damaged bands before all bands are compute
 Evaluate = Callable[[Sequence[Any]], Any]  #: a function from the inputs of a step to its result
 
 
-def call_by_band(step: Step, inputs: Sequence[Any], evaluate: Evaluate, code: str, blobs: Blobs, parts: int = 1) -> Any:
-    """Return the result of ``step``; compute only the wavelength bands that the store ``blobs`` does not contain.
+def call_by_band(
+    step: Step, inputs: Sequence[Any], evaluate: Evaluate, code: str, blobs: Blobs, parts: int = 1
+) -> Any:
+    """Return the result of ``step``; compute only the wavelength bands that the store ``blobs``
+    does not contain.
 
-    ``code`` is the digest of the code of the node. More passes over the bands, ``parts``, need less memory. Tensors
-    that can be stored by band are returned as `Stacked`, which `plain_of` converts to plain tensors.
+    ``code`` is the digest of the code of the node. More passes over the bands, ``parts``, need less
+    memory. Tensors that can be stored by band are returned as `Stacked`, which `plain_of` converts
+    to plain tensors.
     """
     count = band_count(step, inputs)
     if count < 2:
@@ -43,7 +49,9 @@ def call_by_band(step: Step, inputs: Sequence[Any], evaluate: Evaluate, code: st
     keys = band_keys(step, inputs, code)
     fields = range(_fields(step))
     for _ in range(_TRIES):
-        missing = [i for i, key in enumerate(keys) if not all(blobs.has(f"{key}.{n}") for n in fields)]
+        missing = [
+            i for i, key in enumerate(keys) if not all(blobs.has(f"{key}.{n}") for n in fields)
+        ]
         if len(missing) == count and parts == 1:
             break
         try:
@@ -54,16 +62,22 @@ def call_by_band(step: Step, inputs: Sequence[Any], evaluate: Evaluate, code: st
 
 
 def plain_of(value: Any) -> Any:
-    """Return ``value`` with every `Stacked` tensor (stored by band) replaced by an ordinary PyTorch tensor."""
+    """Return ``value`` with every `Stacked` tensor (stored by band) replaced by an ordinary
+    PyTorch tensor.
+    """
     if isinstance(value, Stacked):
         return value.tensor
     return value._make(map(plain_of, value)) if type(value) in BAND_FIELDS else value
 
 
 def band_count(step: Step, inputs: Sequence[Any]) -> int:
-    """Return the number of bands that a step computes independently of each other; 0 if the step has no such bands."""
+    """Return the number of bands that a step computes independently of each other; 0 if the step
+    has no such bands.
+    """
     named = zip(step.node.inputs, inputs, strict=False)
-    banded = [(axis, value) for name, value in named if (axis := _axis(step, name, value)) is not None]
+    banded = [
+        (axis, value) for name, value in named if (axis := _axis(step, name, value)) is not None
+    ]
     if any(not isinstance(value, Tensor) and type(value) not in BAND_FIELDS for _, value in banded):
         return 0  # a low-rank cube has no slice of one band
     found = {x.shape[axis] for axis, value in banded for x in band_tensors(value) if _has(x, axis)}
@@ -71,7 +85,9 @@ def band_count(step: Step, inputs: Sequence[Any]) -> int:
 
 
 def bands_in(node: Node, inputs: Sequence[Any]) -> int:
-    """Return the number of bands that a node computes one by one, from inputs that may have no values; at least 1."""
+    """Return the number of bands that a node computes one by one, from inputs that may have no
+    values; at least 1.
+    """
     for name, value in zip(node.inputs, inputs, strict=False):
         axis = node.bands.get(name) if node.bands else None
         if axis is not None and (isinstance(value, Tensor) or type(value) in BAND_FIELDS):
@@ -80,9 +96,17 @@ def bands_in(node: Node, inputs: Sequence[Any]) -> int:
 
 
 def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
-    """Return the cache key of each wavelength band: a digest of node, code, parameters and this band of the inputs."""
+    """Return the cache key of each wavelength band: a digest of node, code, parameters and this
+    band of the inputs.
+    """
     params = {name: plain(value) for name, value in step.params.items()}
-    same: list[Any] = ["band", step.node.path, code, params, *([said] if (said := written(step)) else [])]
+    same: list[Any] = [
+        "band",
+        step.node.path,
+        code,
+        params,
+        *([said] if (said := written(step)) else []),
+    ]
     each: list[list[str]] = []
     for name, value in zip(step.node.inputs, inputs, strict=False):
         axis = _axis(step, name, value)
@@ -93,7 +117,9 @@ def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
 
 
 def content(value: Any) -> list[Any]:
-    """Return a JSON value that identifies a result: its layout, and type, shape and digest of each tensor."""
+    """Return a JSON value that identifies a result: its layout, and type, shape and digest of
+    each tensor.
+    """
     layout, tensors = pack(value)
     return [layout, [_hashed(x) for x in tensors]]
 
@@ -114,21 +140,29 @@ def band_tensors(value: Any) -> list[Tensor]:
 
 
 def with_band_tensors(value: Any, tensors: Sequence[Tensor]) -> Any:
-    """Return ``value`` with ``tensors`` in place of its tensors that have an axis of wavelength bands."""
+    """Return ``value`` with ``tensors`` in place of its tensors that have an axis of wavelength
+    bands.
+    """
     if isinstance(value, Tensor):
         return tensors[0]
     return value._replace(**dict(zip(band_names(value), tensors, strict=True)))
 
 
 def _without_bands(value: Any) -> Any:
-    return None if isinstance(value, Tensor) else value._replace(**dict.fromkeys(BAND_FIELDS[type(value)]))
+    return (
+        None
+        if isinstance(value, Tensor)
+        else value._replace(**dict.fromkeys(BAND_FIELDS[type(value)]))
+    )
 
 
 def _has(x: Tensor, axis: int) -> bool:
     return -x.dim() <= axis < x.dim()
 
 
-def taken(step: Step, inputs: Sequence[Any], which: list[int], of: Collection[str] | None = None) -> list[Any]:
+def taken(
+    step: Step, inputs: Sequence[Any], which: list[int], of: Collection[str] | None = None
+) -> list[Any]:
     """Return the inputs of a step, reduced to the wavelength bands with the indices ``which``.
 
     If ``of`` names inputs, only these inputs are reduced.
@@ -137,12 +171,16 @@ def taken(step: Step, inputs: Sequence[Any], which: list[int], of: Collection[st
     for i, (name, value) in enumerate(zip(step.node.inputs, inputs, strict=False)):
         axis = _axis(step, name, value)
         if axis is not None and (of is None or name in of):
-            found[i] = with_band_tensors(value, [_slices(x, axis, which) for x in band_tensors(value)])
+            found[i] = with_band_tensors(
+                value, [_slices(x, axis, which) for x in band_tensors(value)]
+            )
     return found
 
 
 def _slices(x: Tensor, axis: int, which: list[int]) -> Tensor:
-    """Return the bands of a tensor with the indices ``which``, as a view if the memory layout allows."""
+    """Return the bands of a tensor with the indices ``which``, as a view if the memory layout
+    allows.
+    """
     if which == list(range(which[0], which[0] + len(which))):
         part = x.narrow(axis, which[0], len(which))
         if part.is_contiguous() and part.data_ptr() % _ALIGN == 0:
@@ -162,7 +200,9 @@ def _rebuilt(step: Step, items: list[Any]) -> Any:
 
 
 def _stacked(step: Step, value: Any, keys: list[str]) -> Any:
-    """Return a large result as `Stacked` tensors with a key for each band, and any other result unchanged."""
+    """Return a large result as `Stacked` tensors with a key for each band, and any other result
+    unchanged.
+    """
     tensors = band_tensors(value)
     leading = all(x.shape[0] == len(keys) and _leads(step, x) for x in tensors)
     if not leading or sum(x.nbytes for x in tensors) < LEAST:
@@ -172,13 +212,21 @@ def _stacked(step: Step, value: Any, keys: list[str]) -> Any:
 
 
 def _leads(step: Step, x: Tensor) -> bool:
-    """Return True if the bands are the first axis of a tensor, so that each band is contiguous in memory."""
+    """Return True if the bands are the first axis of a tensor, so that each band is contiguous
+    in memory.
+    """
     assert step.node.bands is not None
     return _has(x, step.node.bands["return"]) and step.node.bands["return"] % x.dim() == 0
 
 
 def _gathered(
-    step: Step, inputs: Sequence[Any], evaluate: Evaluate, keys: list[str], missing: list[int], size: int, blobs: Blobs
+    step: Step,
+    inputs: Sequence[Any],
+    evaluate: Evaluate,
+    keys: list[str],
+    missing: list[int],
+    size: int,
+    blobs: Blobs,
 ) -> Any:
     """Compute missing bands of a result in groups of ``size`` bands, and assemble all bands.
 
@@ -189,13 +237,17 @@ def _gathered(
     stacks = [_Stack(axis, [f"{key}.{n}" for key in keys], blobs) for n in range(_fields(step))]
     for start in range(0, len(missing), size):
         which = missing[start : start + size]
-        for stack, x in zip(stacks, band_tensors(evaluate(taken(step, inputs, which))), strict=True):
+        for stack, x in zip(
+            stacks, band_tensors(evaluate(taken(step, inputs, which))), strict=True
+        ):
             stack.add(which, x)
     return _rebuilt(step, [stack.whole() for stack in stacks])
 
 
 class _Stack:
-    """A tensor that is assembled from bands; computed bands go to the store, or to memory if writing fails."""
+    """A tensor that is assembled from bands; computed bands go to the store, or to memory if
+    writing fails.
+    """
 
     def __init__(self, axis: int, names: list[str], blobs: Blobs) -> None:
         self.axis, self.names, self.blobs = axis, names, blobs
@@ -217,7 +269,9 @@ class _Stack:
         self.inside.update(which)
 
     def whole(self) -> Tensor | Stacked:
-        """Return all wavelength bands as one tensor; raise `Damaged` if a stored band is damaged."""
+        """Return all wavelength bands as one tensor; raise `Damaged` if a stored band is
+        damaged.
+        """
         blob = self.blobs.about(self.names[0]) if self.held is None else None
         if blob is not None:
             shape = (len(self.names), *blob.shape)

@@ -1,9 +1,11 @@
-"""Laws of the cost of a node: seconds and peak memory from shapes and parameters, with coefficients that were measured.
+"""Laws of the cost of a node: seconds and peak memory from shapes and parameters, with coefficients
+that were measured.
 
-The peak memory of a step is ``a + b inputs + c result + d work`` bytes beyond the memory in use before, and its time is
-``e + f operations`` seconds. ``node_costs.json`` has the coefficients of each shipped node, which
-tests/benchmarks/fit_costs.py fits to runs of the shipped recipes on a CPU, and the spread of the runs about the law.
-Seconds are the processor time of one thread, so that a busy machine does not make a law slow.
+The peak memory of a step is ``a + b inputs + c result + d work`` bytes beyond the memory in use
+before, and its time is ``e + f operations`` seconds. ``node_costs.json`` has the coefficients of
+each shipped node, which tests/benchmarks/fit_costs.py fits to runs of the shipped recipes on a CPU,
+and the spread of the runs about the law. Seconds are the processor time of one thread, so that a
+busy machine does not make a law slow.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ from neusee.workflows.graph.step_shapes import (
     without_values,
 )
 
-_LEAST = float(1 << 26)  #: bytes of a result whose shape is not known, in a recipe without any known shape
+#: bytes of a result whose shape is not known, in a recipe without any known shape
+_LEAST = float(1 << 26)
 
 
 class Size(NamedTuple):
@@ -59,7 +62,9 @@ EXACT: Spread = (Range(), Range())
 
 
 class Loading(NamedTuple):
-    """The additional cost of the first step of a process that uses some libraries, because it loads them."""
+    """The additional cost of the first step of a process that uses some libraries, because it
+    loads them.
+    """
 
     libraries: tuple[str, ...]
     memory: float  #: bytes, which the process keeps
@@ -73,11 +78,15 @@ class Law:
     memory: tuple[float, float, float, float]  #: bytes, and factors of inputs, result and work
     seconds: tuple[float, float]  #: s, and s for each operation
     spread: Spread = EXACT  #: of runs about the law
-    loads: Loading | None = None  #: the libraries that the node loads, whose cost is not in the numbers above
-    most: float = 0.0  #: bytes of the largest result that was measured, for a node without a rule of the shape
+    #: the libraries that the node loads, whose cost is not in the numbers above
+    loads: Loading | None = None
+    #: bytes of the largest result that was measured, for a node without a rule of the shape
+    most: float = 0.0
 
     def peak(self, size: Size) -> float:
-        """Return the peak memory of a step in bytes beyond the memory in use before; at least its result."""
+        """Return the peak memory of a step in bytes beyond the memory in use before; at least
+        its result.
+        """
         a, b, c, d = self.memory
         return max(size.result, a + b * size.inputs + c * size.result + d * size.work)
 
@@ -101,7 +110,9 @@ def shipped() -> Mapping[str, Law]:
 
 @cache
 def guess() -> Law:
-    """Return the law of a node that was never measured: the largest costs for its size that any shipped node has."""
+    """Return the law of a node that was never measured: the largest costs for its size that any
+    shipped node has.
+    """
     return _law(_file()["guess"])
 
 
@@ -112,11 +123,17 @@ def _law(law: Mapping[str, Any]) -> Law:
 
 
 def libraries_of(paths: Iterable[str]) -> float:
-    """Return the bytes of the libraries that the nodes with these paths load, and this process has not loaded yet."""
+    """Return the bytes of the libraries that the nodes with these paths load, and this process
+    has not loaded yet.
+    """
     total, loaded = 0.0, set[str]()
     for path in paths:
         law = shipped().get(path)
-        if law and law.loads and not all(name in loaded or name in sys.modules for name in law.loads.libraries):
+        if (
+            law
+            and law.loads
+            and not all(name in loaded or name in sys.modules for name in law.loads.libraries)
+        ):
             loaded.update(law.loads.libraries)
             total += law.loads.memory
     return total
@@ -134,8 +151,15 @@ class Sized(NamedTuple):
     reads_file: bool  #: which may change
 
     def holds(self, step: Step, inputs: Sequence[Any], below: Sequence[Size], least: float) -> bool:
-        """Return True if a step has the same node, parameters and known inputs, and therefore the same size."""
-        if self.reads_file or step.node is not self.step.node or least != self.least or below != self.below:
+        """Return True if a step has the same node, parameters and known inputs, and therefore
+        the same size.
+        """
+        if (
+            self.reads_file
+            or step.node is not self.step.node
+            or least != self.least
+            or below != self.below
+        ):
             return False
         same = len(inputs) == len(self.inputs) and all(map(is_same, inputs, self.inputs))
         return same and (step.params is self.step.params or _equal(step.params, self.step.params))
@@ -159,10 +183,11 @@ def _remember(sized: Sized) -> None:
 
 
 def sizes_of(recipe: Recipe, order: Sequence[str]) -> dict[str, Size]:
-    """Return the size of each step in ``order`` before anything runs; ``order`` lists each step after its inputs.
+    """Return the size of each step in ``order`` before anything runs; ``order`` lists each step
+    after its inputs.
 
-    A result of unknown shape counts as large as its inputs, or as the largest known result of the recipe if that is
-    larger.
+    A result of unknown shape counts as large as its inputs, or as the largest known result of the
+    recipe if that is larger.
     """
     found = _sizes(recipe, order, 0.0)
     if all(size.known for size in found.values()):
@@ -176,7 +201,10 @@ def _sizes(recipe: Recipe, order: Sequence[str], least: float) -> dict[str, Size
     found: dict[str, Size] = {}
     for name in order:
         step = recipe.steps[name]
-        inputs, below = inputs_of(step, forms), [found[source] for source in dict.fromkeys(step.sources)]
+        inputs, below = (
+            inputs_of(step, forms),
+            [found[source] for source in dict.fromkeys(step.sources)],
+        )
         known = _sized.get(name)
         if known is not None and known.holds(step, inputs, below, least):
             forms[name], found[name] = known.form, known.size
@@ -187,15 +215,21 @@ def _sizes(recipe: Recipe, order: Sequence[str], least: float) -> dict[str, Size
             found[name] = Size(0.0, math.inf, math.inf, math.inf)
             continue
         found[name] = _size(step, inputs, forms[name], below, least)
-        if forms[name] is None and not found[name].known:  # a guess, so that the sizes of later steps can be computed
+        # a guess, so that the sizes of later steps can be computed
+        if forms[name] is None and not found[name].known:
             forms[name] = next((x for x in inputs if x is not None), None)
         if known is not None and alike(forms[name], known.form):
-            forms[name] = known.form  # the same object, so that later steps have the size that they had
-        _remember(Sized(step, inputs, below, least, forms[name], found[name], has_path(step.params)))
+            # the same object, so that later steps have the size that they had
+            forms[name] = known.form
+        _remember(
+            Sized(step, inputs, below, least, forms[name], found[name], has_path(step.params))
+        )
     return found
 
 
-def _size(step: Step, inputs: Sequence[Form], form: Form, below: Sequence[Size], least: float) -> Size:
+def _size(
+    step: Step, inputs: Sequence[Form], form: Form, below: Sequence[Size], least: float
+) -> Size:
     known = all(size.known for size in below)
     if form is not None and complete(step.node, inputs):
         return size_of(step.node, inputs, step.params, form)._replace(known=known)
@@ -211,7 +245,9 @@ def _size(step: Step, inputs: Sequence[Form], form: Form, below: Sequence[Size],
 
 
 def size_of(node: Node, inputs: Sequence[Any], params: Mapping[str, Any], result: Any) -> Size:
-    """Return the size of a step from its inputs and its result, which may be values or forms without values."""
+    """Return the size of a step from its inputs and its result, which may be values or forms
+    without values.
+    """
     read, written = bytes_of(list(inputs)), bytes_of(result)
     work, operations = 0.0, (read + written) / 4
     if node.hooks.work is not None:
@@ -219,8 +255,12 @@ def size_of(node: Node, inputs: Sequence[Any], params: Mapping[str, Any], result
     return Size(read, written, float(work), float(operations), bands_in(node, inputs))
 
 
-def measured_size(node: Node, inputs: Sequence[Any], params: Mapping[str, Any], result: Any) -> list[float] | None:
-    """Return the size of a step that ran, as the journal keeps it, or None if the rule of the node fails."""
+def measured_size(
+    node: Node, inputs: Sequence[Any], params: Mapping[str, Any], result: Any
+) -> list[float] | None:
+    """Return the size of a step that ran, as the journal keeps it, or None if the rule of the
+    node fails.
+    """
     try:
         forms = [without_values(x) for x in inputs]
         return list(size_of(node, forms, params, without_values(result))[:4])

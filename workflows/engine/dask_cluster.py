@@ -1,4 +1,6 @@
-"""The clusters on which the command line computes: workers on this machine, those of a scheduler, or jobs of SLURM."""
+"""The clusters on which the command line computes: workers on this machine, those of a
+scheduler, or jobs of SLURM.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from neusee.workflows.engine.slurm_jobs import slurm_cluster, wait_for_job
 from neusee.workflows.engine.slurm_options import SlurmOptions
 from neusee.workflows.store.result_store import Store
 
-_QUIET = {"DASK_LOGGING__DISTRIBUTED": "critical"}  #: in the environment of workers whose terminal is that of the user
+#: in the environment of workers whose terminal is that of the user
+_QUIET = {"DASK_LOGGING__DISTRIBUTED": "critical"}
 
 
 @contextmanager
@@ -26,9 +29,9 @@ def cluster(
 ) -> Iterator[Dask]:
     """Yield an executor for workers that the text ``where`` names.
 
-    ``dask:4`` are four local workers, ``dask:here`` is this process, ``slurm:4`` are four jobs of SLURM with the
-    options ``job``, such as ``queue=gpu``; anything else is the address of a scheduler. ``say`` is told what is waited
-    for, and ``warn`` of a scheduler that is silent.
+    ``dask:4`` are four local workers, ``dask:here`` is this process, ``slurm:4`` are four jobs of
+    SLURM with the options ``job``, such as ``queue=gpu``; anything else is the address of a
+    scheduler. ``say`` is told what is waited for, and ``warn`` of a scheduler that is silent.
     Raises `ClusterLost` if no scheduler or no worker comes.
     """
     silence_logs()
@@ -58,6 +61,11 @@ def _local(count: str) -> Iterator[Any]:
     workers = 1 if here or not count else int(count)
     quiet = {} if here else {"env": _QUIET}
     with LocalCluster(
-        n_workers=workers, threads_per_worker=1, processes=not here, dashboard_address=":0", silence_logs=50, **quiet
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=not here,
+        dashboard_address=":0",
+        silence_logs=50,
+        **quiet,
     ) as local:
         yield local

@@ -32,17 +32,26 @@ _TRIES = 3  #: number of workers that may die during one chain before the run fa
 
 
 class Dask:
-    """An `Executor` on a cluster: ``client`` is a `distributed.Client`, and every worker can open ``store``."""
+    """An `Executor` on a cluster: ``client`` is a `distributed.Client`, and every worker can
+    open ``store``.
+    """
 
     shares = False
 
     def __init__(
-        self, client: Any, store: Store, threads: int = 0, warn: Callable[[str], None] = warnings.warn
+        self,
+        client: Any,
+        store: Store,
+        threads: int = 0,
+        warn: Callable[[str], None] = warnings.warn,
     ) -> None:
-        """Use ``threads`` threads on a worker, by default as many as here; ``warn`` is told at once of a lost link."""
+        """Use ``threads`` threads on a worker, by default as many as here; ``warn`` is told at
+        once of a lost link.
+        """
         self.where = getattr(store, "url", None) or str(store.root.absolute())
         self.link = SchedulerLink(client, warn)
-        self.threads = threads or torch.get_num_threads()  # as many as here give the same round-off as here
+        # as many as here give the same round-off as here
+        self.threads = threads or torch.get_num_threads()
         self._lanes: dict[str, Lane] = {}
         self._looked = -_LOOK
         self._running: dict[Any, tuple[StepJob, ...]] = {}
@@ -56,13 +65,17 @@ class Dask:
 
     @property
     def lanes(self) -> Mapping[str, Lane]:
-        """Return the device and memory of each worker, by address; the workers are queried at most once a second."""
+        """Return the device and memory of each worker, by address; the workers are queried at
+        most once a second.
+        """
         if time.monotonic() - self._looked > _LOOK or not self._lanes:
             self._look()
         return self._lanes
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Send a chain of jobs to the assigned worker, or to another worker if the assigned worker is gone."""
+        """Send a chain of jobs to the assigned worker, or to another worker if the assigned
+        worker is gone.
+        """
         lane = work[0].lane
         there = {"workers": [lane], "allow_other_workers": True} if lane in self.link.newest else {}
         self._tries[work[0].key] = self._tries.get(work[0].key, 0) + 1
@@ -102,7 +115,9 @@ class Dask:
         return []
 
     def cancel(self) -> None:
-        """Drop the tasks that have not begun; running tasks continue, and their results are stored."""
+        """Drop the tasks that have not begun; running tasks continue, and their results are
+        stored.
+        """
         for future in self._running:
             future.release()  # waits for no answer, which a lost scheduler does not give
         self._running = {}
@@ -117,7 +132,9 @@ class Dask:
             future.release()
 
     def _free_of_lost_workers(self) -> None:
-        """Send again what was meant for a worker that is gone: dask would keep it for that worker if none was left."""
+        """Send again what was meant for a worker that is gone: dask would keep it for that
+        worker if none was left.
+        """
         if there := self.link.newest:
             self._submit_again([f for f in self._bound if self._running[f][0].lane not in there])
 
@@ -129,7 +146,9 @@ class Dask:
             wait(list(self._running), seconds, return_when="FIRST_COMPLETED")
 
     def _taken(self, future: Any) -> list[Outcome]:
-        """Return the outcomes of a chain of jobs, or one outcome with a `RunError` if the workers died."""
+        """Return the outcomes of a chain of jobs, or one outcome with a `RunError` if the
+        workers died.
+        """
         chain = self._running.pop(future)
         self._bound.discard(future)
         if future.status == "finished":
@@ -139,13 +158,16 @@ class Dask:
                     outcome.work = replace(outcome.work, lane=chain[0].lane)
                 return outcomes
         cause = future.exception() if future.status == "error" else None
-        if cause is None and self._tries[chain[0].key] < _TRIES:  # the task was lost with its worker or its scheduler
+        # the task was lost with its worker or its scheduler
+        if cause is None and self._tries[chain[0].key] < _TRIES:
             self.submit(chain)
             return []
         return [Outcome(chain[0], error=RunError(chain[0].step, [], OSError(_why_not(cause))))]
 
     def _look(self) -> None:
-        """Update the list of connected workers and their devices; wait until a worker is connected."""
+        """Update the list of connected workers and their devices; wait until a worker is
+        connected.
+        """
         there = self.link.workers()
         if there is None and self._lanes:  # a cut, which may end
             return
@@ -164,5 +186,8 @@ def _why_not(cause: BaseException | None) -> str:
     if cause is None:
         return "the link to the cluster was lost again and again while a worker computed the step"
     if type(cause).__name__ == "KilledWorker":
-        return "every worker that computed the step died: too little memory, or killed; the log of a worker says more"
+        return (
+            "every worker that computed the step died: too little memory, or killed; the log of a"
+            " worker says more"
+        )
     return f"no worker could carry out the step: {type(cause).__name__}: {cause}"

@@ -6,7 +6,8 @@ import torch
 
 
 def check_devices(text: str) -> None:
-    """Raise ValueError for a list of devices with the same device twice, or with one that cannot compute a recipe here.
+    """Raise ValueError for a list of devices with the same device twice, or with one that cannot
+    compute a recipe here.
 
     ``cpu:0,cpu:1`` are two lanes of one CPU, and so two devices.
     """
@@ -22,13 +23,19 @@ def check_devices(text: str) -> None:
         if lane in found:
             again = name if name == found[lane] else f"{found[lane]} and {name} are one device"
             raise ValueError(
-                f"{text}: names a device twice ({again}): name each device once; cpu:0,cpu:1 are two lanes"
+                f"{text}: names a device twice ({again}): name each device once; cpu:0,cpu:1 are"
+                " two lanes"
             )
         found[lane] = name
 
 
 def _reason(text: str) -> str:
-    """Return why a device cannot compute here, from the error of torch, without the names of its operators."""
+    """Return why a device cannot compute here, from the error of torch, without the names of its
+    operators.
+    """
     if "aten::" in text:
-        return "this build of PyTorch cannot compute there: write cpu, or cuda on a machine with a GPU of NVIDIA"
+        return (
+            "this build of PyTorch cannot compute there: write cpu, or cuda on a machine with a GPU"
+            " of NVIDIA"
+        )
     return text.partition("\n")[0]

@@ -1,4 +1,6 @@
-"""Records of finished steps, from an outcome of this run or from the metadata of a stored result."""
+"""Records of finished steps, from an outcome of this run or from the metadata of a stored
+result.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ if TYPE_CHECKING:
 
 
 def error_in(about: Mapping[str, Any] | None) -> tuple[float, float] | None:
-    """Return the approximation error in the metadata of a stored result, or None if the metadata contain none."""
+    """Return the approximation error in the metadata of a stored result, or None if the metadata
+    contain none.
+    """
     found = (about or {}).get("error")
     return (float(found[0]), float(found[1])) if found else None
 
@@ -26,7 +30,9 @@ def checks_in(about: Mapping[str, Any] | None) -> tuple[Check, ...]:
 
 
 def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
-    """Return the statistics in the metadata of a stored result, or None if the metadata contain none."""
+    """Return the statistics in the metadata of a stored result, or None if the metadata contain
+    none.
+    """
     found = (about or {}).get("facts")
     try:
         return TensorStats(**{**found, "shape": tuple(found["shape"])}) if found else None
@@ -34,23 +40,43 @@ def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
         return None
 
 
-def unneeded(name: str, key: Key, about: Mapping[str, Any] | None, bound: float | None) -> StepRecord:
-    """Return the record of a step whose value no other step needed; its checks are those of the stored result."""
+def unneeded(
+    name: str, key: Key, about: Mapping[str, Any] | None, bound: float | None
+) -> StepRecord:
+    """Return the record of a step whose value no other step needed; its checks are those of the
+    stored result.
+    """
     why, checks, error = "nothing needed it", checks_in(about), error_in(about)
     return StepRecord(name, "not needed", why, 0.0, key, checks=checks, bound=bound, error=error)
 
 
-def loaded(name: str, key: Key, about: Mapping[str, Any], bound: float | None, why: str, seconds: float) -> StepRecord:
+def loaded(
+    name: str, key: Key, about: Mapping[str, Any], bound: float | None, why: str, seconds: float
+) -> StepRecord:
     """Return the record of a step whose stored result was read in ``seconds``."""
     why = why or f"computed {about.get('date')} in {about.get('seconds') or 0.0:.3g} s"
     size, error = about.get("bytes") or 0, error_in(about)
     return StepRecord(
-        name, "cached", why, seconds, key, facts_in(about), checks_in(about), "cpu", size, bound, error=error
+        name,
+        "cached",
+        why,
+        seconds,
+        key,
+        facts_in(about),
+        checks_in(about),
+        "cpu",
+        size,
+        bound,
+        error=error,
     )
 
 
-def ran(outcome: Outcome, why: str, bound: float | None, began: float, expected: Estimate | None) -> StepRecord:
-    """Return the record of a step that was computed in the run that started at the time ``began``."""
+def ran(
+    outcome: Outcome, why: str, bound: float | None, began: float, expected: Estimate | None
+) -> StepRecord:
+    """Return the record of a step that was computed in the run that started at the time
+    ``began``.
+    """
     work = outcome.work
     return StepRecord(
         work.step.name,

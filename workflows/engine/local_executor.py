@@ -1,4 +1,5 @@
-"""Executor in this process: one thread for each device, or the thread of the caller if there is only one device.
+"""Executor in this process: one thread for each device, or the thread of the caller if there is
+only one device.
 
 ``cpu:0,cpu:1`` are two lanes of one CPU, so that two small steps run at the same time.
 """
@@ -23,24 +24,33 @@ from neusee.workflows.store.result_store import Store
 _SHARE = 0.9  #: fraction of a device's memory that a schedule may use
 
 
-def lanes_of(devices: Sequence[str], memory: int | None = None, nodes: Iterable[str] = ()) -> dict[str, Lane]:
-    """Return one `Lane` for each device; devices with a common memory divide the bytes that a schedule may use.
+def lanes_of(
+    devices: Sequence[str], memory: int | None = None, nodes: Iterable[str] = ()
+) -> dict[str, Lane]:
+    """Return one `Lane` for each device; devices with a common memory divide the bytes that a
+    schedule may use.
 
-    Args: memory: the limit of the memory of each GPU, and for the CPU of the memory of this process with what the
-    program itself holds; if None, most of a GPU, or most of the memory that is free now. nodes: the paths of the nodes
-    that will run, whose libraries the program holds as well.
+    Args: memory: the limit of the memory of each GPU, and for the CPU of the memory of this process
+            with what the
+    program itself holds; if None, most of a GPU, or most of the memory that is free now. nodes: the
+    paths of the nodes that will run, whose libraries the program holds as well.
     """
     pools = [pool_of(device) for device in devices]
     found = {}
     for device in devices:
         held = program_memory(nodes) if pool_of(device) == "cpu" else 0
-        limit = memory_limit(memory) if pool_of(device) == "cpu" else memory or _SHARE * there_is(device)
+        limit = (
+            memory_limit(memory)
+            if pool_of(device) == "cpu"
+            else memory or _SHARE * there_is(device)
+        )
         found[device] = Lane(device, (limit - held) / pools.count(pool_of(device)), held)
     return found
 
 
 def memory_limit(memory: int | None, workers: int = 1) -> float:
-    """Return the largest memory of this process in bytes: ``memory``, or most of what is free beside the process.
+    """Return the largest memory of this process in bytes: ``memory``, or most of what is free
+    beside the process.
 
     Several processes, ``workers``, divide what is free.
     """
@@ -48,12 +58,16 @@ def memory_limit(memory: int | None, workers: int = 1) -> float:
 
 
 def program_memory(nodes: Iterable[str] = ()) -> float:
-    """Return the memory of this process in bytes before the first step, with the libraries that ``nodes`` load."""
+    """Return the memory of this process in bytes before the first step, with the libraries that
+    ``nodes`` load.
+    """
     return process_memory() + libraries_of(nodes)
 
 
 class Local:
-    """An `Executor` in this process; with one device, `wait` computes the steps in the thread of the caller."""
+    """An `Executor` in this process; with one device, `wait` computes the steps in the thread of
+    the caller.
+    """
 
     shares = True
 
@@ -78,10 +92,16 @@ class Local:
             if len(self.lanes) == 1:
                 self._queue.append(job)
             else:
-                self._running.add(self._pool(job.lane).submit(carry_out, job, self._fetch, self._store, self.later))
+                self._running.add(
+                    self._pool(job.lane).submit(
+                        carry_out, job, self._fetch, self._store, self.later
+                    )
+                )
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
-        """Compute the next job in the queue and return its outcome, or wait for jobs in other threads."""
+        """Compute the next job in the queue and return its outcome, or wait for jobs in other
+        threads.
+        """
         if self._queue:
             return [carry_out(self._queue.popleft(), self._fetch, self._store, self.later)]
         if not self._running:
@@ -90,7 +110,9 @@ class Local:
         return [future.result() for future in done]
 
     def cancel(self) -> None:
-        """Drop the jobs that have not begun, wait for the running jobs, and finish the writes of results."""
+        """Drop the jobs that have not begun, wait for the running jobs, and finish the writes of
+        results.
+        """
         self._queue.clear()
         for pool in self._pools.values():
             pool.shutdown(wait=True, cancel_futures=True)

@@ -22,8 +22,8 @@ _highest = 0  # peak memory of this process before the last reset of the counter
 class PeakMemory:
     """Peak memory of a block of code in bytes, less the memory in use before the block.
 
-    On the CPU this is the resident memory of the whole process, parallel steps included. ``bytes`` is
-    None if the system gives no numbers.
+    On the CPU this is the resident memory of the whole process, parallel steps included. ``bytes``
+    is None if the system gives no numbers.
     """
 
     def __init__(self, device: str, watched: bool = True) -> None:
@@ -35,7 +35,8 @@ class PeakMemory:
         if not self.watched:
             return self
         if self.device.startswith("cuda"):
-            import torch  # here, because a command that computes nothing asks for the free memory alone
+            # here, because a command that computes nothing asks for the free memory alone
+            import torch
 
             torch.cuda.reset_peak_memory_stats(self.device)
             self._before = torch.cuda.memory_allocated(self.device)
@@ -58,12 +59,16 @@ def _highest_on(device: str) -> int:
 
 
 def pool_of(device: str) -> str:
-    """Return the name of the memory that a device uses; ``cpu:0`` and ``cpu:1`` use the same memory."""
+    """Return the name of the memory that a device uses; ``cpu:0`` and ``cpu:1`` use the same
+    memory.
+    """
     return "cpu" if device.startswith("cpu") else device
 
 
 def _peak_reset() -> bool:
-    """Reset the peak memory of this process; return False if the system does not allow the reset."""
+    """Reset the peak memory of this process; return False if the system does not allow the
+    reset.
+    """
     global _highest
     _highest = max(_highest, resident("VmHWM:") or 0)
     try:
@@ -75,7 +80,9 @@ def _peak_reset() -> bool:
 
 
 def resident(field: str) -> int | None:
-    """Return a number of bytes that the system tells of this process, such as ``VmRSS:``, or None."""
+    """Return a number of bytes that the system tells of this process, such as ``VmRSS:``, or
+    None.
+    """
     with suppress(OSError), open("/proc/self/status") as file:
         for line in file:
             if line.startswith(field):
@@ -84,19 +91,28 @@ def resident(field: str) -> int | None:
 
 
 def process_memory() -> int:
-    """Return the memory of this process in bytes: code, libraries and data that are resident now."""
-    with suppress(OSError), open("/proc/self/statm") as file:  # a fifth of the time of /proc/self/status
+    """Return the memory of this process in bytes: code, libraries and data that are resident
+    now.
+    """
+    # a fifth of the time of /proc/self/status
+    with suppress(OSError), open("/proc/self/statm") as file:
         return int(file.read().split()[1]) * _PAGE
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def process_peak() -> int:
-    """Return the peak memory of this process in bytes since it started, whatever `PeakMemory` measured since then."""
-    return max(_highest, resident("VmHWM:") or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+    """Return the peak memory of this process in bytes since it started, whatever `PeakMemory`
+    measured since then.
+    """
+    return max(
+        _highest, resident("VmHWM:") or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    )
 
 
 def give_back() -> None:
-    """Give the memory that was freed back to the system; glibc keeps blocks below 32 MB of a busy process otherwise."""
+    """Give the memory that was freed back to the system; glibc keeps blocks below 32 MB of a
+    busy process otherwise.
+    """
     with suppress(OSError, AttributeError):  # another C library
         _libc().malloc_trim(0)
 
@@ -107,9 +123,11 @@ def _libc() -> ctypes.CDLL:
 
 
 def free_memory() -> int:
-    """Return the bytes that this process can still use: free memory of the machine, or of its control group.
+    """Return the bytes that this process can still use: free memory of the machine, or of its
+    control group.
 
-    A number that is younger than `FRESH` seconds is told again, because short runs ask more often than it changes.
+    A number that is younger than `FRESH` seconds is told again, because short runs ask more often
+    than it changes.
     """
     now = time.monotonic()
     if not _told[0] <= now < _told[0] + FRESH:
@@ -120,7 +138,10 @@ def free_memory() -> int:
 def _free_memory() -> int:
     found = there_is("cpu") - process_memory()
     with suppress(OSError, ValueError, StopIteration), open("/proc/meminfo") as file:
-        found = min(found, next(int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable:")))
+        found = min(
+            found,
+            next(int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable:")),
+        )
     for limit, used in zip(_CGROUPS, _USED, strict=True):
         with suppress(OSError, ValueError):
             taken = int(Path(used).read_text()) - _reclaimable(Path(used).parent)
@@ -129,7 +150,9 @@ def _free_memory() -> int:
 
 
 def _reclaimable(group: Path) -> int:
-    """Return the bytes of files that a control group keeps in memory and gives back when memory is short."""
+    """Return the bytes of files that a control group keeps in memory and gives back when memory
+    is short.
+    """
     for line in (group / "memory.stat").read_text().splitlines():
         if line.startswith(("inactive_file ", "total_inactive_file ")):
             return int(line.split()[1])

@@ -1,8 +1,10 @@
-"""Watch over the memory of this process: a step or a report that takes the process above its limit is stopped.
+"""Watch over the memory of this process: a step or a report that takes the process above its limit
+is stopped.
 
-A thread reads the resident memory some fifty times a second and raises `MemoryLimit` in its thread, which
-stops when its current call of a library returns. A single call that allocates too much is covered by the prediction
-before the run, and where it reads a file by the size that the header of the file states.
+A thread reads the resident memory some fifty times a second and raises `MemoryLimit` in its thread,
+which stops when its current call of a library returns. A single call that allocates too much is
+covered by the prediction before the run, and where it reads a file by the size that the header of
+the file states.
 """
 
 from __future__ import annotations
@@ -21,14 +23,16 @@ from neusee.workflows.store.byte_sizes import format_size
 _PAUSE = 0.02  #: s between two looks
 _NEAR = 0.9  #: share of the limit from which memory that was freed is given back to the system
 _ADVICE = (
-    "give more memory, or choose a smaller picture, pupil or number of bands; the steps that are finished stay in the "
-    "cache"
+    "give more memory, or choose a smaller picture, pupil or number of bands; the steps that are"
+    " finished stay in the cache"
 )
 _raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
 
 class MemoryLimit(Exception):
-    """Error of a step or a report during which the memory of the process exceeded the limit of the run."""
+    """Error of a step or a report during which the memory of the process exceeded the limit of
+    the run.
+    """
 
     def __str__(self) -> str:
         return f"{self._what()}: {_ADVICE}"
@@ -69,7 +73,9 @@ def limit_now() -> float | None:
 
 
 def _room() -> Room:
-    """Return the memory that the readers of input files may still use: what the limits leave, or what is free."""
+    """Return the memory that the readers of input files may still use: what the limits leave, or
+    what is free.
+    """
     found = free_anywhere()
     if not _limits:
         return found
@@ -82,7 +88,9 @@ measured_by(_room)
 
 @contextmanager
 def guarded() -> Iterator[None]:
-    """Raise `MemoryLimit` in the ``with`` block when the process exceeds its limit; do nothing without a limit."""
+    """Raise `MemoryLimit` in the ``with`` block when the process exceeds its limit; do nothing
+    without a limit.
+    """
     here = threading.get_ident()
     if not _limits or here in _inside:  # the block outside is told
         yield
@@ -105,7 +113,9 @@ def guarded() -> Iterator[None]:
 
 
 def _leave(here: int) -> bool:
-    """Watch a thread no longer; return True if it was told to stop, with no exception left to be delivered."""
+    """Watch a thread no longer; return True if it was told to stop, with no exception left to be
+    delivered.
+    """
     with _guard:
         told = _inside.pop(here, True)
         if told:
@@ -116,10 +126,12 @@ def _leave(here: int) -> bool:
 def _deliver(here: int) -> None:
     """Let the exception that this thread was told arrive here.
 
-    To withdraw it is not enough: CPython 3.11 and 3.12 would go on to look for it at every call, and hang if traced.
+    To withdraw it is not enough: CPython 3.11 and 3.12 would go on to look for it at every call,
+    and hang if traced.
     """
     try:
-        _raise_in(ctypes.c_ulong(here), ctypes.py_object(MemoryLimit))  # in the place of one that is on its way
+        # in the place of one that is on its way
+        _raise_in(ctypes.c_ulong(here), ctypes.py_object(MemoryLimit))
         while True:
             pass
     except MemoryLimit:
@@ -149,7 +161,9 @@ def _stop(now: float, limit: float) -> None:
 
 
 def _forked() -> None:
-    """Begin anew in a forked child process, which has neither the thread that looks nor threads that are watched."""
+    """Begin anew in a forked child process, which has neither the thread that looks nor threads
+    that are watched.
+    """
     global _guard, _wake
     _guard, _wake = threading.RLock(), threading.Event()
     _limits.clear()

@@ -1,4 +1,6 @@
-"""Steps whose results hold for this process alone, since own code was seen to read what its key does not cover."""
+"""Steps whose results hold for this process alone, since own code was seen to read what its key
+does not cover.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ class TaintedRun(Exception):
 
 
 def refuse_taints(outcome: Outcome) -> None:
-    """Taint the code of a step that was seen to reach what its key does not cover; say so, and raise `TaintedRun`.
+    """Taint the code of a step that was seen to reach what its key does not cover; say so, and
+    raise `TaintedRun`.
 
     A step whose code was tainted before has a private key, and its run goes on.
     """
@@ -28,10 +31,14 @@ def refuse_taints(outcome: Outcome) -> None:
         return
     step = outcome.work.step
     for taint in outcome.taints:
-        text = f"{step.name} ({step.node.path}): {WORDS[taint.kind]} {taint.what}, which its cache key does not cover"
+        text = (
+            f"{step.name} ({step.node.path}): {WORDS[taint.kind]} {taint.what}, which its cache key"
+            " does not cover"
+        )
         say_once(
             step.node.fn.__module__,
-            f"{text}: its result, and all that follow, are not stored. {taint.fix[0].upper()}{taint.fix[1:]}",
+            f"{text}: its result, and all that follow, are not stored."
+            f" {taint.fix[0].upper()}{taint.fix[1:]}",
         )
     if taint_code(tainted_modules(outcome.work.own, outcome.taints), outcome.taints):
         raise TaintedRun(outcome)

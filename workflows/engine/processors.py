@@ -1,4 +1,6 @@
-"""The processors that other work leaves free, by which a command chooses its threads and its worker processes."""
+"""The processors that other work leaves free, by which a command chooses its threads and its
+worker processes.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +8,11 @@ import os
 
 
 def free_processors() -> int | None:
-    """Return the number of processors that no other work needs, at least one; None where the system tells no load.
+    """Return the number of processors that no other work needs, at least one; None where the system
+    tells no load.
 
-    Work that has only begun, or that has just ended, does not count: both the last minute and this moment must be busy.
+    Work that has only begun, or that has just ended, does not count: both the last minute and this
+    moment must be busy.
     """
     try:
         mine, all_of_them = len(os.sched_getaffinity(0)), os.cpu_count() or 1
@@ -21,5 +25,7 @@ def free_processors() -> int | None:
 
 
 def threads_for(processors: int, load: float) -> int:
-    """Return the number of threads that fit beside ``load`` busy processes on a number of processors, at least one."""
+    """Return the number of threads that fit beside ``load`` busy processes on a number of
+    processors, at least one.
+    """
     return max(1, min(processors, round(processors - load)))

@@ -17,9 +17,14 @@ from neusee.workflows.tolerance.error_budget import ErrorBudget
 
 
 def resolve(
-    recipe: Recipe, order: Iterable[str], store: Store, device: str = "cpu", code: Code | None = None
+    recipe: Recipe,
+    order: Iterable[str],
+    store: Store,
+    device: str = "cpu",
+    code: Code | None = None,
 ) -> Resolved:
-    """Return the cache key of each step for a run on ``device``; ``order`` lists each step after its inputs.
+    """Return the cache key of each step for a run on ``device``; ``order`` lists each step after
+    its inputs.
 
     ``code`` has the digests of nodes that were read a moment ago, if there are any.
     """

@@ -1,4 +1,6 @@
-"""A series of runs, such as those of the points of a sweep: what a run found that holds for the next run as well."""
+"""A series of runs, such as those of the points of a sweep: what a run found that holds for the
+next run as well.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +18,13 @@ from neusee.workflows.store.result_store import Store
 class RunSeries:
     """What the runs of a series share: the code of nodes, keys of steps, and statistics of results.
 
-    The key of a result decides its statistics, so that they hold whatever has become of the result in the store.
+    The key of a result decides its statistics, so that they hold whatever has become of the result
+    in the store.
     """
 
     known_keys: KnownKeys
-    facts: dict[Key, TensorStats] = field(default_factory=dict)  #: of the results of the newest run alone
+    #: of the results of the newest run alone
+    facts: dict[Key, TensorStats] = field(default_factory=dict)
 
     @classmethod
     def begun(cls, store: Store) -> RunSeries:
@@ -32,7 +36,8 @@ class RunSeries:
         self.known_keys = KnownKeys(Code(store.code_memo))
 
     def keep(self, facts: Mapping[Key, TensorStats | None], keys: Iterable[Key]) -> None:
-        """Keep the statistics of the results ``keys`` for the next run, in place of those of earlier runs.
+        """Keep the statistics of the results ``keys`` for the next run, in place of those of
+        earlier runs.
 
         The next run computes private results again, which may differ then.
         """

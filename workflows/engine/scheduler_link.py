@@ -1,7 +1,8 @@
 """The link to a scheduler of dask: whether it answers, which workers it has, and when to give up.
 
-A link that is cut for less than `PATIENCE` comes back by itself: the client connects again, and what was not told is
-asked for again. Beyond it the run ends with one sentence, and what is finished stays in the cache.
+A link that is cut for less than `PATIENCE` comes back by itself: the client connects again, and
+what was not told is asked for again. Beyond it the run ends with one sentence, and what is finished
+stays in the cache.
 """
 
 from __future__ import annotations
@@ -41,7 +42,11 @@ class SchedulerLink:
         Raises `ClusterLost` if the scheduler does not return, or had no worker for too long.
         """
         client = self.client
-        if client.status != "running" or client.scheduler_comm is None or client.scheduler_comm.closed():
+        if (
+            client.status != "running"
+            or client.scheduler_comm is None
+            or client.scheduler_comm.closed()
+        ):
             self._connect_again()
             return True
         if time.monotonic() - self._asked > _BETWEEN:
@@ -49,19 +54,24 @@ class SchedulerLink:
         return False
 
     def workers(self) -> Mapping[str, int] | None:
-        """Return the number of threads by address of the connected workers, or None if the scheduler does not answer.
+        """Return the number of threads by address of the connected workers, or None if the
+        scheduler does not answer.
 
         Raises `ClusterLost` if there was none for too long.
         """
         found: Mapping[str, int] | None = None
         with suppress(OSError, AttributeError):  # the latter while the client closes
-            found = self.client.sync(self.client.scheduler.ncores, workers=None, callback_timeout=_ANSWER)
+            found = self.client.sync(
+                self.client.scheduler.ncores, workers=None, callback_timeout=_ANSWER
+            )
         self._asked = now = time.monotonic()
         self.newest = found or {}
         if found or found is None:
             self._workers_seen = now
         elif now - self._workers_seen > PATIENCE:
-            raise ClusterLost(f"the scheduler {self.address} has had no worker for {PATIENCE:.0f} s")
+            raise ClusterLost(
+                f"the scheduler {self.address} has had no worker for {PATIENCE:.0f} s"
+            )
         return found
 
     def wait_for_workers(self) -> Mapping[str, int]:
@@ -78,8 +88,13 @@ class SchedulerLink:
                 client.close(timeout=_ANSWER)
 
     def _connect_again(self) -> None:
-        """Connect to the scheduler with a new client, because one that waits for a lost packet misses the return."""
-        self._warn(f"the scheduler {self.address} does not answer: waiting up to {PATIENCE:.0f} s for it to return")
+        """Connect to the scheduler with a new client, because one that waits for a lost packet
+        misses the return.
+        """
+        self._warn(
+            f"the scheduler {self.address} does not answer: waiting up to {PATIENCE:.0f} s for it"
+            " to return"
+        )
         self._lost.append(self.client)
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
@@ -98,11 +113,15 @@ def connected(address: Any, seconds: float = PATIENCE) -> Any:
     try:
         return Client(address, timeout=seconds, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise ClusterLost(f"no scheduler of dask answers at {address} within {seconds:.0f} s") from error
+        raise ClusterLost(
+            f"no scheduler of dask answers at {address} within {seconds:.0f} s"
+        ) from error
 
 
 def silence_logs() -> None:
-    """Let dask and its network print nothing in this process: what a user needs to know is said in a sentence."""
+    """Let dask and its network print nothing in this process: what a user needs to know is said
+    in a sentence.
+    """
     import distributed  # noqa: F401  makes its loggers, each with a handler of its own
 
     known = [name for name in logging.root.manager.loggerDict if name.startswith(f"{_LOGGERS[0]}.")]

@@ -1,4 +1,6 @@
-"""Jobs of SLURM whose workers compute a run: submitted through dask-jobqueue, waited for, and cancelled at the end."""
+"""Jobs of SLURM whose workers compute a run: submitted through dask-jobqueue, waited for, and
+cancelled at the end.
+"""
 
 from __future__ import annotations
 
@@ -32,14 +34,18 @@ class SlurmJobs:
     refused: list[str] = field(default_factory=list)  #: what sbatch said
 
     async def submit(self, command: str, script: str) -> str:
-        """Run the command that submits a script, and return what it prints; note what it refuses."""
+        """Run the command that submits a script, and return what it prints; note what it
+        refuses.
+        """
         process = await asyncio.create_subprocess_exec(
             *shlex.split(command), script, stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
         out, error = (text.decode(errors="replace") for text in await process.communicate())
         found = next((word for word in out.replace(";", " ").split() if word.isdecimal()), "")
         if process.returncode or not found:
-            said = " ".join((error.strip() or out.strip() or f"exit code {process.returncode}").split())
+            said = " ".join(
+                (error.strip() or out.strip() or f"exit code {process.returncode}").split()
+            )
             said = said.removeprefix("sbatch: error: ")
             self.refused.append(said)
             raise ClusterLost(said)
@@ -47,7 +53,9 @@ class SlurmJobs:
         return out
 
     def queue(self) -> str:
-        """Return what squeue says of the jobs, such as ``2 PENDING (Resources)``; an empty text if none is left."""
+        """Return what squeue says of the jobs, such as ``2 PENDING (Resources)``; an empty text
+        if none is left.
+        """
         try:
             words = ["squeue", "--noheader", "--jobs", ",".join(self.ids), "--format", "%T (%r)"]
             done = subprocess.run(words, capture_output=True, text=True, timeout=60)
@@ -81,8 +89,12 @@ def slurm_cluster(count: int, options: SlurmOptions) -> Iterator[SlurmJobs]:
                 jobs.cluster.close(timeout=_CLOSING)
 
 
-def wait_for_job(jobs: SlurmJobs, client: Any, options: SlurmOptions, say: Callable[[str], None]) -> None:
-    """Wait until a worker of the jobs is connected; raise `ClusterLost` if sbatch refuses, or if none comes in time."""
+def wait_for_job(
+    jobs: SlurmJobs, client: Any, options: SlurmOptions, say: Callable[[str], None]
+) -> None:
+    """Wait until a worker of the jobs is connected; raise `ClusterLost` if sbatch refuses, or if
+    none comes in time.
+    """
     began = looked = time.monotonic()
     told = False
     while not client.nthreads():
@@ -91,18 +103,28 @@ def wait_for_job(jobs: SlurmJobs, client: Any, options: SlurmOptions, say: Calla
             raise ClusterLost(f"sbatch refused a job: {jobs.refused[0]}")
         if jobs.ids and not told:
             told = True
-            say(f"jobs     {', '.join(jobs.ids)}: waiting up to {options.wait:g} min for the first worker")
+            say(
+                f"jobs     {', '.join(jobs.ids)}: waiting up to {options.wait:g} min for the first"
+                " worker"
+            )
         if now - looked > _LOOK and jobs.ids:
             looked = now
             if not (queue := jobs.queue()):
-                raise ClusterLost(f"the jobs {', '.join(jobs.ids)} ended before a worker came: see {options.logs}/")
+                raise ClusterLost(
+                    f"the jobs {', '.join(jobs.ids)} ended before a worker came: see"
+                    f" {options.logs}/"
+                )
             if now - began > 60 * options.wait:
-                raise ClusterLost(f"no worker came within {options.wait:g} min; squeue says: {queue}")
+                raise ClusterLost(
+                    f"no worker came within {options.wait:g} min; squeue says: {queue}"
+                )
         time.sleep(0.2)
 
 
 def _dask_jobqueue() -> tuple[type[Any], type[Any]]:
-    """Return the classes of a cluster and of a job; leave Ctrl-C as it is, for which the package exits with 0."""
+    """Return the classes of a cluster and of a job; leave Ctrl-C as it is, for which the package
+    exits with 0.
+    """
     before = signal.getsignal(signal.SIGINT)
     from dask_jobqueue.slurm import SLURMCluster, SLURMJob
 
@@ -121,10 +143,16 @@ def _told(job_class: type[Any], jobs: SlurmJobs) -> type[Any]:
 
 
 def _settings(options: SlurmOptions) -> dict[str, Any]:
-    """Return the arguments of a cluster; what is not stated is left to the configuration of the site."""
-    stated = {name: getattr(options, name) for name in ("queue", "account", "walltime", "interface", "python")}
+    """Return the arguments of a cluster; what is not stated is left to the configuration of the
+    site.
+    """
+    stated = {
+        name: getattr(options, name)
+        for name in ("queue", "account", "walltime", "interface", "python")
+    }
     return {
-        "cores": 1,  # of dask, which would compute as many steps at once: the threads are those of torch
+        # of dask, which would compute as many steps at once: the threads are those of torch
+        "cores": 1,
         "processes": 1,
         "job_cpu": options.cores or torch.get_num_threads(),
         "memory": parse_size(options.memory),

@@ -1,4 +1,6 @@
-"""The options of the jobs that SLURM starts for a run, as the command line states them: ``queue=gpu``, ``cores=4``."""
+"""The options of the jobs that SLURM starts for a run, as the command line states them:
+``queue=gpu``, ``cores=4``.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from neusee.workflows.store.byte_sizes import parse_size
 
 _COMMANDS = ("sbatch", "scancel")
 N = TypeVar("N", int, float)
-_TIME = re.compile(r"(\d+-)?\d+(:\d+){0,2}")  #: of SLURM: minutes, hours:minutes:seconds, or days-hours:minutes:seconds
+#: of SLURM: minutes, hours:minutes:seconds, or days-hours:minutes:seconds
+_TIME = re.compile(r"(\d+-)?\d+(:\d+){0,2}")
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,8 @@ class SlurmOptions:
 
     queue: str = ""  #: partition
     account: str = ""
-    cores: int = 0  #: processors of a job, and threads of its worker; 0: as many as this program computes with
+    #: processors of a job, and threads of its worker; 0: as many as this program computes with
+    cores: int = 0
     memory: str = "8 GB"  #: of a job; the worker is ended at 95 % of it
     walltime: str = ""  #: such as 02:00:00; without it half an hour
     wait: float = 5.0  #: minutes until the first job has to start
@@ -34,7 +38,9 @@ class SlurmOptions:
 
     @classmethod
     def read(cls, words: Sequence[str]) -> SlurmOptions:
-        """Return the options in words such as ``queue=gpu``; raise ValueError for a word that is none."""
+        """Return the options in words such as ``queue=gpu``; raise ValueError for a word that is
+        none.
+        """
         found = cls()
         for word in words:
             name, sign, value = word.partition("=")
@@ -71,7 +77,11 @@ def _value(name: str, text: str, before: Any) -> Any:
     return text
 
 
-_KINDS = {"memory": 'a size such as "16 GB"', "cores": "a whole number of at least 1", "wait": "minutes, such as 30"}
+_KINDS = {
+    "memory": 'a size such as "16 GB"',
+    "cores": "a whole number of at least 1",
+    "wait": "minutes, such as 30",
+}
 
 
 def _at_least_one(number: N) -> N:

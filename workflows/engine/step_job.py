@@ -30,16 +30,24 @@ from neusee.workflows.keys.cache_key import Key, device_kind, is_private, plain
 from neusee.workflows.keys.input_file_digest import file_stamps
 from neusee.workflows.keys.tainted_code import hold_back, may_be_stored
 from neusee.workflows.keys.user_code import OwnCode
-from neusee.workflows.observation.own_call import call_observed, say_hidden, say_lost, tainted_modules, undeclared
+from neusee.workflows.observation.own_call import (
+    call_observed,
+    say_hidden,
+    say_lost,
+    tainted_modules,
+    undeclared,
+)
 from neusee.workflows.observation.taints import Taint
 from neusee.workflows.store.lease import Lease
 from neusee.workflows.store.metadata import INLINE
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import pack, tensors_in
 
-Read = Key | tuple[Key, ...] | None  #: content of one input: one value, a list of values, or nothing
+#: content of one input: one value, a list of values, or nothing
+Read = Key | tuple[Key, ...] | None
 Fetch = Callable[[Key], Any]
-#: function that is told each computed result: the recipe of the run, the keys known so far, the step and its value
+#: function that is told each computed result: the recipe of the run, the keys known so far, the
+#: step and its value
 Show = Callable[[Recipe, Mapping[str, Key], str, Any], None]
 T = TypeVar("T")
 _STATS = tuple(each.name for each in fields(TensorStats))
@@ -47,7 +55,9 @@ _WATCHED = 1 << 20  #: bytes of inputs from which the memory of a step is measur
 
 
 class InputMissing(Exception):
-    """Error for a stored result that is damaged or missing when it is read; the run then computes the result."""
+    """Error for a stored result that is damaged or missing when it is read; the run then
+    computes the result.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,15 +74,19 @@ class StepJob:
     lane: str  #: name of the `Lane` (device or worker) that computes the job
     wanted: bool = False  #: True if the result is requested, and therefore kept whatever its cost
     unlocked: bool = False  #: compute without a lease, because the node takes so little time
-    recompute: bool = False  #: True to compute a stored result because computing is faster than reading
+    #: True to compute a stored result because computing is faster than reading
+    recompute: bool = False
     refetch_seconds: float = 0.0  #: s to obtain the inputs again if this result is not kept
     parts: int = 1  #: number of passes over the bands, for less memory
-    own: OwnCode | None = None  #: the code of a step that is not of neusee, which is observed while it computes
+    #: the code of a step that is not of neusee, which is observed while it computes
+    own: OwnCode | None = None
 
     @property
     def sources(self) -> tuple[Key, ...]:
         """Return the cache keys of all values that the job reads."""
-        return tuple(k for read in self.reads for k in ((read,) if isinstance(read, str) else read or ()))
+        return tuple(
+            k for read in self.reads for k in ((read,) if isinstance(read, str) else read or ())
+        )
 
 
 @dataclass(slots=True)
@@ -86,16 +100,19 @@ class Outcome:
     began: float = 0.0  #: s, by `time.time`
     seconds: float = 0.0
     bytes: int = 0
-    deviation: tuple[float, float] | None = None  #: error of a cheaper form: `Node.approximation_error`
+    #: error of a cheaper form: `Node.approximation_error`
+    deviation: tuple[float, float] | None = None
     peak: int | None = None  #: peak bytes beside the memory in use before
     size: list[float] | None = None  #: the size of the step: `cost_laws.Size`
     kept: bool = False  #: True if the store has the value
-    waits: bool = False  #: True if the value is written during the next steps; its lease is released afterwards
+    #: True if the value is written during the next steps; its lease is released afterwards
+    waits: bool = False
     held: bool = False  #: True if another process computes this result
     found: bool = False  #: True if another process has already stored this result
     error: BaseException | None = None
     lost: tuple[Key, ...] = ()  #: inputs that could not be read
-    taints: tuple[Taint, ...] = ()  #: what an own step reached that its key does not cover; its value is not stored
+    #: what an own step reached that its key does not cover; its value is not stored
+    taints: tuple[Taint, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,20 +138,30 @@ class Executor(Protocol):
 
     @property
     def shares(self) -> bool:
-        """Return True if values stay in this process, and False if steps exchange values through the store."""
+        """Return True if values stay in this process, and False if steps exchange values through
+        the store.
+        """
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Start a chain of jobs on one device or worker; each job computes an input of the next job."""
+        """Start a chain of jobs on one device or worker; each job computes an input of the next
+        job.
+        """
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
-        """Return the outcomes of jobs since the last call; while jobs run, wait at most ``seconds`` for an outcome."""
+        """Return the outcomes of jobs since the last call; while jobs run, wait at most
+        ``seconds`` for an outcome.
+        """
 
     def cancel(self) -> None:
         """Start no further job, and wait for the running jobs."""
 
 
-def carry_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None = None) -> Outcome:
-    """Compute one step and store its result if storing saves time; return an error as part of the outcome."""
+def carry_out(
+    work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None = None
+) -> Outcome:
+    """Compute one step and store its result if storing saves time; return an error as part of
+    the outcome.
+    """
     if work.unlocked or is_private(work.key):
         return _carried_out(work, fetch, store, None, Lease())
     lease = store.claim(work.key)
@@ -151,7 +178,9 @@ def carry_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | No
             lease.release()
 
 
-def _carried_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:
+def _carried_out(
+    work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None, lease: Lease
+) -> Outcome:
     try:
         inputs = [gathered(read, fetch) for read in work.reads]
     except InputMissing as error:
@@ -163,7 +192,9 @@ def _carried_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind |
 
 
 def gathered(read: Read, fetch: Fetch) -> Any:
-    """Fetch the value of an input: a single value, a list of values, or None for an absent input."""
+    """Fetch the value of an input: a single value, a list of values, or None for an absent
+    input.
+    """
     if read is None or isinstance(read, str):
         return None if read is None else fetch(read)
     return [fetch(key) for key in read]
@@ -173,30 +204,47 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     """Compute a step and return its value with statistics, checks and costs."""
     step = work.step
     seen = _Seen()
-    evaluate = _observing(partial(call, step, params=step.params, seed=work.seed, device=work.device), work, seen)
+    evaluate = _observing(
+        partial(call, step, params=step.params, seed=work.seed, device=work.device), work, seen
+    )
     stamps = file_stamps(step.params)
     began, clock = time.time(), time.perf_counter()
     size = sum(t.nbytes for t in tensors_in(inputs))
     watched = size >= _WATCHED or not work.unlocked
     own_here = work.own is not None and work.device.startswith("cpu") and not _is_apart(work)
-    with PeakMemory(work.device, watched) as peak, torch.no_grad(), guarded(), refusing_allocations(own_here):
+    with (
+        PeakMemory(work.device, watched) as peak,
+        torch.no_grad(),
+        guarded(),
+        refusing_allocations(own_here),
+    ):
         if step.node.bands and (work.parts > 1 or work.device.startswith("cpu")):
-            value = call_by_band(step, inputs, evaluate, work.origin["code"], store.blobs, work.parts)
+            value = call_by_band(
+                step, inputs, evaluate, work.origin["code"], store.blobs, work.parts
+            )
         else:
             value = evaluate(inputs)
         bare = plain_of(value)
-        checks = _observing(examine, work, seen)(step, bare, inputs) if step.node.hooks.check else ()
+        checks = (
+            _observing(examine, work, seen)(step, bare, inputs) if step.node.hooks.check else ()
+        )
     seconds = time.perf_counter() - clock
     same = stamps == file_stamps(step.params)
-    if not same or work.origin["params"] != {name: plain(param) for name, param in step.params.items()}:
+    if not same or work.origin["params"] != {
+        name: plain(param) for name, param in step.params.items()
+    }:
         raise RunError(step, [], OSError("an input file changed while it was read: run again"))
     found = sum(t.nbytes for t in tensors_in(bare))
     sized = measured_size(step.node, inputs, step.params, bare)
-    deviation = step.node.hooks.approximation_error(bare) if step.node.hooks.approximation_error else None
+    deviation = (
+        step.node.hooks.approximation_error(bare) if step.node.hooks.approximation_error else None
+    )
     facts = TensorStats.of(bare)
     taints = tuple(dict.fromkeys(seen.taints))
     most = None if peak.bytes is None else peak.bytes + seen.peak
-    return Outcome(work, value, facts, checks, began, seconds, found, deviation, most, sized, taints=taints)
+    return Outcome(
+        work, value, facts, checks, began, seconds, found, deviation, most, sized, taints=taints
+    )
 
 
 @dataclass(slots=True)
@@ -208,14 +256,18 @@ class _Seen:
 
 
 def _observing(function: Callable[..., T], work: StepJob, seen: _Seen) -> Callable[..., T]:
-    """Return a function that is observed where the code is not of neusee, and that adds what it finds to ``seen``."""
+    """Return a function that is observed where the code is not of neusee, and that adds what it
+    finds to ``seen``.
+    """
     own = work.own
     if own is None:
         return function
 
     def watched(*args: Any, **more: Any) -> T:
         try:
-            value, found = _called_observed(partial(function, *args, **more), own, _is_apart(work), seen)
+            value, found = _called_observed(
+                partial(function, *args, **more), own, _is_apart(work), seen
+            )
         except ProcessEnded as error:
             raise RunError(work.step, [], error) from error
         seen.taints.extend(found)
@@ -227,12 +279,23 @@ def _observing(function: Callable[..., T], work: StepJob, seen: _Seen) -> Callab
 
 
 def _is_apart(work: StepJob) -> bool:
-    """Return True for code that may change what other code finds: it runs in a process of its own."""
-    return work.own is not None and work.own.may_change and work.device.startswith("cpu") and may_fork()
+    """Return True for code that may change what other code finds: it runs in a process of its
+    own.
+    """
+    return (
+        work.own is not None
+        and work.own.may_change
+        and work.device.startswith("cpu")
+        and may_fork()
+    )
 
 
-def _called_observed(function: Callable[[], T], own: OwnCode, apart: bool, seen: _Seen) -> tuple[T, list[Taint]]:
-    """Call a function of own code, in a process of its own if ``apart`` and its value can be sent."""
+def _called_observed(
+    function: Callable[[], T], own: OwnCode, apart: bool, seen: _Seen
+) -> tuple[T, list[Taint]]:
+    """Call a function of own code, in a process of its own if ``apart`` and its value can be
+    sent.
+    """
     returned = call_in_fork(partial(call_observed, function, own), own.variables) if apart else None
     if returned is None:
         return call_observed(function, own)
@@ -241,11 +304,16 @@ def _called_observed(function: Callable[[], T], own: OwnCode, apart: bool, seen:
     home, lost = min(own.modules), [taint for taint in found if taint.kind == "memory"]
     say_lost(home, lost)
     say_hidden(home, returned.asked, own.free)
-    return value, [*(taint for taint in found if taint not in lost), *undeclared(own, returned.asked)]
+    return value, [
+        *(taint for taint in found if taint not in lost),
+        *undeclared(own, returned.asked),
+    ]
 
 
 def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:
-    """Store the metadata of a result, and also its value if reading is faster than computing the result again."""
+    """Store the metadata of a result, and also its value if reading is faster than computing the
+    result again.
+    """
     own = outcome.work.own
     if is_private(outcome.work.key) or outcome.taints or (own and not may_be_stored(own.modules)):
         outcome.value = plain_of(outcome.value)
@@ -260,7 +328,9 @@ def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Leas
             store.put_receipt(work.key, about)
         elif later is not None and outcome.bytes >= LARGE:
             pack(value)  # a value that cannot be stored raises here, where the step is known
-            later.add(work.key, outcome.bytes, lambda: _written(store, work.key, value, about, lease))
+            later.add(
+                work.key, outcome.bytes, lambda: _written(store, work.key, value, about, lease)
+            )
             outcome.kept = outcome.waits = True
         else:
             outcome.kept = store.put(work.key, value, about)
@@ -276,8 +346,12 @@ def _written(store: Store, key: Key, value: Any, about: dict[str, Any], lease: L
 
 
 def _pays(outcome: Outcome, store: Store, size: int) -> bool:
-    """Return True if computing a result again takes longer than writing and reading ``size`` bytes."""
-    return outcome.seconds + outcome.work.refetch_seconds > store.write_seconds(size) + store.read_seconds(size)
+    """Return True if computing a result again takes longer than writing and reading ``size``
+    bytes.
+    """
+    return outcome.seconds + outcome.work.refetch_seconds > store.write_seconds(
+        size
+    ) + store.read_seconds(size)
 
 
 def _about(outcome: Outcome) -> dict[str, Any]:

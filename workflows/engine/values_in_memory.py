@@ -21,7 +21,8 @@ class ValuesInMemory(dict[Key, Any]):
     def __init__(self, store: Store, later: WriteBehind) -> None:
         super().__init__()
         self._store, self._later = store, later
-        self._unsure = dict[Key, bool]()  # values that the store may lack; True after a write in the background
+        # values that the store may lack; True after a write in the background
+        self._unsure = dict[Key, bool]()
 
     def add(self, outcome: Outcome) -> None:
         """Add the value of a step that was computed."""
@@ -32,12 +33,16 @@ class ValuesInMemory(dict[Key, Any]):
             self._unsure[key] = outcome.waits
 
     def free(self, keys: Iterable[Key], uses: Counter[Key], keep: bool) -> None:
-        """Delete the values that no later step needs; with ``keep``, only those of which the store has a copy."""
+        """Delete the values that no later step needs; with ``keep``, only those of which the
+        store has a copy.
+        """
         for key in keys:
             unused = uses[key] <= 0 and key in self and key not in self._later
             if unused and not (keep and self._is_only_here(key)):
                 del self[key]
 
     def _is_only_here(self, key: Key) -> bool:
-        """Return True if the store has no copy of a value; a write in the background may have failed."""
+        """Return True if the store has no copy of a value; a write in the background may have
+        failed.
+        """
         return key in self._unsure and (not self._unsure[key] or not self._store.has(key))

@@ -1,7 +1,7 @@
 """Writes of large results in the background, while the next steps compute.
 
-A run ends after all writes. A result that waits stays in memory and keeps its lease, so that another
-process that needs the same result finds either the lease or the result.
+A run ends after all writes. A result that waits stays in memory and keeps its lease, so that
+another process that needs the same result finds either the lease or the result.
 """
 
 from __future__ import annotations
@@ -34,9 +34,14 @@ class WriteBehind:
         return key in self._sizes
 
     def add(self, key: Key, size: int, write: Callable[[], Any]) -> None:
-        """Start a write in the background; wait for earlier writes if too many bytes would be pending."""
+        """Start a write in the background; wait for earlier writes if too many bytes would be
+        pending.
+        """
         while self._sizes and sum(list(self._sizes.values())) + size > _ROOM:
-            wait([self._writes[key] for key in list(self._sizes) if key in self._writes], return_when=FIRST_COMPLETED)
+            wait(
+                [self._writes[key] for key in list(self._sizes) if key in self._writes],
+                return_when=FIRST_COMPLETED,
+            )
         with self._guard:
             self._pool = self._pool or ThreadPoolExecutor(1, "neusee store", _lower_priority)
             self._sizes[key] = size
@@ -64,4 +69,6 @@ def _lower_priority() -> None:
     if sys.platform == "linux":  # on other systems the call would affect the whole process
         with suppress(OSError):
             thread = threading.get_native_id()
-            os.setpriority(os.PRIO_PROCESS, thread, min(os.getpriority(os.PRIO_PROCESS, thread) + _NICE, 19))
+            os.setpriority(
+                os.PRIO_PROCESS, thread, min(os.getpriority(os.PRIO_PROCESS, thread) + _NICE, 19)
+            )

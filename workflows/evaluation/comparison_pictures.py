@@ -1,4 +1,6 @@
-"""Pictures for the comparison figure of the paper: one scene with each laser, for each mask and restorer."""
+"""Pictures for the comparison figure of the paper: one scene with each laser, for each mask and
+restorer.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ _WEAKEST = 1e4  #: strength of the first laser in the figure of the paper
 
 @dataclass(frozen=True)
 class Panel:
-    """A column of the figure that compares masks and restorers: pictures with one laser, in linear sRGB (3, y, x)."""
+    """A column of the figure that compares masks and restorers: pictures with one laser, in
+    linear sRGB (3, y, x).
+    """
 
     case: str
     strength: float
@@ -35,10 +39,12 @@ def panels(
     strengths: Sequence[float],
     figure: Collection[str] | None = None,
 ) -> list[Panel]:
-    """Return the columns of the figure that compares masks and restorers, one for each laser and one without a laser.
+    """Return the columns of the figure that compares masks and restorers, one for each laser and
+    one without a laser.
 
-    The strengths of the lasers rise from 1e4, as in the paper, to the largest of ``strengths``. ``figure`` names the
-    lasers; the columns then have the pictures of the sensor behind each mask too.
+    The strengths of the lasers rise from 1e4, as in the paper, to the largest of ``strengths``.
+    ``figure`` names the lasers; the columns then have the pictures of the sensor behind each mask
+    too.
     """
     columns = []
     lasers = [case for case in figure or CASES if case != NONE]
@@ -47,16 +53,24 @@ def panels(
     for case, strength in zip((*lasers, NONE), (*steps, 0.0), strict=True):
         bench.forget()
         point = PointRequest(replace(scene, case=case), strength)
-        key = digest("evaluate pictures", _SIDE, bool(figure), [[p.name, bench.key(p, point)] for p in each])
+        key = digest(
+            "evaluate pictures", _SIDE, bool(figure), [[p.name, bench.key(p, point)] for p in each]
+        )
         compute = partial(_develop, bench, each, point, bool(figure))
-        columns.append(Panel(case, strength, compute_once(bench.store, key, dict, compute, {"step": "evaluate"})))
+        columns.append(
+            Panel(
+                case, strength, compute_once(bench.store, key, dict, compute, {"step": "evaluate"})
+            )
+        )
     return columns
 
 
 def _develop(
     bench: EvaluationPoints, each: Sequence[PipelineRecipes], point: PointRequest, sensors: bool
 ) -> dict[str, Tensor]:
-    """Return the pictures of one laser by name, with those of the sensor behind each mask first if ``sensors``."""
+    """Return the pictures of one laser by name, with those of the sensor behind each mask first
+    if ``sensors``.
+    """
     pictures: dict[str, Tensor] = {}
     restored: dict[str, Tensor] = {}
     for pipeline in each:

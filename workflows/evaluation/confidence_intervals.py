@@ -1,4 +1,6 @@
-"""Confidence intervals of mean image errors over scenes, and of the differences between two methods in these scenes."""
+"""Confidence intervals of mean image errors over scenes, and of the differences between two
+methods in these scenes.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +14,24 @@ from numpy.typing import NDArray
 Numbers = NDArray[np.float64]
 CONFIDENCE = 0.95
 FEW = 5  #: smallest number of photographs for the bootstrap
-METRICS = ("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "saturated", "peak", "above")
+METRICS = (
+    "l1",
+    "psnr",
+    "ssim",
+    "l1 small",
+    "psnr small",
+    "ssim small",
+    "saturated",
+    "peak",
+    "above",
+)
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean over scenes and its 95 % confidence interval, with NaN as limits if there are too few photographs."""
+    """A mean over scenes and its 95 % confidence interval, with NaN as limits if there are too
+    few photographs.
+    """
 
     mean: float
     low: float
@@ -36,7 +50,9 @@ class Interval:
 
 @dataclass(frozen=True)
 class MetricTable:
-    """The metrics of one mask and restorer as arrays (scene, laser strength), with NaN if a value is missing."""
+    """The metrics of one mask and restorer as arrays (scene, laser strength), with NaN if a
+    value is missing.
+    """
 
     strengths: tuple[float, ...]
     values: Mapping[str, Numbers]
@@ -52,7 +68,9 @@ class MetricTable:
         return mean(self.scenes(metric), self.photographs)
 
     def at(self, metric: str, strength: int) -> Interval:
-        """Return the mean of a metric at one laser strength, over the scenes that have a value, and its interval."""
+        """Return the mean of a metric at one laser strength, over the scenes that have a value,
+        and its interval.
+        """
         column = self.values[metric][:, strength]
         kept = ~np.isnan(column)
         return mean(column[kept], self.photographs[kept])
@@ -64,11 +82,15 @@ def sums_by_photograph(values: Numbers, photographs: Numbers) -> Numbers:
     return np.bincount(number.reshape(-1), weights=values).astype(np.float64)
 
 
-def mean(values: Sequence[float] | Numbers, photographs: Sequence[float] | Numbers | None = None) -> Interval:
-    """Return the mean over scenes of a metric, and its confidence interval from Student's t distribution.
+def mean(
+    values: Sequence[float] | Numbers, photographs: Sequence[float] | Numbers | None = None
+) -> Interval:
+    """Return the mean over scenes of a metric, and its confidence interval from Student's t
+    distribution.
 
-    ``photographs`` has the number of the photograph of each scene; without it each scene has a photograph of its own.
-    The interval is over photographs: several scenes of one photograph count as one draw.
+    ``photographs`` has the number of the photograph of each scene; without it each scene has a
+    photograph of its own. The interval is over photographs: several scenes of one photograph count
+    as one draw.
     """
     x = np.asarray(values, dtype=np.float64)
     owner = np.asarray(range(len(x)) if photographs is None else photographs, dtype=np.float64)
@@ -90,10 +112,13 @@ def metric_table(
 ) -> MetricTable:
     """Arrange the metrics of one mask and restorer as arrays (scene, laser strength).
 
-    ``photographs`` has the number of the photograph of each scene; without it every scene has its own.
+    ``photographs`` has the number of the photograph of each scene; without it every scene has its
+    own.
     """
     each = {
-        metric: np.array([[point.get(k, {}).get(metric, math.nan) for k in strengths] for point in points])
+        metric: np.array(
+            [[point.get(k, {}).get(metric, math.nan) for k in strengths] for point in points]
+        )
         for metric in METRICS
     }
     owner = range(len(points)) if photographs is None else photographs

@@ -1,4 +1,6 @@
-"""Figures of an evaluation of masks: pictures by laser, error by laser strength, laser suppression, and contrast."""
+"""Figures of an evaluation of masks: pictures by laser, error by laser strength, laser
+suppression, and contrast.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,17 @@ import torch
 from neusee.nodes.metrics import most_contrast
 from neusee.workflows.evaluation.confidence_intervals import MetricTable, Numbers
 from neusee.workflows.report.figures.camera_overview import high
-from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, encoded, picture
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    VERMILION,
+    canvas,
+    drawn,
+    encoded,
+    picture,
+)
 
 if TYPE_CHECKING:
     from neusee.workflows.evaluation.comparison_pictures import Panel
@@ -22,13 +34,16 @@ if TYPE_CHECKING:
 
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE, "#56B4E9", "#CC79A7", BLACK, "#777777")
 _STYLES = ("-", "--", ":", "-.")  #: line styles, of which the next begins when all colours are used
-_MARKERS = dict(zip(_STYLES, "osD^", strict=True))  #: marker of a point beside the line style of a curve
+#: marker of a point beside the line style of a curve
+_MARKERS = dict(zip(_STYLES, "osD^", strict=True))
 _GREY = "#777777"
 _LETTERS = 16  #: characters of the longest row name that stays on one line
 
 
 def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return the colour and the line style of the curve of each mask, or of each mask with restorer."""
+    """Return the colour and the line style of the curve of each mask, or of each mask with
+    restorer.
+    """
     count = len(_COLOURS)
     return {
         name: {"color": _COLOURS[i % count], "linestyle": _STYLES[i // count % len(_STYLES)]}
@@ -38,7 +53,8 @@ def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 @drawn
 def cases(panels: Sequence[Panel]) -> Any:
-    """Draw the pictures of the plain lens, and of every mask with restorer, in rows below the true picture.
+    """Draw the pictures of the plain lens, and of every mask with restorer, in rows below the true
+    picture.
 
     The columns have different lasers. All pictures have the same scale.
     """
@@ -59,15 +75,19 @@ def _power(strength: float) -> str:
 
 
 def _broken(name: str) -> str:
-    return name if len(name) <= _LETTERS else re.sub(r" ?\+ ?", "\n+ ", name).replace(", ", ",\n").replace("@", "\n@ ")
+    return (
+        name
+        if len(name) <= _LETTERS
+        else re.sub(r" ?\+ ?", "\n+ ", name).replace(", ", ",\n").replace("@", "\n@ ")
+    )
 
 
 @drawn
 def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
     """Draw the L1 error of every mask and restorer with its 95 % interval over the laser strength.
 
-    The left plot is for pictures of full size, the right plot for reduced pictures. Intervals of few scenes are much
-    wider than the means are apart; they do not stretch the axis.
+    The left plot is for pictures of full size, the right plot for reduced pictures. Intervals of
+    few scenes are much wider than the means are apart; they do not stretch the axis.
     """
     figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
     looks = _looks(list(tables))
@@ -89,27 +109,39 @@ def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
 def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], name: str) -> None:
     intervals = [table.at(metric, i) for i in range(len(table.strengths))]
     at = _places(table.strengths)
-    ax.plot(at, [x.mean for x in intervals], marker="o", markersize=4, linewidth=1.4, label=name, **look)
+    ax.plot(
+        at, [x.mean for x in intervals], marker="o", markersize=4, linewidth=1.4, label=name, **look
+    )
     low, up = [x.low for x in intervals], [x.high for x in intervals]
     ax.fill_between(at, low, up, color=look["color"], alpha=0.15, linewidth=0)
 
 
 def _top(tables: Iterable[MetricTable], metric: str) -> float:
-    """Return the end of an axis that shows every mean, and intervals up to three times the largest mean."""
+    """Return the end of an axis that shows every mean, and intervals up to three times the
+    largest mean.
+    """
     found = [table.at(metric, i) for table in tables for i in range(len(table.strengths))]
     largest = max((x.mean for x in found if x.mean > 0), default=0.0)
-    return 1.05 * max(largest, min(3 * largest, max([x.high for x in found if x.high > 0], default=0.0))) or 1.0
+    return (
+        1.05
+        * max(largest, min(3 * largest, max([x.high for x in found if x.high > 0], default=0.0)))
+        or 1.0
+    )
 
 
 def _places(values: Sequence[float]) -> list[float]:
-    """Return the positions of laser strengths on a logarithmic axis, with strength 0 one decade below the others."""
+    """Return the positions of laser strengths on a logarithmic axis, with strength 0 one decade
+    below the others.
+    """
     logs = [float(np.log10(k)) for k in values if k > 0]
     return [float(np.log10(k)) if k > 0 else (min(logs) - 1 if logs else 0.0) for k in values]
 
 
 @drawn
 def wavelengths(result: EvaluationResult) -> Any:
-    """Draw the L1 error of the reduced pictures at the largest strength over the drawn wavelength of each scene."""
+    """Draw the L1 error of the reduced pictures at the largest strength over the drawn
+    wavelength of each scene.
+    """
     figure, axes = canvas(11.0, 4.2)
     ax, looks = axes[0, 0], _looks([p.name for p in result.pipelines])
     x = np.array([math.nan if metres is None else metres * 1e9 for metres in result.wavelengths])
@@ -133,12 +165,16 @@ def _means(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
         return x, y
     part = np.minimum((6 * (x - x.min()) / max(float(np.ptp(x)), 1e-9)).astype(int), 5)
     each = [i for i in range(6) if (part == i).any()]
-    return np.array([x[part == i].mean() for i in each]), np.array([y[part == i].mean() for i in each])
+    return np.array([x[part == i].mean() for i in each]), np.array(
+        [y[part == i].mean() for i in each]
+    )
 
 
 @drawn
 def curves(masks: Mapping[str, MaskOptics]) -> Any:
-    """Draw the laser and background suppression ratios (LSR, BSR) of every mask over the wavelength."""
+    """Draw the laser and background suppression ratios (LSR, BSR) of every mask over the
+    wavelength.
+    """
     figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
     looks = _looks(list(masks))
     left, right = axes[0]
@@ -146,7 +182,14 @@ def curves(masks: Mapping[str, MaskOptics]) -> Any:
         left.plot(mask.wavelengths, mask.lsr, linewidth=1.6, label=name, **looks[name])
         right.plot(mask.wavelengths, mask.bsr, linewidth=1.6, **looks[name])
     one = next(iter(masks.values()))
-    left.plot(one.wavelengths, one.floor, color=_GREY, linewidth=1.2, linestyle=(0, (1, 2)), label="energy floor")
+    left.plot(
+        one.wavelengths,
+        one.floor,
+        color=_GREY,
+        linewidth=1.2,
+        linestyle=(0, (1, 2)),
+        label="energy floor",
+    )
     left.set_yscale("log")
     left.set_title("laser suppression ratio: less is better")
     right.set_title("background suppression ratio: 1 is best")
@@ -161,7 +204,9 @@ def curves(masks: Mapping[str, MaskOptics]) -> Any:
 
 @drawn
 def plane(masks: Mapping[str, MaskOptics]) -> Any:
-    """Draw the image contrast of each mask over its mean laser suppression ratio, and shade what no mask can reach."""
+    """Draw the image contrast of each mask over its mean laser suppression ratio, and shade what
+    no mask can reach.
+    """
     figure, axes = canvas(8.4, 5.2)
     ax = axes[0, 0]
     floor = float(np.mean([mask.floor.mean() for mask in masks.values()]))
@@ -171,12 +216,27 @@ def plane(masks: Mapping[str, MaskOptics]) -> Any:
     bound = most_contrast(unsuppressed, torch.from_numpy(x)).numpy()
     ax.fill_between(x, bound, 1.5, color=_GREY, alpha=0.15, linewidth=0)
     ax.plot(
-        x, bound, color=_GREY, linewidth=1.2, label="rms contrast: no mask that keeps its light is above (Parseval)"
+        x,
+        bound,
+        color=_GREY,
+        linewidth=1.2,
+        label="rms contrast: no mask that keeps its light is above (Parseval)",
     )
-    ax.axvspan(x[0], floor, color=BLUE, alpha=0.12, linewidth=0, label="LSR: no mask that keeps its light is here")
+    ax.axvspan(
+        x[0],
+        floor,
+        color=BLUE,
+        alpha=0.12,
+        linewidth=0,
+        label="LSR: no mask that keeps its light is here",
+    )
     looks = _looks(list(masks))
     for name, mask in masks.items():
-        at, colour, mark = float(mask.lsr.mean()), looks[name]["color"], _MARKERS[looks[name]["linestyle"]]
+        at, colour, mark = (
+            float(mask.lsr.mean()),
+            looks[name]["color"],
+            _MARKERS[looks[name]["linestyle"]],
+        )
         ax.plot([at, at], [mask.median.mean(), mask.rms.mean()], color=colour, linewidth=0.8)
         ax.plot(at, mask.rms.mean(), mark, markersize=6, markerfacecolor="none", color=colour)
         ax.plot(at, mask.median.mean(), mark, markersize=7, color=colour, label=name)

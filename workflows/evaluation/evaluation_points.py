@@ -1,4 +1,6 @@
-"""The evaluation points: the metrics of one scene at one laser strength with one pipeline (mask and restorer)."""
+"""The evaluation points: the metrics of one scene at one laser strength with one pipeline (mask
+and restorer).
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ class PointRequest:
 
 
 class EvaluationPoints:
-    """The computation of evaluation points, in which a result that several evaluation points use is computed once."""
+    """The computation of evaluation points, in which a result that several evaluation points use
+    is computed once.
+    """
 
     def __init__(self, store: Store, small: int, device: str = "cpu") -> None:
         self.store, self.small, self.device = store, small, device
@@ -56,15 +60,21 @@ class EvaluationPoints:
         self.seconds = 0.0  #: computing time of these evaluation points
         self._code = Code(store.code_memo)
         self._functions: dict[tuple[str, str, int], Any] = {}  #: a recipe is known by its identity
-        #: by identity of a recipe; the recipe is kept too, so that no other recipe gets the same identity
+        #: by identity of a recipe; the recipe is kept too, so that no other recipe gets the same
+        #: identity
         self._drawn: dict[Any, tuple[Recipe, Inputs | None]] = {}
-        self._fixed: dict[str, Any] = {}  #: by key, results that do not depend on a scene: one copy for all functions
+        #: by key, results that do not depend on a scene: one copy for all functions
+        self._fixed: dict[str, Any] = {}
         self._kept = _SharedResults()
 
     def point(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
-        """Return the metrics of an evaluation point from the store, or compute and store the metrics."""
+        """Return the metrics of an evaluation point from the store, or compute and store the
+        metrics.
+        """
         compute = partial(self._measure, pipeline, point)
-        return compute_once(self.store, self.key(pipeline, point), dict, compute, {"step": "evaluate"})
+        return compute_once(
+            self.store, self.key(pipeline, point), dict, compute, {"step": "evaluate"}
+        )
 
     def _measure(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
         began = time.perf_counter()
@@ -73,8 +83,12 @@ class EvaluationPoints:
         self.computed += 1
         return numbers
 
-    def values(self, pipeline: PipelineRecipes, point: PointRequest, more: Sequence[str] = ()) -> dict[str, Any]:
-        """Run a pipeline on one scene and laser, and return the outputs and the results of the steps ``more``."""
+    def values(
+        self, pipeline: PipelineRecipes, point: PointRequest, more: Sequence[str] = ()
+    ) -> dict[str, Any]:
+        """Run a pipeline on one scene and laser, and return the outputs and the results of the
+        steps ``more``.
+        """
         outputs = (*pipeline.pipeline.outputs, *more)
         function = self._function(pipeline, point.lit, outputs)
         self._kept.turn(point)
@@ -99,14 +113,30 @@ class EvaluationPoints:
         self._kept.clear()
 
     def key(self, pipeline: PipelineRecipes, point: PointRequest) -> str:
-        """Return the cache key of an evaluation point from the keys of its steps and the settings of the comparison."""
+        """Return the cache key of an evaluation point from the keys of its steps and the
+        settings of the comparison.
+        """
         recipe, outputs = pipeline.recipe(point.lit), pipeline.pipeline.outputs
         keys = self.point_keys(pipeline, point, outputs)
-        within = [recipe.tolerance, recipe.exact, recipe.estimates, device_kind(self.device), self.small]
+        within = [
+            recipe.tolerance,
+            recipe.exact,
+            recipe.estimates,
+            device_kind(self.device),
+            self.small,
+        ]
         own = [self._code.digest(used.__module__) for used in (quality, resize)]
-        return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
+        return digest(
+            "evaluate",
+            engine("evaluation.evaluation_points"),
+            [keys[name] for name in outputs],
+            within,
+            own,
+        )
 
-    def point_keys(self, pipeline: PipelineRecipes, point: PointRequest, outputs: Sequence[str]) -> dict[str, str]:
+    def point_keys(
+        self, pipeline: PipelineRecipes, point: PointRequest, outputs: Sequence[str]
+    ) -> dict[str, str]:
         """Return the cache keys of the steps of an evaluation point."""
         recipe = pipeline.recipe(point.lit)
         params: dict[str, dict[str, Any]] = {}
@@ -119,8 +149,12 @@ class EvaluationPoints:
         }
         return self.keys(replace(recipe, steps={**recipe.steps, **steps}), outputs, point.scene)
 
-    def keys(self, recipe: Recipe, outputs: Iterable[str], scene: Scene | None = None) -> dict[str, str]:
-        """Return the cache key of each step, with the seed of the scene for all steps that depend on the scene."""
+    def keys(
+        self, recipe: Recipe, outputs: Iterable[str], scene: Scene | None = None
+    ) -> dict[str, str]:
+        """Return the cache key of each step, with the seed of the scene for all steps that
+        depend on the scene.
+        """
         keys = {"scene": scene.key(self._code)} if scene else {}
         live = dependents(recipe, keys)
         for name in needed(recipe, outputs):
@@ -137,9 +171,15 @@ class EvaluationPoints:
             whole = with_substitutions(recipe, outputs)  # as in `run`, but the scene is an argument
             steps = set(needed(whole, outputs))
             inputs = self.inputs(pipeline, case, outputs)
-            free = ["scene", *(r for r in (inputs.readers if inputs else ()) if r.rpartition(".")[0] in steps)]
+            free = [
+                "scene",
+                *(r for r in (inputs.readers if inputs else ()) if r.rpartition(".")[0] in steps),
+            ]
             if case != NONE:
-                free += [f"direction[{BEAM}].angle", *(f"{spot}.strength" for spot in spots(recipe, outputs))]
+                free += [
+                    f"direction[{BEAM}].angle",
+                    *(f"{spot}.strength" for spot in spots(recipe, outputs)),
+                ]
             free += [TOLD + name for name in free if TOLD + name.rpartition(".")[0] in steps]
             caller = self._kept.caller(dependents(whole, list(filter(_is_moved, whole.steps))))
             ways: dict[str, Any] = {"store": self.store, "device": self.device, "caller": caller}
@@ -147,10 +187,14 @@ class EvaluationPoints:
             self._share(self._functions[name], whole)
         return self._functions[name]
 
-    def _changed(self, pipeline: PipelineRecipes, point: PointRequest, outputs: Sequence[str]) -> dict[str, Any]:
-        """Return the parameters that an evaluation point sets: sampled values, laser direction and laser strength.
+    def _changed(
+        self, pipeline: PipelineRecipes, point: PointRequest, outputs: Sequence[str]
+    ) -> dict[str, Any]:
+        """Return the parameters that an evaluation point sets: sampled values, laser direction and
+        laser strength.
 
-        A copy of a step from which the restorer is told gets the same values, with the error of the pipeline.
+        A copy of a step from which the restorer is told gets the same values, with the error of the
+        pipeline.
         """
         recipe = pipeline.recipe(point.lit)
         inputs = self.inputs(pipeline, point.lit, outputs)
@@ -158,15 +202,24 @@ class EvaluationPoints:
         if point.lit != NONE:
             changed[f"direction[{BEAM}].angle"] = point.scene.angle(recipe)
             changed |= {f"{spot}.strength": point.strength for spot in spots(recipe, outputs)}
-        copies = {name: value for name, value in changed.items() if TOLD + name.rpartition(".")[0] in recipe.steps}
+        copies = {
+            name: value
+            for name, value in changed.items()
+            if TOLD + name.rpartition(".")[0] in recipe.steps
+        }
         wrong = {name: value for name, value in pipeline.error.items() if value is not None}
-        told = {TOLD + name: shifted(x, wrong[name]) if name in wrong else x for name, x in copies.items()}
+        told = {
+            TOLD + name: shifted(x, wrong[name]) if name in wrong else x
+            for name, x in copies.items()
+        }
         return changed | told
 
     def inputs(self, pipeline: PipelineRecipes, case: str, outputs: Sequence[str]) -> Inputs | None:
-        """Return the uncertain inputs of a pipeline, or None if no output depends on an uncertain input.
+        """Return the uncertain inputs of a pipeline, or None if no output depends on an uncertain
+        input.
 
-        A restorer that is told an error gets the values of the recipe without the error, whose steps it copies.
+        A restorer that is told an error gets the values of the recipe without the error, whose
+        steps it copies.
         """
         recipe = (pipeline.true or pipeline.recipe)(case)
         if recipe.uncertain is None or not recipe.uncertain.names:
@@ -179,7 +232,9 @@ class EvaluationPoints:
         return self._drawn[key][1]
 
     def _share(self, function: Any, recipe: Recipe) -> None:
-        """Replace constant results in a recipe function by the equal results of an earlier function, to save memory."""
+        """Replace constant results in a recipe function by the equal results of an earlier
+        function, to save memory.
+        """
         keys = self.keys(recipe, function.fixed)
         for name, value in function.fixed.items():
             function.fixed[name] = self._fixed.setdefault(keys[name], value)
@@ -189,7 +244,9 @@ class EvaluationPoints:
         small = whole = values[line.quality]
         if min(truth.shape[-2:]) > self.small:
             domain = pipeline.recipe(NONE).steps[line.quality].params["domain"]
-            small = quality(reduced(values[line.picture], self.small), reduced(truth, self.small), domain=domain)
+            small = quality(
+                reduced(values[line.picture], self.small), reduced(truth, self.small), domain=domain
+            )
         peak, saturated = values["peak[mask]"], values["saturated[mask]"]
         return {
             **{name: float(value) for name, value in whole._asdict().items()},
@@ -202,7 +259,9 @@ class EvaluationPoints:
 
 
 class _SharedResults:
-    """A cache of results that successive evaluation points have in common, by scene and by laser strength."""
+    """A cache of results that successive evaluation points have in common, by scene and by laser
+    strength.
+    """
 
     def __init__(self) -> None:
         self._of_scene: dict[Any, tuple[Any, Any]] = {}
@@ -217,7 +276,9 @@ class _SharedResults:
         self._of_strength.clear()
 
     def turn(self, point: PointRequest) -> None:
-        """Begin an evaluation point, and remove the cached results of other scenes, lasers and laser strengths."""
+        """Begin an evaluation point, and remove the cached results of other scenes, lasers and
+        laser strengths.
+        """
         scene = (point.scene.number, point.scene.seed, point.scene.case)
         if scene != self._scene:
             self._of_scene.clear()
@@ -226,17 +287,21 @@ class _SharedResults:
         self._scene, self._strength, self._seed = scene, point.strength, point.scene.seed
 
     def caller(self, moved: set[str]) -> Callable[..., Any]:
-        """Return a function that computes a step, or returns the cached result if the input objects are the same.
+        """Return a function that computes a step, or returns the cached result if the input objects
+        are the same.
 
         ``moved`` names the steps that depend on the laser strength.
         """
 
-        def compute(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
+        def compute(
+            step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str
+        ) -> Any:
             kept = self._of_strength if step.name in moved else self._of_scene
             own = (step.name, self._seed) if step.node.random else ()
             identities = [tuple(map(id, x)) if type(x) is list else id(x) for x in inputs]
             key = (own, step.node.path, repr(sorted(params.items())), device, *identities)
-            if key not in kept:  # the inputs are kept too, so that no other object gets their identity
+            # the inputs are kept too, so that no other object gets their identity
+            if key not in kept:
                 kept[key] = (inputs, call(step, inputs, params, self._seed, device))
             return kept[key][1]
 
@@ -254,7 +319,9 @@ def spots(recipe: Recipe, outputs: Sequence[str]) -> list[str]:
 
 
 def reduced(picture: Tensor, side: int) -> Tensor:
-    """Clip a picture to [0, 1], and resize it, antialiased, so that its shorter side has ``side`` pixels."""
+    """Clip a picture to [0, 1], and resize it, antialiased, so that its shorter side has
+    ``side`` pixels.
+    """
     y, x = picture.shape[-2:]
     scale = side / min(y, x)
     return resize(picture.clamp(0, 1), round(y * scale), round(x * scale))

@@ -1,4 +1,6 @@
-"""The result of an evaluation: the metrics of every mask and restorer in every scene, and statistics over scenes."""
+"""The result of an evaluation: the metrics of every mask and restorer in every scene, and
+statistics over scenes.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ from neusee.workflows.protection.equal_shade import EqualProtection
 
 @dataclass(frozen=True)
 class MistoldPoint:
-    """The metrics of one scene whose restorer was told the truth, and told optics or laser with one error."""
+    """The metrics of one scene whose restorer was told the truth, and told optics or laser with
+    one error.
+    """
 
     pipeline: str
     error: str
@@ -30,7 +34,9 @@ class MistoldPoint:
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """The result of an evaluation: scenes, metrics by scene, statistics over scenes, masks and pictures."""
+    """The result of an evaluation: scenes, metrics by scene, statistics over scenes, masks and
+    pictures.
+    """
 
     recipe: Recipe
     scenes: Sequence[Scene]
@@ -47,7 +53,8 @@ class EvaluationResult:
     mistold: Sequence[MistoldPoint] = ()
     protection: EqualProtection | None = None  #: if pipelines were brought to one peak
     wavelengths: Sequence[float | None] = ()  #: of the laser of each scene, in m
-    commands: Mapping[str, Sequence[Mapping[float, str]]] = field(default_factory=dict)  #: as `points`, one each
+    #: as `points`, one each
+    commands: Mapping[str, Sequence[Mapping[float, str]]] = field(default_factory=dict)
 
     @property
     def reference(self) -> str:

@@ -1,4 +1,6 @@
-"""Figures of merit of a mask by wavelength: laser suppression and image contrast, with their physical bounds."""
+"""Figures of merit of a mask by wavelength: laser suppression and image contrast, with their
+physical bounds.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,10 @@ class MaskOptics:
 
 
 def masks(
-    each: Sequence[PipelineRecipes], store: Store, device: str, points: Mapping[str, Sequence[Mapping[float, Any]]]
+    each: Sequence[PipelineRecipes],
+    store: Store,
+    device: str,
+    points: Mapping[str, Sequence[Mapping[float, Any]]],
 ) -> dict[str, MaskOptics]:
     """Return the laser suppression and the image contrast of each mask, by name of the mask."""
     optics: dict[str, MaskOptics] = {}
@@ -46,6 +51,13 @@ def _mask(pipeline: PipelineRecipes, store: Store, device: str, bsr: Numbers) ->
     wanted = ("bands", "lsr[mask]", "mtf[mask]", "psf[mask]")
     values = run(pipeline.recipe(NONE), store, wanted, device=device).values
     bands, lsr, mtf, psf = (values[name] for name in wanted)
-    each = (lsr, mtf.median, mtf.rms, least_lsr(psf), metrics.limits(psf).passed, most_unsuppressed(psf))
+    each = (
+        lsr,
+        mtf.median,
+        mtf.rms,
+        least_lsr(psf),
+        metrics.limits(psf).passed,
+        most_unsuppressed(psf),
+    )
     suppression, *rest = (x.double().cpu().numpy() for x in each)
     return MaskOptics(bands.centres.double().cpu().numpy() * 1e9, suppression, bsr, *rest)

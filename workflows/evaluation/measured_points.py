@@ -1,4 +1,6 @@
-"""Everything that an evaluation measures: the points of all scenes, restorers told with errors, masks and pictures."""
+"""Everything that an evaluation measures: the points of all scenes, restorers told with errors,
+masks and pictures.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +10,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 from neusee.workflows.evaluation.comparison_pictures import Panel, panels
-from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointNumbers, PointRequest
+from neusee.workflows.evaluation.evaluation_points import (
+    EvaluationPoints,
+    PointNumbers,
+    PointRequest,
+)
 from neusee.workflows.evaluation.evaluation_result import MistoldPoint
 from neusee.workflows.evaluation.evaluation_scenes import Scene, UnreadablePhotograph
 from neusee.workflows.evaluation.mask_optics import MaskOptics, masks
 from neusee.workflows.evaluation.mistold_points import told_with_errors
-from neusee.workflows.evaluation.pipelines import NONE, SIX, EvaluationRefused, PipelineRecipes, compose_pipelines
+from neusee.workflows.evaluation.pipelines import (
+    NONE,
+    SIX,
+    EvaluationRefused,
+    PipelineRecipes,
+    compose_pipelines,
+)
 from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.study_folder import Progress
@@ -49,7 +61,9 @@ def measure(
     shown: Sequence[Scene],
     strengths: tuple[float, ...],
 ) -> Measured:
-    """Return the numbers of all points, those of restorers told with errors, the masks, and the pictures to show."""
+    """Return the numbers of all points, those of restorers told with errors, the masks, and the
+    pictures to show.
+    """
     points, kept, broken = _points(bench, each, shown, strengths, asked.progress)
     mistold = told_with_errors(bench, each, kept, strengths, asked.progress)
     optics = masks(each, asked.store, bench.device, points)
@@ -58,7 +72,9 @@ def measure(
         lines = [p.pipeline for p in each]
         each = compose_pipelines(asked.recipe, [*asked.changes, *more], lines, asked.folder)
     figure = SIX if asked.settings.lasers == "drawn" else None
-    return Measured(points, kept, broken, mistold, optics, panels(bench, each, kept[0], strengths, figure))
+    return Measured(
+        points, kept, broken, mistold, optics, panels(bench, each, kept[0], strengths, figure)
+    )
 
 
 def _points(
@@ -68,7 +84,8 @@ def _points(
     strengths: Sequence[float],
     progress: Progress,
 ) -> tuple[dict[str, list[dict[float, PointNumbers]]], list[Scene], list[tuple[Path, str]]]:
-    """Compute all evaluation points, and return them, their scenes, and the photographs that could not be decoded.
+    """Compute all evaluation points, and return them, their scenes, and the photographs that could
+    not be decoded.
 
     The scenes come laser by laser, because scenes with the same laser have common optical results.
     """
@@ -86,7 +103,10 @@ def _points(
             progress(f"not read, and left out: {scene.name}")
             continue
         points[scene.number] = own
-        progress(f"scene {done} of {len(shown)} ({scene.case}, {scene.name}): {bench.computed} points computed")
+        progress(
+            f"scene {done} of {len(shown)} ({scene.case}, {scene.name}): {bench.computed} points"
+            " computed"
+        )
     kept = [scene for scene in shown if scene.number in points]
     if not kept:
         raise EvaluationRefused(broken[0][1])

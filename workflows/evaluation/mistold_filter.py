@@ -1,6 +1,7 @@
 """Recipes whose restorer is told optics and laser with one error, while the camera stays as it is.
 
-The steps that compute what the restorer knows are copied with another parameter; the copies have the prefix ``told_``.
+The steps that compute what the restorer knows are copied with another parameter; the copies have
+the prefix ``told_``.
 """
 
 from __future__ import annotations
@@ -16,14 +17,18 @@ from neusee.workflows.recipe.blocks.evaluate_block import Mismatch
 
 
 def errors_of(recipe: Recipe, mismatch: Mismatch) -> dict[str, Mapping[str, Any]]:
-    """Return the errors in what the restorer of a recipe is told: by text, what is added to which parameters.
+    """Return the errors in what the restorer of a recipe is told: by text, what is added to which
+    parameters.
 
-    A parameter with None is removed: the input ``dirt`` of a pupil. The result is empty if the restorer knows nothing.
+    A parameter with None is removed: the input ``dirt`` of a pupil. The result is empty if the
+    restorer knows nothing.
     """
     told = known(recipe, _readers(recipe))
     if not told:
         return {}
-    pupils = [name for name in needed(recipe, told) if recipe.steps[name].node.path == "optics.pupil"]
+    pupils = [
+        name for name in needed(recipe, told) if recipe.steps[name].node.path == "optics.pupil"
+    ]
     found: dict[str, Mapping[str, Any]] = {}
     direction, line = f"direction[{BEAM}]", f"line[{BEAM}]"
     glare = [name for name in needed(recipe, told) if direction in recipe.steps[name].sources]
@@ -32,7 +37,9 @@ def errors_of(recipe: Recipe, mismatch: Mismatch) -> dict[str, Mapping[str, Any]
         angle = mismatch.pixels * lens["pixel_pitch"] / lens["focal_length"]
         found[f"direction {mismatch.pixels:g} px off"] = {f"{direction}.angle": (angle, angle)}
     if mismatch.wavelength and glare and "wavelength" in recipe.steps[line].params:
-        found[f"wavelength {mismatch.wavelength * 1e9:g} nm off"] = {f"{line}.wavelength": mismatch.wavelength}
+        found[f"wavelength {mismatch.wavelength * 1e9:g} nm off"] = {
+            f"{line}.wavelength": mismatch.wavelength
+        }
     if mismatch.defocus and pupils:
         found[f"defocus {mismatch.defocus:g} waves off"] = dict.fromkeys(
             (f"{name}.defocus" for name in pupils), mismatch.defocus
@@ -44,8 +51,12 @@ def errors_of(recipe: Recipe, mismatch: Mismatch) -> dict[str, Mapping[str, Any]
 
 
 def mistold(recipe: Recipe, error: Mapping[str, Any]) -> Recipe:
-    """Return the recipe with a copy of each step that the error changes, from which alone the restorer knows."""
-    added = {name: value for name, value in error.items() if name.rpartition(".")[0] in recipe.steps}
+    """Return the recipe with a copy of each step that the error changes, from which alone the
+    restorer knows.
+    """
+    added = {
+        name: value for name, value in error.items() if name.rpartition(".")[0] in recipe.steps
+    }
     changed = {name.rpartition(".")[0] for name in added}
     readers = _readers(recipe)
     copied = {
@@ -58,7 +69,11 @@ def mistold(recipe: Recipe, error: Mapping[str, Any]) -> Recipe:
 
 def shifted(value: Any, by: Any) -> Any:
     """Return a parameter to which an error is added: a number, or the two angles of a direction."""
-    return tuple(a + b for a, b in zip(value, by, strict=True)) if isinstance(by, tuple) else value + by
+    return (
+        tuple(a + b for a, b in zip(value, by, strict=True))
+        if isinstance(by, tuple)
+        else value + by
+    )
 
 
 def _readers(recipe: Recipe) -> list[str]:

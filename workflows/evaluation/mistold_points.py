@@ -1,4 +1,6 @@
-"""Evaluation points of restorers that are told optics or laser with an error, beside those that are told the truth."""
+"""Evaluation points of restorers that are told optics or laser with an error, beside those that
+are told the truth.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +26,17 @@ def told_with_errors(
     strengths: Sequence[float],
     progress: Progress,
 ) -> list[MistoldPoint]:
-    """Compute the metrics of restorers that are told optics or laser with one error, in the first scenes with a laser.
+    """Compute the metrics of restorers that are told optics or laser with one error, in the first
+    scenes with a laser.
 
-    The recipe declares the errors; a pipeline whose restorer knows nothing of optics and lasers has none.
+    The recipe declares the errors; a pipeline whose restorer knows nothing of optics and lasers has
+    none.
     """
     settings = each[0].recipe(NONE).evaluation or EvaluateSettings()
     mismatch, lit = settings.mismatch, [scene for scene in shown if scene.case != NONE]
-    strength = max(strengths) if mismatch is None or mismatch.strength is None else mismatch.strength
+    strength = (
+        max(strengths) if mismatch is None or mismatch.strength is None else mismatch.strength
+    )
     if mismatch is None or not strength:
         return []
     found: list[MistoldPoint] = []
@@ -62,6 +68,13 @@ def mistold_rows(points: Sequence[MistoldPoint]) -> list[Sequence[Any]]:
     rows: dict[Any, Sequence[Any]] = {}
     for p in points:
         for told, numbers in (("exactly", p.true), (p.error, p.wrong)):
-            place = (p.pipeline, told, p.scene.number, p.scene.name, p.scene.case, f"{p.strength:g}")
+            place = (
+                p.pipeline,
+                told,
+                p.scene.number,
+                p.scene.name,
+                p.scene.case,
+                f"{p.strength:g}",
+            )
             rows[place] = (*place, *(numbers[metric] for metric in METRICS))
     return list(rows.values())

@@ -1,8 +1,10 @@
-"""Confidence intervals of the difference between two pipelines on the same pictures, drawn over photographs.
+"""Confidence intervals of the difference between two pipelines on the same pictures, drawn over
+photographs.
 
-Pictures of one photograph are alike, so that they are no independent draws: the bootstrap draws whole photographs. It
-draws the error of the mean in units of its own standard error (bootstrap-t), because quantiles of the plain bootstrap
-hold the truth of eight to twelve skewed photographs in 81 to 89 instead of 95 of 100 cases.
+Pictures of one photograph are alike, so that they are no independent draws: the bootstrap draws
+whole photographs. It draws the error of the mean in units of its own standard error (bootstrap-t),
+because quantiles of the plain bootstrap hold the truth of eight to twelve skewed photographs in 81
+to 89 instead of 95 of 100 cases.
 """
 
 from __future__ import annotations
@@ -21,19 +23,24 @@ from neusee.workflows.evaluation.confidence_intervals import (
 )
 
 _DRAWS = 10_000  #: sets of photographs that the bootstrap draws
-_SMALL = 30  #: photographs below which neither end may lie nearer than that of Student's t distribution
+#: photographs below which neither end may lie nearer than that of Student's t distribution
+_SMALL = 30
 _AT_ONCE = 500  #: sets in memory at once
 
 
 def ratio(top: Numbers, bottom: Numbers, photographs: Numbers, seed: int) -> Interval:
-    """Return the ratio of the sums of two values over pictures, and its 95 % interval over photographs.
+    """Return the ratio of the sums of two values over pictures, and its 95 % interval over
+    photographs.
 
-    Args: top, bottom: (picture,) values of the same unit, or 1 as ``bottom`` for the mean of ``top``. photographs:
+    Args: top, bottom: (picture,) values of the same unit, or 1 as ``bottom`` for the mean of
+            ``top``. photographs:
     (picture,) the number of the photograph of each picture. seed: of the draws.
-    The limits are NaN for fewer than five photographs. For fewer than thirty each end is that of the bootstrap or of
-    Student's t distribution, whichever lies farther away, times the root of n/(n - 1), by which drawn sets of n
-    photographs scatter too little; skewed photographs need both.
-    Source: Davison and Hinkley, Bootstrap Methods and their Application (1997), section 5.2.1, studentized bootstrap.
+    The limits are NaN for fewer than five photographs. For fewer than thirty each end is that of
+    the bootstrap or of Student's t distribution, whichever lies farther away, times the root of
+    n/(n - 1), by which drawn sets of n photographs scatter too little; skewed photographs need
+    both.
+    Source: Davison and Hinkley, Bootstrap Methods and their Application (1997), section 5.2.1,
+            studentized bootstrap.
     """
     a, b = sums_by_photograph(top, photographs), sums_by_photograph(bottom, photographs)
     value, count = float(a.sum() / b.sum()), len(a)
@@ -58,13 +65,17 @@ _LIMITS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
 
 
 def _standard_error(squares: Numbers, total: Numbers, count: int) -> Numbers:
-    """Return the standard error of a ratio from the sum of the squared residuals of the photographs."""
+    """Return the standard error of a ratio from the sum of the squared residuals of the
+    photographs.
+    """
     error: Numbers = np.sqrt(count / (count - 1) * squares) / total
     return error
 
 
 def _drawn_errors(rest: Numbers, b: Numbers, seed: int) -> Numbers:
-    """Return the error of the ratio in each drawn set of photographs, in units of the standard error in that set."""
+    """Return the error of the ratio in each drawn set of photographs, in units of the standard
+    error in that set.
+    """
     rng, count = np.random.default_rng(seed), len(rest)
     products = np.stack([rest, b, rest * rest, rest * b, b * b], 1)
     found: list[Numbers] = []
@@ -79,18 +90,24 @@ def _drawn_errors(rest: Numbers, b: Numbers, seed: int) -> Numbers:
 
 
 def less(values: Numbers, reference: Numbers, photographs: Numbers, seed: int) -> Interval:
-    """Return by how much a metric lies below that of the reference on the same pictures, in the unit of the metric."""
+    """Return by how much a metric lies below that of the reference on the same pictures, in the
+    unit of the metric.
+    """
     return ratio(reference - values, np.ones_like(reference), photographs, seed)
 
 
 def gain(values: Numbers, reference: Numbers, photographs: Numbers, seed: int) -> Interval:
-    """Return by which fraction the mean of a metric lies below the mean of the reference, such as 0.101 for 10.1 %."""
+    """Return by which fraction the mean of a metric lies below the mean of the reference, such
+    as 0.101 for 10.1 %.
+    """
     x = ratio(values, reference, photographs, seed)
     return Interval(1.0 - x.mean, 1.0 - x.high, 1.0 - x.low)
 
 
 def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict[str, Interval]:
-    """Return the decrease of L1 error against the reference: absolute, relative, and relative for small pictures."""
+    """Return the decrease of L1 error against the reference: absolute, relative, and relative
+    for small pictures.
+    """
     own, other, photographs = values.scenes("l1"), reference.scenes("l1"), values.photographs
     small = values.scenes("l1 small"), reference.scenes("l1 small")
     return {
@@ -101,7 +118,9 @@ def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict
 
 
 def gains_by_strength(values: MetricTable, reference: MetricTable, seed: int) -> list[Interval]:
-    """Return by which fraction the L1 error of the small pictures is lower, at each laser strength."""
+    """Return by which fraction the L1 error of the small pictures is lower, at each laser
+    strength.
+    """
     found = []
     for i in range(len(values.strengths)):
         own, other = values.values["l1 small"][:, i], reference.values["l1 small"][:, i]

@@ -1,7 +1,7 @@
 """The command of `neusee run` that gives the numbers of an evaluation point, to the last bit.
 
-The command has the camera of the evaluation, the mask and the restorer, the part of the photograph, the laser with its
-direction, the seed of the scene, and the values that were drawn for the scene.
+The command has the camera of the evaluation, the mask and the restorer, the part of the photograph,
+the laser with its direction, the seed of the scene, and the values that were drawn for the scene.
 """
 
 from __future__ import annotations
@@ -13,7 +13,13 @@ from pathlib import Path
 
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest, spots
 from neusee.workflows.evaluation.evaluation_scenes import PHOTOGRAPH, Scene
-from neusee.workflows.evaluation.pipelines import BEAM, NONE, WAVELENGTHS, PipelineRecipes, laser_line
+from neusee.workflows.evaluation.pipelines import (
+    BEAM,
+    NONE,
+    WAVELENGTHS,
+    PipelineRecipes,
+    laser_line,
+)
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, dependents, needed
 from neusee.workflows.recipe.distributions.scalar import written
@@ -35,35 +41,49 @@ class PointCommands:
     def commands(
         self, each: Sequence[PipelineRecipes], scenes: Sequence[Scene], strengths: Sequence[float]
     ) -> dict[str, list[dict[float, str]]]:
-        """Return the command of each point by pipeline, scene and strength; empty where no command gives the point.
+        """Return the command of each point by pipeline, scene and strength; empty where no command
+        gives the point.
 
-        One point of each pipeline is proved, and one beyond the scene 0, which has the seed of the evaluation: the
-        command loads a recipe whose steps have the same keys.
+        One point of each pipeline is proved, and one beyond the scene 0, which has the seed of the
+        evaluation: the command loads a recipe whose steps have the same keys.
         """
         proved: dict[tuple[str, bool], bool] = {}
         listed: dict[str, list[dict[float, str]]] = {}
         for pipeline in each:
             listed[pipeline.name] = []
             for scene in scenes:
-                points = [PointRequest(scene, k) for k in (strengths if scene.case != NONE else (0.0,))]
+                points = [
+                    PointRequest(scene, k) for k in (strengths if scene.case != NONE else (0.0,))
+                ]
                 kind = (pipeline.name, scene.number == 0)
                 if kind not in proved:
                     proved[kind] = self.is_same(pipeline, points[-1])
-                own = {point.strength: self._command(pipeline, point) if proved[kind] else "" for point in points}
+                own = {
+                    point.strength: self._command(pipeline, point) if proved[kind] else ""
+                    for point in points
+                }
                 listed[pipeline.name].append(own)
         return listed
 
     def _command(self, pipeline: PipelineRecipes, point: PointRequest) -> str:
         return shlex.join(["neusee", "run", self.recipe, *self.words(pipeline, point)])
 
-    def words(self, pipeline: PipelineRecipes, point: PointRequest, strength: float | None = None) -> list[str]:
-        """Return the arguments of `neusee run` after the recipe; ``strength`` replaces that of the laser."""
+    def words(
+        self, pipeline: PipelineRecipes, point: PointRequest, strength: float | None = None
+    ) -> list[str]:
+        """Return the arguments of `neusee run` after the recipe; ``strength`` replaces that of
+        the laser.
+        """
         scene, line = point.scene, pipeline.pipeline
         recipe = pipeline.recipe(point.lit)
         drawn = self._drawn(pipeline, point)
         wavelength = drawn.pop(_WAVELENGTH, None)
         words = [change if isinstance(change, str) else change.text for change in self.changes]
-        words += [*pipeline.words, *_scene_words(recipe, scene), _laser_word(pipeline, point, wavelength, strength)]
+        words += [
+            *pipeline.words,
+            *_scene_words(recipe, scene),
+            _laser_word(pipeline, point, wavelength, strength),
+        ]
         words += [f"{path}={value}" for path, value in drawn.items()]
         outputs = ", ".join(f'"{name}"' for name in (line.quality, "saturated[mask]", "peak[mask]"))
         return [*words, f"seed={scene.seed}", "estimates=false", f"outputs=[{outputs}]"]
@@ -76,15 +96,17 @@ class PointCommands:
         laws, units = inputs.uncertain.laws, inputs.uncertain.units
         drawn = point.scene.draw(inputs)
         return {
-            path: str(written(value, laws[path].unit if path in laws else units[path])) for path, value in drawn.items()
+            path: str(written(value, laws[path].unit if path in laws else units[path]))
+            for path, value in drawn.items()
         }
 
     def is_same(self, pipeline: PipelineRecipes, point: PointRequest) -> bool:
-        """Return True if the recipe of a command has the steps of an evaluation point, with equal keys.
+        """Return True if the recipe of a command has the steps of an evaluation point, with equal
+        keys.
 
-        An evaluation computes a laser of strength 1 and gives each spot its strength, and so does this comparison.
-        A random step that no scene reaches, such as dirt on the lens, has the seed of the evaluation, which the command
-        gives only for the scene 0.
+        An evaluation computes a laser of strength 1 and gives each spot its strength, and so does
+        this comparison. A random step that no scene reaches, such as dirt on the lens, has the seed
+        of the evaluation, which the command gives only for the scene 0.
         """
         outputs = [name for name in pipeline.pipeline.outputs if name != "bsr[mask]"]
         try:
@@ -98,9 +120,13 @@ class PointCommands:
             return False
         steps = dict(recipe.steps)
         for name in spots(recipe, outputs):
-            steps[name] = replace(steps[name], params={**steps[name].params, "strength": point.strength})
+            steps[name] = replace(
+                steps[name], params={**steps[name].params, "strength": point.strength}
+            )
         same_seed = replace(recipe, seed=scene.recipe.seed, steps=steps)
-        return self.bench.keys(same_seed, outputs, scene) == self.bench.point_keys(pipeline, point, outputs)
+        return self.bench.keys(same_seed, outputs, scene) == self.bench.point_keys(
+            pipeline, point, outputs
+        )
 
 
 def _has_fixed_noise(recipe: Recipe, outputs: Sequence[str]) -> bool:
@@ -110,13 +136,19 @@ def _has_fixed_noise(recipe: Recipe, outputs: Sequence[str]) -> bool:
 
 
 def _shows(recipe: Recipe, scene: Scene) -> bool:
-    """Return True if the scene of a recipe is the part of the photograph that an evaluation shows."""
+    """Return True if the scene of a recipe is the part of the photograph that an evaluation
+    shows.
+    """
     step = recipe.steps["scene"]
     if step.node.path != PHOTOGRAPH or scene.path is None:
         return False
     file, shape, crop = (step.params.get(name) for name in ("file", "shape", "crop"))
     same_file = Path(str(file)).absolute() == scene.path.absolute()
-    return same_file and tuple(shape or ()) == scene.shape and tuple(crop or ()) == (scene.recipe.seed, scene.number)
+    return (
+        same_file
+        and tuple(shape or ()) == scene.shape
+        and tuple(crop or ()) == (scene.recipe.seed, scene.number)
+    )
 
 
 def _scene_words(recipe: Recipe, scene: Scene) -> list[str]:
@@ -128,10 +160,14 @@ def _scene_words(recipe: Recipe, scene: Scene) -> list[str]:
     if step.node.path == PHOTOGRAPH and "scene.file" in recipe.config.settings:
         return [f"scene.file={file}", f"+steps.scene.with.crop={crop}"]
     shape = list(scene.shape)
-    return [f"steps.scene={{node: {PHOTOGRAPH}, with: {{file: {file}, shape: {shape}, crop: {crop}}}}}"]
+    return [
+        f"steps.scene={{node: {PHOTOGRAPH}, with: {{file: {file}, shape: {shape}, crop: {crop}}}}}"
+    ]
 
 
-def _laser_word(pipeline: PipelineRecipes, point: PointRequest, wavelength: str | None, strength: float | None) -> str:
+def _laser_word(
+    pipeline: PipelineRecipes, point: PointRequest, wavelength: str | None, strength: float | None
+) -> str:
     """Return the word that sets the laser of a scene, with its direction and strength."""
     if point.lit == NONE:
         return "lasers={}"
@@ -151,7 +187,9 @@ def _quoted(path: Path) -> str:
 def shown_commands(
     commands: Mapping[str, Sequence[Mapping[float, str]]],
 ) -> list[tuple[str, int, float, str]]:
-    """Return pipeline, place of the scene, strength and command of one point of each pipeline: the strongest laser."""
+    """Return pipeline, place of the scene, strength and command of one point of each pipeline:
+    the strongest laser.
+    """
     rows: list[tuple[str, int, float, str]] = []
     for pipeline, scenes in commands.items():
         lit = [(place, max(own)) for place, own in enumerate(scenes) if own]

@@ -1,10 +1,12 @@
-"""The evaluation of masks and restorers as in the paper, with the same scenes and laser strengths for all.
+"""The evaluation of masks and restorers as in the paper, with the same scenes and laser strengths
+for all.
 
-    evaluate("first_light", read_pipelines("flat+none, five_half_rings+wiener", Path()), data=Path("photographs"))
+    evaluate("first_light", read_pipelines("flat+none, five_half_rings+wiener", Path()),
+    data=Path("photographs"))
 
-Each point has a scene, a laser strength and a pipeline, and its metrics equal those of a run of the recipe to the last
-bit. A run that cannot prove its tolerance is computed again more strictly; a point is computed once. The store keeps
-all points, so that an interrupted evaluation continues.
+Each point has a scene, a laser strength and a pipeline, and its metrics equal those of a run of the
+recipe to the last bit. A run that cannot prove its tolerance is computed again more strictly; a
+point is computed once. The store keeps all points, so that an interrupted evaluation continues.
 """
 
 from __future__ import annotations
@@ -64,7 +66,8 @@ __all__ = [
     "read_settings",
 ]
 
-STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  #: strengths of the paper, in multiples of saturation
+#: strengths of the paper, in multiples of saturation
+STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
 SMALL = 256  #: pixels of the shorter side of the pictures that the paper restores
 
 
@@ -86,13 +89,16 @@ def evaluate(
     device: str = "cpu",
     folder: Path | None = None,
 ) -> Path:
-    """Evaluate every pipeline on ``count`` scenes at all laser ``strengths``, and return the folder of the results.
+    """Evaluate every pipeline on ``count`` scenes at all laser ``strengths``, and return the folder
+    of the results.
 
-    Args: recipe, changes: the camera, as for `load`; its block ``evaluate`` says which lasers the scenes have. data: a
-    folder of photographs, by default the scene of the recipe. count: by default 20, None means every photograph once.
-    small: shorter side of the reduced pictures, which are compared too. reference: the pipeline with which all other
-    pipelines are compared, by default the first pipeline. equal: the peak to which filters and stops bring every
-    pipeline. progress: receives a line for each scene.
+    Args: recipe, changes: the camera, as for `load`; its block ``evaluate`` says which lasers the
+            scenes have. data: a
+    folder of photographs, by default the scene of the recipe. count: by default 20, None means
+    every photograph once. small: shorter side of the reduced pictures, which are compared too.
+    reference: the pipeline with which all other pipelines are compared, by default the first
+    pipeline. equal: the peak to which filters and stops bring every pipeline. progress: receives a
+    line for each scene.
     Raises: `EvaluationRefused` with every mistake before anything runs.
     """
     place = folder or Path.cwd()
@@ -104,14 +110,18 @@ def evaluate(
     study_run = StudyRun("evaluate", base, command)
     if settings.lasers == "drawn":
         refuse_fixed_laser(base)
-    shown, broken = scenes(base, asked.store, data, count, [DRAWN] if settings.lasers == "drawn" else list(CASES))
+    shown, broken = scenes(
+        base, asked.store, data, count, [DRAWN] if settings.lasers == "drawn" else list(CASES)
+    )
     refuse_directions(bare[0], shown)
     each, references = _equalled(asked, bare, reference, equal)
     _report_scenes(shown, broken, strengths, each, progress)
     bench = EvaluationPoints(asked.store, small, device)
     found = measure(asked, bench, each, shown, strengths)
     waves = tuple(wavelengths(bare[0], found.scenes))
-    result = _result(base, strengths, small, references, found, [p.pipeline for p in each], equal, broken, waves)
+    result = _result(
+        base, strengths, small, references, found, [p.pipeline for p in each], equal, broken, waves
+    )
     commands = PointCommands(recipe, changes, place, bench).commands(each, found.scenes, strengths)
     result = replace(result, commands=commands)
     document = study_run.document(_document(result, bench))
@@ -119,7 +129,9 @@ def evaluate(
 
 
 def read_settings(recipe: str, changes: Sequence[str | Override], folder: Path) -> EvaluateSettings:
-    """Return the block ``evaluate`` of a recipe; raise `EvaluationRefused` with all mistakes in the recipe."""
+    """Return the block ``evaluate`` of a recipe; raise `EvaluationRefused` with all mistakes in
+    the recipe.
+    """
     return base_recipe(recipe, changes, folder).evaluation or EvaluateSettings()
 
 
@@ -132,7 +144,9 @@ def options_of(
     by: str | None,
     folder: Path,
 ) -> dict[str, Any]:
-    """Return arguments of `evaluate`: those that are given, and else those of the settings of the recipe."""
+    """Return arguments of `evaluate`: those that are given, and else those of the settings of
+    the recipe.
+    """
     lines = settings.pipelines if pipelines is None else pipelines
     mark = Location("evaluate.pipelines", 1, folder=str(folder)) if pipelines is None else None
     level = settings.equal_protection if equal_protection is None else equal_protection
@@ -147,10 +161,14 @@ def options_of(
 def _equalled(
     asked: AskedCamera, bare: list[PipelineRecipes], reference: str, equal: EqualProtection | None
 ) -> tuple[list[PipelineRecipes], dict[str, str]]:
-    """Return the pipelines, at equal protection if that was asked for, and the name of the reference of each."""
+    """Return the pipelines, at equal protection if that was asked for, and the name of the
+    reference of each.
+    """
     if equal is None:
         return bare, dict.fromkeys((p.name for p in bare), reference)
-    shaded = protect(asked.recipe, asked.changes, bare, equal, asked.store, asked.folder, asked.progress)
+    shaded = protect(
+        asked.recipe, asked.changes, bare, equal, asked.store, asked.folder, asked.progress
+    )
     rival = {old.name: new.name for old, new in zip(bare, shaded, strict=True)}[reference]
     references = dict.fromkeys((p.name for p in shaded), rival)
     if not asked.settings.beside:
@@ -173,15 +191,20 @@ def _result(
     owners, lost = photographs(found.scenes), [*broken, *found.broken]
     tables = {name: metric_table(own, strengths, owners) for name, own in found.points.items()}
     least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
-    more = {name: compare_with(own, tables[references[name]], base.seed) for name, own in tables.items()}
+    more = {
+        name: compare_with(own, tables[references[name]], base.seed) for name, own in tables.items()
+    }
     rest = (found.masks, found.panels, pipelines, found.mistold, equal, waves)
-    return EvaluationResult(base, found.scenes, lost, strengths, least, references, found.points, tables, more, *rest)
+    return EvaluationResult(
+        base, found.scenes, lost, strengths, least, references, found.points, tables, more, *rest
+    )
 
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
     if not strengths or min(strengths) < 0 or not all(map(np.isfinite, strengths)):
         raise EvaluationRefused(
-            "--strengths: write finite multiples of saturation that are not negative, such as 0,1e1,1e6"
+            "--strengths: write finite multiples of saturation that are not negative, such as"
+            " 0,1e1,1e6"
         )
     return tuple(sorted(set(map(float, strengths))))
 
@@ -189,7 +212,9 @@ def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
 def _reference(reference: str, pipelines: Sequence[Pipeline]) -> str:
     names = [pipeline.name for pipeline in pipelines]
     if reference and reference not in names:
-        raise EvaluationRefused(f"--reference {reference} is not evaluated: write one of {', '.join(names)}")
+        raise EvaluationRefused(
+            f"--reference {reference} is not evaluated: write one of {', '.join(names)}"
+        )
     return reference or names[0]
 
 
@@ -208,7 +233,7 @@ def _report_scenes(
         progress(f"not read: {len(broken) - 5} more")
 
 
-# --- the folder -------------------------------------------------------------------------------------------------------
+# --- the folder -----------------------------------------------------------------------------------
 
 
 def _document(result: EvaluationResult, bench: EvaluationPoints) -> dict[str, Any]:
@@ -229,29 +254,66 @@ def _document(result: EvaluationResult, bench: EvaluationPoints) -> dict[str, An
 
 
 def _report(result: EvaluationResult) -> StudyReport:
-    from neusee.workflows.evaluation.evaluation_page import COLUMNS, draw_pictures, lead, rows, sections
+    from neusee.workflows.evaluation.evaluation_page import (
+        COLUMNS,
+        draw_pictures,
+        lead,
+        rows,
+        sections,
+    )
 
     pictures = draw_pictures(result)
     tables: dict[str, CsvTable] = {
         "points.csv": ((*_POINT, *METRICS, "command"), _point_rows(result)),
         "table.csv": (COLUMNS, rows(result)),
-        "mistold.csv": ((*_POINT[:1], "told", *_POINT[3:6], *_POINT[7:], *METRICS), mistold_rows(result.mistold)),
-        "suppression.csv": (("mask", "wavelength (nm)", "lsr", "bsr", "floor"), _curve_rows(result)),
+        "mistold.csv": (
+            (*_POINT[:1], "told", *_POINT[3:6], *_POINT[7:], *METRICS),
+            mistold_rows(result.mistold),
+        ),
+        "suppression.csv": (
+            ("mask", "wavelength (nm)", "lsr", "bsr", "floor"),
+            _curve_rows(result),
+        ),
     }
     if result.protection is not None:
-        tables["protection.csv"] = equal_protection.COLUMNS, equal_protection.protection_rows(result)
+        tables["protection.csv"] = (
+            equal_protection.COLUMNS,
+            equal_protection.protection_rows(result),
+        )
     shown = ("command", "date", "seconds", "computed", "seconds a point", "reference", "versions")
     title = f"{result.recipe.name}: evaluated"
-    return StudyReport(title, lead(result), sections(result, pictures), pictures, tables, shown=shown)
+    return StudyReport(
+        title, lead(result), sections(result, pictures), pictures, tables, shown=shown
+    )
 
 
-_POINT = ("pipeline", "mask", "restorer", "scene", "photograph", "laser", "wavelength (nm)", "strength")
+_POINT = (
+    "pipeline",
+    "mask",
+    "restorer",
+    "scene",
+    "photograph",
+    "laser",
+    "wavelength (nm)",
+    "strength",
+)
 
 
 def _point_rows(result: EvaluationResult) -> list[Sequence[Any]]:
     waves = ["" if metres is None else f"{metres * 1e9:.6g}" for metres in result.wavelengths]
     return [
-        (p.name, p.front, p.back, s.number, s.name, s.case, nm, f"{k:g}", *(point[m] for m in METRICS), commands[k])
+        (
+            p.name,
+            p.front,
+            p.back,
+            s.number,
+            s.name,
+            s.case,
+            nm,
+            f"{k:g}",
+            *(point[m] for m in METRICS),
+            commands[k],
+        )
         for p in result.pipelines
         for s, at, nm, commands in zip(
             result.scenes, result.points[p.name], waves, result.commands[p.name], strict=True

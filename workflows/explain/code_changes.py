@@ -15,14 +15,24 @@ _OTHER = frozenset({"Python", _SETTINGS, "closure", _PROGRAM})
 
 
 def edits(root: Path, old: str, new: str) -> list[str]:
-    """Return one text clause for each definition that differs between two versions of code; [] if no record exists."""
+    """Return one text clause for each definition that differs between two versions of code; []
+    if no record exists.
+    """
     before, after = read_parts(root, old), read_parts(root, new)
     if not before or not after:
         return []
     names = [name for name in after if name in before and _is_module(name)]
     inside = [text for name in names for text in _inside(name, before[name], after[name])]
-    came = [f"{_file(name)} is imported now" for name in after if name not in before and _is_module(name)]
-    gone = [f"{_file(name)} is no longer imported" for name in before if name not in after and _is_module(name)]
+    came = [
+        f"{_file(name)} is imported now"
+        for name in after
+        if name not in before and _is_module(name)
+    ]
+    gone = [
+        f"{_file(name)} is no longer imported"
+        for name in before
+        if name not in after and _is_module(name)
+    ]
     source = sorted(inside, key=lambda text: text.startswith("the ")) + came + gone
     beside = [
         text
@@ -31,8 +41,8 @@ def edits(root: Path, old: str, new: str) -> list[str]:
         for text in _beside(name, before.get(name, {}), after.get(name, {}))
     ]
     return source + beside or [
-        f"a value that {_file(name.removeprefix(_STATE))} holds was changed while the program ran: a constant, "
-        "a table, a default or a function"
+        f"a value that {_file(name.removeprefix(_STATE))} holds was changed while the program ran:"
+        " a constant, a table, a default or a function"
         for name in after
         if name.startswith(_STATE) and before.get(name, after[name]) != after[name]
     ]
@@ -43,13 +53,21 @@ def _is_module(name: str) -> bool:
 
 
 def _beside(name: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
-    """Return one text clause for each difference in versions, settings and declared dependencies."""
+    """Return one text clause for each difference in versions, settings and declared
+    dependencies.
+    """
     labels = [label for label in dict.fromkeys([*new, *old]) if old.get(label) != new.get(label)]
     if not labels:
         return []
     if name == _SETTINGS:
-        values = [(label, old.get(label, USUAL.get(label)), new.get(label, USUAL.get(label))) for label in labels]
-        return [f"{label} {before} -> {after}, a setting of this process" for label, before, after in values]
+        values = [
+            (label, old.get(label, USUAL.get(label)), new.get(label, USUAL.get(label)))
+            for label in labels
+        ]
+        return [
+            f"{label} {before} -> {after}, a setting of this process"
+            for label, before, after in values
+        ]
     if name == "Python" or name.startswith("package "):
         before, after = old.get("version"), new.get("version")
         if not before or not after:
@@ -62,7 +80,9 @@ def _beside(name: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
     if name == _PROGRAM:
         return ["the program itself changed, which the node imports (neusee/workflows)"]
     what = f"declared {name}" if name.startswith("file ") else name
-    return [f"{what} changed" if old and new else f"{name} is declared {'now' if new else 'no more'}"]
+    return [
+        f"{what} changed" if old and new else f"{name} is declared {'now' if new else 'no more'}"
+    ]
 
 
 def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
@@ -72,7 +92,8 @@ def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
     lines = _lines(module) if differ else {}
     at = {label: f" (line {lines[label]})" if label in lines else "" for label in differ}
     changed = [
-        f"{'code of ' + label if label.endswith('()') else _named(label)} in {file} changed{at[label]}"
+        f"{'code of ' + label if label.endswith('()') else _named(label)} in {file}"
+        f" changed{at[label]}"
         for label in differ
     ]
     added = [f"{_named(label)} was added to {file}" for label in new if label not in old]
@@ -81,7 +102,9 @@ def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
 
 
 def _lines(module: str) -> dict[str, int]:
-    """Return the line of each function, hook, class and constant at the top of a module, as its file is now."""
+    """Return the line of each function, hook, class and constant at the top of a module, as its
+    file is now.
+    """
     path = source_file(module)
     try:
         body = ast.parse(path.read_bytes()).body if path else []
@@ -95,12 +118,18 @@ def _lines(module: str) -> dict[str, int]:
             hooks = [ast.unparse(each) for each in item.decorator_list] if item.name == "_" else []
             found |= {f"{name}()": item.lineno for name in hooks or [item.name]}
         elif isinstance(item, ast.Assign):
-            found |= {f"constant {each.id}": item.lineno for each in item.targets if isinstance(each, ast.Name)}
+            found |= {
+                f"constant {each.id}": item.lineno
+                for each in item.targets
+                if isinstance(each, ast.Name)
+            }
     return found
 
 
 def _named(label: str) -> str:
-    """Return the name of a definition with its kind, such as ``function psf()`` or ``the imports``."""
+    """Return the name of a definition with its kind, such as ``function psf()`` or ``the
+    imports``.
+    """
     if label.endswith("()"):
         return f"function {label}"
     return label if label.startswith(("class ", "constant ")) else f"the {label}"

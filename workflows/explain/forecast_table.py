@@ -1,4 +1,6 @@
-"""Table of a forecast: what each step of a recipe would cost, with the range that is expected, in 80 columns."""
+"""Table of a forecast: what each step of a recipe would cost, with the range that is expected,
+in 80 columns.
+"""
 
 from __future__ import annotations
 
@@ -17,28 +19,42 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 _SHORT, _SMALL = 0.01, 1e6  #: s and bytes below which a cost is not written out in the table
-_SURE = 1e7  #: bytes of a peak below which its range is not written, because freed memory is used again
+#: bytes of a peak below which its range is not written, because freed memory is used again
+_SURE = 1e7
 
 
 def forecast_rows(plan: Plan, store: Store) -> list[Row]:
-    """Return what is expected of each step of a recipe as values for JSON: its state, its costs and their ranges.
+    """Return what is expected of each step of a recipe as values for JSON: its state, its costs and
+    their ranges.
 
-    A range is a dict with the keys ``expected``, ``least`` and ``most``. A guess counts at its upper end.
+    A range is a dict with the keys ``expected``, ``least`` and ``most``. A guess counts at its
+    upper end.
     """
     return [_row(name, plan, store) for name in plan.order]
 
 
 def _row(name: str, plan: Plan, store: Store) -> Row:
     step, about = plan.recipe.steps[name], store.about(plan.keys[name])
-    row: Row = {"step": name, "node": step.node.path, "state": "", "where": "", "seconds": None, "bytes": None}
+    row: Row = {
+        "step": name,
+        "node": step.node.path,
+        "state": "",
+        "where": "",
+        "seconds": None,
+        "bytes": None,
+    }
     row |= {"memory": None, "guess": False, "reads": list(dict.fromkeys(step.sources))}
     if plan.left_out.get(name):
         return row | {"state": "left out"}
     if name in plan.expected:
         where = plan.lanes.get(name, "?")
         return row | {"state": "run", "where": where, **_costs(plan.expected[name], where)}
-    state = "stored" if store.has(plan.keys[name]) else "run" if name in plan.awake else "not needed"
-    known = {"seconds": _ranged(about["seconds"], Range()), "bytes": about["bytes"]} if about else {}
+    state = (
+        "stored" if store.has(plan.keys[name]) else "run" if name in plan.awake else "not needed"
+    )
+    known = (
+        {"seconds": _ranged(about["seconds"], Range()), "bytes": about["bytes"]} if about else {}
+    )
     return row | {"state": state, **known}
 
 
@@ -58,8 +74,8 @@ def _ranged(expected: float, around: Range) -> dict[str, float]:
 def table_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the table of a forecast as lines of text, from the rows of `forecast_rows`.
 
-    A range is written behind its value, ``0.81 (0.7-1.2)``. What is negligible is written as below a limit, and a
-    guess as ``guess`` with its upper end.
+    A range is written behind its value, ``0.81 (0.7-1.2)``. What is negligible is written as below
+    a limit, and a guess as ``guess`` with its upper end.
     """
     head = ["step", "where", "seconds", "bytes", "memory"]
     return columns([head, *(_cells(row) for row in rows)])
@@ -71,8 +87,20 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
     size = "" if row["bytes"] is None else format_size(row["bytes"])
     if row["guess"]:
         size = f"guess <{size}" if row["bytes_guessed"] else size
-        return [row["step"], state, f"guess <{seconds['most']:.2g}", size, f"guess <{format_size(memory['most'])}"]
-    return [row["step"], state, seconds_text(seconds) if seconds else "", size, memory_text(memory) if memory else ""]
+        return [
+            row["step"],
+            state,
+            f"guess <{seconds['most']:.2g}",
+            size,
+            f"guess <{format_size(memory['most'])}",
+        ]
+    return [
+        row["step"],
+        state,
+        seconds_text(seconds) if seconds else "",
+        size,
+        memory_text(memory) if memory else "",
+    ]
 
 
 def seconds_text(cost: Mapping[str, float]) -> str:
@@ -97,5 +125,7 @@ def _between(cost: Mapping[str, float], unit: float) -> str:
 
 
 def _figures(value: float) -> str:
-    """Return a number as text without an exponent: two decimals below 1, one below 10, and none above."""
+    """Return a number as text without an exponent: two decimals below 1, one below 10, and none
+    above.
+    """
     return f"{value:.{2 if value < 0.995 else 1 if value < 9.95 else 0}f}"

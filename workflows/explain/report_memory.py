@@ -1,4 +1,5 @@
-"""Memory of the report of a run: the results that its pictures and data files show, and the copies that are written.
+"""Memory of the report of a run: the results that its pictures and data files show, and the copies
+that are written.
 
 Also of the results that files hold which are made beside the run.
 """
@@ -17,24 +18,31 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report.contents import FIGURES, files_of, wanted
 from neusee.workflows.report.files_beside import LARGE, ROOM
 
-#: Three numbers that tests/benchmarks/bench_memory.py fits to the measured memory of the reports of shipped recipes.
+#: Three numbers that tests/benchmarks/bench_memory.py fits to the measured memory of the reports of
+#: shipped recipes.
 DRAWING = 74.3e6  #: bytes of the libraries that draw pictures and write files
-HELD_BACK = 0.0101  #: share of the memory of the steps that the process does not give back to the system
+#: share of the memory of the steps that the process does not give back to the system
+HELD_BACK = 0.0101
 COPIES = 2.25  #: copies of the results in memory, while a picture or file of them is made
-_NEED = re.compile(r"\??(?P<step>[\w.]+(\[[^\]]*\])?)$")  # not a parameter and not a function of a step
+# not a parameter and not a function of a step
+_NEED = re.compile(r"\??(?P<step>[\w.]+(\[[^\]]*\])?)$")
 
 
 def shown_steps(recipe: Recipe) -> list[str]:
-    """Return the steps whose results the pictures and data files of a run show, as far as the recipe has them."""
+    """Return the steps whose results the pictures and data files of a run show, as far as the
+    recipe has them.
+    """
     groups = [recipe.outputs, *(group for job in _jobs(recipe) for group in job)]
     return list(dict.fromkeys(name for group in groups for name in group if name in recipe.steps))
 
 
 def held_beside(recipe: Recipe, costs: Costs, limit: float) -> float:
-    """Return the most bytes of results that files hold which are made beside a run, as `FilesBeside` holds them.
+    """Return the most bytes of results that files hold which are made beside a run, as
+    `FilesBeside` holds them.
 
-    The values that the run returns are not counted, because they stay in memory with or without files. ``limit`` is the
-    memory (bytes) that the process may use; with 0 no file is made beside the run.
+    The values that the run returns are not counted, because they stay in memory with or without
+    files. ``limit`` is the memory (bytes) that the process may use; with 0 no file is made beside
+    the run.
     """
     large, room, most = min(LARGE, limit / 32), min(ROOM, limit / 16), limit / 16
     sizes = [costs.size_of(name) for name in shown_steps(recipe) if name not in wanted(recipe)]
@@ -52,7 +60,8 @@ def report_peak(
 ) -> float:
     """Return the predicted peak memory of this process in bytes while the report is written.
 
-    Args: works: the steps that only the report needs. keys: the keys of the results that are shown, by step.
+    Args: works: the steps that only the report needs. keys: the keys of the results that are shown,
+            by step.
     running: the predicted peak memory of this process while the steps run.
     """
     schedule = prepare(works, costs, {}, lanes, list(keys.values())).schedule if works else None
@@ -63,10 +72,11 @@ def report_peak(
 
 
 def shown_at_once(recipe: Recipe, costs: Costs) -> float:
-    """Return the largest number of bytes of results that are in memory together while pictures and files are made.
+    """Return the largest number of bytes of results that are in memory together while pictures and
+    files are made.
 
-    The outputs of the recipe stay in memory. Another result is there from the first picture or file that shows it to
-    the last, as `workflows.report.shown_values` holds it.
+    The outputs of the recipe stay in memory. Another result is there from the first picture or file
+    that shows it to the last, as `workflows.report.shown_values` holds it.
     """
     most = 0.0
     for groups in _jobs(recipe):

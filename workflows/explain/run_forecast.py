@@ -40,20 +40,25 @@ class Plan:
     lanes: Mapping[str, str]  #: by step
     schedule: Schedule | None
     refused: str = ""  #: why the memory is too small
-    running: float = 0.0  #: peak memory of this process in bytes while the steps run, the program itself included
+    #: peak memory of this process in bytes while the steps run, the program itself included
+    running: float = 0.0
     reporting: float = 0.0  #: peak memory of this process in bytes while the report is written
 
 
 def lanes_for(recipe: Recipe, device: str, memory: int | None) -> dict[str, Lane]:
-    """Return the lanes of a run on the devices ``device``, with the libraries that its steps load in the program."""
+    """Return the lanes of a run on the devices ``device``, with the libraries that its steps
+    load in the program.
+    """
     cheaper = with_substitutions(recipe, wanted(recipe))
     return lanes_of(device.split(","), memory, nodes_of(cheaper, wanted(recipe)))
 
 
 def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane], beside: float = 0.0) -> Plan:
-    """Return the forecast of a run: the steps to compute and to read, their costs and their schedule.
+    """Return the forecast of a run: the steps to compute and to read, their costs and their
+    schedule.
 
-    ``beside`` is the memory (bytes) of a run that makes files beside its steps, and 0 for one that makes them later.
+    ``beside`` is the memory (bytes) of a run that makes files beside its steps, and 0 for one that
+    makes them later.
     """
     recipe = with_substitutions(recipe, wanted(recipe))
     order = steps_of(recipe)
@@ -77,39 +82,58 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane], beside: flo
     except TooLarge as error:
         return replace(empty, refused=str(error))
     where = {w.step.name: w.lane for w in found.works}
-    running = running_peak(found.schedule, lanes) + (held_beside(recipe, costs, beside) if works else 0.0)
+    running = running_peak(found.schedule, lanes) + (
+        held_beside(recipe, costs, beside) if works else 0.0
+    )
     plan = replace(empty, lanes=where, schedule=found.schedule, running=running)
     return _with_report(plan, store, costs, lanes, code)
 
 
-def _with_report(plan: Plan, store: Store, costs: Costs, lanes: Mapping[str, Lane], code: Code) -> Plan:
-    """Return the plan with the memory of the report, and with the reason if the limit is too small for the report."""
+def _with_report(
+    plan: Plan, store: Store, costs: Costs, lanes: Mapping[str, Lane], code: Code
+) -> Plan:
+    """Return the plan with the memory of the report, and with the reason if the limit is too
+    small for the report.
+    """
     cpu = [lane for lane in lanes.values() if lane.kind == "cpu"]
     shown = shown_steps(plan.recipe)
     order = needed(plan.recipe, shown)
-    keys = resolve(plan.recipe, order, store, ",".join(lane.device for lane in lanes.values()), code).keys
+    keys = resolve(
+        plan.recipe, order, store, ",".join(lane.device for lane in lanes.values()), code
+    ).keys
     there = {plan.keys[name] for name in plan.order}
     makers: dict[Key, str] = {}
     for name in _awake(plan.recipe, keys, store, shown, there)[0]:
         makers.setdefault(keys[name], name)
     devices = [lane.device for lane in lanes.values()]
-    works = [_work(plan.recipe, name, keys, devices) for name in order if name in set(makers.values())]
+    works = [
+        _work(plan.recipe, name, keys, devices) for name in order if name in set(makers.values())
+    ]
     costs = costs.with_sizes(sizes_of(plan.recipe, order))
     try:
-        peak = report_peak(works, plan.recipe, {name: keys[name] for name in shown}, costs, lanes, plan.running)
+        peak = report_peak(
+            works, plan.recipe, {name: keys[name] for name in shown}, costs, lanes, plan.running
+        )
     except TooLarge as error:
         return replace(plan, refused=f"for the report, {error}")
     limit = sum(lane.memory for lane in cpu) + max((lane.held for lane in cpu), default=0.0)
     plan = replace(plan, reporting=peak)
     if not cpu or peak <= limit:
         return plan
-    why = f"the report needs {format_size(peak)} to show the results, and the limit is {format_size(limit)}"
-    return replace(plan, refused=f"{why}: give more memory, or choose a smaller picture or number of bands")
+    why = (
+        f"the report needs {format_size(peak)} to show the results, and the limit is"
+        f" {format_size(limit)}"
+    )
+    return replace(
+        plan, refused=f"{why}: give more memory, or choose a smaller picture or number of bands"
+    )
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Forecast of a run for a reader: lines of text, and the costs of each step as values for JSON."""
+    """Forecast of a run for a reader: lines of text, and the costs of each step as values for
+    JSON.
+    """
 
     lines: list[str]
     steps: list[dict[str, Any]]
@@ -117,16 +141,24 @@ class Forecast:
     refused: bool  #: True if the run would lack memory
 
 
-def forecast(recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None) -> Forecast:
-    """Return the forecast of a run with the table of its steps, its totals, and whether it would lack memory."""
+def forecast(
+    recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None
+) -> Forecast:
+    """Return the forecast of a run with the table of its steps, its totals, and whether it would
+    lack memory.
+    """
     lanes = lanes_for(recipe, device, memory)
     plan = planned(recipe, store, lanes, memory_limit(None) if memory is None else 0.0)
     rows, totals = forecast_rows(plan, store), _totals(plan)
-    return Forecast([*table_lines(rows), *_sums(plan, lanes, totals)], rows, totals, bool(plan.refused))
+    return Forecast(
+        [*table_lines(rows), *_sums(plan, lanes, totals)], rows, totals, bool(plan.refused)
+    )
 
 
 def _totals(plan: Plan) -> dict[str, Any]:
-    """Return the totals of a forecast over all steps as values for JSON: seconds with their range, bytes and memory."""
+    """Return the totals of a forecast over all steps as values for JSON: seconds with their
+    range, bytes and memory.
+    """
     took = plan.schedule.makespan if plan.schedule else None
     sums = [(cost.seconds["cpu"], cost.spread[1]) for cost in plan.expected.values()]
     alone = sum(seconds for seconds, _ in sums)
@@ -146,7 +178,9 @@ def _totals(plan: Plan) -> dict[str, Any]:
 
 
 def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
-    """Return the forecast of a run with an empty store on the machines of a YAML file, as lines of text."""
+    """Return the forecast of a run with an empty store on the machines of a YAML file, as lines
+    of text.
+    """
     from neusee.workflows.explain.cluster_forecast import cluster_lines
     from neusee.workflows.placement.machine_file import read_machines
 
@@ -156,19 +190,34 @@ def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
         sorted({"cpu", *(device.kind for device in cluster.devices)}),
     )
     names = steps_of(recipe)
-    return cluster_lines(recipe, costs.in_turn(((name, recipe.steps[name], None) for name in names), kinds), cluster)
+    return cluster_lines(
+        recipe, costs.in_turn(((name, recipe.steps[name], None) for name in names), kinds), cluster
+    )
 
 
 def _sums(plan: Plan, lanes: Mapping[str, Lane], totals: Mapping[str, Any]) -> list[str]:
-    """Return text lines with the totals of a forecast over all steps, and with the steps that may be left out."""
+    """Return text lines with the totals of a forecast over all steps, and with the steps that
+    may be left out.
+    """
     lines = []
     if unsure := [name for name, known in plan.left_out.items() if known is None]:
-        lines += _wrapped(f"left out or not, depending on the values of the inputs: {', '.join(unsure)}")
+        lines += _wrapped(
+            f"left out or not, depending on the values of the inputs: {', '.join(unsure)}"
+        )
     seconds = totals["seconds"]
-    took = f"about {seconds_text(seconds)} s" if seconds else "no schedule" if seconds is None else "no time"
+    took = (
+        f"about {seconds_text(seconds)} s"
+        if seconds
+        else "no schedule"
+        if seconds is None
+        else "no time"
+    )
     guessed = f", {totals['guesses']} of them guessed at the upper end, because never measured"
     read, new = format_size(sum(plan.loaded.values())), format_size(int(totals["bytes"]))
-    would = f"{totals['steps']} of {len(plan.order)} steps would run{guessed if totals['guesses'] else ''}"
+    would = (
+        f"{totals['steps']} of {len(plan.order)} steps would"
+        f" run{guessed if totals['guesses'] else ''}"
+    )
     lines += _wrapped(f"{would}: {took}, {new} new, {read} to load")
     if plan.schedule and plan.expected:
         for name, lane in lanes.items():
@@ -177,8 +226,9 @@ def _sums(plan: Plan, lanes: Mapping[str, Lane], totals: Mapping[str, Any]) -> l
     if plan.running and plan.expected:
         held = format_size(max(lane.held for lane in lanes.values()))
         lines += _wrapped(
-            f"memory  process: {format_size(plan.running)} while the steps run, of which the program itself holds "
-            f"{held}; {format_size(plan.reporting)} while the report is written"
+            f"memory  process: {format_size(plan.running)} while the steps run, of which the"
+            f" program itself holds {held}; {format_size(plan.reporting)} while the report is"
+            " written"
         )
     return [*lines, *(_wrapped(f"refused: {plan.refused}") if plan.refused else [])]
 
@@ -190,14 +240,24 @@ def _wrapped(text: str) -> list[str]:
 
 def _work(recipe: Recipe, name: str, keys: Mapping[str, Key], devices: Sequence[str]) -> StepJob:
     step = recipe.steps[name]
-    reads = tuple(tuple(keys[s] for s in ((w,) if isinstance(w, str) else w or ())) for w in step.wires.values())
-    return StepJob(step, keys[name], {}, reads, recipe.seed, recipe.name, places(step, devices)[0], "")
+    reads = tuple(
+        tuple(keys[s] for s in ((w,) if isinstance(w, str) else w or ()))
+        for w in step.wires.values()
+    )
+    return StepJob(
+        step, keys[name], {}, reads, recipe.seed, recipe.name, places(step, devices)[0], ""
+    )
 
 
 def _awake(
-    recipe: Recipe, keys: Mapping[str, Key], store: Store, targets: Iterable[str], there: Container[Key] = ()
+    recipe: Recipe,
+    keys: Mapping[str, Key],
+    store: Store,
+    targets: Iterable[str],
+    there: Container[Key] = (),
 ) -> tuple[set[str], dict[str, int]]:
-    """Return the steps that a run must compute, and the size (bytes) of each stored result that the run must read.
+    """Return the steps that a run must compute, and the size (bytes) of each stored result that the
+    run must read.
 
     Results with the keys ``there`` are known and need no step.
     """

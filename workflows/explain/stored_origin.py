@@ -20,14 +20,19 @@ _LINKS = 6  #: steps of a chain that are named
 
 
 def why_key_lines(store: Store, prefix: str) -> list[str]:
-    """Return text lines on the origin of the result with key ``prefix...``, and on differences from earlier results.
+    """Return text lines on the origin of the result with key ``prefix...``, and on differences from
+    earlier results.
 
     Raises `LookupError` if no key or more than one key begins with ``prefix``.
     """
-    found = sorted(dict.fromkeys(row["key"] for row in rows_of(store) if row["key"].startswith(prefix)))
+    found = sorted(
+        dict.fromkeys(row["key"] for row in rows_of(store) if row["key"].startswith(prefix))
+    )
     if len(found) != 1:
         some = f"; there are {', '.join(key[:12] for key in found[:5])}" if found else ""
-        raise LookupError(f"{len(found) or 'no'} results have a key that begins with {prefix!r}{some}")
+        raise LookupError(
+            f"{len(found) or 'no'} results have a key that begins with {prefix!r}{some}"
+        )
     key, about = found[0], store.about(found[0])
     if about is None:
         raise LookupError(f"the result {found[0]} is no longer in the store")
@@ -40,7 +45,11 @@ def state_of(about: Mapping[str, Any] | None) -> str:
     if about is None:
         return "not stored, so it would run where it is needed"
     made = f"{_date(about)}, computed in {about.get('seconds', 0.0):.3g} s"
-    return f"stored since {made}" if about.get("kept", True) else f"ran {made}, but its value was not kept"
+    return (
+        f"stored since {made}"
+        if about.get("kept", True)
+        else f"ran {made}, but its value was not kept"
+    )
 
 
 def because(
@@ -52,19 +61,30 @@ def because(
     earlier = keys[: keys.index(key)] if key in keys else keys
     found = _nearest(comparison, label, key, earlier)
     if found is None:
-        yield f"  no earlier result to compare with: {'the first' if key in keys else 'no'} result of this step"
+        yield (
+            f"  no earlier result to compare with: {'the first' if key in keys else 'no'} result of"
+            " this step"
+        )
         return
     old, roots = found
     for text in list(roots.found)[:_SHOWN]:
         yield f"  {_chain(roots.chain(text))}: {text}"
     if len(roots.found) > _SHOWN:
         yield f"  and {len(roots.found) - _SHOWN} more"
-    which = "the earlier result" if len(earlier) == 1 else f"the nearest of {len(earlier)} earlier results"
+    which = (
+        "the earlier result"
+        if len(earlier) == 1
+        else f"the nearest of {len(earlier)} earlier results"
+    )
     yield f"  compared with {which}, {old[:8]} of {_date(comparison.about(old) or {})}"
 
 
-def _nearest(comparison: Comparison, label: str, key: Key, earlier: list[Key]) -> tuple[Key, Roots] | None:
-    """Return the earlier result with the fewest differences, and these differences; prefer the newest result."""
+def _nearest(
+    comparison: Comparison, label: str, key: Key, earlier: list[Key]
+) -> tuple[Key, Roots] | None:
+    """Return the earlier result with the fewest differences, and these differences; prefer the
+    newest result.
+    """
     best: tuple[Key, Roots] | None = None
     for old in earlier[: -_CANDIDATES - 1 : -1]:
         if comparison.origin(old) is None:
@@ -78,7 +98,9 @@ def _nearest(comparison: Comparison, label: str, key: Key, earlier: list[Key]) -
 
 
 def _made_of(comparison: Comparison, key: Key) -> Iterator[str]:
-    """Yield one text line for each part of a cache key: node, parameters, inputs and random stream."""
+    """Yield one text line for each part of a cache key: node, parameters, inputs and random
+    stream.
+    """
     origin = comparison.origin(key)
     if origin is None:
         return
@@ -93,7 +115,9 @@ def _made_of(comparison: Comparison, key: Key) -> Iterator[str]:
 
 
 def _chain(names: list[str]) -> str:
-    """Return names of steps as a chain such as ``restored <- raw <- read``, shortened if the chain is long."""
+    """Return names of steps as a chain such as ``restored <- raw <- read``, shortened if the
+    chain is long.
+    """
     if len(names) > _LINKS:
         names = [*names[: _LINKS - 2], f"({len(names) - _LINKS + 1} more)", names[-1]]
     return " <- ".join(names)
@@ -108,5 +132,7 @@ def _date(about: Mapping[str, Any]) -> str:
 
 
 def rows_of(store: Store, step: str | None = None) -> list[dict[str, Any]]:
-    """Return the lines on one step or on all steps from the journal of a result store, in order of time."""
+    """Return the lines on one step or on all steps from the journal of a result store, in order
+    of time.
+    """
     return store.journal.rows() if step is None else store.journal.of_step(step)

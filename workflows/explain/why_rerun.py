@@ -1,4 +1,6 @@
-"""Reasons why a step runs again: the differences from the most similar earlier result of the step."""
+"""Reasons why a step runs again: the differences from the most similar earlier result of the
+step.
+"""
 
 from __future__ import annotations
 
@@ -32,18 +34,28 @@ def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> l
     recipe = with_substitutions(recipe, [*recipe.outputs, *names])
     resolved = resolve(recipe, needed(recipe, [*recipe.outputs, *names]), store, device)
     comparison = Comparison(store, recipe, resolved)
-    return [line for name in names for line in _step_lines(comparison, recipe, recipe.steps[name], resolved)]
+    return [
+        line
+        for name in names
+        for line in _step_lines(comparison, recipe, recipe.steps[name], resolved)
+    ]
 
 
-def explained(recipe: Recipe, store: Store, watch: Callable[[Event], None]) -> Callable[[Event], None]:
-    """Return a function that adds the reason why a step ran to each event, and then calls ``watch``."""
+def explained(
+    recipe: Recipe, store: Store, watch: Callable[[Event], None]
+) -> Callable[[Event], None]:
+    """Return a function that adds the reason why a step ran to each event, and then calls
+    ``watch``.
+    """
     comparison = Comparison(store, recipe)
     before: dict[str, list[Key]] = {}
 
     def tell(event: Event) -> None:
         done = event.done
         if done is None:
-            before[event.step] = keys_in(row for row in store.journal.latest() if row["step"] == event.step)
+            before[event.step] = keys_in(
+                row for row in store.journal.latest() if row["step"] == event.step
+            )
         elif done.state == "run":
             why = _at_once(comparison, recipe.steps[done.step], done.key, before.pop(done.step, []))
             event = Event(event.step, replace(done, why=why))
@@ -52,7 +64,9 @@ def explained(recipe: Recipe, store: Store, watch: Callable[[Event], None]) -> C
     return tell
 
 
-def _step_lines(comparison: Comparison, recipe: Recipe, step: Step, resolved: Resolved) -> list[str]:
+def _step_lines(
+    comparison: Comparison, recipe: Recipe, step: Step, resolved: Resolved
+) -> list[str]:
     """Return lines with the state of one step and its differences from earlier results."""
     key, verdict = resolved.keys[step.name], resolved.verdicts.get(step.name)
     head = f"{step.name} ({step.node.path})"
@@ -64,7 +78,10 @@ def _step_lines(comparison: Comparison, recipe: Recipe, step: Step, resolved: Re
     if maker != step.name:
         lines.append(f"  same key as {maker}")
     if unsure := [name for name in needed(recipe, [step.name]) if resolved.left_out(name) is None]:
-        lines.append(f"  left out or not, depending on the values of the inputs: {', '.join(unsure[:_SHOWN])}")
+        lines.append(
+            "  left out or not, depending on the values of the inputs:"
+            f" {', '.join(unsure[:_SHOWN])}"
+        )
     return [*lines, *because(comparison, step.name, key, about, maker)]
 
 
@@ -83,7 +100,9 @@ def _at_once(comparison: Comparison, step: Step, key: Key, earlier: list[Key]) -
 
 
 def _direct(comparison: Comparison, step: Step, old: Origin, new: Origin) -> list[str]:
-    """Return the differences between two results of a step, followed by the names of inputs that differ."""
+    """Return the differences between two results of a step, followed by the names of inputs that
+    differ.
+    """
     texts = comparison.own(step.name, old, new)
     if old["node"] != new["node"] or len(old["inputs"]) != len(new["inputs"]):
         return texts

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from neusee.workflows.keys.regular_file import text_of
 
-_LEVEL = re.compile(r"^[bd]\s+[\d.,]+(\s|$)", re.MULTILINE)  #: a line of a descriptor that begins a light level
+#: a line of a descriptor that begins a light level
+_LEVEL = re.compile(r"^[bd]\s+[\d.,]+(\s|$)", re.MULTILINE)
 
 
 def descriptors_in(folder: Path) -> list[Path]:
@@ -33,7 +34,11 @@ def descriptor_of(path: Path) -> Path:
     found = descriptors_in(path)
     if len(found) == 1:
         return found[0]
-    has = f"has {len(found)} descriptors" if found else "has no descriptor, a .txt with levels in lines b and d"
+    has = (
+        f"has {len(found)} descriptors"
+        if found
+        else "has no descriptor, a .txt with levels in lines b and d"
+    )
     raise ValueError(f"{path} {has}: name one file")
 
 

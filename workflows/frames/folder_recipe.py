@@ -9,10 +9,21 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from neusee.nodes.calibrate import LeastSquares, frame_divisor, hot_pixels, least_squares, refuse_descriptor
+from neusee.nodes.calibrate import (
+    LeastSquares,
+    frame_divisor,
+    hot_pixels,
+    least_squares,
+    refuse_descriptor,
+)
 from neusee.workflows.engine.runner import run
 from neusee.workflows.frames.descriptor_file import descriptor_of, descriptors_in, quoted
-from neusee.workflows.frames.frame_folder import FolderLevel, FolderLevels, FolderRefused, find_levels
+from neusee.workflows.frames.frame_folder import (
+    FolderLevel,
+    FolderLevels,
+    FolderRefused,
+    find_levels,
+)
 from neusee.workflows.graph.final_values import Config
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
@@ -38,7 +49,8 @@ steps:
   measured: {{node: calibrate.levels, from: level}}
 """
 _REST = """  least_squares: {{node: calibrate.least_squares, from: measured}}
-  prior:   # free parameters, with a median and a factor each; signal and bends with a mean and a standard deviation
+  # free parameters, with a median and a factor each; signal and bends with mean and deviation
+  prior:
     node: calibrate.camera_prior
     with:
       gain: ["${{camera.gain}}", 10]
@@ -49,7 +61,7 @@ _REST = """  least_squares: {{node: calibrate.least_squares, from: measured}}
       scatter: ["${{camera.scatter}}", 3]
       lamp: ["${{camera.lamp}}", 10]
       drift: ["${{camera.drift}}", 5]
-      bend: [0, 0.05]                # y = K e (1 + bend x + twist x2), x = 1 at the brightest level used
+      bend: [0, 0.05]      # y = K e (1 + bend x + twist x2), x = 1 at the brightest level used
       twist: [0, 0.05]
   camera:
     node: calibrate.camera
@@ -75,7 +87,8 @@ camera:                    # first estimates by least squares; the frames decide
   drift: {drift:.3g}
 {traced}outputs: [measured, least_squares, camera]
 """
-_HOT = """  hot: {{node: calibrate.hot_pixels, with: {{files: [{files}]{divisor}}}}}   # in the longest dark exposure
+_HOT = """  hot: {{node: calibrate.hot_pixels, with: {{files: [{files}]{divisor}}}}}   # in the
+longest dark exposure
 """
 _RELATIVE = """traceability:
   photons: {known: relative}   # no radiometry: no quantum efficiency is told
@@ -91,14 +104,20 @@ class _Corrections:
 
 
 def recipe_of_folder(
-    folder: Path, store: Store, changes: Sequence[str] = (), progress: Progress = silent, every_pixel: bool = False
+    folder: Path,
+    store: Store,
+    changes: Sequence[str] = (),
+    progress: Progress = silent,
+    every_pixel: bool = False,
 ) -> Recipe:
-    """Return the recipe of a calibration of the frames in a folder; the frames are read, and reduced to moments.
+    """Return the recipe of a calibration of the frames in a folder; the frames are read, and
+    reduced to moments.
 
-    ``progress`` receives what was read as exposure before any frame is reduced, and what is divided or left out. With
-    ``every_pixel`` hot pixels count too, as EMVA 1288 demands of a sheet.
+    ``progress`` receives what was read as exposure before any frame is reduced, and what is divided
+    or left out. With ``every_pixel`` hot pixels count too, as EMVA 1288 demands of a sheet.
 
-    Raises: `FolderRefused` with all reasons why the frames are no measurement, `RecipeError` with all mistakes of
+    Raises: `FolderRefused` with all reasons why the frames are no measurement, `RecipeError` with
+            all mistakes of
     ``changes``.
     """
     name = "".join(c if c.isalnum() else "_" for c in folder.absolute().name) or "frames"
@@ -118,7 +137,10 @@ def _corrections(found: FolderLevels, progress: Progress, every_pixel: bool) -> 
     """Return which numbers are divided and which pixels are left out, and tell both."""
     divisor = _shift(found)
     if divisor > 1:
-        progress(f"all numbers are multiples of {divisor}: shifted to the left in the files, and divided by {divisor}")
+        progress(
+            f"all numbers are multiples of {divisor}: shifted to the left in the files, and divided"
+            f" by {divisor}"
+        )
     if every_pixel:
         return _Corrections(divisor, ())
     darkest = max((level for level in found.levels if level.dark), key=lambda level: level.exposure)
@@ -127,12 +149,17 @@ def _corrections(found: FolderLevels, progress: Progress, every_pixel: bool) -> 
     if not count:
         return _Corrections(divisor, ())
     share = f"{count} of {mask.numel()} pixels ({count / mask.numel():.2%})"
-    progress(f"{share} are hot in the dark frames of {darkest.exposure:g} s: they are left out of all levels")
+    progress(
+        f"{share} are hot in the dark frames of {darkest.exposure:g} s: they are left out of all"
+        " levels"
+    )
     return _Corrections(divisor, darkest.files)
 
 
 def _shift(found: FolderLevels) -> int:
-    """Return the divisor of numbers of a converter of 8 to 14 bits that are shifted to the left in 16 bits, else 1."""
+    """Return the divisor of numbers of a converter of 8 to 14 bits that are shifted to the left
+    in 16 bits, else 1.
+    """
     divisor = 0
     for level in found.levels:
         divisor = int(np.gcd(divisor, frame_divisor(level.files[0])))
@@ -190,11 +217,16 @@ def _listed(files: Sequence[Path]) -> str:
 
 def _level(level: FolderLevel, scale: float) -> str:
     files = _listed(level.files)
-    return f"  {level.name}: {{photons: {level.light * scale:.8g}, exposure: {level.exposure:.9g} s, files: [{files}]}}"
+    return (
+        f"  {level.name}: {{photons: {level.light * scale:.8g}, exposure: {level.exposure:.9g} s,"
+        f" files: [{files}]}}"
+    )
 
 
 def _rest(fit: LeastSquares, efficiency: float, times: int, relative: bool) -> str:
-    """Return the steps after the levels, with first estimates; ``times`` is the number of exposures of darks."""
+    """Return the steps after the levels, with first estimates; ``times`` is the number of
+    exposures of darks.
+    """
     gain, noise = float(fit.gain), max(float(fit.temporal_dark_noise), 0.1)
     dark = float(fit.dark_current)
     return _REST.format(
@@ -203,7 +235,11 @@ def _rest(fit: LeastSquares, efficiency: float, times: int, relative: bool) -> s
         signal=float(fit.dark_signal),
         noise=noise,
         dark=dark if dark > 0 else float(times > 1),  # NaN where all darks have one exposure
-        current='["${camera.dark_current}", 10]' if times > 1 else "null   # all darks have one exposure",
+        current=(
+            '["${camera.dark_current}", 10]'
+            if times > 1
+            else "null   # all darks have one exposure"
+        ),
         drift=max(0.01 * noise * gain, 0.003),
         traced=_RELATIVE if relative else "",
     )

@@ -1,4 +1,6 @@
-"""The light levels in a folder of frames: which files belong together, and what is missing or does not fit."""
+"""The light levels in a folder of frames: which files belong together, and what is missing or
+does not fit.
+"""
 
 from __future__ import annotations
 
@@ -17,21 +19,44 @@ from neusee.workflows.report.study_folder import Progress, silent
 
 SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr", ".fits", ".fit", ".fts")
 #: suffixes of pictures that hold no raw grey numbers, or that nothing here reads
-NOT_READ = (".jpg", ".jpeg", ".jpe", ".jp2", ".heic", ".heif", ".webp", ".gif", ".bmp", ".dng", ".cr2", ".cr3", ".nef",
-            ".arw", ".raf", ".rw2", ".orf", ".avi", ".mp4", ".mov")  # fmt: skip
+NOT_READ = (
+    ".jpg",
+    ".jpeg",
+    ".jpe",
+    ".jp2",
+    ".heic",
+    ".heif",
+    ".webp",
+    ".gif",
+    ".bmp",
+    ".dng",
+    ".cr2",
+    ".cr3",
+    ".nef",
+    ".arw",
+    ".raf",
+    ".rw2",
+    ".orf",
+    ".avi",
+    ".mp4",
+    ".mov",
+)
 _LOSSY = (".jpg", ".jpeg", ".jpe", ".jp2", ".heic", ".heif", ".webp")
 _SHOWN = 3  #: files that a message names
-_LIT = 4  #: lit levels: a gain, a bend, a twist and the lamp are told from fewer only by their priors
+#: lit levels: a gain, a bend, a twist and the lamp are told from fewer only by their priors
+_LIT = 4
 _SAME = 1e-6  #: relative difference of two exposures that are one
-_HOW = """name files such as dark_10ms_1.png and lit_10ms_5000ph_1.png (exposure, photons of a pixel, number of the
-frame), or write a table frames.csv with the columns file, exposure and photons, or light for light that is known up to
-a factor""".replace("\n", " ")
+_HOW = """name files such as dark_10ms_1.png and lit_10ms_5000ph_1.png (exposure, photons of a
+pixel, number of the frame), or write a table frames.csv with the columns file, exposure and
+photons, or light for light that is known up to a factor""".replace("\n", " ")
 
 Light = Literal["photons", "relative", "exposure"]  #: how the light of the levels is known
 
 
 class FolderRefused(ValueError):
-    """Error raised if the frames of a folder are no measurement; the text has all reasons, one a line."""
+    """Error raised if the frames of a folder are no measurement; the text has all reasons, one a
+    line.
+    """
 
 
 @dataclass(frozen=True)
@@ -85,7 +110,9 @@ def find_levels(folder: Path, progress: Progress = silent) -> FolderLevels:
     levels = tuple(_named(groups))
     problems = [*_numbers(groups, levels, folder), *_light_problems(levels, light)]
     if not problems:
-        problems = list(misplaced_frames([(level.name, level.dark, level.files) for level in levels], folder))
+        problems = list(
+            misplaced_frames([(level.name, level.dark, level.files) for level in levels], folder)
+        )
     if problems:
         raise FolderRefused("\n".join(problems))
     return FolderLevels(levels, light, source)
@@ -97,19 +124,31 @@ def _no_frames(folder: Path, unread: Sequence[Path]) -> str:
         return f"{folder}: no frames: {_HOW}"
     kinds = "/".join(sorted({path.suffix.lower() for path in unread}))
     lossy = all(path.suffix.lower() in _LOSSY for path in unread)
-    why = "JPEG and its like change the noise of each pixel" if lossy else "no raw grey numbers are read from them"
-    return (f"{_some(unread, folder)}: {kinds} cannot be calibrated: {why}; save the raw frames of one channel as PNG "
-            f"or TIFF of 16 bits, FITS or NumPy, and {_HOW}")  # fmt: skip
+    why = (
+        "JPEG and its like change the noise of each pixel"
+        if lossy
+        else "no raw grey numbers are read from them"
+    )
+    return (
+        f"{_some(unread, folder)}: {kinds} cannot be calibrated: {why}; save the raw frames of "
+        "one channel as PNG "
+        f"or TIFF of 16 bits, FITS or NumPy, and {_HOW}"
+    )
 
 
 def _exposures(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
-    """Yield a line for each exposure with what said it, so that a wrong one is seen before the work."""
+    """Yield a line for each exposure with what said it, so that a wrong one is seen before the
+    work.
+    """
     told: dict[tuple[bool, float, str], list[Path]] = defaultdict(list)
     for frame in frames:
         told[not frame.dark, frame.exposure or 0.0, frame.told].append(frame.file)
     for (lit, seconds, text), files in sorted(told.items()):
         kind, count = "lit" if lit else "dark", f"{len(files)} file{'s' * (len(files) != 1)}"
-        yield f"{kind}: exposure {_readable(seconds)}, from {text}: {count} such as {_short(files[0], folder)}"
+        yield (
+            f"{kind}: exposure {_readable(seconds)}, from {text}: {count} such as"
+            f" {_short(files[0], folder)}"
+        )
 
 
 def _readable(seconds: float) -> str:
@@ -133,7 +172,9 @@ def _found(folder: Path) -> tuple[list[Frame], str, list[str]]:
     except ValueError as error:
         return [], "", [str(error)]
     listed = {row.file.resolve(): row for row in rows}
-    files = [row.file for row in rows] or sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES)
+    files = [row.file for row in rows] or sorted(
+        p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES
+    )
     for file in files:
         name, row = read_name(file, folder), listed.get(file.resolve())
         try:
@@ -145,10 +186,16 @@ def _found(folder: Path) -> tuple[list[Frame], str, list[str]]:
         problems += _contradiction(frames[-1], name, row, table, folder)
         if row is None or row.exposure is None:
             problems += _doubt(frames[-1], name, files, folder)
-    return frames, f"the table {table.name}" if table else "names and headers of the files", problems
+    return (
+        frames,
+        f"the table {table.name}" if table else "names and headers of the files",
+        problems,
+    )
 
 
-def _frame(file: Path, name: NamedFrame, row: TableRow | None, header: FrameHeader, table: Path | None) -> Frame:
+def _frame(
+    file: Path, name: NamedFrame, row: TableRow | None, header: FrameHeader, table: Path | None
+) -> Frame:
     """Return a frame with what a table says of it, else its name, else its header."""
     photons, exposure = (row.photons, row.exposure) if row else (name.photons, name.exposure)
     light = row.light if row else None
@@ -180,7 +227,9 @@ def _contradiction(
 
 
 def _doubt(frame: Frame, name: NamedFrame, files: Sequence[Path], folder: Path) -> Iterator[str]:
-    """Yield a problem for a name such as ``dark_1_200s``, unless a frame 2 shows that the 1 is a number of frames."""
+    """Yield a problem for a name such as ``dark_1_200s``, unless a frame 2 shows that the 1 is a
+    number of frames.
+    """
     if not name.doubtful or frame.header.exposure is not None:
         return
     text = str(frame.file.relative_to(folder)).lower()
@@ -188,12 +237,19 @@ def _doubt(frame: Frame, name: NamedFrame, files: Sequence[Path], folder: Path) 
     if second in (str(path.relative_to(folder)).lower() for path in files):
         return
     seconds = float(re.findall(r"\d+", name.doubtful)[-1])
-    yield (f"{_short(frame.file, folder)}: {name.doubtful} may be 1/{seconds:g} s, or number 1 of {seconds:g} s: write "
-           f"{_readable(1 / seconds).replace(' ', '')} or {seconds:g}s, or a table frames.csv")  # fmt: skip
+    yield (
+        f"{_short(frame.file, folder)}: {name.doubtful} may be 1/{seconds:g} s, or number 1 of "
+        f"{seconds:g} s: write "
+        f"{_readable(1 / seconds).replace(' ', '')} or {seconds:g}s, or a table frames.csv"
+    )
 
 
 def _short(file: Path, folder: Path) -> str:
-    return str(file.resolve().relative_to(folder.resolve())) if file.is_relative_to(folder) else str(file)
+    return (
+        str(file.resolve().relative_to(folder.resolve()))
+        if file.is_relative_to(folder)
+        else str(file)
+    )
 
 
 def _some(files: Sequence[Path], folder: Path) -> str:
@@ -210,8 +266,11 @@ def _sizes(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
             usual = counts.most_common(1)[0][0]
             odd = [frame.file for frame, text in zip(frames, has, strict=True) if text != usual]
             others = ", ".join(sorted(counts.keys() - {usual}))
-            yield (f"{_some(odd, folder)}: {others} {what}, but {counts[usual]} files have {usual} {what}: give frames "
-                   "of one sensor and one setting")  # fmt: skip
+            yield (
+                f"{_some(odd, folder)}: {others} {what}, but {counts[usual]} files have {usual} "
+                f"{what}: give frames "
+                "of one sensor and one setting"
+            )
 
 
 def _unknown(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
@@ -220,11 +279,17 @@ def _unknown(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
         yield f"{_some(timeless, folder)}: the exposure is unknown: {_HOW}"
     lit = [frame for frame in frames if not frame.dark]
     if frames and len(lit) == len(frames):
-        yield f"{folder}: no dark frames: cover the lens, take two or more, and name them such as dark_10ms_1.png"
+        yield (
+            f"{folder}: no dark frames: cover the lens, take two or more, and name them such as"
+            " dark_10ms_1.png"
+        )
     for name in ("photons", "light"):
         missing = [frame.file for frame in lit if getattr(frame, name) is None]
         if 0 < len(missing) < len(lit):
-            yield f"{_some(missing, folder)}: no {name}, which {len(lit) - len(missing)} other lit files have: {_HOW}"
+            yield (
+                f"{_some(missing, folder)}: no {name}, which {len(lit) - len(missing)} other lit"
+                f" files have: {_HOW}"
+            )
 
 
 def _kind_of_light(frames: Sequence[Frame]) -> Light:
@@ -238,9 +303,11 @@ _Key = tuple[bool, float, float, str]
 
 
 def _groups(frames: Sequence[Frame], light: Light) -> dict[_Key, list[Frame]]:
-    """Return the frames of each level, in rising order of light and exposure, by what they have in common.
+    """Return the frames of each level, in rising order of light and exposure, by what they have in
+    common.
 
-    Where only exposures tell the light, frames of one exposure are one level if their names agree too.
+    Where only exposures tell the light, frames of one exposure are one level if their names agree
+    too.
     """
     groups: dict[_Key, list[Frame]] = defaultdict(list)
     for frame in frames:
@@ -268,15 +335,23 @@ def _time(seconds: float) -> str:
     return f"{1e3 * seconds:.6g}ms".replace(".", "p").replace("+", "")
 
 
-def _numbers(groups: dict[_Key, list[Frame]], levels: Sequence[FolderLevel], folder: Path) -> Iterator[str]:
+def _numbers(
+    groups: dict[_Key, list[Frame]], levels: Sequence[FolderLevel], folder: Path
+) -> Iterator[str]:
     """Yield a problem for levels of one frame, and for too few lit levels."""
     single = [f[0].file for f in groups.values() if sum(frame.header.frames for frame in f) < 2]
     if single:
-        yield (f"{_some(single, folder)}: one frame of its level: take two or more frames of each exposure and light, "
-               "or give frames of one level one name with a number at its end, such as _1 and _2")  # fmt: skip
+        yield (
+            f"{_some(single, folder)}: one frame of its level: take two or more frames of each "
+            "exposure and light, "
+            "or give frames of one level one name with a number at its end, such as _1 and _2"
+        )
     lit = len({level.light for level in levels if not level.dark})
     if lit < _LIT:
-        yield f"{folder}: {lit} lit level{'s' * (lit != 1)}: take {_LIT} or more of different light, up to saturation"
+        yield (
+            f"{folder}: {lit} lit level{'s' * (lit != 1)}: take {_LIT} or more of different light,"
+            " up to saturation"
+        )
 
 
 def _light_problems(levels: Sequence[FolderLevel], light: Light) -> Iterator[str]:

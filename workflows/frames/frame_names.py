@@ -10,9 +10,11 @@ _NUMBER = r"(\d+(?:[.,p]\d+)?(?:e[-+]?\d+)?)"  #: 10p5 is 10.5, as in names with
 _UNIT = r"(ns|us|µs|μs|ms|s)"
 _WORD = r"(?:exposure|exptime|texp|exp|t)"
 _SPACE = r"[ =_-]?"
-#: 1/200 of a second: a file name has no stroke; after a hyphen, and between lone numbers, it may be something else
+#: 1/200 of a second: a file name has no stroke; after a hyphen, and between lone numbers, it may be
+#: something else
 _FRACTION = re.compile(
-    rf"(?<![a-z0-9.,-]){_WORD}?{_SPACE}(?<![\d.,-])1(?:[-⁄]|over|div)([1-9][\d.]*) ?s(?:ec)?(?![a-z0-9])"
+    rf"(?<![a-z0-9.,-]){_WORD}?{_SPACE}(?<![\d.,-])1(?:[-⁄]|over|div)([1-9][\d.]*)"
+    r" ?s(?:ec)?(?![a-z0-9])"
 )
 _DOUBTFUL = re.compile(r"(?<![\d.,])(?:(?<=[a-z-])1-|1[_/ ])([1-9]\d*) ?s(?:ec)?(?![a-z0-9])")
 _EXPOSURE = re.compile(rf"(?<![a-z0-9.,]){_WORD}?{_SPACE}{_NUMBER}[ _-]?{_UNIT}(?:ec)?(?![a-z0-9])")
@@ -44,8 +46,8 @@ class _Exposure(NamedTuple):
 def read_name(file: Path, folder: Path) -> NamedFrame:
     """Return what the path of a file below ``folder`` says, such as ``flat_10ms_1200ph_2.tif``.
 
-    Folders count as parts of the name: ``dark/10ms/1.png``. An exposure is a number and its unit in either order:
-    ``10ms``, ``10p5ms``, ``exp_ms_10``, or a fraction of a second such as ``1-200s``.
+    Folders count as parts of the name: ``dark/10ms/1.png``. An exposure is a number and its unit in
+    either order: ``10ms``, ``10p5ms``, ``exp_ms_10``, or a fraction of a second such as ``1-200s``.
     """
     parts = file.relative_to(folder).with_suffix("").parts
     text = "/".join(parts).lower()
@@ -62,7 +64,9 @@ def read_name(file: Path, folder: Path) -> NamedFrame:
 
 
 def _exposure(text: str) -> _Exposure | None:
-    """Return the last exposure of a name; a fraction counts before a number, and a number before a unit."""
+    """Return the last exposure of a name; a fraction counts before a number, and a number before
+    a unit.
+    """
     if fraction := _last(_FRACTION, text):
         return _Exposure(1 / _float(fraction[1]), fraction[0])
     if match := _last(_EXPOSURE, text):

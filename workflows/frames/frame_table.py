@@ -11,13 +11,21 @@ from typing import NamedTuple
 from neusee.nodes.input_files import csv_rows
 from neusee.nodes.units import read_any
 
-_TIMES = {"exposure": 0.0, "exposure_s": 1.0, "exposure_ms": 1e-3, "exposure_us": 1e-6, "exposure_ns": 1e-9}
+_TIMES = {
+    "exposure": 0.0,
+    "exposure_s": 1.0,
+    "exposure_ms": 1e-3,
+    "exposure_us": 1e-6,
+    "exposure_ns": 1e-9,
+}
 _FRACTION = re.compile(r"\s*(\d+)\s*[/⁄]\s*([1-9]\d*(?:\.\d+)?)\s*(s|sec)?\s*")  #: 1/200 s
 _COLUMNS = "file, exposure (such as 10 ms) or exposure_ms, and photons or light"
 
 
 class TableRow(NamedTuple):
-    """A line of a table: a file and what is told of it; None for an empty cell or a column that is missing."""
+    """A line of a table: a file and what is told of it; None for an empty cell or a column that
+    is missing.
+    """
 
     line: int
     file: Path
@@ -27,15 +35,22 @@ class TableRow(NamedTuple):
 
 
 def find_table(folder: Path) -> Path | None:
-    """Return the only CSV file of a folder with a column ``file``, or None; raise ValueError for several."""
+    """Return the only CSV file of a folder with a column ``file``, or None; raise ValueError for
+    several.
+    """
     found = [path for path in sorted(folder.glob("*.csv")) if "file" in _header(path)]
     if len(found) > 1:
-        raise ValueError(f"{folder} has {len(found)} tables of frames, {', '.join(p.name for p in found)}: keep one")
+        raise ValueError(
+            f"{folder} has {len(found)} tables of frames, {', '.join(p.name for p in found)}:"
+            " keep one"
+        )
     return found[0] if found else None
 
 
 def read_table(table: Path) -> list[TableRow]:
-    """Return the lines of a table of frames; raise ValueError with all mistakes, each with its line."""
+    """Return the lines of a table of frames; raise ValueError with all mistakes, each with its
+    line.
+    """
     found = list(_read(table))
     rows = [item for item in found if isinstance(item, TableRow)]
     if problems := [item for item in found if isinstance(item, str)]:
@@ -81,7 +96,10 @@ def _exposure(text: str, column: str) -> float | None:
     else:
         number, unit = (float(text), "s") if scale else read_any(text)
     if unit != "s" or not 0 < number < math.inf:
-        raise ValueError(f"exposure {text}: write a time with a unit, such as 10 ms, or name the column exposure_ms")
+        raise ValueError(
+            f"exposure {text}: write a time with a unit, such as 10 ms, or name the column"
+            " exposure_ms"
+        )
     return number * (scale or 1.0)
 
 

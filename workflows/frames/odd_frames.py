@@ -9,7 +9,8 @@ import numpy as np
 
 from neusee.nodes.calibrate import frame_means
 
-_OFF, _FLOOR = 0.1, 0.01  #: most difference of two frames: of their signal, and of the brightest signal
+#: most difference of two frames: of their signal, and of the brightest signal
+_OFF, _FLOOR = 0.1, 0.01
 
 _CHANCE = 6.0  #: standard errors of a mean, added to the difference
 
@@ -17,14 +18,25 @@ Files = tuple[str, bool, Sequence[Path]]  #: name of a level, True for a dark on
 
 
 def misplaced_frames(levels: Sequence[Files], folder: Path) -> Iterator[str]:
-    """Yield a sentence for each level whose frames differ too much in their means, or one if darks are not dark."""
-    means = [[(file, *found) for file in files for found in frame_means(file)] for _, _, files in levels]
+    """Yield a sentence for each level whose frames differ too much in their means, or one if
+    darks are not dark.
+    """
+    means = [
+        [(file, *found) for file in files for found in frame_means(file)] for _, _, files in levels
+    ]
     middles = [float(np.median([mean for _, mean, _ in each])) for each in means]
     darks = [middle for middle, (_, dark, _) in zip(middles, levels, strict=True) if dark]
-    lit = float(np.median([middle for middle, (_, dark, _) in zip(middles, levels, strict=True) if not dark]))
+    lit = float(
+        np.median(
+            [middle for middle, (_, dark, _) in zip(middles, levels, strict=True) if not dark]
+        )
+    )
     if lit <= max(darks):
-        yield (f"{folder}: dark frames have means up to {max(darks):.0f} DN, and half of the lit levels no more than "
-               f"{lit:.0f} DN: cover the lens, or check which files are dark")  # fmt: skip
+        yield (
+            f"{folder}: dark frames have means up to {max(darks):.0f} DN, and half of the lit "
+            "levels no more than "
+            f"{lit:.0f} DN: cover the lens, or check which files are dark"
+        )
         return
     black, bright = min(darks), max(middles)
     for (_, dark, _), each, middle in zip(levels, means, middles, strict=True):
@@ -40,11 +52,17 @@ def _odd(each: Sequence[tuple[Path, float]], middle: float, room: float, folder:
     values = [mean for _, mean in each]
     if len(values) == 2:
         (a, one), (b, other) = each
-        both = f"{_name(a, folder)} and {_name(b, folder)} count as one level, but have means of {one:.1f} and"
+        both = (
+            f"{_name(a, folder)} and {_name(b, folder)} count as one level, but have means of"
+            f" {one:.1f} and"
+        )
         return f"{both} {other:.1f} DN: check names and table"
     file, mean = max(each, key=lambda pair: abs(pair[1] - middle))
-    return (f"{_name(file, folder)} has a mean of {mean:.1f} DN, but its level {middle:.1f} DN, which may differ by "
-            f"{room:.1f} DN: check its name, or remove it")  # fmt: skip
+    return (
+        f"{_name(file, folder)} has a mean of {mean:.1f} DN, but its level {middle:.1f} DN, "
+        "which may differ by "
+        f"{room:.1f} DN: check its name, or remove it"
+    )
 
 
 def _name(file: Path, folder: Path) -> str:

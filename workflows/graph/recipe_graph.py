@@ -1,4 +1,6 @@
-"""Graph of a checked recipe: its steps, the connections between the steps, and the order in which the steps run."""
+"""Graph of a checked recipe: its steps, the connections between the steps, and the order in
+which the steps run.
+"""
 
 from __future__ import annotations
 
@@ -23,14 +25,27 @@ if TYPE_CHECKING:
     from neusee.workflows.recipe.distributions.nominal_values import Uncertain
     from neusee.workflows.store.result_store import Store
 
-__all__ = ["Config", "Expectation", "Recipe", "Setting", "Step", "Substitution", "Wire", "in_order", "needed"]
+__all__ = [
+    "Config",
+    "Expectation",
+    "Recipe",
+    "Setting",
+    "Step",
+    "Substitution",
+    "Wire",
+    "in_order",
+    "needed",
+]
 
-Wire = str | tuple[str, ...] | None  #: one step, the steps of all items, or no step for an optional input
+#: one step, the steps of all items, or no step for an optional input
+Wire = str | tuple[str, ...] | None
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One step of a recipe: a node (a function), its validated parameters and the steps that compute its inputs."""
+    """One step of a recipe: a node (a function), its validated parameters and the steps that
+    compute its inputs.
+    """
 
     name: str  #: ``psf[mask]``, ``spot[mask,green]``
     node: Node
@@ -38,7 +53,8 @@ class Step:
     wires: Mapping[str, Wire]  #: by input, in the node's order
     mark: Location
     param_marks: Mapping[str, Location]  #: location of each given value
-    device: str = ""  #: requested device: ``cpu``, ``gpu``, ``cuda:1``; empty if any; never part of a key
+    #: requested device: ``cpu``, ``gpu``, ``cuda:1``; empty if any; never part of a key
+    device: str = ""
     cached: bool = True  #: False for ``cache: false``: computed in each run, and never stored
     #: names of all steps whose results are inputs of this step, in the order of the inputs
     sources: tuple[str, ...] = field(init=False, repr=False, compare=False)
@@ -60,7 +76,9 @@ class Substitution:
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """Number that a recipe expects in the result of ``step`` at the indices ``at``, with a relative tolerance."""
+    """Number that a recipe expects in the result of ``step`` at the indices ``at``, with a
+    relative tolerance.
+    """
 
     name: str
     step: str
@@ -71,12 +89,15 @@ class Expectation:
 
 
 _COPIES = 8  #: copies of a step that a message lists
-METRIC_TOLERANCE = 1e-3  #: largest error of an input of a metric, because a metric may depend on a small difference
+#: largest error of an input of a metric, because a metric may depend on a small difference
+METRIC_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Recipe:
-    """Checked recipe, in which all steps, values and connections of steps are valid and no step has run yet."""
+    """Checked recipe, in which all steps, values and connections of steps are valid and no step
+    has run yet.
+    """
 
     name: str
     title: str
@@ -87,31 +108,47 @@ class Recipe:
     expect: tuple[Expectation, ...] = ()
     config: Config = field(default_factory=Config)
     notes: tuple[str, ...] = ()
-    absent: Mapping[str, str] = field(default_factory=dict)  #: location of the null, by the name of a step that is null
+    #: location of the null, by the name of a step that is null
+    absent: Mapping[str, str] = field(default_factory=dict)
     exact: bool = False  #: whether every step is computed in full at any tolerance
-    estimates: bool = True  #: whether errors that are estimated, not proved, may count towards the tolerance
-    substitutions: tuple[Substitution, ...] = ()  #: cheaper steps in place of full steps; empty after loading
+    #: whether errors that are estimated, not proved, may count towards the tolerance
+    estimates: bool = True
+    #: cheaper steps in place of full steps; empty after loading
+    substitutions: tuple[Substitution, ...] = ()
     tolerance_scale: float = 1.0  #: fraction of the tolerance in use; below 1 after a failed proof
-    unsubstituted: Recipe | None = field(default=None, compare=False)  #: the recipe before substitutions, if any
-    uncertain: Uncertain | None = field(default=None, compare=False)  #: distributions for the study of uncertainty
-    training: Training | None = field(default=None, compare=False)  #: settings of the training of a network
-    cameras: tuple[Recipe, ...] = field(default=(), compare=False)  #: of `train.cameras`, one recipe each
-    lifting: LiftTraining | None = field(default=None, compare=False)  #: settings of the training of a lift
-    safety: Safety | None = field(default=None, compare=False)  #: settings of the estimate of damage and dazzle
-    evaluation: EvaluateSettings | None = field(default=None, compare=False)  #: settings of an evaluation
-    traceability: Traceability | None = field(default=None, compare=False)  #: what the laboratory states of its light
-    exports: Mapping[str, bool] | None = field(default=None, compare=False)  #: data files, True for half; None: all
-    unbounded: frozenset[str] = frozenset()  #: steps whose errors reach a node without an error bound
+    #: the recipe before substitutions, if any
+    unsubstituted: Recipe | None = field(default=None, compare=False)
+    #: distributions for the study of uncertainty
+    uncertain: Uncertain | None = field(default=None, compare=False)
+    #: settings of the training of a network
+    training: Training | None = field(default=None, compare=False)
+    #: of `train.cameras`, one recipe each
+    cameras: tuple[Recipe, ...] = field(default=(), compare=False)
+    #: settings of the training of a lift
+    lifting: LiftTraining | None = field(default=None, compare=False)
+    #: settings of the estimate of damage and dazzle
+    safety: Safety | None = field(default=None, compare=False)
+    #: settings of an evaluation
+    evaluation: EvaluateSettings | None = field(default=None, compare=False)
+    #: what the laboratory states of its light
+    traceability: Traceability | None = field(default=None, compare=False)
+    #: data files, True for half; None: all
+    exports: Mapping[str, bool] | None = field(default=None, compare=False)
+    #: steps whose errors reach a node without an error bound
+    unbounded: frozenset[str] = frozenset()
 
     def limit(self, step: str) -> float:
         """Return the largest relative error allowed in the result of a step.
 
-        This is the tolerance of the recipe, or at most `METRIC_TOLERANCE` if a later node has no error bound.
+        This is the tolerance of the recipe, or at most `METRIC_TOLERANCE` if a later node has no
+        error bound.
         """
         return min(self.tolerance, METRIC_TOLERANCE) if step in self.unbounded else self.tolerance
 
     def allowed(self, step: str) -> float:
-        """Return the total relative error that omitted and approximated steps may cause in the result of ``step``."""
+        """Return the total relative error that omitted and approximated steps may cause in the
+        result of ``step``.
+        """
         return self.limit(step) * self.tolerance_scale
 
     def run(
@@ -155,12 +192,15 @@ def copies_of(recipe: Recipe, names: Iterable[str]) -> set[str]:
 
 
 def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
-    """Return the names of the steps that must run to compute the steps ``outputs``, in topological order."""
+    """Return the names of the steps that must run to compute the steps ``outputs``, in
+    topological order.
+    """
     return ordered({name: step.sources for name, step in recipe.steps.items()}, outputs)
 
 
 def ordered(sources: Mapping[str, tuple[str, ...]], names: Iterable[str]) -> list[str]:
-    """Return what `in_order` returns; the order of a graph is found once, because points of a sweep share few graphs.
+    """Return what `in_order` returns; the order of a graph is found once, because points of a sweep
+    share few graphs.
 
     ``sources`` has the steps that each step reads.
     """
@@ -168,7 +208,9 @@ def ordered(sources: Mapping[str, tuple[str, ...]], names: Iterable[str]) -> lis
 
 
 @lru_cache(32)
-def _ordered(steps: tuple[str, ...], sources: tuple[tuple[str, ...], ...], names: tuple[str, ...]) -> tuple[str, ...]:
+def _ordered(
+    steps: tuple[str, ...], sources: tuple[tuple[str, ...], ...], names: tuple[str, ...]
+) -> tuple[str, ...]:
     return tuple(in_order(dict(zip(steps, sources, strict=True)), names))
 
 
@@ -177,10 +219,14 @@ def nodes_of(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(recipe.steps[name].node.path for name in needed(recipe, outputs)))
 
 
-def dependents(recipe: Recipe, roots: Iterable[str], order: Iterable[str] | None = None) -> set[str]:
-    """Return the names of the steps ``roots`` and of all steps that depend on ``roots``, directly or not.
+def dependents(
+    recipe: Recipe, roots: Iterable[str], order: Iterable[str] | None = None
+) -> set[str]:
+    """Return the names of the steps ``roots`` and of all steps that depend on ``roots``, directly
+    or not.
 
-    ``order`` lists the steps to consider, in topological order; by default, all steps of the recipe.
+    ``order`` lists the steps to consider, in topological order; by default, all steps of the
+    recipe.
     """
     found = set(roots)
     for name in needed(recipe, recipe.steps) if order is None else order:
@@ -190,7 +236,9 @@ def dependents(recipe: Recipe, roots: Iterable[str], order: Iterable[str] | None
 
 
 def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list[str]:
-    """Return the steps ``names`` and all steps that they depend on, in topological order; the graph has no cycle."""
+    """Return the steps ``names`` and all steps that they depend on, in topological order; the
+    graph has no cycle.
+    """
     order: dict[str, None] = {}
     stack = [(name, iter(sources[name])) for name in reversed(list(names))]
     while stack:
@@ -205,7 +253,9 @@ def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list
 
 
 def unknown_step(name: str, steps: Collection[str]) -> str:
-    """Return the error message for an unknown step name, which suggests names such as ``psf[mask]``."""
+    """Return the error message for an unknown step name, which suggests names such as
+    ``psf[mask]``.
+    """
     copies = sorted(step for step in steps if step.startswith(f"{name}["))
     if not copies:
         return f"no step {name!r}; {nearest(name, steps)}"

@@ -1,4 +1,6 @@
-"""Records of the steps of a run: the state of each step with its reason, and the device, time and memory."""
+"""Records of the steps of a run: the state of each step with its reason, and the device, time
+and memory.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ State = Literal["run", "cached", "left out", "not needed"]
 
 @dataclass(frozen=True, slots=True)
 class StepRecord:
-    """Record of one step in a run: its state, the reason for this state, its time, memory and checks."""
+    """Record of one step in a run: its state, the reason for this state, its time, memory and
+    checks.
+    """
 
     step: str
     state: State  #: ``not needed``: no step that ran needed this step
@@ -28,14 +32,17 @@ class StepRecord:
     lane: str = ""  #: device or worker of the executor that computed the step
     peak: int | None = None  #: peak memory in bytes beyond the memory in use before the step
     predicted: float | None = None  #: time in s predicted from earlier runs
-    error: tuple[float, float] | None = None  #: of a cheaper step: rms and maximum, relative to the largest element
+    #: of a cheaper step: rms and maximum, relative to the largest element
+    error: tuple[float, float] | None = None
     predicted_peak: float | None = None  #: predicted peak memory in bytes, as ``peak``
     kept: bool = True  #: whether the value is in the store
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Start or end of a step during a run, reported to a live display; ``done`` is None at the start."""
+    """Start or end of a step during a run, reported to a live display; ``done`` is None at the
+    start.
+    """
 
     step: str
     done: StepRecord | None

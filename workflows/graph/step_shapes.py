@@ -1,8 +1,9 @@
 """Shapes, types and small values of the results of a recipe, found before anything runs.
 
-A form is a tensor on the device ``meta``, which has a shape and no values, a tensor of few numbers, or a named tuple of
-such tensors. The rule of a node (``@node.shape``) computes the form of its result from the forms of its inputs. No node
-runs for this, apart from those with ``before_run``, whose results have few numbers.
+A form is a tensor on the device ``meta``, which has a shape and no values, a tensor of few numbers,
+or a named tuple of such tensors. The rule of a node (``@node.shape``) computes the form of its
+result from the forms of its inputs. No node runs for this, apart from those with ``before_run``,
+whose results have few numbers.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ Form = Any  #: a tensor, a named tuple of tensors, or None where the shape is no
 
 
 def forms_of(recipe: Recipe, order: Iterable[str]) -> dict[str, Form]:
-    """Return the form of the result of each step in ``order``, which lists each step after its inputs."""
+    """Return the form of the result of each step in ``order``, which lists each step after its
+    inputs.
+    """
     found: dict[str, Form] = {}
     for name in order:
         step = recipe.steps[name]
@@ -31,13 +34,18 @@ def forms_of(recipe: Recipe, order: Iterable[str]) -> dict[str, Form]:
 
 
 def inputs_of(step: Step, forms: Mapping[str, Form]) -> list[Form]:
-    """Return the forms of the inputs of a step, in the order of the node; a list input is a list of forms."""
+    """Return the forms of the inputs of a step, in the order of the node; a list input is a list
+    of forms.
+    """
     wires = (step.wires.get(name) for name in step.node.inputs)
-    return [w and (forms.get(w) if isinstance(w, str) else [forms.get(n) for n in w]) for w in wires]
+    return [
+        w and (forms.get(w) if isinstance(w, str) else [forms.get(n) for n in w]) for w in wires
+    ]
 
 
 def form_of(node: Node, inputs: Sequence[Form], params: Mapping[str, Any]) -> Form:
-    """Return the form of the result of a node, or None if the node has no rule or the rule needs an unknown input.
+    """Return the form of the result of a node, or None if the node has no rule or the rule needs an
+    unknown input.
 
     Raises: OverflowError for a result with more bytes than any machine can address.
     """
@@ -66,11 +74,15 @@ def has_path(value: Any) -> bool:
     """Return True if a parameter, or a part of it, is the path of a file, which may change."""
     if isinstance(value, Mapping):
         return any(map(has_path, value.values()))
-    return isinstance(value, Path) or (isinstance(value, list | tuple) and any(map(has_path, value)))
+    return isinstance(value, Path) or (
+        isinstance(value, list | tuple) and any(map(has_path, value))
+    )
 
 
 def complete(node: Node, inputs: Sequence[Form]) -> bool:
-    """Return True if the shape of every input that a node needs is known, and of every item of a list."""
+    """Return True if the shape of every input that a node needs is known, and of every item of a
+    list.
+    """
     named = zip(inputs, node.inputs, strict=False)
     lists = (x for x in inputs if type(x) is list)
     return all(x is not None or name in node.optional for x, name in named) and not any(
@@ -94,7 +106,9 @@ _FEW = 4096  #: numbers of a tensor up to which the values may tell the work of 
 
 def bytes_of(form: Form) -> float:
     """Return the bytes of a result from its form, or of a list of results."""
-    return float(sum(math.prod(tensor.shape) * tensor.element_size() for tensor in tensors_of(form)))
+    return float(
+        sum(math.prod(tensor.shape) * tensor.element_size() for tensor in tensors_of(form))
+    )
 
 
 def tensors_of(form: Form) -> list[Tensor]:
@@ -103,11 +117,17 @@ def tensors_of(form: Form) -> list[Tensor]:
 
     if isinstance(form, Tensor):
         return [form]
-    return [tensor for item in form for tensor in tensors_of(item)] if isinstance(form, tuple | list) else []
+    return (
+        [tensor for item in form for tensor in tensors_of(item)]
+        if isinstance(form, tuple | list)
+        else []
+    )
 
 
 def alike(one: Form, other: Form) -> bool:
-    """Return True if two forms tell the same: equal shapes and types, and equal values as far as these are known."""
+    """Return True if two forms tell the same: equal shapes and types, and equal values as far as
+    these are known.
+    """
     from torch import Tensor, equal
 
     if type(one) is not type(other):

@@ -1,6 +1,8 @@
-"""Copies of the steps from which a restorer knows optics and laser, so that a camera may differ from what is believed.
+"""Copies of the steps from which a restorer knows optics and laser, so that a camera may differ
+from what is believed.
 
-The camera keeps its steps. The copies have the prefix ``told_``, and the restorer reads these in place of the camera's.
+The camera keeps its steps. The copies have the prefix ``told_``, and the restorer reads these in
+place of the camera's.
 """
 
 from __future__ import annotations
@@ -11,8 +13,10 @@ from dataclasses import replace
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
 
 TOLD = "told_"  #: prefix of the copies
-KNOWLEDGE = ("psf", "glare", "nearby")  #: inputs of a restorer that say what the optics and the laser are
-FRAME = "raw[mask]"  #: step of the frame behind the mask, before which the camera is and after which the user
+#: inputs of a restorer that say what the optics and the laser are
+KNOWLEDGE = ("psf", "glare", "nearby")
+#: step of the frame behind the mask, before which the camera is and after which the user
+FRAME = "raw[mask]"
 
 
 def knowers(recipe: Recipe, steps: Iterable[str]) -> list[str]:
@@ -29,7 +33,9 @@ def known(recipe: Recipe, readers: Iterable[str]) -> list[str]:
 def with_copies(
     recipe: Recipe, readers: Iterable[str], copied: Collection[str], change: Callable[[Step], Step]
 ) -> Recipe:
-    """Return the recipe with changed copies of the steps ``copied``, from which alone the ``readers`` know."""
+    """Return the recipe with changed copies of the steps ``copied``, from which alone the
+    ``readers`` know.
+    """
     steps = dict(recipe.steps)
     for name in copied:
         step = change(recipe.steps[name])
@@ -37,7 +43,10 @@ def with_copies(
         steps[TOLD + name] = replace(step, name=TOLD + name, wires=wires)
     for name in readers:
         step = recipe.steps[name]
-        wires = {key: _told(wire, copied) if key in KNOWLEDGE else wire for key, wire in step.wires.items()}
+        wires = {
+            key: _told(wire, copied) if key in KNOWLEDGE else wire
+            for key, wire in step.wires.items()
+        }
         steps[name] = replace(step, wires=wires)
     return replace(recipe, steps=steps)
 

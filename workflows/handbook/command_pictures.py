@@ -17,22 +17,32 @@ _FINE = (0, 3)  #: exit codes after which the folder of results is whole
 
 
 class NoPicture(RuntimeError):
-    """Error for a command of a page that failed, or that did not write the picture that the page shows."""
+    """Error for a command of a page that failed, or that did not write the picture that the page
+    shows.
+    """
 
 
 def draw_pictures(
-    pictures: Iterable[Picture], work: Path, target: Path, progress: Callable[[str], None], strict: bool = True
+    pictures: Iterable[Picture],
+    work: Path,
+    target: Path,
+    progress: Callable[[str], None],
+    strict: bool = True,
 ) -> dict[Picture, str]:
-    """Run each command once in the folder ``work``, copy the pictures to ``target`` and return their file names.
+    """Run each command once in the folder ``work``, copy the pictures to ``target`` and return
+    their file names.
 
     Commands run in their order, and `runs/latest` is what the one before wrote.
-    If a command fails, a ``strict`` build raises `NoPicture`; any other build says so and goes on without the picture.
+    If a command fails, a ``strict`` build raises `NoPicture`; any other build says so and goes on
+    without the picture.
     """
     by_words: dict[tuple[str, ...], list[Picture]] = {}
     for picture in pictures:
         by_words.setdefault(picture.words, []).append(picture)
     target.mkdir(parents=True, exist_ok=True)
-    progress(f"commands that draw pictures: {len(by_words)}; what the cache holds is not computed again")
+    progress(
+        f"commands that draw pictures: {len(by_words)}; what the cache holds is not computed again"
+    )
     names: dict[Picture, str] = {}
     for number, (words, wanted) in enumerate(by_words.items(), 1):
         try:
@@ -61,13 +71,16 @@ def _run(words: tuple[str, ...], work: Path, results: Path) -> Path:
     folders = [path for path in results.glob("*") if path.is_dir() and not path.is_symlink()]
     if done.returncode not in _FINE or len(folders) != 1:
         raise NoPicture(
-            f"neusee {' '.join(words)} ended with exit code {done.returncode}: {done.stderr.strip()[-500:]}"
+            f"neusee {' '.join(words)} ended with exit code {done.returncode}:"
+            f" {done.stderr.strip()[-500:]}"
         )
     return folders[0]
 
 
 def _name_latest(results: Path, work: Path) -> None:
-    """Make a folder of results the `runs/latest` of the commands that follow, as it is for a reader who types them."""
+    """Make a folder of results the `runs/latest` of the commands that follow, as it is for a
+    reader who types them.
+    """
     latest = work / "runs" / "latest"
     latest.parent.mkdir(exist_ok=True)
     latest.unlink(missing_ok=True)
@@ -78,8 +91,13 @@ def _take(picture: Picture, results: Path, target: Path) -> str:
     """Copy a picture out of a folder of results and return its new name."""
     found = sorted(results.glob(picture.file))
     if not found:
-        there = ", ".join(sorted(str(path.relative_to(results)) for path in results.rglob("*.png"))) or "no picture"
-        raise NoPicture(f"neusee {' '.join(picture.words)} wrote no {picture.file}; it wrote {there}")
+        there = (
+            ", ".join(sorted(str(path.relative_to(results)) for path in results.rglob("*.png")))
+            or "no picture"
+        )
+        raise NoPicture(
+            f"neusee {' '.join(picture.words)} wrote no {picture.file}; it wrote {there}"
+        )
     digest = hashlib.sha256(" ".join([*picture.words, picture.file]).encode()).hexdigest()[:12]
     name = f"{digest}{found[0].suffix}"
     shutil.copyfile(found[0], target / name)

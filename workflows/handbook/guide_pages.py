@@ -1,4 +1,6 @@
-"""The pages of the guide as text: their titles, the files that they define, and the pictures that they ask for."""
+"""The pages of the guide as text: their titles, the files that they define, and the pictures
+that they ask for.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +14,19 @@ import neusee.recipes
 
 GUIDE = Path(neusee.recipes.__file__).parent / "guide"
 
-#: a file of the reader: a fenced block whose first line is a comment with the path of the file below ``my/``
-_FILE = re.compile(r"^```\w+\n(?P<text># (?P<path>my/[\w/]+\.\w+)\b.*?)^```", re.MULTILINE | re.DOTALL)
+#: a file of the reader: a fenced block whose first line is a comment with the path of the file
+#: below ``my/``
+_FILE = re.compile(
+    r"^```\w+\n(?P<text># (?P<path>my/[\w/]+\.\w+)\b.*?)^```", re.MULTILINE | re.DOTALL
+)
 _COMMAND = re.compile(r"^    neusee (?P<words>.+)$", re.MULTILINE)
 _MARK = re.compile(r"^<!-- picture (?P<file>[\w./*-]+): (?P<caption>[^>]+?) -->$", re.MULTILINE)
 
 
 class Picture(NamedTuple):
-    """A picture of a page: a file in the folder of results of the command that stands before the picture."""
+    """A picture of a page: a file in the folder of results of the command that stands before the
+    picture.
+    """
 
     words: tuple[str, ...]
     file: str
@@ -28,7 +35,10 @@ class Picture(NamedTuple):
 
 def read_pages() -> dict[str, str]:
     """Return the text of each page of the guide by its path below the folder of the guide."""
-    return {str(path.relative_to(GUIDE)): path.read_text(encoding="utf-8") for path in sorted(GUIDE.rglob("*.md"))}
+    return {
+        str(path.relative_to(GUIDE)): path.read_text(encoding="utf-8")
+        for path in sorted(GUIDE.rglob("*.md"))
+    }
 
 
 def title_of(text: str) -> str:
@@ -47,17 +57,23 @@ def write_files(pages: Mapping[str, str], folder: Path) -> None:
 
 
 def pictures_of(text: str) -> Iterator[Picture]:
-    """Yield each picture of a page; raise ValueError for a picture that stands before the first command."""
+    """Yield each picture of a page; raise ValueError for a picture that stands before the first
+    command.
+    """
     for mark in _MARK.finditer(text):
         commands = _COMMAND.findall(text, 0, mark.start())
         if not commands:
-            raise ValueError(f"the picture {mark['file']} stands before the first command of its page")
+            raise ValueError(
+                f"the picture {mark['file']} stands before the first command of its page"
+            )
         words = tuple(shlex.split(commands[-1], comments=True))
         yield Picture(words, mark["file"], " ".join(mark["caption"].split()))
 
 
 def with_pictures(text: str, paths: Mapping[Picture, str]) -> str:
-    """Return the text of a page in which pictures take the place of their marks; other marks stay invisible."""
+    """Return the text of a page in which pictures take the place of their marks; other marks
+    stay invisible.
+    """
     wanted = pictures_of(text)
 
     def figure(mark: re.Match[str]) -> str:
@@ -65,8 +81,12 @@ def with_pictures(text: str, paths: Mapping[Picture, str]) -> str:
         if picture not in paths:
             return mark[0]
         shown = (
-            f"[![{picture.caption}]({paths[picture]})]({paths[picture]})"  # a click shows the picture at its full size
+            # a click shows the picture at its full size
+            f"[![{picture.caption}]({paths[picture]})]({paths[picture]})"
         )
-        return f'<figure markdown="span">\n{shown}\n<figcaption>{picture.caption}</figcaption>\n</figure>'
+        return (
+            "<figure"
+            f' markdown="span">\n{shown}\n<figcaption>{picture.caption}</figcaption>\n</figure>'
+        )
 
     return _MARK.sub(figure, text)

@@ -9,9 +9,13 @@ _CODE = re.compile(r"(``.+?``|`[^`]+`)", re.DOTALL)
 
 
 def escaped(text: str) -> str:
-    """Return a text in which signs that Markdown would read stand for themselves, outside of code."""
+    """Return a text in which signs that Markdown would read stand for themselves, outside of
+    code.
+    """
     parts = _CODE.split(text)
-    return "".join(part if n % 2 else re.sub(r"([\\*_<>\[\]|])", r"\\\1", part) for n, part in enumerate(parts))
+    return "".join(
+        part if n % 2 else re.sub(r"([\\*_<>\[\]|])", r"\\\1", part) for n, part in enumerate(parts)
+    )
 
 
 def cell(text: str) -> str:
@@ -35,7 +39,9 @@ def prose(text: str) -> list[str]:
 
 
 def _sentences(paragraph: str) -> Iterator[str]:
-    """Yield the lines of a paragraph; a line such as ``Source: …`` begins a paragraph of its own."""
+    """Yield the lines of a paragraph; a line such as ``Source: …`` begins a paragraph of its
+    own.
+    """
     for line in paragraph.splitlines():
         if named := re.match(r"([A-Z]\w+): ", line):
             yield from ("", f"**{named[1]}:** {escaped(line[named.end() :])}")

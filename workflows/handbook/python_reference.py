@@ -1,4 +1,6 @@
-"""The page of the handbook on Python, written from the signatures and docstrings of the public names."""
+"""The page of the handbook on Python, written from the signatures and docstrings of the public
+names.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,17 @@ from neusee.workflows.handbook.plain_markdown import prose
 def python_page() -> str:
     """Return the page on every public name of the package ``neusee``."""
     found = {name: getattr(neusee, name) for name in neusee.__all__ if not name.startswith("_")}
-    functions = [line for name, value in found.items() if not inspect.isclass(value) for line in _section(name, value)]
-    errors = {name for name, value in found.items() if inspect.isclass(value) and issubclass(value, Exception)}
+    functions = [
+        line
+        for name, value in found.items()
+        if not inspect.isclass(value)
+        for line in _section(name, value)
+    ]
+    errors = {
+        name
+        for name, value in found.items()
+        if inspect.isclass(value) and issubclass(value, Exception)
+    }
     classes = [
         line
         for name, value in found.items()
@@ -26,8 +37,14 @@ def python_page() -> str:
     opening = [
         "# Public names",
         "",
-        "These names are `neusee.load`, `neusee.run` and so on. The page [from Python](../python.md) has examples, and",
-        "[exceptions](../exceptions.md) says who raises what. The text below is that of the program itself.",
+        (
+            "These names are `neusee.load`, `neusee.run` and so on. The page [from"
+            " Python](../python.md) has examples, and"
+        ),
+        (
+            "[exceptions](../exceptions.md) says who raises what. The text below is that of the"
+            " program itself."
+        ),
         "",
         *prose(inspect.getdoc(neusee) or ""),
     ]
@@ -49,7 +66,9 @@ def _class(name: str, value: type) -> Iterator[str]:
     yield from _section(name, value)
     for method, function in vars(value).items():
         inner = function.fget if isinstance(function, property) else function
-        if not method.startswith("_") and (inspect.isfunction(inner) or isinstance(function, classmethod)):
+        if not method.startswith("_") and (
+            inspect.isfunction(inner) or isinstance(function, classmethod)
+        ):
             yield from _section(f"{name}.{method}", getattr(inner, "__func__", inner), "####")
 
 
@@ -59,5 +78,10 @@ def _signature(value: Any) -> str:
         found = inspect.signature(value)
     except (TypeError, ValueError):
         return "()"
-    shown = str(found.replace(parameters=[each for name, each in found.parameters.items() if name != "self"]))
-    return re.sub(r"<(?:function|class) '?([\w.]*\.)?(\w+)'?(?: at 0x[0-9a-f]+)?>", r"\2", shown)  # no address
+    shown = str(
+        found.replace(
+            parameters=[each for name, each in found.parameters.items() if name != "self"]
+        )
+    )
+    # no address
+    return re.sub(r"<(?:function|class) '?([\w.]*\.)?(\w+)'?(?: at 0x[0-9a-f]+)?>", r"\2", shown)

@@ -1,4 +1,6 @@
-"""The build of the handbook: pages, pictures and reference become a site that a browser opens as files."""
+"""The build of the handbook: pages, pictures and reference become a site that a browser opens as
+files.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ from neusee.workflows.handbook.guide_pages import (
 )
 from neusee.workflows.report.run_folder import writable_folder
 
-_MARK = ".neusee_handbook"  #: the file by which a folder is known as a handbook, which a new build may replace
+#: the file by which a folder is known as a handbook, which a new build may replace
+_MARK = ".neusee_handbook"
 _REST = "More"  #: the section of the pages that the list `nav` of the settings does not name
 _NEEDED = ("mkdocs", "material")
 
@@ -35,7 +38,9 @@ Tree = list[dict[str, Any]]
 
 
 class HandbookError(RuntimeError):
-    """Error for a handbook that cannot be built: a module is missing, the folder is in use, or MkDocs failed."""
+    """Error for a handbook that cannot be built: a module is missing, the folder is in use, or
+    MkDocs failed.
+    """
 
 
 def check_modules() -> None:
@@ -51,16 +56,24 @@ def check_folder(out: Path) -> None:
     except ValueError as error:
         raise HandbookError(f"--out: {error}") from None
     if out.is_dir() and any(out.iterdir()) and not (out / _MARK).is_file():
-        raise HandbookError(f"{out} holds files that are no handbook, and a build replaces a folder: name a new folder")
+        raise HandbookError(
+            f"{out} holds files that are no handbook, and a build replaces a folder: name a new"
+            " folder"
+        )
 
 
 def build_handbook(
-    out: Path, reference: Mapping[str, str], pictures: bool, progress: Callable[[str], None], strict: bool = False
+    out: Path,
+    reference: Mapping[str, str],
+    pictures: bool,
+    progress: Callable[[str], None],
+    strict: bool = False,
 ) -> Path:
     """Build the handbook in the folder ``out`` and return the path of its first page.
 
-    ``reference`` has the pages that the program writes about itself, by path. Without ``pictures`` no command of a page
-    runs. A ``strict`` build fails at a link that leads nowhere, and at a command of a page that fails.
+    ``reference`` has the pages that the program writes about itself, by path. Without ``pictures``
+    no command of a page runs. A ``strict`` build fails at a link that leads nowhere, and at a
+    command of a page that fails.
     """
     check_modules()
     check_folder(out)
@@ -78,17 +91,24 @@ def build_handbook(
 
 
 def settings_text(pages: Mapping[str, str], docs: Path, site: Path) -> str:
-    """Return the settings of MkDocs: those of the guide, with the folders, and every page in the list `nav`."""
+    """Return the settings of MkDocs: those of the guide, with the folders, and every page in the
+    list `nav`.
+    """
     yaml = YAML()
     settings = yaml.load(GUIDE / "mkdocs.yml")
-    settings |= {"docs_dir": str(docs), "site_dir": str(site), "nav": complete_nav(settings["nav"], pages)}
+    settings |= {
+        "docs_dir": str(docs),
+        "site_dir": str(site),
+        "nav": complete_nav(settings["nav"], pages),
+    }
     text = StringIO()
     yaml.dump(settings, text)
     return text.getvalue()
 
 
 def complete_nav(nav: Tree, pages: Mapping[str, str]) -> Tree:
-    """Return the list `nav` without pages that do not exist, and with a section of the pages that it does not name.
+    """Return the list `nav` without pages that do not exist, and with a section of the pages that
+    it does not name.
 
     An entry that ends in ``/`` stands for all pages in a folder.
     """
@@ -109,12 +129,20 @@ def _filled(entry: Any, pages: Mapping[str, str]) -> Any:
 
 def _named(entry: Any, pages: Mapping[str, str]) -> set[str]:
     if isinstance(entry, str):
-        return {path for path in pages if path == entry or (entry.endswith("/") and path.startswith(entry))}
+        return {
+            path
+            for path in pages
+            if path == entry or (entry.endswith("/") and path.startswith(entry))
+        }
     return {path for each in entry for inner in each.values() for path in _named(inner, pages)}
 
 
 def _draw(
-    pages: Mapping[str, str], work: Path, target: Path, progress: Callable[[str], None], strict: bool
+    pages: Mapping[str, str],
+    work: Path,
+    target: Path,
+    progress: Callable[[str], None],
+    strict: bool,
 ) -> dict[Picture, str]:
     write_files(pages, work)
     wanted = [picture for text in pages.values() for picture in pictures_of(text)]
@@ -123,7 +151,9 @@ def _draw(
 
 def _write_docs(pages: Mapping[str, str], drawn: Mapping[Picture, str], docs: Path) -> None:
     """Write the pages with their pictures, and the files of the guide that are no pages."""
-    shutil.copytree(GUIDE, docs, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.md", "mkdocs.yml"))
+    shutil.copytree(
+        GUIDE, docs, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.md", "mkdocs.yml")
+    )
     for path, text in pages.items():
         up = "../" * path.count("/")
         target = docs / path
@@ -135,9 +165,13 @@ def _write_docs(pages: Mapping[str, str], drawn: Mapping[Picture, str], docs: Pa
 def _run_mkdocs(settings: Path, strict: bool) -> None:
     words = ["build", "--quiet", *(["--strict"] if strict else []), "--config-file", str(settings)]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run([sys.executable, "-m", "mkdocs", *words], env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", *words], env=environment, capture_output=True, text=True
+    )
     if done.returncode:
-        raise HandbookError(f"mkdocs could not build the pages: {(done.stderr or done.stdout).strip()[-2000:]}")
+        raise HandbookError(
+            f"mkdocs could not build the pages: {(done.stderr or done.stdout).strip()[-2000:]}"
+        )
 
 
 def _replace(out: Path, site: Path) -> None:

@@ -1,8 +1,9 @@
-"""Cache keys: the key of a result is a digest of everything that determines the result, and of nothing else.
+"""Cache keys: the key of a result is a digest of everything that determines the result, and of
+nothing else.
 
-A key depends on the node with its code, the versions of the packages that the code imports, the parameters, the content
-of input files, the keys of the inputs and the random stream. A key does not depend on tensors, the number of threads
-or, except for random nodes, the device.
+A key depends on the node with its code, the versions of the packages that the code imports, the
+parameters, the content of input files, the keys of the inputs and the random stream. A key does not
+depend on tensors, the number of threads or, except for random nodes, the device.
 """
 
 from __future__ import annotations
@@ -22,11 +23,14 @@ if TYPE_CHECKING:
     from neusee.workflows.keys.code_digest import Code
 
 Key = str
-PRIVATE = "private-"  #: first letters of the key of a result that holds for one process alone and is not stored
+#: first letters of the key of a result that holds for one process alone and is not stored
+PRIVATE = "private-"
 
 
 def digest(*parts: Any) -> str:
-    """Return the digest of the JSON values ``parts`` as 32 hexadecimal digits; every bit of a float affects it."""
+    """Return the digest of the JSON values ``parts`` as 32 hexadecimal digits; every bit of a
+    float affects it.
+    """
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
@@ -34,7 +38,8 @@ def digest(*parts: Any) -> str:
 def key_of(
     step: Step, keys: Mapping[str, Key], seed: int, code: Code, device: str = "cpu"
 ) -> tuple[Key, dict[str, Any]]:
-    """Return the cache key of ``step`` and the data from which the key is computed, such as parameters.
+    """Return the cache key of ``step`` and the data from which the key is computed, such as
+    parameters.
 
     ``keys`` are the cache keys of the steps whose results are inputs of ``step``.
     """
@@ -49,13 +54,20 @@ def key_of(
         parts["written"] = said
     if node.random:
         parts["stream"] = [seed, step.name, device_kind(device)]
-    private = not step.cached or any(map(is_private, [parts["code"], *(keys[name] for name in step.sources)]))
+    private = not step.cached or any(
+        map(is_private, [parts["code"], *(keys[name] for name in step.sources)])
+    )
     return (PRIVATE + digest(parts)[:24] if private else digest(parts)), parts
 
 
 def code_of(step: Step, code: Code) -> str:
-    """Return the digest of the code of a step: of its node, and of the network classes that its parameters name."""
-    return code.of(step.node, tuple(dict.fromkeys((each.__module__, each.__qualname__) for each in networks_of(step))))
+    """Return the digest of the code of a step: of its node, and of the network classes that its
+    parameters name.
+    """
+    return code.of(
+        step.node,
+        tuple(dict.fromkeys((each.__module__, each.__qualname__) for each in networks_of(step))),
+    )
 
 
 def networks_of(step: Step) -> list[type[Any]]:
@@ -64,18 +76,24 @@ def networks_of(step: Step) -> list[type[Any]]:
 
 
 def _network_of(value: Any) -> type[Any] | None:
-    """Return the network class that a parameter names, or None for another value, without an import of torch."""
+    """Return the network class that a parameter names, or None for another value, without an
+    import of torch.
+    """
     module = sys.modules.get("neusee.nodes.network_classes")  # imported where there is such a value
     return value.network if module and isinstance(value, module.Architecture) else None
 
 
 def is_private(key: Key) -> bool:
-    """Return True for the key of a result that holds for one process alone, whose code may not be that of its file."""
+    """Return True for the key of a result that holds for one process alone, whose code may not
+    be that of its file.
+    """
     return key.startswith(PRIVATE)
 
 
 def stream_seed(seed: int, step: str) -> int:
-    """Return the seed of the random numbers of a step, which depends only on the recipe's seed and the step's name."""
+    """Return the seed of the random numbers of a step, which depends only on the recipe's seed
+    and the step's name.
+    """
     return int(digest(seed, step)[:15], 16)
 
 
@@ -91,7 +109,9 @@ def _keys_of(wire: Wire, keys: Mapping[str, Key]) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Return a step's parameter as JSON that is the same in every process; a file becomes the digest of its content."""
+    """Return a step's parameter as JSON that is the same in every process; a file becomes the
+    digest of its content.
+    """
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, float):
@@ -106,4 +126,6 @@ def plain(value: Any) -> Any:
         return {"class": f"{network.__module__}.{network.__qualname__}"}
     if isinstance(value, complex):
         return {"complex": [value.real, value.imag]}
-    raise TypeError(f"a parameter must be a number, a string, a file or a collection of these, not {value!r}")
+    raise TypeError(
+        f"a parameter must be a number, a string, a file or a collection of these, not {value!r}"
+    )

@@ -1,6 +1,8 @@
-"""Sealed files about code: the summaries of source files, so that a run from the cache parses no source.
+"""Sealed files about code: the summaries of source files, so that a run from the cache parses no
+source.
 
-A file that is damaged, of another format, or without the signature that is asked for is ignored and written again.
+A file that is damaged, of another format, or without the signature that is asked for is ignored and
+written again.
 """
 
 from __future__ import annotations
@@ -24,27 +26,49 @@ from neusee.workflows.keys.seal import seal_file, seal_record, secrets, unseal_f
 from neusee.workflows.keys.source_summary import Summary
 
 _SUMMARISING = (
-    *("source_summary", "unfollowed_constructs", "reachable_code", "code_objects", "syntax_pass", "outward_code"),
-    *("scopes_of_names", "hash_order", "facts_beside_content", "facts_of_the_moment", "literal_texts", "local_names"),
+    *(
+        "source_summary",
+        "unfollowed_constructs",
+        "reachable_code",
+        "code_objects",
+        "syntax_pass",
+        "outward_code",
+    ),
+    *(
+        "scopes_of_names",
+        "hash_order",
+        "facts_beside_content",
+        "facts_of_the_moment",
+        "literal_texts",
+        "local_names",
+    ),
     "scratch_files",
 )
 #: digest of the code that summarises a source file, so that an older summary is not used
-EDITION = xxhash.xxh3_64_hexdigest(b"".join(Path(__file__).with_name(f"{n}.py").read_bytes() for n in _SUMMARISING))
+EDITION = xxhash.xxh3_64_hexdigest(
+    b"".join(Path(__file__).with_name(f"{n}.py").read_bytes() for n in _SUMMARISING)
+)
 _KEPT = 1000  #: number of summaries in the file
-_right: dict[Path, tuple[int, ...]] = {}  #: stamps of files of digests that this process has read or written
+#: stamps of files of digests that this process has read or written
+_right: dict[Path, tuple[int, ...]] = {}
 
-Parts = dict[str, dict[str, str]]  #: digests of definitions, versions or contents, by module or other dependency
+#: digests of definitions, versions or contents, by module or other dependency
+Parts = dict[str, dict[str, str]]
 
 
 class Outline(NamedTuple):
-    """Digest of the syntax of a source file of the program, and the import statements at its top level."""
+    """Digest of the syntax of a source file of the program, and the import statements at its top
+    level.
+    """
 
     digest: str
     imports: list[tuple[str, list[str]]]  #: of ``from a import b``: the module and the names
 
 
-outlines: dict[str, Outline] = {}  #: of source files of the program, by the edition and the digest of the source
-known_contents: dict[str, str] = {}  #: digests of the files of packages, by the digest of the stamps of the files
+#: of source files of the program, by the edition and the digest of the source
+outlines: dict[str, Outline] = {}
+#: digests of the files of packages, by the digest of the stamps of the files
+known_contents: dict[str, str] = {}
 
 
 class _Known(NamedTuple):
@@ -62,7 +86,9 @@ _saved: dict[Path, int] = {}  #: number of outlines and of digests of packages i
 
 
 def read_memo(memo: Path) -> dict[str, Summary]:
-    """Return the saved summaries of source files, or an empty dict if their file is missing or damaged."""
+    """Return the saved summaries of source files, or an empty dict if their file is missing or
+    damaged.
+    """
     _saved[memo] = 0
     try:
         known, summaries = _read(memo.name, bytes_of(memo), secrets())
@@ -80,14 +106,18 @@ def read_memo(memo: Path) -> dict[str, Summary]:
 
 @functools.lru_cache(4)
 def _read(name: str, raw: bytes, signed_by: tuple[bytes, ...]) -> tuple[_Known, dict[str, Summary]]:
-    """Return what a memo says; the same bytes are read once in a process, for each list of secrets."""
+    """Return what a memo says; the same bytes are read once in a process, for each list of
+    secrets.
+    """
     seal, _, content = raw.partition(b"\n")
     known, text = unseal_file("sources", name, seal, content).split(b"\n", 1)
     return _KNOWN.validate_json(known), _SUMMARIES.validate_json(text)
 
 
 def is_complete(memo: Path) -> bool:
-    """Return True if a memo has an outline of each source file of the program, and of each package, that was read."""
+    """Return True if a memo has an outline of each source file of the program, and of each
+    package, that was read.
+    """
     return _saved.get(memo, 0) >= len(outlines) + len(known_contents)
 
 
@@ -99,11 +129,15 @@ def write_memo(memo: Path, summaries: Mapping[str, Summary]) -> None:
     known = _KNOWN.dump_json(_Known(distributions_of, newest, packages))
     text = json.dumps(dict(list(summaries.items())[-_KEPT:])).encode()
     content = b"\n".join([known, text])
-    _write(memo, b"\n".join([seal_file("sources", memo.name, content), content]), memo.parent / "tmp")
+    _write(
+        memo, b"\n".join([seal_file("sources", memo.name, content), content]), memo.parent / "tmp"
+    )
 
 
 def read_parts(root: Path, code: str) -> Parts:
-    """Return the digest of each definition that the digest ``code`` covers; {} if the record is missing or damaged."""
+    """Return the digest of each definition that the digest ``code`` covers; {} if the record is
+    missing or damaged.
+    """
     try:
         record = unseal_record("definitions", bytes_of(root / "code" / f"{code}.json"))
         return _PARTS.validate_python(record) if record.pop("key", "") == f"code/{code}" else {}
@@ -112,7 +146,9 @@ def read_parts(root: Path, code: str) -> Parts:
 
 
 def write_parts(root: Path, code: str, parts: Parts) -> None:
-    """Save the digest of each definition that the digest ``code`` covers, unless an undamaged record exists."""
+    """Save the digest of each definition that the digest ``code`` covers, unless an undamaged
+    record exists.
+    """
     path = root / "code" / f"{code}.json"
     with suppress(OSError):
         stamp = _stamp(path)

@@ -1,4 +1,5 @@
-"""Digests of compiled functions, which tell whether the code that a process runs is that of a source file.
+"""Digests of compiled functions, which tell whether the code that a process runs is that of a
+source file.
 
 Line numbers, file names and docstrings of modules and classes do not count.
 """
@@ -14,7 +15,9 @@ from types import CodeType
 import xxhash
 
 #: what the byte code of a source depends on beside the source
-PYTHON = f"{'{}.{}'.format(*sys.version_info)}-{importlib.util.MAGIC_NUMBER.hex()}-{sys.flags.optimize}"
+PYTHON = (
+    f"{'{}.{}'.format(*sys.version_info)}-{importlib.util.MAGIC_NUMBER.hex()}-{sys.flags.optimize}"
+)
 _MOST = 20_000  #: number of code objects whose digests are kept
 _known: dict[int, tuple[CodeType, str]] = {}  #: code objects with their digests, by id
 _SHORT = 12  #: digits of the digest of a code object
@@ -27,7 +30,9 @@ def functions_of(source: bytes) -> list[str]:
 
 
 def function_code(code: CodeType) -> str:
-    """Return the digest of a code object, which never changes, with its name, its constants and its inner functions."""
+    """Return the digest of a code object, which never changes, with its name, its constants and
+    its inner functions.
+    """
     known = _known.get(id(code))
     if known is None or known[0] is not code:
         if len(_known) > _MOST:
@@ -37,7 +42,9 @@ def function_code(code: CodeType) -> str:
 
 
 def _digest_of(code: CodeType) -> str:
-    consts = tuple(function_code(item) if isinstance(item, CodeType) else item for item in code.co_consts)
+    consts = tuple(
+        function_code(item) if isinstance(item, CodeType) else item for item in code.co_consts
+    )
     names = (code.co_qualname, code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars)
     sizes = (code.co_flags, code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount)
     raw = marshal.dumps((code.co_code, consts, names, sizes, code.co_exceptiontable), 2)

@@ -1,7 +1,8 @@
-"""Dependencies that a node declares with ``depends=`` or a module with ``__depends__``, and the constructs they cover.
+"""Dependencies that a node declares with ``depends=`` or a module with ``__depends__``, and the
+constructs they cover.
 
-An entry is a file or folder beside the module (``table.csv``), ``env:NAME``, the name of a module, or
-``unaffected:open``: the author states that no result depends on this construct.
+An entry is a file or folder beside the module (``table.csv``), ``env:NAME``, the name of a module,
+or ``unaffected:open``: the author states that no result depends on this construct.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from neusee.workflows.keys.unfollowed_constructs import Construct
 FREE = "unaffected:"
 VARIABLE = "env:"
 _FIX = {
-    "file": 'give it as a parameter of type Path, or declare it: depends=["{name}"], beside the module',
+    "file": (
+        'give it as a parameter of type Path, or declare it: depends=["{name}"], beside the module'
+    ),
     "env": 'make it a parameter, or declare it: depends=["env:{name}"]',
     "import": 'write the import as a statement, or declare each module: depends=["package.module"]',
     "run": 'declare the file or the module that it runs: depends=["kernel.cpp"]',
@@ -33,7 +36,9 @@ _NAME = {"file": "table.csv", "env": "NAME"}
 
 
 class Declared(NamedTuple):
-    """Declared dependencies: the digest of each, by its name, the modules among them, and the changed files."""
+    """Declared dependencies: the digest of each, by its name, the modules among them, and the
+    changed files.
+    """
 
     parts: dict[str, dict[str, str]]
     modules: list[str]
@@ -41,9 +46,14 @@ class Declared(NamedTuple):
 
 
 def resolve(
-    entries: Sequence[str], module: str, source: Path, then: Mapping[str, str | None], exists: Callable[[str], bool]
+    entries: Sequence[str],
+    module: str,
+    source: Path,
+    then: Mapping[str, str | None],
+    exists: Callable[[str], bool],
 ) -> Declared:
-    """Return the dependencies that a module declares; ``then`` are the variables of the environment at its import.
+    """Return the dependencies that a module declares; ``then`` are the variables of the environment
+    at its import.
 
     Raises `LookupError` for an entry that is neither a file nor a module.
     """
@@ -61,28 +71,42 @@ def resolve(
             elif all(part.isidentifier() for part in entry.split(".")) and exists(entry):
                 found.modules.append(entry)
             else:
-                text = f"{source}: depends={entry!r} is no file in {source.parent} and no module: correct the name"
+                text = (
+                    f"{source}: depends={entry!r} is no file in {source.parent} and no module:"
+                    " correct the name"
+                )
                 raise UnfollowedCode(text)
     return found
 
 
 def uncovered(found: Iterable[Construct], entries: Sequence[str]) -> Construct | None:
     """Return the first construct that no entry covers, or None."""
-    return next((item for item in found if not any(_covers(entry, item) for entry in entries)), None)
+    return next(
+        (item for item in found if not any(_covers(entry, item) for entry in entries)), None
+    )
 
 
 def refusal(item: Construct, source: Path) -> str:
     """Return the message that refuses a construct: its place, its text, the reason and the fix."""
     fix = _FIX[item.kind].format(name=item.name or _NAME.get(item.kind, ""))
-    free = f'or, if no result depends on it, depends=["{FREE}{item.text if item.text.isidentifier() else item.kind}"]'
-    return f"{source}:{item.line}: {item.text}: {item.why}, and a cache key cannot see it: {fix}; {free}"
+    free = (
+        "or, if no result depends on it,"
+        f' depends=["{FREE}{item.text if item.text.isidentifier() else item.kind}"]'
+    )
+    return (
+        f"{source}:{item.line}: {item.text}: {item.why}, and a cache key cannot see it: {fix};"
+        f" {free}"
+    )
 
 
 def changing_refusal(name: str, what: str, source: Path) -> str:
-    """Return the message that refuses a name of a module whose object changes while a process runs, or is not read."""
+    """Return the message that refuses a name of a module whose object changes while a process
+    runs, or is not read.
+    """
     return (
         f"{source}: {name} is or holds a {what}, and a cache key cannot see it: "
-        f'make it inside of the function that uses it; or, if no result depends on it, depends=["{FREE}{name}"]'
+        "make it inside of the function that uses it; or, if no result depends on it,"
+        f' depends=["{FREE}{name}"]'
     )
 
 
@@ -94,7 +118,11 @@ def _covers(entry: str, item: Construct) -> bool:
     if entry.startswith(VARIABLE):
         return item.kind == "env" and item.name in ("", entry.removeprefix(VARIABLE))
     if item.kind == "file":
-        return not item.name or not PurePath(entry).suffix or PurePath(entry).name == PurePath(item.name).name
+        return (
+            not item.name
+            or not PurePath(entry).suffix
+            or PurePath(entry).name == PurePath(item.name).name
+        )
     if item.kind == "source":
         return PurePath(entry).suffix == ".py"
     return item.kind in ("run", "import")
@@ -104,7 +132,9 @@ def _content(path: Path) -> str:
     """Return the digest of a file, or of all files of a folder with their names."""
     if not path.is_dir():
         return file_digest(path)
-    files = sorted(file for file in path.rglob("*") if file.is_file() and "__pycache__" not in file.parts)
+    files = sorted(
+        file for file in path.rglob("*") if file.is_file() and "__pycache__" not in file.parts
+    )
     return digest([[file.relative_to(path).as_posix(), file_digest(file)] for file in files])
 
 

@@ -1,7 +1,8 @@
-"""Digest of the program's own code, over given modules and all modules of `neusee.workflows` that they import.
+"""Digest of the program's own code, over given modules and all modules of `neusee.workflows` that
+they import.
 
-The key of a stored study, design or posterior contains this digest, so that changed code never leads to an old
-result. `code_digest.Code` computes the digests of nodes.
+The key of a stored study, design or posterior contains this digest, so that changed code never
+leads to an old result. `code_digest.Code` computes the digests of nodes.
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ _ROOT = "neusee.workflows"
 
 @functools.cache
 def engine(*modules: str) -> str:
-    """Return the digest of the code of some modules of neusee.workflows and of all modules that these import.
+    """Return the digest of the code of some modules of neusee.workflows and of all modules that
+    these import.
 
-    The default module is ``engine.runner``. Only imports of neusee.workflows at the top level of a module count.
-    Raises `LookupError` for a module without a source file.
+    The default module is ``engine.runner``. Only imports of neusee.workflows at the top level of a
+    module count. Raises `LookupError` for a module without a source file.
     """
     seen: dict[str, str] = {}
     todo = list(modules or ("engine.runner",))
@@ -36,14 +38,18 @@ def engine(*modules: str) -> str:
             continue
         path = _source(name)
         if path is None:
-            raise LookupError(f"{_ROOT}.{name} has no source file below {_HERE}, so its results have no cache key")
+            raise LookupError(
+                f"{_ROOT}.{name} has no source file below {_HERE}, so its results have no cache key"
+            )
         seen[name], imports = outline(path.read_bytes())
         todo += imported(imports)
     return digest(seen)
 
 
 def outline(source: bytes) -> Outline:
-    """Return the digest of a source file and the import statements at its top level; an equal source is parsed once."""
+    """Return the digest of a source file and the import statements at its top level; an equal
+    source is parsed once.
+    """
     name = f"{PYTHON}:{EDITION}:{xxhash.xxh3_128_hexdigest(source)}"
     if name not in outlines:
         outlines[name] = Outline(*syntax_outline(source))
@@ -51,7 +57,9 @@ def outline(source: bytes) -> Outline:
 
 
 def imported(statements: Iterable[tuple[str, list[str]]]) -> Iterator[str]:
-    """Yield the name of each module of neusee.workflows in import statements, such as ``engine.runner``."""
+    """Yield the name of each module of neusee.workflows in import statements, such as
+    ``engine.runner``.
+    """
     for base, names in statements:
         if not base:
             yield from (_below(name) for name in names if name.startswith(f"{_ROOT}."))

@@ -1,4 +1,5 @@
-"""Permissions below the root of a store: folders and files have the group and the permissions of the root.
+"""Permissions below the root of a store: folders and files have the group and the permissions of
+the root.
 
 A umask of 022 would take from the group what the owner of the root gave it.
 """
@@ -25,11 +26,14 @@ def make_folders(folder: str, root: str) -> None:
         os.mkdir(folder)
         inherit(folder, root, 0o7777)
         if os.stat(folder).st_gid != os.getegid():
-            os.chmod(folder, os.stat(folder).st_mode | stat.S_ISGID)  # what is made in it has its group
+            # what is made in it has its group
+            os.chmod(folder, os.stat(folder).st_mode | stat.S_ISGID)
 
 
 def inherit(path: str, root: str, mask: int) -> None:
-    """Give a file or folder the group of ``root``, and those of its permissions that are in ``mask``."""
+    """Give a file or folder the group of ``root``, and those of its permissions that are in
+    ``mask``.
+    """
     top, own = os.stat(root), os.stat(path)
     with suppress(OSError):  # of a group of which this user is no member
         if own.st_gid != top.st_gid:

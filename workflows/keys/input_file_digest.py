@@ -1,4 +1,6 @@
-"""Digest of the content of an input file, which is part of the cache key of each step that reads the file."""
+"""Digest of the content of an input file, which is part of the cache key of each step that reads
+the file.
+"""
 
 from __future__ import annotations
 
@@ -13,19 +15,21 @@ import xxhash
 
 from neusee.workflows.keys.regular_file import opened
 
-_SETTLED = 2_000_000_000  #: ns after a change of a file in which a second change may not change the time stamp
+#: ns after a change of a file in which a second change may not change the time stamp
+_SETTLED = 2_000_000_000
 _TICK = 20_000_000  #: ns, longer than a tick of the clock of a file system
 _TRIES = 3  #: readings of a file that changes while it is read
 _files: dict[tuple[int, ...], str] = {}
 
-Stamp = tuple[int, ...]  #: device, inode, size, and the times (ns) of the last change of content and of the entry
+#: device, inode, size, and the times (ns) of the last change of content and of the entry
+Stamp = tuple[int, ...]
 
 
 def file_digest(path: Path) -> str:
     """Return the xxh3 digest of a file; an unchanged file is read only once in a process.
 
-    A file that changed in the last two seconds is read each time, because its time stamp may not show a second change.
-    Raises `OSError` if the file changes each time while it is read.
+    A file that changed in the last two seconds is read each time, because its time stamp may not
+    show a second change. Raises `OSError` if the file changes each time while it is read.
     """
     for _ in range(_TRIES):
         stamp = _stamp(path)
@@ -43,8 +47,9 @@ def file_digest(path: Path) -> str:
 def file_stamps(value: Any) -> list[Stamp]:
     """Return a stamp of each file in a parameter or a collection of parameters.
 
-    Equal stamps before and after a reading say that the file was not replaced in between, not even by a file that was
-    taken away again. A file that changed in this moment is waited for, because its next change could have its stamp.
+    Equal stamps before and after a reading say that the file was not replaced in between, not even
+    by a file that was taken away again. A file that changed in this moment is waited for, because
+    its next change could have its stamp.
     """
     stamps = [_stamp(path) for path in files_in(value)]
     if stamps and time.time_ns() - max(max(stamp[-2:]) for stamp in stamps) < _TICK:
@@ -58,7 +63,11 @@ def files_in(value: Any) -> Iterable[Path]:
         return [value]
     if isinstance(value, Mapping):
         return [path for part in value.values() for path in files_in(part)]
-    return [path for part in value for path in files_in(part)] if isinstance(value, tuple | list) else []
+    return (
+        [path for part in value for path in files_in(part)]
+        if isinstance(value, tuple | list)
+        else []
+    )
 
 
 def _stamp(path: Path) -> Stamp:

@@ -1,9 +1,11 @@
-"""Content of installed packages that code of a user imports: which files have they, and what do they import?
+"""Content of installed packages that code of a user imports: which files have they, and what do
+they import?
 
-A version does not say which files a package has: a helper that is installed again under the same version, or edited in
-place, is other code. The packages that neusee itself declares count by their version alone, because their wheels differ
-between platforms and devices, and machines share results. Any other package counts by the content of its files, with
-the packages that it requires. Byte code, scripts and metadata do not count, so machines with equal wheels agree.
+A version does not say which files a package has: a helper that is installed again under the same
+version, or edited in place, is other code. The packages that neusee itself declares count by their
+version alone, because their wheels differ between platforms and devices, and machines share
+results. Any other package counts by the content of its files, with the packages that it requires.
+Byte code, scripts and metadata do not count, so machines with equal wheels agree.
 """
 
 from __future__ import annotations
@@ -27,13 +29,43 @@ from neusee.workflows.keys.regular_file import opened
 #: distributions that neusee declares for its users, in pyproject.toml, in the form of `plain`
 BY_VERSION = frozenset(
     {
-        *("arviz", "astropy", "colour_science", "dask", "dask_jobqueue", "deepinv", "distributed", "emcee", "fsspec"),
-        *("h5netcdf", "h5py", "jinja2", "kornia", "kornia_rs", "matplotlib", "numpy", "onnx", "onnxscript"),
-        *("openexr", "pillow", "pydantic", "rich", "ruamel_yaml", "safetensors", "scipy", "tensorboard"),
+        *(
+            "arviz",
+            "astropy",
+            "colour_science",
+            "dask",
+            "dask_jobqueue",
+            "deepinv",
+            "distributed",
+            "emcee",
+            "fsspec",
+        ),
+        *(
+            "h5netcdf",
+            "h5py",
+            "jinja2",
+            "kornia",
+            "kornia_rs",
+            "matplotlib",
+            "numpy",
+            "onnx",
+            "onnxscript",
+        ),
+        *(
+            "openexr",
+            "pillow",
+            "pydantic",
+            "rich",
+            "ruamel_yaml",
+            "safetensors",
+            "scipy",
+            "tensorboard",
+        ),
         *("torch", "typer", "xarray", "xxhash"),
     }
 )
-_SETTLED = 2_000_000_000  #: ns after a change of a file in which a second change may not change its time stamp
+#: ns after a change of a file in which a second change may not change its time stamp
+_SETTLED = 2_000_000_000
 _REQUIRED = re.compile(r"^Requires-Dist: *([\w.-]+)(.*)$", re.MULTILINE)
 _OF_AN_EXTRA = re.compile(r";.*\bextra *==")
 _PROGRAM = "neusee"
@@ -55,7 +87,8 @@ class Counted(NamedTuple):
 
 
 def counted(module: str, version: str) -> Counted:
-    """Return what an imported module of an installed package adds: its distributions, and those that they require.
+    """Return what an imported module of an installed package adds: its distributions, and those
+    that they require.
 
     ``version`` is what the module counts by if neusee declares its package.
     """
@@ -68,7 +101,9 @@ def counted(module: str, version: str) -> Counted:
 
 @functools.cache
 def _counted(top: str, version: str) -> Counted:
-    """Return what a top-level module of a package adds that neusee does not declare, as it was when first asked."""
+    """Return what a top-level module of a package adds that neusee does not declare, as it was
+    when first asked.
+    """
     own = [module_origin.plain(name) for name in module_origin.distributions_with(top)]
     found = {name: _content(name, top) for name in own}
     parts = {f"package {top}": {"version": version, "content": _joined(found.values())}}
@@ -86,17 +121,28 @@ def _joined(contents: Iterable[Content]) -> str:
 
 
 def _required(names: Iterable[str]) -> set[str]:
-    """Return the installed distributions that some distributions require, directly or not, without their extras.
+    """Return the installed distributions that some distributions require, directly or not, without
+    their extras.
 
-    What a package that neusee declares requires does not count, as it does not where a node imports that package.
+    What a package that neusee declares requires does not count, as it does not where a node imports
+    that package.
     """
     first = set(names)
     found, todo = set(first), [*first]
     while todo:
-        text = module_origin.metadata_text(todo.pop(), "METADATA").decode(errors="replace").partition("\n\n")[0]
+        text = (
+            module_origin.metadata_text(todo.pop(), "METADATA")
+            .decode(errors="replace")
+            .partition("\n\n")[0]
+        )
         for name, rest in _REQUIRED.findall(text):
             each = module_origin.plain(name)
-            if each in found or _OF_AN_EXTRA.search(rest) or each == _PROGRAM or not module_origin.released(each):
+            if (
+                each in found
+                or _OF_AN_EXTRA.search(rest)
+                or each == _PROGRAM
+                or not module_origin.released(each)
+            ):
                 continue
             found.add(each)
             todo += [] if each in BY_VERSION else [each]
@@ -104,7 +150,8 @@ def _required(names: Iterable[str]) -> set[str]:
 
 
 def _content(name: str, top: str) -> Content:
-    """Return the digest of the files of a distribution; ``top`` is its module if no record lists its files.
+    """Return the digest of the files of a distribution; ``top`` is its module if no record lists
+    its files.
 
     A digest is noted with the stamps of the files, so that the next process reads none of them.
     """
@@ -123,9 +170,11 @@ def _content(name: str, top: str) -> Content:
 
 
 def _files(name: str, top: str) -> dict[str, str]:
-    """Return the path of each file that the code of a distribution may be or read, by its path in the distribution.
+    """Return the path of each file that the code of a distribution may be or read, by its path in
+    the distribution.
 
-    The files are those of the record of its installation, and modules that stand in its packages without a record.
+    The files are those of the record of its installation, and modules that stand in its packages
+    without a record.
     """
     site = os.path.dirname(module_origin.metadata_folder(name))
     found = [*_recorded(module_origin.metadata_text(name, "RECORD").decode(errors="replace"))]
@@ -134,16 +183,22 @@ def _files(name: str, top: str) -> dict[str, str]:
         for package in sorted(each for each in folders if each.rpartition("/")[0] not in folders):
             found += filter(_is_module, _below(site, package))
     else:
-        found += [each for each in os.listdir(site) if each.partition(".")[0] == top and _is_module(each)]
+        found += [
+            each for each in os.listdir(site) if each.partition(".")[0] == top and _is_module(each)
+        ]
         found += _below(site, top)
     return {path: os.path.join(site, path) for path in found}
 
 
 def _recorded(record: str) -> Iterator[str]:
-    """Yield the files of a record: not metadata, byte code, or scripts outside of the folder of packages."""
+    """Yield the files of a record: not metadata, byte code, or scripts outside of the folder of
+    packages.
+    """
     for line in record.splitlines():
         path = line.rsplit(",", 2)[0].strip('"').replace("\\", "/")
-        outside = path.startswith(("..", "/")) or path.partition("/")[0].endswith((".dist-info", ".data"))
+        outside = path.startswith(("..", "/")) or path.partition("/")[0].endswith(
+            (".dist-info", ".data")
+        )
         if path and not outside and not path.endswith(_LEFT_OUT):
             yield path
 
@@ -161,7 +216,9 @@ def _is_module(file: str) -> bool:
 
 
 def _stamp(file: str) -> tuple[int, ...]:
-    """Return what changes whenever a file is changed, last the times of its content and entry; nothing if missing."""
+    """Return what changes whenever a file is changed, last the times of its content and entry;
+    nothing if missing.
+    """
     try:
         stat = os.stat(file)
     except OSError:

@@ -1,4 +1,6 @@
-"""Cache keys of recipes that follow one another, such as the points of a sweep: most steps keep the key they had."""
+"""Cache keys of recipes that follow one another, such as the points of a sweep: most steps keep
+the key they had.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ class _Known(NamedTuple):
 
 
 class KnownKeys:
-    """The newest cache key of each step; a key is computed again only if something that it depends on has changed.
+    """The newest cache key of each step; a key is computed again only if something that it depends
+    on has changed.
 
     The code of nodes counts as it is in ``code``, and files are read again each time.
     """
@@ -32,8 +35,12 @@ class KnownKeys:
         self.code = code
         self._newest: dict[str, _Known] = {}
 
-    def of(self, step: Step, keys: Mapping[str, Key], seed: int, device: str) -> tuple[Key, dict[str, Any]]:
-        """Return the cache key of ``step`` and the data from which the key is computed, as `key_of` does."""
+    def of(
+        self, step: Step, keys: Mapping[str, Key], seed: int, device: str
+    ) -> tuple[Key, dict[str, Any]]:
+        """Return the cache key of ``step`` and the data from which the key is computed, as
+        `key_of` does.
+        """
         beside = (seed, device_kind(device), *(keys[name] for name in step.sources))
         known = self._newest.get(step.name)
         if known is not None and known.beside == beside and _is_same(step, known.step):
@@ -47,7 +54,9 @@ class KnownKeys:
 
 
 def _is_same(step: Step, other: Step) -> bool:
-    """Return True if two steps of one name have the same node, inputs and parameters, to the sign of each zero."""
+    """Return True if two steps of one name have the same node, inputs and parameters, to the
+    sign of each zero.
+    """
     if step is other:
         return True
     same = step.node is other.node and step.wires == other.wires and step.cached == other.cached
@@ -56,7 +65,11 @@ def _is_same(step: Step, other: Step) -> bool:
 
 
 def _is_equal(one: Any, other: Any) -> bool:
-    """Return True for the same object, and for numbers and words that are equal and written alike."""
+    """Return True for the same object, and for numbers and words that are equal and written
+    alike.
+    """
     if one is other:
         return True
-    return type(one) is type(other) and isinstance(one, float | int | str) and repr(one) == repr(other)
+    return (
+        type(one) is type(other) and isinstance(one, float | int | str) and repr(one) == repr(other)
+    )

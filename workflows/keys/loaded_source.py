@@ -1,6 +1,8 @@
-"""Source of a loaded module: its file is read once, and a file that was edited after the import is told.
+"""Source of a loaded module: its file is read once, and a file that was edited after the import is
+told.
 
-Python runs the code that it loaded, whatever the file says later. The first reading holds for this process.
+Python runs the code that it loaded, whatever the file says later. The first reading holds for this
+process.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ import xxhash
 from neusee.nodes.import_times import import_time
 
 _edited_since: set[str] = set()  #: loaded modules whose source was edited after the import
-_frozen: dict[str, tuple[Any, bytes, str]] = {}  #: spec, source and its digest at the first reading, by module
+#: spec, source and its digest at the first reading, by module
+_frozen: dict[str, tuple[Any, bytes, str]] = {}
 _said: set[tuple[str, str]] = set()  #: warnings of this process
 
 
@@ -38,7 +41,9 @@ def source_of(module: str, path: Path) -> tuple[bytes, str]:
         _frozen[module] = (spec, *found)
         if _edited(module, spec, path):
             _edited_since.add(module)
-            say_once(module, f"{path} was edited after its import: restart Python to reuse new results")
+            say_once(
+                module, f"{path} was edited after its import: restart Python to reuse new results"
+            )
     return found
 
 
@@ -48,7 +53,9 @@ def edited_since(module: str) -> bool:
 
 
 def imported(module: str) -> bool:
-    """Import a module that a function imports later, so that its values count at once; return False if it fails."""
+    """Import a module that a function imports later, so that its values count at once; return
+    False if it fails.
+    """
     if module not in sys.modules:
         with suppress(Exception):
             importlib.import_module(module)
@@ -56,7 +63,9 @@ def imported(module: str) -> bool:
 
 
 def compiled_as_written(module: str) -> bool:
-    """Return True if the loader of a module compiles its source without a change, as an assertion rewriter does not."""
+    """Return True if the loader of a module compiles its source without a change, as an
+    assertion rewriter does not.
+    """
     return type(getattr(sys.modules.get(module), "__loader__", None)) is SourceFileLoader
 
 
@@ -68,7 +77,9 @@ def say_once(module: str, text: str) -> None:
 
 
 def _edited(module: str, spec: Any, path: Path) -> bool:
-    """Return True if a source file was changed after the import began, or after Python wrote the byte code."""
+    """Return True if a source file was changed after the import began, or after Python wrote the
+    byte code.
+    """
     stat = os.stat(path)
     if stat.st_ctime_ns > import_time(module):
         return True
@@ -78,5 +89,7 @@ def _edited(module: str, spec: Any, path: Path) -> bool:
         writable = os.access(os.path.dirname(spec.cached), os.W_OK) and not sys.dont_write_bytecode
     except OSError:
         return False
-    stamp = b"".join((int(n) & 0xFFFFFFFF).to_bytes(4, "little") for n in (stat.st_mtime, stat.st_size))
+    stamp = b"".join(
+        (int(n) & 0xFFFFFFFF).to_bytes(4, "little") for n in (stat.st_mtime, stat.st_size)
+    )
     return writable and head[4:8] == bytes(4) and head[8:] != stamp

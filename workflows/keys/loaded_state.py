@@ -1,8 +1,10 @@
-"""State of a loaded module: the values of its constants, tables, defaults and closures, and the functions it names.
+"""State of a loaded module: the values of its constants, tables, defaults and closures, and the
+functions it names.
 
-The source of a module says how its names get their values. What a process computes with are the values themselves: a
-table that another module filled, a constant or function that was replaced, a default that an import computed.
-Values of classes of other packages count by their type alone, also where their own methods fail.
+The source of a module says how its names get their values. What a process computes with are the
+values themselves: a table that another module filled, a constant or function that was replaced, a
+default that an import computed. Values of classes of other packages count by their type alone, also
+where their own methods fail.
 """
 
 from __future__ import annotations
@@ -20,7 +22,14 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from enum import Enum
 from fractions import Fraction
 from pathlib import PurePath
-from types import BuiltinFunctionType, CellType, FunctionType, MethodType, ModuleType, SimpleNamespace
+from types import (
+    BuiltinFunctionType,
+    CellType,
+    FunctionType,
+    MethodType,
+    ModuleType,
+    SimpleNamespace,
+)
 from typing import Any
 
 import numpy as np
@@ -37,12 +46,29 @@ from neusee.workflows.keys.source_summary import Summary
 _DISPATCH = getattr(
     functools.singledispatch(str), "__code__", None
 )  #: of a function that a type chooses, whose closure holds a cache
-_SKIPPED = re.compile(r"__\w+__|_abc_\w*|model_\w+|__pydantic\w*")  #: names of a class that its source decides
-_FORETELLING = frozenset({"shape", "work", "example"})  #: hooks that decide no result: size, cost, and a call to try
+#: names of a class that its source decides
+_SKIPPED = re.compile(r"__\w+__|_abc_\w*|model_\w+|__pydantic\w*")
+#: hooks that decide no result: size, cost, and a call to try
+_FORETELLING = frozenset({"shape", "work", "example"})
 _KINDS: tuple[tuple[str, tuple[type, ...]], ...] = (
     ("text", (str, PurePath)),
     ("object", (Enum,)),
-    ("plain", (bool, int, float, complex, bytes, type(None), type(...), range, slice, re.Pattern, Fraction)),
+    (
+        "plain",
+        (
+            bool,
+            int,
+            float,
+            complex,
+            bytes,
+            type(None),
+            type(...),
+            range,
+            slice,
+            re.Pattern,
+            Fraction,
+        ),
+    ),
     ("plain", (torch.dtype, torch.device, torch.Size, np.dtype, np.generic)),
     ("plain", (operator.itemgetter, operator.attrgetter, operator.methodcaller)),
     ("builtin", (BuiltinFunctionType,)),
@@ -50,7 +76,17 @@ _KINDS: tuple[tuple[str, tuple[type, ...]], ...] = (
     ("function", (FunctionType,)),
     ("class", (type,)),
     ("array", (torch.Tensor, np.ndarray)),
-    ("changing", (torch.Generator, np.random.Generator, np.random.RandomState, random.Random, io.IOBase, mmap.mmap)),
+    (
+        "changing",
+        (
+            torch.Generator,
+            np.random.Generator,
+            np.random.RandomState,
+            random.Random,
+            io.IOBase,
+            mmap.mmap,
+        ),
+    ),
     ("table", (Mapping,)),
     ("list", (list, tuple, deque)),
     ("set", (set, frozenset)),
@@ -76,25 +112,39 @@ _HOW = _Hows()
 
 
 class LoadedState:
-    """The state of a loaded module, as a digest, with the modules of the functions and classes that it names."""
+    """The state of a loaded module, as a digest, with the modules of the functions and classes
+    that it names.
+    """
 
     def __init__(
-        self, module: ModuleType, functions: Collection[str], followed: Callable[[str], bool], lazy: bool = True
+        self,
+        module: ModuleType,
+        functions: Collection[str],
+        followed: Callable[[str], bool],
+        lazy: bool = True,
     ) -> None:
-        """Describe a module; without ``lazy`` not what a ``cached_property`` holds, which the rest decides."""
-        self.modules: dict[str, set[str]] = {}  #: names of functions and classes that the module holds, by module
-        self.replaced: list[str] = []  #: functions of the module's own file whose code is not that of the file
-        self.changing: dict[str, str] = {}  #: objects such as generators, and why, by the name that is or holds them
+        """Describe a module; without ``lazy`` not what a ``cached_property`` holds, which the
+        rest decides.
+        """
+        #: names of functions and classes that the module holds, by module
+        self.modules: dict[str, set[str]] = {}
+        #: functions of the module's own file whose code is not that of the file
+        self.replaced: list[str] = []
+        #: objects such as generators, and why, by the name that is or holds them
+        self.changing: dict[str, str] = {}
         self._changes: list[str] = []
         self._holds: dict[int, list[str]] = {}  # changes in repeated objects, by id
         self._name, self._file = module.__name__, getattr(module, "__file__", "") or ""
         self._folder = self._file.rpartition("/")[0] or "."
         self._functions, self._followed, self._lazy = frozenset(functions), followed, lazy
         self._seen: dict[int, int] = {}
-        self._kept: list[Any] = []  # objects whose id is in _seen, so that no other object gets the same id
+        # objects whose id is in _seen, so that no other object gets the same id
+        self._kept: list[Any] = []
 
     def digest(self, values: Mapping[str, Any]) -> str:
-        """Return the digest of named values of the module; names such as ``__file__`` do not count."""
+        """Return the digest of named values of the module; names such as ``__file__`` do not
+        count.
+        """
         state: list[Any] = []
         for name in sorted(values):
             if name == "__getattr__" or not (name.startswith("__") and name.endswith("__")):
@@ -105,14 +155,18 @@ class LoadedState:
         return xxhash.xxh3_128_hexdigest(repr(state).encode(errors="surrogatepass"))
 
     def _shallow(self, value: Any) -> Any:
-        """Return a value as text and tuples, or its type if it holds itself, or much, one in the other without end."""
+        """Return a value as text and tuples, or its type if it holds itself, or much, one in the
+        other without end.
+        """
         try:
             return self._of(value)
         except RecursionError:
             return self._unread(value, "is nested too deeply")
 
     def _of(self, value: Any) -> Any:
-        """Return a value as text and tuples that are the same in each process; a repeated object is its number."""
+        """Return a value as text and tuples that are the same in each process; a repeated object
+        is its number.
+        """
         if value is None:
             return _NOTHING
         how = _HOW[type(value)]
@@ -135,7 +189,9 @@ class LoadedState:
         return told
 
     def _unread(self, value: Any, why: str) -> str:
-        """Return the type of a value whose parts cannot be told; note it if the parts of such a value count."""
+        """Return the type of a value whose parts cannot be told; note it if the parts of such a
+        value count.
+        """
         kind = type(value)
         if kind.__module__ == "builtins" or self._followed(_home(kind)):
             self._changes.append(f"{kind.__name__}, which {why}")
@@ -160,15 +216,23 @@ class LoadedState:
         if plain.dtype.hasobject:
             return type(value).__name__, str(plain.dtype), plain.shape, self._of(plain.tolist())
         mask = np.ma.getmask(value) if isinstance(value, np.ma.MaskedArray) else np.ma.nomask
-        return type(value).__name__, *_array(plain), *(_array(mask) if isinstance(mask, np.ndarray) else ())
+        return (
+            type(value).__name__,
+            *_array(plain),
+            *(_array(mask) if isinstance(mask, np.ndarray) else ()),
+        )
 
     def _changing(self, value: Any) -> Any:
-        """Note an object that changes while a process runs, such as a generator or a file, and return its type."""
+        """Note an object that changes while a process runs, such as a generator or a file, and
+        return its type.
+        """
         self._changes.append(f"{type(value).__name__}, which changes while a process runs")
         return self._typed(value)
 
     def _table(self, value: Any) -> Any:
-        return self._typed(value), [(self._of(key), self._of(part)) for key, part in list(value.items())]
+        return self._typed(value), [
+            (self._of(key), self._of(part)) for key, part in list(value.items())
+        ]
 
     def _list(self, value: Any) -> Any:
         return self._typed(value), [self._of(part) for part in value]
@@ -192,19 +256,29 @@ class LoadedState:
         return "property", self._of(value.fget), self._of(value.fset)
 
     def _wrapped(self, value: Any) -> Any:
-        return type(value).__name__, self._of(getattr(value, "__func__", None) or getattr(value, "func", None))
+        return type(value).__name__, self._of(
+            getattr(value, "__func__", None) or getattr(value, "func", None)
+        )
 
     def _object(self, value: Any) -> Any:
-        """Return an object that is no container: by its parts if the source of its class is followed, else by type.
+        """Return an object that is no container: by its parts if the source of its class is
+        followed, else by type.
 
         A module of torch counts by its parts, whose weights others may have set.
         """
         kind = type(value)
         if kind is SimpleNamespace or issubclass(kind, nn.Module) or self._followed(_home(kind)):
-            parts = [(name, part) for name, part in _attributes(value) if self._lazy or not _is_lazy(kind, name)]
+            parts = [
+                (name, part)
+                for name, part in _attributes(value)
+                if self._lazy or not _is_lazy(kind, name)
+            ]
             return self._typed(value), [(name, self._of(part)) for name, part in parts]
         # a class that answers to each name answers to this one too
-        wraps = kind.__module__ != "typing" and inspect.getattr_static(value, "__wrapped__", None) is not None
+        wraps = (
+            kind.__module__ != "typing"
+            and inspect.getattr_static(value, "__wrapped__", None) is not None
+        )
         inner = value.__wrapped__ if wraps else None
         return self._typed(value), self._of(inner) if callable(inner) else ""
 
@@ -213,7 +287,9 @@ class LoadedState:
         home, code = str(function.__globals__.get("__name__")), function.__code__
         if code is _DISPATCH:
             kinds: Mapping[type, Any] = function.registry  # type: ignore[attr-defined]
-            parts = sorted(kinds.items(), key=lambda item: f"{item[0].__module__}.{item[0].__qualname__}")
+            parts = sorted(
+                kinds.items(), key=lambda item: f"{item[0].__module__}.{item[0].__qualname__}"
+            )
             return "singledispatch", [(self._of(kind), self._of(part)) for kind, part in parts]
         own = home == self._name and code.co_filename == self._file
         if home != self._name:
@@ -221,11 +297,17 @@ class LoadedState:
         if own and self._functions and function_code(code) not in self._functions:
             self.replaced.append(function.__qualname__)
         local = own or not _found(home, function)
-        held = (function.__defaults__, function.__kwdefaults__, function.__closure__) if local else ()
+        held = (
+            (function.__defaults__, function.__kwdefaults__, function.__closure__) if local else ()
+        )
         exact = function_code(code) if local and not own and self._followed(home) else ""
         told = [part and self._of(part) for part in held]
         if own and is_own(home):  # an attribute of a function may hold what a call left in it
-            told += [(name, self._of(part)) for name, part in vars(function).items() if name != "__wrapped__"]
+            told += [
+                (name, self._of(part))
+                for name, part in vars(function).items()
+                if name != "__wrapped__"
+            ]
         return "function", home, code.co_qualname, exact, told
 
     def _class(self, kind: type) -> Any:
@@ -235,7 +317,11 @@ class LoadedState:
         bases = [(base.__module__, base.__qualname__) for base in kind.__mro__[1:]]
         for base in kind.__mro__[1:]:
             self._noted(base.__module__, base.__qualname__)
-        parts = [(name, part) for name, part in vars(kind).items() if not _SKIPPED.fullmatch(name) or _is_method(part)]
+        parts = [
+            (name, part)
+            for name, part in vars(kind).items()
+            if not _SKIPPED.fullmatch(name) or _is_method(part)
+        ]
         return name, bases, [(name, self._of(part)) for name, part in parts]
 
     def _typed(self, value: Any) -> str:
@@ -243,13 +329,17 @@ class LoadedState:
         return f"{self._noted(_home(kind), kind.__qualname__)}.{kind.__qualname__}"
 
     def _noted(self, module: str, name: str = "") -> str:
-        """Note a function or class that the state contains, or a whole module, if its source is followed."""
+        """Note a function or class that the state contains, or a whole module, if its source is
+        followed.
+        """
         if module != self._name and self._followed(module):
             self.modules.setdefault(module, set()).add(name.partition(".")[0])
         return module
 
     def _placed(self, text: str) -> str:
-        """Return a text without the folder of the module, so that it is the same for each place of installation."""
+        """Return a text without the folder of the module, so that it is the same for each place
+        of installation.
+        """
         return text.replace(self._folder, "<folder>") if self._folder in text else text
 
 
@@ -261,8 +351,12 @@ _DESCRIBED: dict[str, Callable[[LoadedState, Any], Any]] = {
 }
 
 
-def counted_values(module: ModuleType, summary: Summary, free: Collection[str], root: bool) -> dict[str, Any]:
-    """Return the values of a loaded module that count: of a node's own module, those that its nodes reach."""
+def counted_values(
+    module: ModuleType, summary: Summary, free: Collection[str], root: bool
+) -> dict[str, Any]:
+    """Return the values of a loaded module that count: of a node's own module, those that its
+    nodes reach.
+    """
     values = {name: value for name, value in vars(module).items() if name not in free}
     nodes = [name for name, value in values.items() if root and issubclass(type(value), Node)]
     if nodes:
@@ -273,10 +367,20 @@ def counted_values(module: ModuleType, summary: Summary, free: Collection[str], 
     return {name: value for name, value in values.items() if name not in noted}
 
 
-def without_modules(package: str, values: Mapping[str, Any], left_out: Callable[[str], bool]) -> dict[str, Any]:
-    """Return the values of a package without those of its own modules whose names are ``left_out``."""
-    inside = {name for name, value in values.items() if value is sys.modules.get(f"{package}.{name}")}
-    return {name: value for name, value in values.items() if name not in inside or not left_out(f"{package}.{name}")}
+def without_modules(
+    package: str, values: Mapping[str, Any], left_out: Callable[[str], bool]
+) -> dict[str, Any]:
+    """Return the values of a package without those of its own modules whose names are
+    ``left_out``.
+    """
+    inside = {
+        name for name, value in values.items() if value is sys.modules.get(f"{package}.{name}")
+    }
+    return {
+        name: value
+        for name, value in values.items()
+        if name not in inside or not left_out(f"{package}.{name}")
+    }
 
 
 def _hooks(node: Node) -> Iterator[Any]:
@@ -292,7 +396,11 @@ def _array(value: Any) -> tuple[Any, ...]:
         if value.device.type == "meta" or value.layout != torch.strided:
             return str(value.dtype), tuple(value.shape)
         flat = value.detach().cpu().contiguous().reshape(-1)
-        raw: Any = flat.resolve_conj().resolve_neg().view(torch.uint8).numpy().data if flat.numel() else b""
+        raw: Any = (
+            flat.resolve_conj().resolve_neg().view(torch.uint8).numpy().data
+            if flat.numel()
+            else b""
+        )
     elif value.flags.c_contiguous and value.dtype.kind in "biufc":
         raw = value.data  # without a copy
     else:
@@ -302,8 +410,14 @@ def _array(value: Any) -> tuple[Any, ...]:
 
 def _attributes(value: Any) -> list[tuple[str, Any]]:
     """Return the attributes of an object, from its ``__dict__`` and its slots."""
-    slots = {slot for base in type(value).__mro__ for slot in _named(vars(base).get("__slots__", ()))}
-    found = {slot: getattr(value, slot) for slot in sorted(slots) if not slot.startswith("__") and hasattr(value, slot)}
+    slots = {
+        slot for base in type(value).__mro__ for slot in _named(vars(base).get("__slots__", ()))
+    }
+    found = {
+        slot: getattr(value, slot)
+        for slot in sorted(slots)
+        if not slot.startswith("__") and hasattr(value, slot)
+    }
     return list({**found, **getattr(value, "__dict__", {})}.items())
 
 
@@ -333,7 +447,9 @@ def _content(cell: CellType) -> Any:
 
 
 def _found(module: str, function: FunctionType) -> bool:
-    """Return True if a function is what its module has under its name, so that the source of the module decides it."""
+    """Return True if a function is what its module has under its name, so that the source of the
+    module decides it.
+    """
     found: Any = sys.modules.get(module)
     for name in function.__qualname__.split("."):
         found = getattr(found, name, None)

@@ -1,4 +1,6 @@
-"""What one module adds to the digest of a node, and the digest of a module with all that it imports."""
+"""What one module adds to the digest of a node, and the digest of a module with all that it
+imports.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from neusee.workflows.keys.loaded_source import say_once
 from neusee.workflows.keys.source_summary import Summary
 
 OURS = frozenset({"neusee"})  #: packages that are followed by source for a node of neusee
-Names = dict[str, set[str]]  #: names that are used of each module; an empty name stands for all of them
+#: names that are used of each module; an empty name stands for all of them
+Names = dict[str, set[str]]
 
 
 class Look(NamedTuple):
@@ -23,7 +26,8 @@ class Look(NamedTuple):
     summary: Summary | None = None  #: None for a module that counts by its version
     path: Path | None = None
     state: str = ""
-    changing: Mapping[str, str] = {}  #: loaded objects that no digest covers, such as generators, and why, by name
+    #: loaded objects that no digest covers, such as generators, and why, by name
+    changing: Mapping[str, str] = {}
     private: bool = False  #: True if the loaded code is not that of the file
 
 
@@ -45,17 +49,27 @@ def digest_of(look: Look, documents: bool) -> list[Any]:
     if look.summary is None:
         return [look.parts]
     source = look.summary.whole if documents else look.summary.tree
-    other = {name: part for name, part in look.parts.items() if name.startswith(("file ", "environment "))}
+    other = {
+        name: part
+        for name, part in look.parts.items()
+        if name.startswith(("file ", "environment "))
+    }
     return [source, look.state, other]
 
 
 def installed_look(module: str, version: str, packages: frozenset[str]) -> Look:
-    """Return what a module of an installed package adds, where ``packages`` are followed by source; without a version,
-    that it is missing.
+    """Return what a module of an installed package adds, where ``packages`` are followed by source;
+    without a version, that it is missing.
     """
     if not version or packages == OURS:
-        return Look({f"package {module.partition('.')[0]}": {"version": version or "not installed"}}, {})
+        return Look(
+            {f"package {module.partition('.')[0]}": {"version": version or "not installed"}}, {}
+        )
     found = counted(module, version)
     if found.edited:
-        say_once(module, f"the package {found.edited} was changed after its import: restart Python to store results")
+        say_once(
+            module,
+            f"the package {found.edited} was changed after its import: restart Python to store"
+            " results",
+        )
     return Look(found.parts, {}, private=bool(found.edited))

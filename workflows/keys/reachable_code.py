@@ -1,4 +1,6 @@
-"""Statements of a module that a node may run: what the module runs at import, and what the names in use refer to."""
+"""Statements of a module that a node may run: what the module runs at import, and what the names
+in use refer to.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +31,19 @@ def statements(blocks: Iterable[Block]) -> list[Statement]:
 
 
 def reached(parts: Sequence[Statement], names: Collection[str] | None) -> Iterator[range]:
-    """Yield the lines of the statements that the use of some names, or None for all names, may run."""
+    """Yield the lines of the statements that the use of some names, or None for all names, may
+    run.
+    """
     if names is None or "*" in names:
         yield from (range(part.first, part.last + 1) for part in parts)
         return
     wanted, seen = set(names), set[int]()
     while True:
-        new = [n for n, part in enumerate(parts) if n not in seen and (not part.binds or wanted & {*part.binds})]
+        new = [
+            n
+            for n, part in enumerate(parts)
+            if n not in seen and (not part.binds or wanted & {*part.binds})
+        ]
         if not new:
             return
         for n in new:
@@ -45,7 +53,9 @@ def reached(parts: Sequence[Statement], names: Collection[str] | None) -> Iterat
 
 
 def read_names(parts: Sequence[Statement], names: Collection[str]) -> set[str]:
-    """Return the names that the statements read which the use of some names, or of all if none is given, may run."""
+    """Return the names that the statements read which the use of some names, or of all if none
+    is given, may run.
+    """
     wanted = set(names) or {name for part in parts for name in part.binds}
     while True:
         run = [part for part in parts if not part.binds or wanted & {*part.binds}]
@@ -56,8 +66,12 @@ def read_names(parts: Sequence[Statement], names: Collection[str]) -> set[str]:
 
 
 def written_only(parts: Sequence[Statement]) -> set[str]:
-    """Return the names whose objects a module changes and that none of its code reads, such as a log."""
-    return {name for part in parts for name in part.writes} - {name for part in parts for name in part.refers}
+    """Return the names whose objects a module changes and that none of its code reads, such as a
+    log.
+    """
+    return {name for part in parts for name in part.writes} - {
+        name for part in parts for name in part.refers
+    }
 
 
 def _statement(item: ast.stmt, kinds: Kinds) -> Statement:
@@ -67,11 +81,15 @@ def _statement(item: ast.stmt, kinds: Kinds) -> Statement:
     loads = [part for part in each(kinds, ast.Name) if isinstance(part.ctx, ast.Load)]
     refers = {part.id for part in loads if id(part) not in written}
     writes = {part.id for part in loads if id(part) in written}
-    return Statement(first, item.end_lineno or item.lineno, sorted(_binds(item)), sorted(refers), sorted(writes))
+    return Statement(
+        first, item.end_lineno or item.lineno, sorted(_binds(item)), sorted(refers), sorted(writes)
+    )
 
 
 def _noted(kinds: Kinds) -> Iterator[ast.AST]:
-    """Yield the name in ``name.append(x)`` and ``name[i] = x``, which write to an object and do not read it."""
+    """Yield the name in ``name.append(x)`` and ``name[i] = x``, which write to an object and do
+    not read it.
+    """
     for item in each(kinds, ast.Expr):
         called = item.value.func if isinstance(item.value, ast.Call) else None
         if isinstance(called, ast.Attribute) and called.attr in _WRITERS:

@@ -1,7 +1,8 @@
-"""Reading of files of the program's own kinds: texts, documents and records, never of what is no regular file.
+"""Reading of files of the program's own kinds: texts, documents and records, never of what is no
+regular file.
 
-A pipe, a device or a socket in the place of a file makes nobody wait, and a file that is too long for its kind is not
-read. This module imports little, because the fast commands read files with it.
+A pipe, a device or a socket in the place of a file makes nobody wait, and a file that is too long
+for its kind is not read. This module imports little, because the fast commands read files with it.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ class NotRegular(OSError, ValueError):
 
 
 def refuse_other_than_file(path: Path | str) -> None:
-    """Raise `NotRegular` for a pipe, a device, a socket or a folder; a file that is missing passes."""
+    """Raise `NotRegular` for a pipe, a device, a socket or a folder; a file that is missing
+    passes.
+    """
     try:
         mode = os.stat(path).st_mode
     except OSError:
@@ -35,7 +38,9 @@ def _refuse(path: Path | str, mode: int) -> None:
 
 
 def opened(path: Path | str) -> BufferedReader:
-    """Open a regular file to read its bytes, without waiting; raise `NotRegular` for anything else."""
+    """Open a regular file to read its bytes, without waiting; raise `NotRegular` for anything
+    else.
+    """
     refuse_other_than_file(path)  # some devices do something when they are opened
     number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
@@ -47,11 +52,15 @@ def opened(path: Path | str) -> BufferedReader:
 
 
 def bytes_of(path: Path | str, most: int = MOST) -> bytes:
-    """Return the bytes of a regular file; raise `NotRegular` for anything else, and for more than ``most`` bytes."""
+    """Return the bytes of a regular file; raise `NotRegular` for anything else, and for more
+    than ``most`` bytes.
+    """
     with opened(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
-            raise NotRegular(f"{path} has {size} bytes, more than the limit of {most}: give a shorter file")
+            raise NotRegular(
+                f"{path} has {size} bytes, more than the limit of {most}: give a shorter file"
+            )
         return file.read(size)
 
 
@@ -61,6 +70,10 @@ def head_of(path: Path | str, count: int) -> bytes:
         return file.read(count)
 
 
-def text_of(path: Path | str, encoding: str = "utf-8", errors: str = "strict", most: int = MOST) -> str:
-    """Return the text of a regular file, with ``\\n`` at the end of each line; raise what `bytes_of` raises."""
+def text_of(
+    path: Path | str, encoding: str = "utf-8", errors: str = "strict", most: int = MOST
+) -> str:
+    """Return the text of a regular file, with ``\\n`` at the end of each line; raise what
+    `bytes_of` raises.
+    """
     return bytes_of(path, most).decode(encoding, errors).replace("\r\n", "\n").replace("\r", "\n")

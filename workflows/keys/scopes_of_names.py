@@ -1,4 +1,5 @@
-"""What a name in a function or a module stands for: an import, an argument, something of the module, or a new object.
+"""What a name in a function or a module stands for: an import, an argument, something of the
+module, or a new object.
 
 A name that is assigned stands for all that the expressions on the right side are parts of.
 """
@@ -13,16 +14,32 @@ from typing import Literal, NamedTuple
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 _INNER = (*_FUNCTIONS, ast.ClassDef)
 _SELF, _CLASS = frozenset({"self", "ctx"}), frozenset({"cls", "mcs", "metacls"})
-_THROUGH = ("getattr", "vars", "iter", "reversed", "enumerate", "zip", "list", "tuple")  #: give a part of what they get
+#: give a part of what they get
+_THROUGH = ("getattr", "vars", "iter", "reversed", "enumerate", "zip", "list", "tuple")
 #: packages whose functions return new objects
-_NEW = frozenset({"torch", "numpy", "scipy", "math", "copy", "json", "neusee", "collections", "functools", "itertools"})
+_NEW = frozenset(
+    {
+        "torch",
+        "numpy",
+        "scipy",
+        "math",
+        "copy",
+        "json",
+        "neusee",
+        "collections",
+        "functools",
+        "itertools",
+    }
+)
 
 
 class Root(NamedTuple):
     """What the first name of an expression stands for."""
 
     kind: Literal["import", "own", "argument", "class"]
-    name: str  #: full name of an import, with the attributes that follow; ``()`` stands for the result of a call
+    #: full name of an import, with the attributes that follow; ``()`` stands for the result of a
+    #: call
+    name: str
 
 
 class Scope:
@@ -32,7 +49,11 @@ class Scope:
         self.above = above
         self.is_module = above is None
         inner = getattr(item, "args", None) if isinstance(item, _FUNCTIONS) else None
-        self.arguments = {part.arg for part in ast.walk(inner) if isinstance(part, ast.arg)} if inner else set[str]()
+        self.arguments = (
+            {part.arg for part in ast.walk(inner) if isinstance(part, ast.arg)}
+            if inner
+            else set[str]()
+        )
         self.values: dict[str, list[ast.expr | None]] = defaultdict(list)
         body = getattr(item, "body", [])
         for part in _inside(body if isinstance(body, list) else [body]):
@@ -47,7 +68,9 @@ class Scope:
         return here
 
 
-def roots(item: ast.expr, scope: Scope, bound: Mapping[str, str], seen: frozenset[str] = frozenset()) -> list[Root]:
+def roots(
+    item: ast.expr, scope: Scope, bound: Mapping[str, str], seen: frozenset[str] = frozenset()
+) -> list[Root]:
     """Return what an expression is part of; nothing for a new object."""
     attributes: list[str] = []
     while isinstance(item, ast.Attribute | ast.Subscript | ast.Starred):
@@ -64,14 +87,22 @@ def roots(item: ast.expr, scope: Scope, bound: Mapping[str, str], seen: frozense
     if "__class__" in attributes:
         return [Root("class", item.id)]
     return [
-        Root(root.kind, ".".join([root.name, *reversed(attributes)])) if root.kind == "import" else root
+        Root(root.kind, ".".join([root.name, *reversed(attributes)]))
+        if root.kind == "import"
+        else root
         for root in _of_name(item.id, scope, bound, seen | {item.id})
     ]
 
 
 def last_name(item: ast.expr) -> str:
     """Return the last word of an expression such as ``a.b.c``."""
-    return item.attr if isinstance(item, ast.Attribute) else item.id if isinstance(item, ast.Name) else ""
+    return (
+        item.attr
+        if isinstance(item, ast.Attribute)
+        else item.id
+        if isinstance(item, ast.Name)
+        else ""
+    )
 
 
 def _of_name(name: str, scope: Scope, bound: Mapping[str, str], seen: frozenset[str]) -> list[Root]:
@@ -88,8 +119,12 @@ def _of_name(name: str, scope: Scope, bound: Mapping[str, str], seen: frozenset[
     return [*found, Root("own", name)] if holder.is_module else found
 
 
-def _of_call(call: ast.Call, scope: Scope, bound: Mapping[str, str], seen: frozenset[str]) -> list[Root]:
-    """Return what the result of a call may be part of: of the object whose method it is, unless it is a new object."""
+def _of_call(
+    call: ast.Call, scope: Scope, bound: Mapping[str, str], seen: frozenset[str]
+) -> list[Root]:
+    """Return what the result of a call may be part of: of the object whose method it is, unless
+    it is a new object.
+    """
     name = last_name(call.func)
     if isinstance(call.func, ast.Name) and name in _THROUGH:
         return [root for argument in call.args for root in roots(argument, scope, bound, seen)]
@@ -97,12 +132,24 @@ def _of_call(call: ast.Call, scope: Scope, bound: Mapping[str, str], seen: froze
         return [Root("own" if name == "globals" else "class", name)]
     found = roots(call.func, scope, bound, seen)
     new = name[:1].isupper() or name in ("copy", "clone", "deepcopy", "detach", "tolist", "item")
-    old = [] if new else [root for root in found if root.kind == "import" and root.name.partition(".")[0] not in _NEW]
-    return [Root("import", root.name if root.name.endswith("()") else f"{root.name}()") for root in old]
+    old = (
+        []
+        if new
+        else [
+            root
+            for root in found
+            if root.kind == "import" and root.name.partition(".")[0] not in _NEW
+        ]
+    )
+    return [
+        Root("import", root.name if root.name.endswith("()") else f"{root.name}()") for root in old
+    ]
 
 
 def _parts(item: ast.expr) -> list[ast.expr]:
-    """Return the expressions of which a value may be one, such as those of a list or of ``a if b else c``."""
+    """Return the expressions of which a value may be one, such as those of a list or of ``a if b
+    else c``.
+    """
     if isinstance(item, ast.Tuple | ast.List | ast.Set):
         return item.elts
     if isinstance(item, ast.IfExp):
@@ -125,7 +172,9 @@ def _inside(items: list[ast.AST]) -> Iterator[ast.AST]:
 
 
 def _bindings(item: ast.AST) -> Iterator[tuple[str, ast.expr | None]]:
-    """Yield each name that a statement binds, with the value; None for an import and a definition."""
+    """Yield each name that a statement binds, with the value; None for an import and a
+    definition.
+    """
     if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
         yield item.name, None
     elif isinstance(item, ast.Import | ast.ImportFrom):

@@ -1,4 +1,6 @@
-"""Files that a function makes for itself: in a folder of `tempfile`, under a name that it drew, or in memory."""
+"""Files that a function makes for itself: in a folder of `tempfile`, under a name that it drew,
+or in memory.
+"""
 
 from __future__ import annotations
 
@@ -11,25 +13,46 @@ from neusee.workflows.keys.syntax_pass import Scope, Syntax
 _MADE = frozenset(
     {
         *("io.BytesIO", "io.StringIO"),
-        *(f"tempfile.{name}" for name in ("TemporaryDirectory", "NamedTemporaryFile", "TemporaryFile", "mkdtemp")),
+        *(
+            f"tempfile.{name}"
+            for name in ("TemporaryDirectory", "NamedTemporaryFile", "TemporaryFile", "mkdtemp")
+        ),
         *("tempfile.mkstemp", "tempfile.SpooledTemporaryFile"),
     }
 )
 #: functions that give a path or an open file of what they get first
 _THROUGH = frozenset(
     {
-        *("str", "os.fspath", "os.fsencode", "os.path.join", "os.path.abspath", "os.path.realpath", "os.fdopen"),
-        *("pathlib.Path", "pathlib.PurePath", "contextlib.closing", "io.TextIOWrapper", "io.BufferedReader"),
+        *(
+            "str",
+            "os.fspath",
+            "os.fsencode",
+            "os.path.join",
+            "os.path.abspath",
+            "os.path.realpath",
+            "os.fdopen",
+        ),
+        *(
+            "pathlib.Path",
+            "pathlib.PurePath",
+            "contextlib.closing",
+            "io.TextIOWrapper",
+            "io.BufferedReader",
+        ),
         *("enter_context", "gzip.GzipFile", "iter", "sorted", "list", "next", "enumerate"),
     }
 )
 
 
 class Scratch:
-    """What in a module is a path of a temporary file, or a file in memory; false if nothing makes one."""
+    """What in a module is a path of a temporary file, or a file in memory; false if nothing
+    makes one.
+    """
 
     def __init__(self, bound: Mapping[str, str], reads: Callable[[str], bool]) -> None:
-        """Tell by the full names of imported names; ``reads`` says whether a function opens a file."""
+        """Tell by the full names of imported names; ``reads`` says whether a function opens a
+        file.
+        """
         self._bound, self._reads = bound, reads
         self._makes = any(name.partition(".")[0] in ("io", "tempfile") for name in bound.values())
 
@@ -41,13 +64,17 @@ class Scratch:
         return self._makes and self._is_made(item, scope, frozenset())
 
     def texts(self, tree: Syntax) -> set[int]:
-        """Return the ids of the texts that name a file in a temporary folder, or in an archive in memory."""
+        """Return the ids of the texts that name a file in a temporary folder, or in an archive
+        in memory.
+        """
         joins = [item.right for scope, item in tree.joins if self.holds(item.left, scope)]
         calls = [(scope, call) for scope, call in tree.calls if self._is_below_made(call, scope)]
         return {id(part) for part in [*joins, *(part for _, call in calls for part in call.args)]}
 
     def _is_below_made(self, call: ast.Call, scope: Scope) -> bool:
-        """Return True for a call that joins words to a temporary path, and for a method of an object in memory."""
+        """Return True for a call that joins words to a temporary path, and for a method of an
+        object in memory.
+        """
         if isinstance(call.func, ast.Attribute) and self.holds(call.func.value, scope):
             return True
         joins = dotted(call.func, self._bound) in _THROUGH

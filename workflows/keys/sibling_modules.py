@@ -1,8 +1,9 @@
 """Modules of a user beside those of a node: which of them may change what the node computes?
 
-All files under ``nodes:`` of a recipe are loaded into one process. A file that patches a library changes every result
-of the process, also those of neusee's own nodes; one that fills a registry or derives a class changes results of other
-own nodes. Such a file joins their keys. A file that changes nothing beyond itself joins no other key.
+All files under ``nodes:`` of a recipe are loaded into one process. A file that patches a library
+changes every result of the process, also those of neusee's own nodes; one that fills a registry or
+derives a class changes results of other own nodes. Such a file joins their keys. A file that
+changes nothing beyond itself joins no other key.
 """
 
 from __future__ import annotations
@@ -30,14 +31,17 @@ class Siblings:
         self._scopes: dict[str, Scope] = {}
 
     def of(self, roots: Sequence[str]) -> list[str]:
-        """Return the own modules that may change what the code of ``roots`` computes, in the order of their import.
+        """Return the own modules that may change what the code of ``roots`` computes, in the order
+        of their import.
 
         Raises `LookupError` for a module that cannot be followed.
         """
         others = own_modules()
         if not others:
             return []
-        followed = {name: look for root in roots for name, look in self._whole_of(root).looks.items()}
+        followed = {
+            name: look for root in roots for name, look in self._whole_of(root).looks.items()
+        }
         mine = _own(followed)
         beside = [name for name in others if name not in followed]
         return [name for name in beside if self._joins(name, mine, any(map(is_own, roots)))]
@@ -71,19 +75,27 @@ def _scope(looks: Mapping[str, Look]) -> Scope:
 
 def _own(looks: Mapping[str, Look]) -> dict[str, Reach]:
     """Return what the modules of a user reach, by name."""
-    return {name: look.summary.reach for name, look in looks.items() if is_own(name) and look.summary}
+    return {
+        name: look.summary.reach for name, look in looks.items() if is_own(name) and look.summary
+    }
 
 
 def _is_of_user(name: str) -> bool:
     """Return True if a full name is that of something in a module of a user."""
-    return name.startswith(".") or (_kind(name) in ("source", "folder") and is_own(name.partition(".")[0]))
+    return name.startswith(".") or (
+        _kind(name) in ("source", "folder") and is_own(name.partition(".")[0])
+    )
 
 
 def _is_shared(name: str) -> bool:
-    """Return True for something of a library that others see: not for the result of a call, such as an open file."""
+    """Return True for something of a library that others see: not for the result of a call, such
+    as an open file.
+    """
     called, found, _ = name.rpartition("()")
     return not found or _GETTER.search(called.rpartition(".")[2]) is not None
 
 
 def _kind(name: str) -> str:
-    return origin_of(name.partition(".")[0], frozenset()).kind if name.partition(".")[0] else "nowhere"
+    return (
+        origin_of(name.partition(".")[0], frozenset()).kind if name.partition(".")[0] else "nowhere"
+    )

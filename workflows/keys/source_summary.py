@@ -1,4 +1,6 @@
-"""Summary of a source file: the digests of the file and of its definitions, its imports, and what is not followed."""
+"""Summary of a source file: the digests of the file and of its definitions, its imports, and
+what is not followed.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +26,17 @@ from neusee.workflows.keys.unfollowed_constructs import Construct, constructs, l
 __all__ = ["ROOT", "Import", "Summary", "Use", "module_file", "summarise", "syntax_outline"]
 
 ROOT = "neusee.nodes"
-_parsing = threading.Lock()  #: lock of the parser of Python 3.11, which miscounts the depth in two threads
+#: lock of the parser of Python 3.11, which miscounts the depth in two threads
+_parsing = threading.Lock()
 _READS = ("__doc__", "getdoc", "cleandoc", "getcomments")  #: names by which code reads docstrings
 _SHORT = 16  #: digits of the digest of a definition
-_LARGE = frozenset({"torch", "numpy", "scipy", *sys.stdlib_module_names})  #: packages of which no chain is noted
+#: packages of which no chain is noted
+_LARGE = frozenset({"torch", "numpy", "scipy", *sys.stdlib_module_names})
 
-Import = tuple[int, str, str]  #: level of a relative import, module, name (empty for ``import module``)
-Use = tuple[int, str, str, str, int]  #: use of an imported name: its import, the attributes after the name, the line
+#: level of a relative import, module, name (empty for ``import module``)
+Import = tuple[int, str, str]
+#: use of an imported name: its import, the attributes after the name, the line
+Use = tuple[int, str, str, str, int]
 
 
 class Summary(NamedTuple):
@@ -42,7 +48,8 @@ class Summary(NamedTuple):
     imports: list[Import]
     binds: list[str]  #: names bound by the imports
     uses: list[Use]
-    definitions: dict[str, str]  #: digest by label: ``psf()``, ``class Psf``, ``constant _FALL``, ``imports``
+    #: digest by label: ``psf()``, ``class Psf``, ``constant _FALL``, ``imports``
+    definitions: dict[str, str]
     functions: list[str]  #: digests of the compiled functions
     constructs: list[Construct]
     statements: list[Statement]
@@ -51,7 +58,8 @@ class Summary(NamedTuple):
 
 
 def summarise(source: bytes, own: bool = False) -> Summary:
-    """Return the summary of a source file; comments, layout and docstrings do not affect the digests.
+    """Return the summary of a source file; comments, layout and docstrings do not affect the
+    digests.
 
     What only matters in code of a user is looked for if the file is the user's ``own``.
     """
@@ -64,16 +72,23 @@ def summarise(source: bytes, own: bool = False) -> Summary:
     imports, bound = _imports(tree.all)
     binds = sorted(name for name, ways in bound.items() if any(way[2] for way in ways))
     names = {
-        name: ".".join(filter(None, way[1:])) for name, ways in bound.items() for way in sorted(ways) if not way[0]
+        name: ".".join(filter(None, way[1:]))
+        for name, ways in bound.items()
+        for way in sorted(ways)
+        if not way[0]
     }
-    imports += [way for call in each(tree.all, ast.Call) if (way := _by_literal(call, names)) is not None]
+    imports += [
+        way for call in each(tree.all, ast.Call) if (way := _by_literal(call, names)) is not None
+    ]
     return Summary(
         text,
         digest(text, tree.documents),
         any(_reads_docstrings(kinds, own) for kinds in (tree.all, tree.not_run)),
         imports,
         binds,
-        _uses(tree.all, {name: {way for way in ways if _chained(way)} for name, ways in bound.items()}),
+        _uses(
+            tree.all, {name: {way for way in ways if _chained(way)} for name, ways in bound.items()}
+        ),
         _definitions(tree.texts),
         functions,
         _all_constructs(parsed, tree, names) if own else constructs(tree, names),
@@ -84,15 +99,18 @@ def summarise(source: bytes, own: bool = False) -> Summary:
 
 
 def syntax_outline(source: bytes) -> tuple[str, list[tuple[str, list[str]]]]:
-    """Return the digest of the syntax tree of a source file, and the import statements at its top level.
+    """Return the digest of the syntax tree of a source file, and the import statements at its top
+    level.
 
-    No comment, layout or docstring affects the digest. An import statement is the module in ``from a import b, c`` with
-    the names, or an empty text with the modules of ``import a, b``.
+    No comment, layout or docstring affects the digest. An import statement is the module in ``from
+    a import b, c`` with the names, or an empty text with the modules of ``import a, b``.
     """
     with _parsing:
         tree = ast.parse(source)
     found = [item for item in tree.body if isinstance(item, ast.Import | ast.ImportFrom)]
-    imports = [(getattr(item, "module", "") or "", [alias.name for alias in item.names]) for item in found]
+    imports = [
+        (getattr(item, "module", "") or "", [alias.name for alias in item.names]) for item in found
+    ]
     return _digest_of(Syntax(tree)), imports
 
 
@@ -107,7 +125,9 @@ def _imports(kinds: Kinds) -> tuple[list[Import], dict[str, set[Import]]]:
     for item in each(kinds, ast.Import):
         imports += [(0, alias.name, "") for alias in item.names]
         for alias in item.names:
-            bound[alias.asname or _top(alias.name)].add((0, alias.name if alias.asname else _top(alias.name), ""))
+            bound[alias.asname or _top(alias.name)].add(
+                (0, alias.name if alias.asname else _top(alias.name), "")
+            )
     for item in each(kinds, ast.ImportFrom):
         ways = [(item.level, item.module or "", alias.name) for alias in item.names]
         imports += ways
@@ -132,25 +152,40 @@ def _all_constructs(parsed: ast.Module, tree: Syntax, names: Mapping[str, str]) 
 
 
 def _reads_docstrings(kinds: Kinds, own: bool) -> bool:
-    """Return True for code that reads a docstring as data, or attributes that it does not name in code of a user."""
-    if own and (reads_attributes_unnamed(kinds) or any("__doc__" in text for text, _ in texts(kinds))):
+    """Return True for code that reads a docstring as data, or attributes that it does not name
+    in code of a user.
+    """
+    if own and (
+        reads_attributes_unnamed(kinds) or any("__doc__" in text for text, _ in texts(kinds))
+    ):
         return True
     by_attribute = any(item.attr in _READS for item in each(kinds, ast.Attribute))
-    by_name = any(item.id in _READS[:2] and isinstance(item.ctx, ast.Load) for item in each(kinds, ast.Name))
-    return by_attribute or by_name or any(item.value == "__doc__" for item in each(kinds, ast.Constant))
+    by_name = any(
+        item.id in _READS[:2] and isinstance(item.ctx, ast.Load) for item in each(kinds, ast.Name)
+    )
+    return (
+        by_attribute
+        or by_name
+        or any(item.value == "__doc__" for item in each(kinds, ast.Constant))
+    )
 
 
 def _declared(item: ast.stmt) -> list[str]:
     """Return the entries of ``__depends__ = ("table.csv", "env:NAME")``."""
-    if not isinstance(item, ast.Assign) or "__depends__" not in [getattr(name, "id", "") for name in item.targets]:
+    if not isinstance(item, ast.Assign) or "__depends__" not in [
+        getattr(name, "id", "") for name in item.targets
+    ]:
         return []
     try:
         entries = ast.literal_eval(item.value)
     except ValueError:
         entries = None
-    if not isinstance(entries, tuple | list) or not all(isinstance(entry, str) for entry in entries):
+    if not isinstance(entries, tuple | list) or not all(
+        isinstance(entry, str) for entry in entries
+    ):
         raise ValueError(
-            f"line {item.lineno}: __depends__ must be a tuple of texts, not {ast.unparse(item.value)[:60]}"
+            f"line {item.lineno}: __depends__ must be a tuple of texts, not"
+            f" {ast.unparse(item.value)[:60]}"
         )
     return list(entries)
 
@@ -162,7 +197,9 @@ def _full(ways: set[Import]) -> str:
 
 
 def _chained(way: Import) -> bool:
-    """Return True for an import of which the attributes may name a module that is followed by source."""
+    """Return True for an import of which the attributes may name a module that is followed by
+    source.
+    """
     return bool(way[0]) or _top(way[1]) not in _LARGE
 
 
@@ -171,7 +208,9 @@ def _top(module: str) -> str:
 
 
 def _uses(kinds: Kinds, bound: dict[str, set[Import]]) -> list[Use]:
-    """Return each use of an imported name in an expression such as ``a.b.c``, and each use of a whole package."""
+    """Return each use of an imported name in an expression such as ``a.b.c``, and each use of a
+    whole package.
+    """
     lines: dict[tuple[int, str, str, str], int] = {}
     for name, attributes, line in _chains(kinds):
         for way in bound.get(name, ()):
@@ -182,8 +221,11 @@ def _uses(kinds: Kinds, bound: dict[str, set[Import]]) -> list[Use]:
 
 
 def _chains(kinds: Kinds) -> Iterator[tuple[str, list[str], int]]:
-    """Yield the first name, the attributes and the line number of each expression such as ``a.b.c`` in a module."""
-    inner: set[int] = set()  # parts of earlier expressions, because an expression comes before its parts
+    """Yield the first name, the attributes and the line number of each expression such as
+    ``a.b.c`` in a module.
+    """
+    # parts of earlier expressions, because an expression comes before its parts
+    inner: set[int] = set()
     for item in each(kinds, ast.Attribute, ast.Name):
         if id(item) in inner:
             continue
@@ -198,7 +240,8 @@ def _chains(kinds: Kinds) -> Iterator[tuple[str, list[str], int]]:
 
 
 def _definitions(texts: Iterable[tuple[ast.stmt, str]]) -> dict[str, str]:
-    """Return the digest of each top-level definition of a module, by labels such as ``psf()`` or ``class Psf``.
+    """Return the digest of each top-level definition of a module, by labels such as ``psf()`` or
+    ``class Psf``.
 
     Definitions with the same label share one digest.
     """
@@ -210,21 +253,37 @@ def _definitions(texts: Iterable[tuple[ast.stmt, str]]) -> dict[str, str]:
 
 
 def _labels(item: ast.stmt) -> Iterable[str]:
-    """Return the labels of the definitions in a top-level statement, such as ``psf()`` or ``constant _FALL``."""
+    """Return the labels of the definitions in a top-level statement, such as ``psf()`` or
+    ``constant _FALL``.
+    """
     if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef):
         return [f"{_owner(item)}()"]
     if isinstance(item, ast.ClassDef):
         return [f"class {item.name}"]
     if isinstance(item, ast.Import | ast.ImportFrom):
         return ["imports"]
-    targets = item.targets if isinstance(item, ast.Assign) else [getattr(item, "target", None) or item]
-    names = [n.id for t in targets if not isinstance(t, ast.stmt) for n in ast.walk(t) if isinstance(n, ast.Name)]
+    targets = (
+        item.targets if isinstance(item, ast.Assign) else [getattr(item, "target", None) or item]
+    )
+    names = [
+        n.id
+        for t in targets
+        if not isinstance(t, ast.stmt)
+        for n in ast.walk(t)
+        if isinstance(n, ast.Name)
+    ]
     return [f"constant {name}" for name in names] or ["other statements"]
 
 
 def _owner(function: ast.FunctionDef | ast.AsyncFunctionDef) -> str:
-    """Return the name of a function, or ``psf.check`` for a function ``_`` with the decorator ``@psf.check``."""
+    """Return the name of a function, or ``psf.check`` for a function ``_`` with the decorator
+    ``@psf.check``.
+    """
     for mark in function.decorator_list:
-        if function.name == "_" and isinstance(mark, ast.Attribute) and isinstance(mark.value, ast.Name):
+        if (
+            function.name == "_"
+            and isinstance(mark, ast.Attribute)
+            and isinstance(mark.value, ast.Name)
+        ):
             return f"{mark.value.id}.{mark.attr}"
     return function.name

@@ -1,6 +1,7 @@
 """One pass over the syntax tree of a source file, which finds all that a summary of the file needs.
 
-The text of a tree says the same as `ast.dump`: kinds, names and constants in order, without docstrings and positions.
+The text of a tree says the same as `ast.dump`: kinds, names and constants in order, without
+docstrings and positions.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from typing import Any, NamedTuple
 
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 _DOCUMENTED = frozenset({ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef})
-_UNSEEN = frozenset({"ctx", "kind", "type_comment", "type_ignores"})  #: fields that other fields decide, or nothing
+#: fields that other fields decide, or nothing
+_UNSEEN = frozenset({"ctx", "kind", "type_comment", "type_ignores"})
 _NOT_RUN = {
     "TYPE_CHECKING": "TYPE_CHECKING",
     "typing": "typing.TYPE_CHECKING",
@@ -33,14 +35,17 @@ class Block(NamedTuple):
 class Syntax:
     """The texts of the statements of a module, its docstrings, and its parts that a process runs.
 
-    Blocks for type checkers alone, and for a file that is run as a program, have texts and no parts.
+    Blocks for type checkers alone, and for a file that is run as a program, have texts and no
+    parts.
     """
 
     def __init__(self, tree: ast.Module) -> None:
         self.texts: list[tuple[ast.stmt, str]] = []  #: statements at the top level with their texts
         self.documents: list[tuple[int, int, str]] = []  #: the place and the text of each docstring
-        self.calls: list[tuple[Scope, ast.Call]] = []  #: calls that a process runs, with the functions around them
-        self.joins: list[tuple[Scope, ast.BinOp]] = []  #: sums, paths that are put together, and so on, likewise
+        #: calls that a process runs, with the functions around them
+        self.calls: list[tuple[Scope, ast.Call]] = []
+        #: sums, paths that are put together, and so on, likewise
+        self.joins: list[tuple[Scope, ast.BinOp]] = []
         self.blocks: list[Block] = []
         self.all: Kinds = defaultdict(list)  #: the parts of every block
         self.not_run: Kinds = defaultdict(list)
@@ -108,7 +113,9 @@ class Syntax:
                 words.append(repr(value))
 
     def _visit_else(self, item: ast.If, scope: Scope) -> None:
-        """Add a branch that no process runs by its text alone, and the other branch with its parts."""
+        """Add a branch that no process runs by its text alone, and the other branch with its
+        parts.
+        """
         self._kinds[ast.If].pop()
         self._visit_quietly(item.test)
         self._visit_quietly(*item.body)
@@ -127,10 +134,16 @@ class Syntax:
         del self.calls[calls:], self.joins[joins:]
 
     def _without_docstring(self, item: Any) -> list[ast.stmt]:
-        """Return the statements of a definition or a module without its docstring, which is noted."""
+        """Return the statements of a definition or a module without its docstring, which is
+        noted.
+        """
         body: list[ast.stmt] = item.body
         first = body[0] if body else None
-        if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str):
+        if (
+            isinstance(first, ast.Expr)
+            and isinstance(first.value, ast.Constant)
+            and isinstance(first.value.value, str)
+        ):
             self.documents.append((len(self.texts), len(self._words), first.value.value))
             return body[1:]
         return body
@@ -143,13 +156,27 @@ def each(kinds: Kinds, *wanted: type) -> Iterator[Any]:
 
 
 def _is_not_run(test: ast.expr) -> bool:
-    """Return True for the test of a block for type checkers, or of a file that is run as a program."""
-    first = test.left if isinstance(test, ast.Compare) else test.value if isinstance(test, ast.Attribute) else test
-    return isinstance(first, ast.Name) and first.id in _NOT_RUN and ast.unparse(test) in _NOT_RUN.values()
+    """Return True for the test of a block for type checkers, or of a file that is run as a
+    program.
+    """
+    first = (
+        test.left
+        if isinstance(test, ast.Compare)
+        else test.value
+        if isinstance(test, ast.Attribute)
+        else test
+    )
+    return (
+        isinstance(first, ast.Name)
+        and first.id in _NOT_RUN
+        and ast.unparse(test) in _NOT_RUN.values()
+    )
 
 
 _SHAPES: dict[type, tuple[str, tuple[str, ...]]] = {}  #: name and fields of each kind of part
 
 
 def _shape(kind: type[ast.AST]) -> tuple[str, tuple[str, ...]]:
-    return _SHAPES.setdefault(kind, (kind.__name__, tuple(field for field in kind._fields if field not in _UNSEEN)))
+    return _SHAPES.setdefault(
+        kind, (kind.__name__, tuple(field for field in kind._fields if field not in _UNSEEN))
+    )

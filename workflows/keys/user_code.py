@@ -31,19 +31,28 @@ class OwnCode:
     followed: frozenset[str]  #: all modules whose source counts
     files: frozenset[str]  #: real paths of parameter files, and of declared files and folders
     free: frozenset[str]  #: what the author states to decide no result: a kind, a name or a path
-    changed: frozenset[str] = frozenset()  #: full names of what the code may change in modules of others
-    unread: frozenset[str] = frozenset()  #: full names of logs: lists and dicts that their modules only write to
-    may_change: bool = False  #: True if the code may change what other code finds: its imports do more than compute
+    #: full names of what the code may change in modules of others
+    changed: frozenset[str] = frozenset()
+    #: full names of logs: lists and dicts that their modules only write to
+    unread: frozenset[str] = frozenset()
+    #: True if the code may change what other code finds: its imports do more than compute
+    may_change: bool = False
     variables: frozenset[str] = frozenset()  #: variables of the environment that the code declares
 
 
 def own_code(step: Step, code: Code) -> OwnCode | None:
     """Return the code of a step that is not of neusee, or None for a step of the package alone."""
-    return own_code_of(step.node, step.params, [each.__module__ for each in networks_of(step)], code)
+    return own_code_of(
+        step.node, step.params, [each.__module__ for each in networks_of(step)], code
+    )
 
 
-def own_code_of(node: Node, params: Mapping[str, Any], networks: Sequence[str], code: Code) -> OwnCode | None:
-    """Return the code of a call of a node, as `own_code` does; ``networks`` are the modules of its network classes."""
+def own_code_of(
+    node: Node, params: Mapping[str, Any], networks: Sequence[str], code: Code
+) -> OwnCode | None:
+    """Return the code of a call of a node, as `own_code` does; ``networks`` are the modules of
+    its network classes.
+    """
     roots = [node.fn.__module__, *networks]
     if not any(map(is_own, roots)):
         return None
@@ -56,13 +65,26 @@ def own_code_of(node: Node, params: Mapping[str, Any], networks: Sequence[str], 
     declared.append((looks[roots[0]].path, [*node.depends]))
     for source, entries in declared:
         free.update(entry.removeprefix(FREE) for entry in entries if entry.startswith(FREE))
-        variables.update(entry.removeprefix(VARIABLE) for entry in entries if entry.startswith(VARIABLE))
+        variables.update(
+            entry.removeprefix(VARIABLE) for entry in entries if entry.startswith(VARIABLE)
+        )
         beside = [source.parent / entry for entry in entries] if source else []
         files.update(os.path.realpath(path) for path in beside if path.exists())
     summaries = {name: followed[name].summary for name in modules}
     changed = outward_names([each.reach for each in summaries.values() if each])
-    unread = {f"{name}.{log}" for name, each in summaries.items() if each for log in written_only(each.statements)}
-    imports = {module for each in summaries.values() if each for level, module, _ in each.imports if not level}
+    unread = {
+        f"{name}.{log}"
+        for name, each in summaries.items()
+        if each
+        for log in written_only(each.statements)
+    }
+    imports = {
+        module
+        for each in summaries.values()
+        if each
+        for level, module, _ in each.imports
+        if not level
+    }
     may_change = bool(changed) or any(not is_calm(name) for name in imports - modules)
     return OwnCode(
         modules=modules,
@@ -77,7 +99,11 @@ def own_code_of(node: Node, params: Mapping[str, Any], networks: Sequence[str], 
 
 
 def reads_time(looks: Mapping[str, Look]) -> bool:
-    """Return True if code of a user may read the time zone: by the standard library, or by a package of its own."""
+    """Return True if code of a user may read the time zone: by the standard library, or by a
+    package of its own.
+    """
     own = [look for name, look in looks.items() if is_own(name)]
     names = {imported.partition(".")[0] for look in own for imported in look.imports}
-    return not _TIMED.isdisjoint(names) or any("content" in part for look in own for part in look.parts.values())
+    return not _TIMED.isdisjoint(names) or any(
+        "content" in part for look in own for part in look.parts.values()
+    )

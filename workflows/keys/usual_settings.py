@@ -1,4 +1,6 @@
-"""Settings of a new process, from which `process_settings.settings` tells the differences; torch is not needed."""
+"""Settings of a new process, from which `process_settings.settings` tells the differences; torch
+is not needed.
+"""
 
 from __future__ import annotations
 

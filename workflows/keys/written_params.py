@@ -1,7 +1,9 @@
-"""What the parameters of an own node say beside their values: names of files, and the order of mappings.
+"""What the parameters of an own node say beside their values: names of files, and the order of
+mappings.
 
-The nodes of neusee read the content of a file and the entries of a mapping, so equal ones share results. A node of a
-user may also read an exposure in ``dark_20ms.npy``, or take the first entry of a mapping.
+The nodes of neusee read the content of a file and the entries of a mapping, so equal ones share
+results. A node of a user may also read an exposure in ``dark_20ms.npy``, or take the first entry of
+a mapping.
 """
 
 from __future__ import annotations
@@ -17,12 +19,14 @@ if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Step
 
 
-#: parameters of nodes of neusee whose entries count in their order: light meets the first surface of a lens first
+#: parameters of nodes of neusee whose entries count in their order: light meets the first surface
+#: of a lens first
 _ORDERED = frozenset({("flare.stray_light", "surfaces"), ("flare.stray_shares", "surfaces")})
 
 
 def written(step: Step) -> dict[str, Any]:
-    """Return the names of files and the order of mappings in the parameters of an own node, as JSON by parameter.
+    """Return the names of files and the order of mappings in the parameters of an own node, as JSON
+    by parameter.
 
     Of a node of neusee only the order of a mapping counts, where the node says so.
     """
@@ -52,12 +56,16 @@ def _said(value: Any, folders: list[str]) -> Any:
 
 
 def _name(path: Path, folders: list[str]) -> list[str]:
-    """Return the path of a file as a recipe in one of some folders writes it, and the name that links lead to."""
+    """Return the path of a file as a recipe in one of some folders writes it, and the name that
+    links lead to.
+    """
     full = os.path.abspath(path)
     folder = next((each for each in folders if _is_in(full, each)), None)
     real, top = os.path.realpath(full), folder and os.path.realpath(folder)
     name = Path(os.path.relpath(full, folder) if folder else full).as_posix()
-    target = Path(os.path.relpath(real, top) if top and _is_in(real, top) else os.path.basename(real)).as_posix()
+    target = Path(
+        os.path.relpath(real, top) if top and _is_in(real, top) else os.path.basename(real)
+    ).as_posix()
     plain = target == (name if top and _is_in(real, top) else os.path.basename(full))
     return [name] if plain else [name, target]
 

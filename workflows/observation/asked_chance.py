@@ -21,8 +21,14 @@ class WatchedChance:
     def __init__(self) -> None:
         # temporary files have drawn names, which no result has: their generator is made before
         next(tempfile._get_candidate_names())  # type: ignore[attr-defined]
-        places: list[tuple[Any, str]] = [(os, "urandom"), (random, "_urandom"), (random.Random, "seed")]
-        self._before = [(place, name, getattr(place, name)) for place, name in places if hasattr(place, name)]
+        places: list[tuple[Any, str]] = [
+            (os, "urandom"),
+            (random, "_urandom"),
+            (random.Random, "seed"),
+        ]
+        self._before = [
+            (place, name, getattr(place, name)) for place, name in places if hasattr(place, name)
+        ]
 
     def __enter__(self) -> None:
         for place, name, function in self._before:

@@ -1,7 +1,8 @@
 """What Python's own audit events say of an observed call.
 
-Where the kernel watches, they add only what it cannot know: that a child process is one of the program. Elsewhere they
-are the layer that sees files, processes and sockets, as far as Python code asks for them.
+Where the kernel watches, they add only what it cannot know: that a child process is one of the
+program. Elsewhere they are the layer that sees files, processes and sockets, as far as Python code
+asks for them.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ _OF_CODE = (*SOURCES, ".pyc", ".so", ".pyd", ".zip", ".egg")  #: files that an i
 
 
 def listen() -> None:
-    """Listen to the events of this process; a hook cannot be taken away, and returns at once between the calls."""
+    """Listen to the events of this process; a hook cannot be taken away, and returns at once
+    between the calls.
+    """
     if not _installed:
         _installed.append(True)
         sys.addaudithook(_heard)
@@ -47,7 +50,9 @@ def _program(watch: Watch, arguments: tuple[Any, ...]) -> None:
         watch.trust_child()
     elif not watch.kernel and not watch.trusted():
         command = arguments[0] or arguments[1]
-        words = command if isinstance(command, str | bytes | os.PathLike) else next(iter(command), "")
+        words = (
+            command if isinstance(command, str | bytes | os.PathLike) else next(iter(command), "")
+        )
         watch.records.append(Record("exec", os.fsdecode(words)))
 
 
@@ -75,7 +80,9 @@ def _unwatched(watch: Watch) -> Iterator[None]:
 
 
 def _source(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    """Take note of a source file that is opened, and of whether a message or a compiler asked for it."""
+    """Take note of a source file that is opened, and of whether a message or a compiler asked
+    for it.
+    """
     path = arguments[0]
     if isinstance(path, str | bytes | os.PathLike) and os.fsdecode(path).endswith(SOURCES):
         frame = sys._getframe(2)
@@ -84,12 +91,17 @@ def _source(watch: Watch, arguments: tuple[Any, ...]) -> None:
 
 
 def _settings(watch: Watch, arguments: tuple[Any, ...]) -> None:
-    """Take note of a file that an installed package reads while it is imported, such as settings in the home folder.
+    """Take note of a file that an installed package reads while it is imported, such as settings in
+    the home folder.
 
     Its code, its tables and caches are installed: the judgement leaves them out.
     """
     path, _, flags = arguments
-    if isinstance(path, int) or flags & (os.O_CREAT | os.O_TRUNC) or os.fsdecode(path).endswith(_OF_CODE):
+    if (
+        isinstance(path, int)
+        or flags & (os.O_CREAT | os.O_TRUNC)
+        or os.fsdecode(path).endswith(_OF_CODE)
+    ):
         return
     real = os.path.realpath(os.fsdecode(path))
     if os.path.isfile(real):
@@ -136,7 +148,9 @@ def _of_path(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
 
 
 def _of_named_path(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
-    """Return what takes note of an event whose first argument is a path, where a link at its end is meant itself."""
+    """Return what takes note of an event whose first argument is a path, where a link at its end
+    is meant itself.
+    """
 
     def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
         text, folder = os.fsdecode(arguments[0]), arguments[-1]
@@ -167,7 +181,9 @@ def _database(watch: Watch, arguments: tuple[Any, ...]) -> None:
     name = os.fsdecode(arguments[0])
     if name and name != ":memory:":
         real = os.path.realpath(name)
-        watch.records.append(Record("open", real, "", os.O_RDWR | os.O_CREAT, os.path.lexists(real)))
+        watch.records.append(
+            Record("open", real, "", os.O_RDWR | os.O_CREAT, os.path.lexists(real))
+        )
 
 
 def _of_address(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
@@ -199,7 +215,9 @@ _HANDLERS: dict[str, _Handler] = {
     "os.mkdir": _of_named_path("make"),
     "os.remove": _of_named_path("remove"),
     "os.rmdir": _of_named_path("remove"),
-    "os.symlink": lambda watch, arguments: _of_named_path("make")(watch, (arguments[1], arguments[2])),
+    "os.symlink": lambda watch, arguments: _of_named_path("make")(
+        watch, (arguments[1], arguments[2])
+    ),
     "os.rename": _of_two_paths("move"),
     "os.link": _of_two_paths("link"),
     "os.truncate": _of_path("check"),

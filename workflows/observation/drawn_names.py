@@ -1,7 +1,7 @@
 """Names that libraries draw by ``uuid4`` for things of their own, and that no result has.
 
-A library may as well draw a seed in this way, or an identifier that it writes into a file. So each is listed here,
-with the reason why its names decide nothing.
+A library may as well draw a seed in this way, or an identifier that it writes into a file. So each
+is listed here, with the reason why its names decide nothing.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ _BETWEEN = ("uuid", "cloudpickle")  #: modules that draw for the one that calls 
 
 
 def draws_name(depth: int) -> bool:
-    """Return True if the function that asks for chance draws a name; ``depth`` counts the calls up to it."""
+    """Return True if the function that asks for chance draws a name; ``depth`` counts the calls
+    up to it.
+    """
     frame = sys._getframe(depth + 1)
     if _module(frame) != "uuid":
         return False

@@ -28,7 +28,11 @@ class Judgement:
     """The taints of one call, from its records in their order."""
 
     def __init__(
-        self, covered: Covered, bodies: dict[str, str], quiet: Set[str] = frozenset(), temporary: Set[str] = frozenset()
+        self,
+        covered: Covered,
+        bodies: dict[str, str],
+        quiet: Set[str] = frozenset(),
+        temporary: Set[str] = frozenset(),
     ) -> None:
         """Judge by what the key covers, and by what the process knows: see `python_watch.Watch`."""
         self._covered, self._bodies = covered, bodies
@@ -50,7 +54,9 @@ class Judgement:
         self._taints[taint(kind, what)] = None
 
     def judge_modules(self) -> None:
-        """Add a taint for each module of the user that was executed and that the key does not follow."""
+        """Add a taint for each module of the user that was executed and that the key does not
+        follow.
+        """
         for name in self._bodies:
             if not self._covered.modules(name):
                 self.add("import", name)
@@ -58,16 +64,20 @@ class Judgement:
     def taints(self) -> tuple[Taint, ...]:
         """Return the taints, each once; a look at a folder on the way to another one is none."""
         reached = [each.what for each in self._taints if each.kind in ("file", "folder", "write")]
-        on_the_way = {above for path in (*reached, *self._looks) for above in _with_parents(path)[1:]}
+        on_the_way = {
+            above for path in (*reached, *self._looks) for above in _with_parents(path)[1:]
+        }
         for path in self._looks:
             if path not in on_the_way:
                 self._read(path)
         return tuple(self._taints)
 
-    # --- what was done ------------------------------------------------------------------------------------------------
+    # --- what was done ----------------------------------------------------------------------------
 
     def _open(self, record: Record) -> None:
-        """Judge a file that was opened: whoever does not empty it may learn its length, or that it was there."""
+        """Judge a file that was opened: whoever does not empty it may learn its length, or that
+        it was there.
+        """
         flags = record.flags
         if _TMPFILE and flags & _TMPFILE == _TMPFILE:
             return  # a new file without a name
@@ -84,7 +94,9 @@ class Judgement:
             self._read_source(record.path)
 
     def _make(self, record: Record) -> None:
-        """Judge what is made if it is not there: that it could be made says that it was not there before."""
+        """Judge what is made if it is not there: that it could be made says that it was not
+        there before.
+        """
         if record.there or os.path.lexists(record.path):  # the next run finds it
             self._meet(record)
         if not record.there:
@@ -95,13 +107,18 @@ class Judgement:
 
     def _meet(self, record: Record) -> None:
         """Judge a path where the success of a call depends on what was there before."""
-        path, named_by_chance = record.path, any(above in self._temporary for above in _with_parents(record.path))
+        path, named_by_chance = (
+            record.path,
+            any(above in self._temporary for above in _with_parents(record.path)),
+        )
         free = record.trusted or named_by_chance or path in self._folders
         if not (free or self._is_covered(path) or is_searched_program(path)):
             self.add("write", path)
 
     def _move(self, record: Record) -> None:
-        """Follow a file of the step to its new name; any other file is read there, perhaps in a folder of the step."""
+        """Follow a file of the step to its new name; any other file is read there, perhaps in a
+        folder of the step.
+        """
         if os.path.isdir(record.second):  # one that is there stops a move
             self._meet(record._replace(path=record.second))
         if self._is_made(record.path):
@@ -116,11 +133,17 @@ class Judgement:
 
     def _xattr(self, record: Record) -> None:
         """Judge marks beside a file: no key has them, also of a file that is covered."""
-        if record.path not in self._quiet and not (self._is_made(record.path) or self._is_of_machine(record.path)):
+        if record.path not in self._quiet and not (
+            self._is_made(record.path) or self._is_of_machine(record.path)
+        ):
             self.add("attribute", record.path)
 
     def _check(self, record: Record) -> None:
-        if not (record.path in self._folders or self._is_covered(record.path) or is_searched_program(record.path)):
+        if not (
+            record.path in self._folders
+            or self._is_covered(record.path)
+            or is_searched_program(record.path)
+        ):
             self._looks[record.path] = None
 
     def _list(self, record: Record) -> None:
@@ -157,7 +180,7 @@ class Judgement:
     def _unseen(self, record: Record) -> None:
         self.add("unknown", record.path)
 
-    # --- what is covered ----------------------------------------------------------------------------------------------
+    # --- what is covered --------------------------------------------------------------------------
 
     def _read(self, path: str) -> None:
         if is_chance(path):
@@ -166,13 +189,20 @@ class Judgement:
             self.add("folder" if os.path.isdir(path) else "file", path)
 
     def _read_source(self, path: str) -> None:
-        """Judge source of a module that the key follows, which has neither its comments nor its lines."""
-        if path not in self._quiet and not self._is_covered_as_a_whole(path) and self._is_source(path):
+        """Judge source of a module that the key follows, which has neither its comments nor its
+        lines.
+        """
+        if (
+            path not in self._quiet
+            and not self._is_covered_as_a_whole(path)
+            and self._is_source(path)
+        ):
             self.add("file", path)
 
     def _is_covered(self, path: str) -> bool:
         if "\n" in path and not os.path.lexists(path):
-            return True  # a text of several lines, of which a library asks whether it is the name of a file
+            # a text of several lines, of which a library asks whether it is the name of a file
+            return True
         return self._is_covered_as_a_whole(path) or self._is_source(path)
 
     def _is_covered_as_a_whole(self, path: str) -> bool:
@@ -187,7 +217,9 @@ class Judgement:
         return not self._caches.isdisjoint(_with_parents(path))
 
     def _is_source(self, path: str) -> bool:
-        """Return True for source or byte code of a module that the key follows; a traceback reads the source again."""
+        """Return True for source or byte code of a module that the key follows; a traceback
+        reads the source again.
+        """
         folder, name = os.path.split(path)
         if os.path.basename(folder) == "__pycache__":
             folder, name = os.path.dirname(folder), f"{name.partition('.')[0]}.py"
@@ -198,7 +230,8 @@ class Judgement:
         """Yield the modules that were made from a file."""
         yield from (module for module, file in self._bodies.items() if file == source)
         for module, loaded in sys.modules.copy().items():
-            file = getattr(loaded, "__dict__", {}).get("__file__")  # to ask a lazy module would import it
+            # to ask a lazy module would import it
+            file = getattr(loaded, "__dict__", {}).get("__file__")
             if (
                 isinstance(file, str)
                 and os.path.basename(file) == os.path.basename(source)
@@ -225,5 +258,7 @@ def _with_parents(path: str) -> list[str]:
 
 
 def _with_all_parents(paths: Iterable[str]) -> set[str]:
-    """Return paths with the folders that they are in: to look at one says only that the way to the end exists."""
+    """Return paths with the folders that they are in: to look at one says only that the way to
+    the end exists.
+    """
     return {above for path in paths for above in _with_parents(path)}

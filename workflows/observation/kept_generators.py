@@ -1,7 +1,7 @@
 """Generators that installed packages make for themselves when they are imported.
 
-No result depends on an import that makes one. A step that draws from one later depends on chance, or on the steps that
-drew before it.
+No result depends on an import that makes one. A step that draws from one later depends on chance,
+or on the steps that drew before it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ _kept: dict[int, tuple[str, Any]] = {}  #: module and generator, by id
 
 
 class KeptGenerators:
-    """The generators that packages keep, with their states before an observed call, or after their import in it."""
+    """The generators that packages keep, with their states before an observed call, or after
+    their import in it.
+    """
 
     def __init__(self) -> None:
         self.drew = False  #: an installed package has asked for chance when it was imported
@@ -28,7 +30,9 @@ class KeptGenerators:
         self._drawn: list[str] = []  #: modules with a generator that drew while they were imported
 
     def keep(self, generator: Any, module: str) -> None:
-        """Remember the bits of NumPy, or a generator of Python, that a module of an installed package makes."""
+        """Remember the bits of NumPy, or a generator of Python, that a module of an installed
+        package makes.
+        """
         _kept[id(generator)] = module, generator
 
     def note(self) -> None:
@@ -44,11 +48,19 @@ class KeptGenerators:
 
     def changed(self) -> list[str]:
         """Return what has drawn since."""
-        drawn = [_kept[number][0] for number, state in self._states.items() if _state(_kept[number][1]) != state]
-        return [f"a generator that {module} keeps" for module in dict.fromkeys([*self._drawn, *drawn])]
+        drawn = [
+            _kept[number][0]
+            for number, state in self._states.items()
+            if _state(_kept[number][1]) != state
+        ]
+        return [
+            f"a generator that {module} keeps" for module in dict.fromkeys([*self._drawn, *drawn])
+        ]
 
     def _keep_of_modules(self) -> None:
-        """Remember the generators that stand in modules of installed packages that were not loaded before."""
+        """Remember the generators that stand in modules of installed packages that were not
+        loaded before.
+        """
         for name, module in sys.modules.copy().items():
             values = getattr(module, "__dict__", {})
             if name not in self._modules and is_installed(str(values.get("__file__"))):
@@ -60,4 +72,6 @@ class KeptGenerators:
 
 
 def _state(generator: Any) -> bytes:
-    return pickle.dumps(generator.getstate() if isinstance(generator, random.Random) else generator.state)
+    return pickle.dumps(
+        generator.getstate() if isinstance(generator, random.Random) else generator.state
+    )

@@ -1,7 +1,8 @@
 """What a step leaves in modules: another step may read it there, although no wire joins the two.
 
-The state of the user's modules is compared before and after a step, by what the keys count of it; so are the modules
-and classes of libraries that the code may change, and the settings of the process.
+The state of the user's modules is compared before and after a step, by what the keys count of it;
+so are the modules and classes of libraries that the code may change, and the settings of the
+process.
 """
 
 from __future__ import annotations
@@ -29,31 +30,47 @@ _ABSENT = object()
 
 
 def watch_state(own: OwnCode) -> _Told:
-    """Note what own modules and changed libraries hold; return what tells what has changed since then."""
+    """Note what own modules and changed libraries hold; return what tells what has changed since
+    then.
+    """
     modules, others, now = _of_modules(own), _of_others(own), _settings()
 
     def told() -> list[Taint]:
         names = [*_changed_modules(own, modules), *_changed_others(own, others)]
         later = _settings()
-        names += [f"a setting of the process, {name}" for name in now | later if now.get(name) != later.get(name)]
+        names += [
+            f"a setting of the process, {name}"
+            for name in now | later
+            if now.get(name) != later.get(name)
+        ]
         return [taint("memory", name) for name in dict.fromkeys(names)]
 
     return told
 
 
 def is_of_library(found: Taint, own: OwnCode) -> bool:
-    """Return True for something that a step left outside of its own modules, where code of any module may read it."""
-    return found.kind == "memory" and not any(found.what.startswith(f"{module}.") for module in own.modules)
+    """Return True for something that a step left outside of its own modules, where code of any
+    module may read it.
+    """
+    return found.kind == "memory" and not any(
+        found.what.startswith(f"{module}.") for module in own.modules
+    )
 
 
 def _of_modules(own: OwnCode) -> dict[str, dict[str, str]]:
     """Return a digest of each value of the user's modules, by module and name; empty for None."""
-    found = {name: module for name in own.modules if isinstance(module := sys.modules.get(name), ModuleType)}
+    found = {
+        name: module
+        for name in own.modules
+        if isinstance(module := sys.modules.get(name), ModuleType)
+    }
     return {name: _digests(module, own) for name, module in found.items()}
 
 
 def _digests(module: ModuleType, own: OwnCode) -> dict[str, str]:
-    values = {name: value for name, value in vars(module).copy().items() if not name.startswith("__")}
+    values = {
+        name: value for name, value in vars(module).copy().items() if not name.startswith("__")
+    }
     return {name: _digest(module, name, value, own) for name, value in values.items()}
 
 
@@ -71,14 +88,18 @@ def _digest(module: ModuleType, name: str, value: Any, own: OwnCode) -> str:
 
 
 def _is_usual(function: FunctionType) -> bool:
-    """Return True for a function that holds numbers and words alone, and is compared in little time."""
+    """Return True for a function that holds numbers and words alone, and is compared in little
+    time.
+    """
     if function.__kwdefaults__ or function.__closure__ or vars(function):
         return False
     return all(type(part) in _UNLIKE for part in function.__defaults__ or ())
 
 
 def _changed_modules(own: OwnCode, before: dict[str, dict[str, str]]) -> Iterator[str]:
-    """Yield the full names of what changed in own modules, but for constants that are made at the first call."""
+    """Yield the full names of what changed in own modules, but for constants that are made at
+    the first call.
+    """
     for module, now in _of_modules(own).items():
         then = before.get(module, now)
         for name in dict.fromkeys([*then, *now]):
@@ -91,12 +112,18 @@ def _changed_modules(own: OwnCode, before: dict[str, dict[str, str]]) -> Iterato
 
 
 def _is_unread(own: OwnCode, module: str, name: str) -> bool:
-    """Return True for a log: its module only writes to it, and no other module of the user has it."""
+    """Return True for a log: its module only writes to it, and no other module of the user has
+    it.
+    """
     if f"{module}.{name}" not in own.unread:
         return False
     home = sys.modules[module]
     value = getattr(home, name, None)
-    others = [sys.modules[each] for each in {*own_modules(), *own.modules} - {module} if each in sys.modules]
+    others = [
+        sys.modules[each]
+        for each in {*own_modules(), *own.modules} - {module}
+        if each in sys.modules
+    ]
     return not any(part is value or part is home for each in others for part in vars(each).values())
 
 
@@ -108,7 +135,9 @@ def _is_lazy(module: str, name: str) -> bool:
 
 
 def _of_others(own: OwnCode) -> dict[str, dict[str, Any]]:
-    """Return the attributes of the modules, classes and objects of libraries that own code may change."""
+    """Return the attributes of the modules, classes and objects of libraries that own code may
+    change.
+    """
     names = [name for name in own.changed if "()" not in name and not name.startswith(".")]
     found = {name: _attributes(value) for name in names if (value := _found(name)) is not None}
     for name in names:
@@ -133,14 +162,23 @@ def _found(name: str) -> Any:
 def _attributes(value: Any) -> dict[str, Any]:
     """Return the attributes of an object, or a digest of one that is a list, a dict or an array.
 
-    The entries of a dict in an attribute of an object count too: a table of a library is often a class around one.
+    The entries of a dict in an attribute of an object count too: a table of a library is often a
+    class around one.
     """
     names = getattr(value, "__dict__", None)
     if isinstance(names, dict | MappingProxyType):
         found = {name: part for name, part in names.copy().items() if not name.startswith("__")}
-        tables = [] if isinstance(value, ModuleType | type) else [n for n, part in found.items() if type(part) is dict]
+        tables = (
+            []
+            if isinstance(value, ModuleType | type)
+            else [n for n, part in found.items() if type(part) is dict]
+        )
         for table in tables:
-            found |= {f"{table}[{key!r}]": entry for key, entry in found[table].items() if isinstance(key, str)}
+            found |= {
+                f"{table}[{key!r}]": entry
+                for key, entry in found[table].items()
+                if isinstance(key, str)
+            }
         return found
     return {"": LoadedState(sys, (), lambda _: False).digest({"value": value})}
 
@@ -156,7 +194,9 @@ def _changed_others(own: OwnCode, before: dict[str, dict[str, Any]]) -> Iterator
 
 
 def _is_of_package(value: Any, place: str) -> bool:
-    """Return True for a function or a class of the package itself, which it imports when it is first asked for."""
+    """Return True for a function or a class of the package itself, which it imports when it is
+    first asked for.
+    """
     return str(getattr(value, "__module__", "")).partition(".")[0] == place.partition(".")[0]
 
 

@@ -1,6 +1,7 @@
 """Legacy generators of NumPy: ``RandomState(3)`` asks for chance first, and only then for its seed.
 
-So does all that takes ``random_state=3``. While a call is observed, such a generator says whether a seed followed.
+So does all that takes ``random_state=3``. While a call is observed, such a generator says whether a
+seed followed.
 """
 
 from __future__ import annotations
@@ -15,11 +16,14 @@ import numpy as np
 from neusee.workflows.observation.python_watch import watch_here
 
 _PLACE: Any = np.random.mtrand
-_NAME = "_MT19937"  #: what ``RandomState`` begins with; where it is missing, a seeded one counts as chance
+#: what ``RandomState`` begins with; where it is missing, a seeded one counts as chance
+_NAME = "_MT19937"
 
 
 class _Replacement(abc.ABCMeta):
-    """Class of a class that stands for `MT19937`: a ``RandomState`` asks whether its generator is an instance."""
+    """Class of a class that stands for `MT19937`: a ``RandomState`` asks whether its generator
+    is an instance.
+    """
 
     def __instancecheck__(cls, instance: object) -> bool:
         return isinstance(instance, np.random.MT19937)
@@ -29,7 +33,9 @@ class LegacyGenerator(np.random.MT19937, metaclass=_Replacement):
     """The generator of a ``RandomState`` that an observed call makes."""
 
     def __init__(self, *seed: Any) -> None:
-        """Make the generator; what it takes from the system counts at the end of the call, if no seed followed."""
+        """Make the generator; what it takes from the system counts at the end of the call, if no
+        seed followed.
+        """
         self._seeded, self._first = bool(seed), b""
         watch = watch_here()
         if watch is None or seed:
@@ -62,10 +68,15 @@ class LegacyGenerator(np.random.MT19937, metaclass=_Replacement):
         """Return what a file keeps: the generator of NumPy that this is."""
         made: tuple[Any, ...] = super().__reduce__()
         make, arguments, *rest = made
-        return make, tuple(np.random.MT19937 if each is LegacyGenerator else each for each in arguments), *rest
+        return (
+            make,
+            tuple(np.random.MT19937 if each is LegacyGenerator else each for each in arguments),
+            *rest,
+        )
 
 
-LegacyGenerator.__name__ = np.random.MT19937.__name__  # its state names its class, and a file keeps its state
+# its state names its class, and a file keeps its state
+LegacyGenerator.__name__ = np.random.MT19937.__name__
 
 
 class WatchedLegacyGenerators:

@@ -1,4 +1,6 @@
-"""Call of a step of the user that is observed: its value, and what it reached that its key does not know."""
+"""Call of a step of the user that is observed: its value, and what it reached that its key does
+not know.
+"""
 
 from __future__ import annotations
 
@@ -23,20 +25,25 @@ from neusee.workflows.observation.watched_imports import WatchedImports
 from neusee.workflows.observation.watched_threads import WatchedThreads
 
 T = TypeVar("T")
-_turn = [threading.Lock()]  #: one observed call at a time: hooks and generators belong to the process
-_LOOK = 0.05  #: s after which a caller that waits for its turn sees an exception that another thread raises in it
+#: one observed call at a time: hooks and generators belong to the process
+_turn = [threading.Lock()]
+#: s after which a caller that waits for its turn sees an exception that another thread raises in it
+_LOOK = 0.05
 
 
 def observed(
-    function: Callable[[], T], covered: Covered, state: Callable[[], Callable[[], list[Taint]]] | None = None
+    function: Callable[[], T],
+    covered: Covered,
+    state: Callable[[], Callable[[], list[Taint]]] | None = None,
 ) -> tuple[T, tuple[Taint, ...]]:
     """Return the value of a function, and what the function reached that is not covered.
 
     ``state`` notes what modules hold, before the call, and returns what tells the changes after it.
 
-    The function runs in a thread of its own, as its caller would run it, and its exceptions pass unchanged. If the
-    process that watches it dies meanwhile, calls of the function fail, so the function is called again: what it uses
-    up, such as a generator, it makes itself. An observed call within an observed call is a part of it, without taints.
+    The function runs in a thread of its own, as its caller would run it, and its exceptions pass
+    unchanged. If the process that watches it dies meanwhile, calls of the function fail, so the
+    function is called again: what it uses up, such as a generator, it makes itself. An observed
+    call within an observed call is a part of it, without taints.
     """
     if python_watch.watch_here() is not None:
         return function(), ()
@@ -61,7 +68,8 @@ def one_at_a_time() -> Iterator[None]:
 
 @contextmanager
 def watched_in_fork() -> Iterator[Callable[[], None]]:
-    """Give what a fork of this process calls first, so that the kernel watches it as it would watch this process.
+    """Give what a fork of this process calls first, so that the kernel watches it as it would watch
+    this process.
 
     Only one fork is observed at a time, and this process waits for it: see `one_at_a_time`.
     """
@@ -86,14 +94,18 @@ def watched_in_fork() -> Iterator[Callable[[], None]]:
 
 
 def observed_import(load: Callable[[], T], covered: Covered) -> tuple[T, tuple[Taint, ...]]:
-    """Return what a function imports, and what the bodies of the modules of the user reached meanwhile.
+    """Return what a function imports, and what the bodies of the modules of the user reached
+    meanwhile.
 
-    A module that is loaded already is not executed again, so it reaches nothing: observe its first import.
+    A module that is loaded already is not executed again, so it reaches nothing: observe its first
+    import.
     """
     return observed(load, covered)
 
 
-def _observed(function: Callable[[], T], covered: Covered) -> tuple[StepThread[T], tuple[Taint, ...]]:
+def _observed(
+    function: Callable[[], T], covered: Covered
+) -> tuple[StepThread[T], tuple[Taint, ...]]:
     """Return the step that has ended, and its taints; without the kernel's layer where it fails."""
     unwatched = ""
     if not kernel_layer.missing():
@@ -108,13 +120,23 @@ def _observed(function: Callable[[], T], covered: Covered) -> tuple[StepThread[T
     return step, _judged(watch, covered, [*watch.records, *unseen])
 
 
-def _run(function: Callable[[], T], client: NotificationClient | None) -> tuple[StepThread[T], Watch]:
-    """Run a function in its thread until it has ended; raise `NoServer` if its thread could not be watched."""
+def _run(
+    function: Callable[[], T], client: NotificationClient | None
+) -> tuple[StepThread[T], Watch]:
+    """Run a function in its thread until it has ended; raise `NoServer` if its thread could not
+    be watched.
+    """
     watch = Watch(kernel=client is not None)
     step = StepThread(function, lambda: kernel_layer.stop_here(client) if client else None)
     watch.add(step.thread)
     audit_events.listen()
-    with WatchedChance(), WatchedLegacyGenerators(), WatchedImports(), WatchedThreads(), SharedGenerators() as shared:
+    with (
+        WatchedChance(),
+        WatchedLegacyGenerators(),
+        WatchedImports(),
+        WatchedThreads(),
+        SharedGenerators() as shared,
+    ):
         python_watch.begin(watch)
         try:
             step.run()
@@ -132,7 +154,8 @@ def _judged(watch: Watch, covered: Covered, records: list[Record]) -> tuple[Tain
         return ()
     quiet = {path for path, is_quiet in watch.quiet.items() if is_quiet}
     judgement = Judgement(covered, watch.bodies, quiet, watch.temporary)
-    # where Python knows which source of chance was asked, what the kernel says of it is the same once more
+    # where Python knows which source of chance was asked, what the kernel says of it is the same
+    # once more
     judgement.judge(record for record in records if record.does != "entropy" or not chance)
     judgement.judge(Record("input", path) for path in sorted(watch.settings) if decides(path))
     judgement.judge_modules()
@@ -142,7 +165,9 @@ def _judged(watch: Watch, covered: Covered, records: list[Record]) -> tuple[Tain
 
 
 def _in_child() -> None:
-    """Let the fork of a process observe calls of its own, unless it is a part of the observed call."""
+    """Let the fork of a process observe calls of its own, unless it is a part of the observed
+    call.
+    """
     _turn[0] = threading.Lock()
     if python_watch.watch_here() is None:
         python_watch.end()

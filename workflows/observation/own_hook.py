@@ -1,4 +1,6 @@
-"""Observed hook of an own node that runs before its step: what the hook reads may stay in a memo of its module."""
+"""Observed hook of an own node that runs before its step: what the hook reads may stay in a memo
+of its module.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +24,26 @@ T = TypeVar("T")
 
 
 def call_hook(node: Node, hook: Callable[[], T], params: Mapping[str, Any]) -> T:
-    """Return what a hook of an own node returns; taint own modules by what it reaches beyond the parameters."""
+    """Return what a hook of an own node returns; taint own modules by what it reaches beyond the
+    parameters.
+    """
     home = node.fn.__module__
     files = frozenset(Path(os.path.realpath(file)) for file in files_in(params))
     value, found = observed(hook, Covered(files, lambda _: True))
     free = {entry.removeprefix(FREE) for entry in node.depends}
-    left = [each for each in found if not (free & {each.kind, each.what, Path(each.what).name} or declares(home, each))]
+    left = [
+        each
+        for each in found
+        if not (free & {each.kind, each.what, Path(each.what).name} or declares(home, each))
+    ]
     if left:
         taint_code({home, *own_modules()}, tuple(left))
         for each in left:
-            text = f"a hook of {node.path} {WORDS[each.kind]} {each.what}, which no cache key covers"
-            say_once(home, f"{text}: the results of own nodes are not stored; to have them stored, {each.fix}")
+            text = (
+                f"a hook of {node.path} {WORDS[each.kind]} {each.what}, which no cache key covers"
+            )
+            say_once(
+                home,
+                f"{text}: the results of own nodes are not stored; to have them stored, {each.fix}",
+            )
     return value

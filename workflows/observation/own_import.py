@@ -1,4 +1,6 @@
-"""Observed import of own modules: what they read while they are imported stays in them, and no later call shows it."""
+"""Observed import of own modules: what they read while they are imported stays in them, and no
+later call shows it.
+"""
 
 from __future__ import annotations
 
@@ -23,13 +25,15 @@ from neusee.workflows.observation.own_call import WORDS, say_hidden
 from neusee.workflows.observation.step_thread import is_alone
 from neusee.workflows.observation.taints import Covered, Taint, taint
 
-_VARIABLE = re.compile(rb"[\"']env:(\w+)[\"']")  #: as a module declares a variable of the environment
+#: as a module declares a variable of the environment
+_VARIABLE = re.compile(rb"[\"']env:(\w+)[\"']")
 
 
 def import_observed(name: str) -> ModuleType:
     """Import a module of a user; taint it, and those that it imports, by what they reach meanwhile.
 
-    What a module declares in ``__depends__`` is no taint. A module that is loaded already is not observed again.
+    What a module declares in ``__depends__`` is no taint. A module that is loaded already is not
+    observed again.
     """
     if name in sys.modules:
         return sys.modules[name]
@@ -39,14 +43,22 @@ def import_observed(name: str) -> ModuleType:
         module, found = observed_import(load, Covered(frozenset(), lambda _: True))
     say_hidden(name, asked)
     found += tuple(taint("variable", each) for each in asked.of_own_code)
-    new = [each for each in sys.modules if each not in before and origin_of(each, frozenset()).kind == "source"]
+    new = [
+        each
+        for each in sys.modules
+        if each not in before and origin_of(each, frozenset()).kind == "source"
+    ]
     taints = tuple(each for each in found if not _is_declared(each, new))
     if taints:
         taint_code(new, taints)
         for each in taints:
-            reached = f"{WORDS[each.kind]} {each.what} when it is imported, which no cache key covers"
+            reached = (
+                f"{WORDS[each.kind]} {each.what} when it is imported, which no cache key covers"
+            )
             say_once(
-                name, f"{name} {reached}: the results of its nodes are not stored; to have them stored, {each.fix}"
+                name,
+                f"{name} {reached}: the results of its nodes are not stored; to have them stored,"
+                f" {each.fix}",
             )
     return module
 
@@ -57,7 +69,9 @@ def _is_declared(found: Taint, modules: Iterable[str]) -> bool:
 
 @contextmanager
 def _hidden(name: str) -> Iterator[Asked]:
-    """Hide variables of the environment from the libraries that a module imports, but not beside foreign threads."""
+    """Hide variables of the environment from the libraries that a module imports, but not beside
+    foreign threads.
+    """
     if not is_alone():
         yield Asked()
         return
@@ -66,7 +80,9 @@ def _hidden(name: str) -> Iterator[Asked]:
 
 
 def _declared_variables(name: str) -> frozenset[str]:
-    """Return the variables that a module, or one beside or below it, declares; it is not imported yet."""
+    """Return the variables that a module, or one beside or below it, declares; it is not
+    imported yet.
+    """
     spec = importlib.util.find_spec(name)
     if spec is None or not spec.has_location or spec.origin is None:
         return frozenset()
@@ -86,7 +102,10 @@ def declares(module: str, taint: Taint) -> bool:
     free = {entry.removeprefix(FREE) for entry in entries if entry.startswith(FREE)}
     if free & {taint.kind, taint.what, Path(taint.what).name}:
         return True
-    return any(path == Path(taint.what) or path in Path(taint.what).parents for path in _beside(loaded, entries))
+    return any(
+        path == Path(taint.what) or path in Path(taint.what).parents
+        for path in _beside(loaded, entries)
+    )
 
 
 def _beside(module: ModuleType, entries: list[str]) -> Iterator[Path]:

@@ -1,4 +1,6 @@
-"""What this process itself sees of the observed call under way: its threads, its imports, and what its hooks record."""
+"""What this process itself sees of the observed call under way: its threads, its imports, and
+what its hooks record.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +24,18 @@ class Watch:
     """One observed call."""
 
     def __init__(self, kernel: bool) -> None:
-        self.kernel = kernel  #: True if the kernel watches too: then it sees all that is opened, and more
+        #: True if the kernel watches too: then it sees all that is opened, and more
+        self.kernel = kernel
         self.records: list[Record] = []
         self.draws: set[str] = set()  #: sources of chance that were asked
         self.kept = KeptGenerators()  #: generators of installed packages
         self.generators: list[Seedable] = []  #: that were made before their seed, if any, was known
-        self.bodies: dict[str, str] = {}  #: file of each module of the user that was executed, by name
-        self.quiet: dict[str, bool] = {}  #: files, and whether all who asked for their source or marks need no record
-        self.settings: set[str] = set()  #: files that installed packages read while they were imported
+        #: file of each module of the user that was executed, by name
+        self.bodies: dict[str, str] = {}
+        #: files, and whether all who asked for their source or marks need no record
+        self.quiet: dict[str, bool] = {}
+        #: files that installed packages read while they were imported
+        self.settings: set[str] = set()
         self.temporary: set[str] = set()  #: files and folders with names that chance gave
         self._threads: set[threading.Thread] = set()
         self._local = threading.local()
@@ -48,7 +54,9 @@ class Watch:
         return self.draws | ({"numpy.random.RandomState without a seed"} if unseeded else set())
 
     def trusted(self) -> bool:
-        """Return True if the current thread imports an installed package, or searches for a module."""
+        """Return True if the current thread imports an installed package, or searches for a
+        module.
+        """
         return bool(getattr(self._local, "trusted", False))
 
     def trust(self, trusted: bool) -> bool:

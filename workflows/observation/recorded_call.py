@@ -1,4 +1,6 @@
-"""Record of one thing that a step reached, made from a stopped system call: what was done, with real paths."""
+"""Record of one thing that a step reached, made from a stopped system call: what was done, with
+real paths.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +26,16 @@ class Record(NamedTuple):
 
 
 def recorded(task: Task, call: Call, arguments: Sequence[int]) -> Record:
-    """Return the record of a stopped call; raise `OSError` if what the task handed over cannot be read."""
+    """Return the record of a stopped call; raise `OSError` if what the task handed over cannot
+    be read.
+    """
     return _READ[call.does](task, call, arguments)
 
 
 def without_reading(record: Record) -> Record | None:
-    """Return what remains of a call of a trusted task: the step may read what was made, and nothing else counts."""
+    """Return what remains of a call of a trusted task: the step may read what was made, and
+    nothing else counts.
+    """
     if record.does == "open" and record.flags & (os.O_CREAT | os.O_TRUNC):
         return record._replace(flags=(record.flags & ~os.O_ACCMODE) | os.O_WRONLY, trusted=True)
     return record._replace(trusted=True) if record.does in ("make", "move") else None
@@ -54,7 +60,9 @@ def _signed(argument: int) -> int:
 def _opened(task: Task, call: Call, arguments: Sequence[int]) -> Record:
     if call.does == "creat":
         flags = os.O_CREAT | os.O_WRONLY | os.O_TRUNC
-    elif call.does == "openat2":  # the pointer to a ``struct open_how``, whose first field are the flags
+    elif (
+        call.does == "openat2"
+    ):  # the pointer to a ``struct open_how``, whose first field are the flags
         flags = int(struct.unpack("Q", task.memory(arguments[call.number], 8))[0])
     else:
         flags = _number(call, arguments)
@@ -69,7 +77,9 @@ def _at_path(task: Task, call: Call, arguments: Sequence[int]) -> Record:
 
 
 def _two_paths(task: Task, call: Call, arguments: Sequence[int]) -> Record:
-    first, second = (_path(task, place, arguments, follow=False) for place in (call.path, call.second))
+    first, second = (
+        _path(task, place, arguments, follow=False) for place in (call.path, call.second)
+    )
     return Record(call.does, first, second, there=os.path.lexists(first))
 
 
@@ -84,13 +94,19 @@ def _address(task: Task, call: Call, arguments: Sequence[int]) -> Record:
     family = struct.unpack_from("H", data)[0] if len(data) > 1 else socket.AF_UNSPEC
     if family == socket.AF_UNIX:
         name = os.fsdecode(data[2:].partition(b"\0")[0])
-        return Record(call.does, task.path(name, AT_FDCWD) if name else f"@{os.fsdecode(data[3:])}", "unix")
+        return Record(
+            call.does, task.path(name, AT_FDCWD) if name else f"@{os.fsdecode(data[3:])}", "unix"
+        )
     if family in (socket.AF_INET, socket.AF_INET6):
         start, length = (4, 4) if family == socket.AF_INET else (8, 16)
         host = socket.inet_ntop(family, data[start : start + length])
         return Record(call.does, f"{host}:{struct.unpack_from('!H', data, 2)[0]}", "internet")
     # the kernel itself answers a netlink socket, and a socket without a family is only let go
-    return Record(call.does, f"family {family}", "" if family in (socket.AF_UNSPEC, socket.AF_NETLINK) else "other")
+    return Record(
+        call.does,
+        f"family {family}",
+        "" if family in (socket.AF_UNSPEC, socket.AF_NETLINK) else "other",
+    )
 
 
 def _named(task: Task, call: Call, arguments: Sequence[int]) -> Record:
@@ -99,10 +115,13 @@ def _named(task: Task, call: Call, arguments: Sequence[int]) -> Record:
 
 def _entropy(task: Task, call: Call, arguments: Sequence[int]) -> Record:
     length, flags = arguments[call.number], arguments[call.number + 1]
-    return Record("entropy", f"{call.name} of {length} bytes", flags=flags & 0xFF, there=length > _SMALL)
+    return Record(
+        "entropy", f"{call.name} of {length} bytes", flags=flags & 0xFF, there=length > _SMALL
+    )
 
 
-#: bytes of chance that Python and the library of C take for names of files and places in memory, and no result has
+#: bytes of chance that Python and the library of C take for names of files and places in memory,
+#: and no result has
 _SMALL = 32
 _READ: dict[Does, Callable[[Task, Call, Sequence[int]], Record]] = {
     **dict.fromkeys(("open", "openat2", "creat"), _opened),

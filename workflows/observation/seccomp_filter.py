@@ -1,7 +1,9 @@
-"""Filter of the kernel that stops a thread, and what the thread starts, at the system calls of the table.
+"""Filter of the kernel that stops a thread, and what the thread starts, at the system calls of the
+table.
 
-The filter belongs to the thread that installs it and cannot be taken away: install it in a thread made for it. Its
-threads and child processes inherit it. A stopped call waits until the listener, a file descriptor, is answered.
+The filter belongs to the thread that installs it and cannot be taken away: install it in a thread
+made for it. Its threads and child processes inherit it. A stopped call waits until the listener, a
+file descriptor, is answered.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from neusee.workflows.observation.system_calls import (
 PR_SET_NO_NEW_PRIVS = 38
 SECCOMP_SET_MODE_FILTER, SECCOMP_GET_ACTION_AVAIL = 1, 2
 SECCOMP_FILTER_FLAG_NEW_LISTENER = 1 << 3
-SECCOMP_FILTER_FLAG_WAIT_KILLABLE_RECV = 1 << 5  #: from Linux 5.19: a signal does not cut a stopped call short
+#: from Linux 5.19: a signal does not cut a stopped call short
+SECCOMP_FILTER_FLAG_WAIT_KILLABLE_RECV = 1 << 5
 SECCOMP_RET_USER_NOTIF, SECCOMP_RET_ALLOW = 0x7FC00000, 0x7FFF0000
 _SECCOMP = {"x86_64": 317, "aarch64": 277}  #: number of the call that installs a filter
 _X32 = 0x40000000  #: bit of the number of a call of the x32 convention, which no table has
@@ -37,7 +40,12 @@ _NUMBER, _ARCH, _ARGUMENTS = 0, 4, 16
 class sock_filter(ctypes.Structure):
     """One instruction, as in linux/filter.h."""
 
-    _fields_ = (("code", ctypes.c_uint16), ("jt", ctypes.c_uint8), ("jf", ctypes.c_uint8), ("k", ctypes.c_uint32))
+    _fields_ = (
+        ("code", ctypes.c_uint16),
+        ("jt", ctypes.c_uint8),
+        ("jf", ctypes.c_uint8),
+        ("k", ctypes.c_uint32),
+    )
 
 
 class sock_fprog(ctypes.Structure):
@@ -47,7 +55,9 @@ class sock_fprog(ctypes.Structure):
 
 
 class Step(NamedTuple):
-    """One instruction: its code, how many to skip where its test holds and where not, and its operand."""
+    """One instruction: its code, how many to skip where its test holds and where not, and its
+    operand.
+    """
 
     code: int
     then: int
@@ -64,11 +74,21 @@ def program(name: str) -> list[Step]:
     x32 = [Step(BPF_JGE, 0, 1, _X32), _STOP] if name == "x86_64" else []
     calls = [step for number, call in numbers(name).items() for step in _call(number, call.when)]
     usual = [_load(_NUMBER), *x32, *calls, _PASS]
-    return [_load(_ARCH), Step(BPF_JEQ, len(of_32_bits) + 1, 0, audit_arch(name)), *of_32_bits, _PASS, *usual]
+    return [
+        _load(_ARCH),
+        Step(BPF_JEQ, len(of_32_bits) + 1, 0, audit_arch(name)),
+        *of_32_bits,
+        _PASS,
+        *usual,
+    ]
 
 
 def _calls_of_32_bits() -> list[Step]:
-    stops = [step for number in CALLS_OF_32_BITS.values() for step in (Step(BPF_JEQ, 0, 1, number), _STOP)]
+    stops = [
+        step
+        for number in CALLS_OF_32_BITS.values()
+        for step in (Step(BPF_JEQ, 0, 1, number), _STOP)
+    ]
     return [Step(BPF_JEQ, 0, len(stops) + 1, AUDIT_ARCH_I386), _load(_NUMBER), *stops]
 
 
@@ -105,7 +125,8 @@ class Filter:
         self._flags = SECCOMP_FILTER_FLAG_NEW_LISTENER | SECCOMP_FILTER_FLAG_WAIT_KILLABLE_RECV
 
     def install(self) -> int:
-        """Install the filter in the current thread and return its listener; raise `OSError` where that fails.
+        """Install the filter in the current thread and return its listener; raise `OSError` where
+        that fails.
 
         From here the thread waits at the calls of the table until somebody serves the listener.
         """
@@ -114,7 +135,9 @@ class Filter:
         listener = self._seccomp(SECCOMP_SET_MODE_FILTER, self._flags, ctypes.byref(self._program))
         if listener < 0 and ctypes.get_errno() == errno.EINVAL:  # before Linux 5.19
             self._flags = SECCOMP_FILTER_FLAG_NEW_LISTENER
-            listener = self._seccomp(SECCOMP_SET_MODE_FILTER, self._flags, ctypes.byref(self._program))
+            listener = self._seccomp(
+                SECCOMP_SET_MODE_FILTER, self._flags, ctypes.byref(self._program)
+            )
         if listener < 0:
             raise OSError(ctypes.get_errno(), f"no filter: {os.strerror(ctypes.get_errno())}")
         return listener

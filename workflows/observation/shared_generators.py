@@ -1,7 +1,9 @@
-"""Generators that all code of a process shares: did an observed call draw from one before it had set the seed?
+"""Generators that all code of a process shares: did an observed call draw from one before it had
+set the seed?
 
-``torch.manual_seed(3)`` and ``np.random.seed(3)`` determine all numbers that follow. A call that draws before it
-depends on what the process drew earlier, also if it puts the state back at the end, as ``torch.random.fork_rng`` does.
+``torch.manual_seed(3)`` and ``np.random.seed(3)`` determine all numbers that follow. A call that
+draws before it depends on what the process drew earlier, also if it puts the state back at the end,
+as ``torch.random.fork_rng`` does.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ from neusee.workflows.observation.python_watch import watch_here
 
 _By = Literal["seed", "state", "system"]  #: what determines the numbers that follow
 _TORCH: Any = torch.random
-_GENERATOR = "default_generator"  #: what the functions of torch for seeds ask; where it is missing, each draw counts
+#: what the functions of torch for seeds ask; where it is missing, each draw counts
+_GENERATOR = "default_generator"
 
 
 class Shared:
@@ -26,7 +29,8 @@ class Shared:
     def __init__(self, state: Callable[[], Any]) -> None:
         """Watch a generator; ``state`` returns its state, which is the first one now."""
         self._state, self._first = state, state()
-        self._seeded = False  #: what it draws now is determined by a seed, or by a state, that the call has set
+        #: what it draws now is determined by a seed, or by a state, that the call has set
+        self._seeded = False
         self._drew = False
 
     def drew(self) -> bool:
@@ -35,7 +39,9 @@ class Shared:
         return self._drew
 
     def set(self, change: Callable[[], Any], by: _By) -> Any:
-        """Let a call set the generator; the state that it had at the beginning determines nothing."""
+        """Let a call set the generator; the state that it had at the beginning determines
+        nothing.
+        """
         self.drew()
         value, state = change(), self._state()
         disturbed = watch_here() is None and bool(state)  # by a thread that is not of the call
@@ -45,7 +51,9 @@ class Shared:
 
 
 class SharedGenerators:
-    """The shared generators during an observed call, with the functions that set their seeds and states wrapped."""
+    """The shared generators during an observed call, with the functions that set their seeds and
+    states wrapped.
+    """
 
     def __init__(self) -> None:
         self._shared = {
@@ -89,7 +97,11 @@ class SharedGenerators:
             (torch.cuda, of_cuda),
             (torch.cuda.random, of_cuda),
         )
-        wrapped = [(place, name, function) for place, functions in places for name, function in functions.items()]
+        wrapped = [
+            (place, name, function)
+            for place, functions in places
+            for name, function in functions.items()
+        ]
         return [(_TORCH, _GENERATOR, generator), *wrapped]
 
 
@@ -113,7 +125,9 @@ class _Seeded:
 
 
 def _setting(function: Callable[..., Any], shared: Shared, by: _By) -> Callable[..., Any]:
-    """Return a function that sets a seed or a state, wrapped; without a value, or with None, the system gives it."""
+    """Return a function that sets a seed or a state, wrapped; without a value, or with None, the
+    system gives it.
+    """
 
     def set_generator(*given: Any, **named: Any) -> Any:
         without = next(iter((*given, *named.values())), None) is None
@@ -123,7 +137,9 @@ def _setting(function: Callable[..., Any], shared: Shared, by: _By) -> Callable[
 
 
 def _differs(state: Any, first: Any) -> bool:
-    """Return True if a generator has another state; a graphics processor that came into use has drawn nothing yet."""
+    """Return True if a generator has another state; a graphics processor that came into use has
+    drawn nothing yet.
+    """
     if isinstance(state, dict):
         return any(found != first.get(number, (found[0], 0)) for number, found in state.items())
     return bool(state != first)
@@ -137,4 +153,6 @@ def _of_numpy() -> tuple[Any, ...]:
 def _of_cuda() -> dict[int, tuple[int, int]]:
     """Return seed and count of the draws of each graphics processor in use."""
     generators = torch.cuda.default_generators if torch.cuda.is_initialized() else ()  # type: ignore[no-untyped-call]
-    return {number: (each.initial_seed(), each.get_offset()) for number, each in enumerate(generators)}
+    return {
+        number: (each.initial_seed(), each.get_offset()) for number, each in enumerate(generators)
+    }

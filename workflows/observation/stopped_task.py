@@ -1,6 +1,7 @@
 """Thread that the kernel has stopped at a system call: its memory, its open files and its folders.
 
-The thread waits, so what it handed to the call is read from the outside, from the files of ``/proc``.
+The thread waits, so what it handed to the call is read from the outside, from the files of
+``/proc``.
 """
 
 from __future__ import annotations
@@ -39,13 +40,15 @@ class Task:
             return next(int(line.split()[1]) for line in lines if line.startswith(f"{word}:"))
 
     def path(self, text: str, folder: int, follow: bool = True) -> str:
-        """Return the real path of a text, which begins at the open folder ``folder`` if it is relative.
+        """Return the real path of a text, which begins at the open folder ``folder`` if it is
+        relative.
 
         Without ``follow``, a link at the end of the path stays.
         """
         if not text.startswith("/"):
             text = os.path.join(self.link("cwd" if folder == AT_FDCWD else f"fd/{folder}"), text)
-        for own in ("/proc/self", "/proc/thread-self"):  # of the thread, not of the process that reads this
+        # of the thread, not of the process that reads this
+        for own in ("/proc/self", "/proc/thread-self"):
             if f"{text}/".startswith(f"{own}/"):
                 text = f"/proc/{self.thread}{text.removeprefix(own)}"
         if follow:

@@ -1,7 +1,8 @@
-"""Table of the system calls that a step is stopped at: numbers, what each does, and where its arguments stand.
+"""Table of the system calls that a step is stopped at: numbers, what each does, and where its
+arguments stand.
 
-A call that is not in the table passes at full speed. A row that changes what counts as reached is a row of this table;
-the filter and the process that serves it are made from it.
+A call that is not in the table passes at full speed. A row that changes what counts as reached is a
+row of this table; the filter and the process that serves it are made from it.
 """
 
 from __future__ import annotations
@@ -12,9 +13,25 @@ from typing import Literal, NamedTuple
 
 #: what a call does, for the process that records it and for the judgement of the records
 Does = Literal[
-    "open", "openat2", "creat", "check", "xattr", "xattr_open", "list", "input", "make", "remove", "move", "link",
-    "exec", "fork", "connect", "bind", "entropy", "unseen",
-]  # fmt: skip
+    "open",
+    "openat2",
+    "creat",
+    "check",
+    "xattr",
+    "xattr_open",
+    "list",
+    "input",
+    "make",
+    "remove",
+    "move",
+    "link",
+    "exec",
+    "fork",
+    "connect",
+    "bind",
+    "entropy",
+    "unseen",
+]
 Test = Literal["without", "nonzero", "zero"]
 
 AT_EMPTY_PATH = 0x1000  #: the call asks about an open file, not about a path
@@ -24,7 +41,9 @@ AUDIT_ARCH_I386 = 0x40000003
 
 
 class Condition(NamedTuple):
-    """What an argument must be for the call to count: ``without`` the bits of a mask, ``nonzero`` or ``zero``."""
+    """What an argument must be for the call to count: ``without`` the bits of a mask,
+    ``nonzero`` or ``zero``.
+    """
 
     argument: int
     test: Test
@@ -32,14 +51,18 @@ class Condition(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Where the arguments of a path stand: the pointer, and the folder that a relative path begins at (-1: of work)."""
+    """Where the arguments of a path stand: the pointer, and the folder that a relative path
+    begins at (-1: of work).
+    """
 
     pointer: int
     folder: int = -1
 
 
 class Call(NamedTuple):
-    """One system call: its number on each processor (-1 where it is missing), and where its arguments stand."""
+    """One system call: its number on each processor (-1 where it is missing), and where its
+    arguments stand.
+    """
 
     name: str
     does: Does
@@ -85,7 +108,8 @@ CALLS = (
     Call("chmod", "check", 90, -1, Path(0)),
     Call("fchmodat", "check", 268, 53, Path(1, 0)),
     Call("utimensat", "check", 280, 88, Path(1, 0), when=Condition(1, "nonzero")),
-    # what the step makes itself, and may therefore read; whether it could be made or removed says what was there before
+    # what the step makes itself, and may therefore read; whether it could be made or removed says
+    # what was there before
     Call("mkdir", "make", 83, -1, Path(0)),
     Call("mkdirat", "make", 258, 34, Path(1, 0)),
     Call("mknod", "make", 133, -1, Path(0)),
@@ -121,17 +145,31 @@ CALLS = (
     Call("getrandom", "entropy", 318, 278, number=1),
 )  # fmt: skip
 
-#: calls of 32 bits that open, look or start something; a 64-bit process that makes one is out of the ordinary
+#: calls of 32 bits that open, look or start something; a 64-bit process that makes one is out of
+#: the ordinary
 CALLS_OF_32_BITS = {
-    "open": 5, "creat": 8, "execve": 11, "stat": 106, "socketcall": 102, "stat64": 195, "openat": 295,
-    "getrandom": 355, "execveat": 358, "connect": 362, "openat2": 437,
-}  # fmt: skip
+    "open": 5,
+    "creat": 8,
+    "execve": 11,
+    "stat": 106,
+    "socketcall": 102,
+    "stat64": 195,
+    "openat": 295,
+    "getrandom": 355,
+    "execveat": 358,
+    "connect": 362,
+    "openat2": 437,
+}
 
 
 def machine() -> str:
-    """Return the processor if the table has its numbers: ``x86_64`` or ``aarch64``, of 64 bits, else an empty text."""
+    """Return the processor if the table has its numbers: ``x86_64`` or ``aarch64``, of 64 bits,
+    else an empty text.
+    """
     name = platform.machine()
-    return name if sys.platform == "linux" and name in _ARCHITECTURES and sys.maxsize > 2**32 else ""
+    return (
+        name if sys.platform == "linux" and name in _ARCHITECTURES and sys.maxsize > 2**32 else ""
+    )
 
 
 def audit_arch(name: str) -> int:

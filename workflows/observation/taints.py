@@ -7,7 +7,17 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 Kind = Literal[
-    "file", "folder", "write", "attribute", "process", "network", "random", "import", "memory", "variable", "unknown"
+    "file",
+    "folder",
+    "write",
+    "attribute",
+    "process",
+    "network",
+    "random",
+    "import",
+    "memory",
+    "variable",
+    "unknown",
 ]
 
 
@@ -28,18 +38,36 @@ class Taint(NamedTuple):
 
 _OF_PATHS = ("file", "folder", "write", "attribute")
 _FIX: dict[Kind, str] = {
-    "file": 'declare it, depends=["{name}"], or make it a parameter of type DataFile; or write cache: false',
-    "folder": 'declare the folder, depends=["{name}"], or make its files a parameter of type DataFiles; or write '
-    "cache: false",
-    "write": 'empty the file where it is opened, mode "w", or write to a temporary one; or, if no result depends on '
-    'what was there before, depends=["unaffected:{name}"]; or write cache: false',
+    "file": (
+        'declare it, depends=["{name}"], or make it a parameter of type DataFile; or write cache:'
+        " false"
+    ),
+    "folder": (
+        'declare the folder, depends=["{name}"], or make its files a parameter of type DataFiles;'
+        " or write cache: false"
+    ),
+    "write": (
+        'empty the file where it is opened, mode "w", or write to a temporary one; or, if no result'
+        ' depends on what was there before, depends=["unaffected:{name}"]; or write cache: false'
+    ),
     "attribute": "give it as a parameter; or write cache: false",
-    "process": "compute it in the node, or run it before and give its output as a DataFile; or write cache: false",
+    "process": (
+        "compute it in the node, or run it before and give its output as a DataFile; or write"
+        " cache: false"
+    ),
     "network": "fetch it before and give the file as a DataFile; or write cache: false",
-    "random": "draw from an argument rng of the node, a generator that the engine seeds; or write cache: false",
-    "import": 'write the import as a statement, or declare the module: depends=["{name}"]; or write cache: false',
-    "memory": "return it as a value to the steps that read it, or, if no result depends on it, declare "
-    'depends=["unaffected:{name}"]; or write cache: false',
+    "random": (
+        "draw from an argument rng of the node, a generator that the engine seeds; or write cache:"
+        " false"
+    ),
+    "import": (
+        'write the import as a statement, or declare the module: depends=["{name}"]; or write'
+        " cache: false"
+    ),
+    "memory": (
+        "return it as a value to the steps that read it, or, if no result depends on it, declare "
+        'depends=["unaffected:{name}"]; or write cache: false'
+    ),
     "variable": 'make it a parameter, or declare it, depends=["env:{name}"]; or write cache: false',
     "unknown": "write cache: false",
 }
@@ -59,7 +87,11 @@ _OF_CHANCE = {
 def taint(kind: Kind, what: str) -> Taint:
     """Return a taint with what to write against it."""
     fix = _FIX[kind].format(name=_short(kind, what))
-    return Taint(kind, what, f"{_OF_CHANCE[what]}; or {fix}" if kind == "random" and what in _OF_CHANCE else fix)
+    return Taint(
+        kind,
+        what,
+        f"{_OF_CHANCE[what]}; or {fix}" if kind == "random" and what in _OF_CHANCE else fix,
+    )
 
 
 def _short(kind: Kind, what: str) -> str:

@@ -1,20 +1,24 @@
-"""Threads and processes whose calls need no record, because the program, or an installed package, makes them.
+"""Threads and processes whose calls need no record, because the program, or an installed package,
+makes them.
 
-The observed process says so itself, in order with its calls: it asks for rights to a file that nobody can have, and the
-call stops.
+The observed process says so itself, in order with its calls: it asks for rights to a file that
+nobody can have, and the call stops.
 """
 
 from __future__ import annotations
 
 from neusee.workflows.observation.stopped_task import Task
 
-#: marks in place of the rights that ``access`` asks for: whose calls follow. The kernel refuses them.
+#: marks in place of the rights that ``access`` asks for: whose calls follow. The kernel refuses
+#: them.
 TRUSTED, UNTRUSTED, CHILD = 0x6E650001, 0x6E650002, 0x6E650003
 MARKS = (TRUSTED, UNTRUSTED, CHILD)
 
 
 class TrustedTasks:
-    """Threads that import an installed package, and child processes that the program or such a thread starts."""
+    """Threads that import an installed package, and child processes that the program or such a
+    thread starts.
+    """
 
     def __init__(self, process: int) -> None:
         self._process = process  #: that is observed

@@ -1,8 +1,9 @@
-"""Imports in an observed call: which reads belong to an installed package, and which to a module of the user.
+"""Imports in an observed call: which reads belong to an installed package, and which to a module of
+the user.
 
-Python searches folders and reads byte code, and packages read their own tables: none of this is an input. The body of
-a module of the user is watched like the step itself. Two functions of importlib tell both apart; a Python without them
-counts every import as the step's own reading.
+Python searches folders and reads byte code, and packages read their own tables: none of this is an
+input. The body of a module of the user is watched like the step itself. Two functions of importlib
+tell both apart; a Python without them counts every import as the step's own reading.
 """
 
 from __future__ import annotations
@@ -59,7 +60,9 @@ def _searching(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _executing(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the execution of a module, with a thread that is not trusted if the module is one of the user."""
+    """Return the execution of a module, with a thread that is not trusted if the module is one
+    of the user.
+    """
 
     def execute(called: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
         watch = watch_here()

@@ -1,4 +1,6 @@
-"""Threads that an observed call starts: their calls are the call's, and those of other threads are not."""
+"""Threads that an observed call starts: their calls are the call's, and those of other threads
+are not.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ from neusee.workflows.observation.recorded_call import Record
 
 
 class WatchedThreads:
-    """The two functions that start a thread, wrapped while a call is observed; audit events tell from Python 3.12."""
+    """The two functions that start a thread, wrapped while a call is observed; audit events tell
+    from Python 3.12.
+    """
 
     def __init__(self) -> None:
         places: list[tuple[Any, str]] = [(threading.Thread, "start"), (_thread, "start_new_thread")]
@@ -20,7 +24,11 @@ class WatchedThreads:
 
     def __enter__(self) -> None:
         for place, name, function in self._before:
-            setattr(place, name, _starting(function) if place is threading.Thread else _starting_nameless(function))
+            setattr(
+                place,
+                name,
+                _starting(function) if place is threading.Thread else _starting_nameless(function),
+            )
 
     def __exit__(self, *_: object) -> None:
         for place, name, function in self._before:

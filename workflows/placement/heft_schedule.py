@@ -1,9 +1,9 @@
 """Scheduling of tasks on devices by the heuristic HEFT, with memory as a hard constraint.
 
-A schedule is a pure function of tasks, costs and devices, for this machine and for machines described in a file.
-A result leaves a device after its last use. HEFT inserts tasks into idle gaps between placed tasks. A task that
-does not fit into memory is cut into parts of bands, waits or runs elsewhere; a task that fits nowhere is refused
-with the number of bytes that it needs.
+A schedule is a pure function of tasks, costs and devices, for this machine and for machines
+described in a file. A result leaves a device after its last use. HEFT inserts tasks into idle gaps
+between placed tasks. A task that does not fit into memory is cut into parts of bands, waits or runs
+elsewhere; a task that fits nowhere is refused with the number of bytes that it needs.
 
 Source: Topcuoglu, Hariri, Wu, IEEE Transactions on Parallel and Distributed Systems 13 (2002) 260.
 """
@@ -18,19 +18,29 @@ from dataclasses import replace
 
 from neusee.workflows.placement.partial_schedule import PartialSchedule
 from neusee.workflows.placement.task_priorities import Graph, frugal, ranked, upward
-from neusee.workflows.placement.tasks_and_devices import Cluster, Device, Link, Schedule, Slot, Task, TooLarge
+from neusee.workflows.placement.tasks_and_devices import (
+    Cluster,
+    Device,
+    Link,
+    Schedule,
+    Slot,
+    Task,
+    TooLarge,
+)
 
 __all__ = ["Cluster", "Device", "Link", "Schedule", "Slot", "Task", "TooLarge", "heft"]
 
 
 def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
-    """Return the HEFT schedule: tasks by longest remaining path, each on the device with the earliest finish time.
+    """Return the HEFT schedule: tasks by longest remaining path, each on the device with the
+    earliest finish time.
 
-    ``keep`` names the results that stay in memory to the end. If memory is short, orders of the tasks that need less
-    memory are tried too. If one device alone would finish all tasks sooner, this device runs all tasks; tasks that one
-    device could run alone are never refused.
+    ``keep`` names the results that stay in memory to the end. If memory is short, orders of the
+    tasks that need less memory are tried too. If one device alone would finish all tasks sooner,
+    this device runs all tasks; tasks that one device could run alone are never refused.
 
-    Raises: `TooLarge` if no schedule fits, with the memory that the closest schedule needs; ValueError for tasks that
+    Raises: `TooLarge` if no schedule fits, with the memory that the closest schedule needs;
+            ValueError for tasks that
     no device runs, and for cyclic dependencies.
     """
     graph = Graph(tasks, cluster, keep)
@@ -40,8 +50,13 @@ def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
     try:
         schedule = _best(graph, orders)
     except TooLarge as error:
-        return _alone(graph, _able(graph), error)  # reports the memory for one device, if this is less
-    sooner = {d: took for d in _able(graph) if (took := sum(row[d] for row in graph.seconds)) < schedule.makespan}
+        # reports the memory for one device, if this is less
+        return _alone(graph, _able(graph), error)
+    sooner = {
+        d: took
+        for d in _able(graph)
+        if (took := sum(row[d] for row in graph.seconds)) < schedule.makespan
+    }
     try:
         return _alone(graph, sorted(sooner, key=sooner.__getitem__)) if sooner else schedule
     except TooLarge:
@@ -49,7 +64,9 @@ def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
 
 
 def _best(graph: Graph, orders: Sequence[Sequence[int]]) -> Schedule:
-    """Return the schedule of the first task order if the memory suffices, else the shortest schedule that fits."""
+    """Return the schedule of the first task order if the memory suffices, else the shortest
+    schedule that fits.
+    """
     memory = {device.name: device.memory for device in graph.cluster.devices}
     schedule = _placed(PartialSchedule(graph, bounded=False), orders[0]).schedule()
     if all(peak <= memory[name] for name, peak in schedule.peak.items()):
@@ -67,11 +84,13 @@ def _best(graph: Graph, orders: Sequence[Sequence[int]]) -> Schedule:
     return best
 
 
-def _placed(board: PartialSchedule, order: Sequence[int], below: float = math.inf) -> PartialSchedule:
+def _placed(
+    board: PartialSchedule, order: Sequence[int], below: float = math.inf
+) -> PartialSchedule:
     """Add the tasks to the partial schedule ``board`` in the order ``order``, and return ``board``.
 
-    A task that does not fit into memory waits until later tasks free memory. The placement stops early if it cannot
-    end before ``below``.
+    A task that does not fit into memory waits until later tasks free memory. The placement stops
+    early if it cannot end before ``below``.
     """
     graph = board.graph
     missing, turn = [len(sources) for sources in graph.sources], {i: n for n, i in enumerate(order)}
@@ -100,7 +119,7 @@ def _placed(board: PartialSchedule, order: Sequence[int], below: float = math.in
     return board
 
 
-# --- one device -----------------------------------------------------------------------------------------------------
+# --- one device -----------------------------------------------------------------------------------
 
 
 def _able(graph: Graph) -> list[int]:
@@ -111,7 +130,9 @@ def _able(graph: Graph) -> list[int]:
 
 
 def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule:
-    """Try each device alone, with two task orders each, and return the first schedule that fits into memory."""
+    """Try each device alone, with two task orders each, and return the first schedule that fits
+    into memory.
+    """
     for d in devices:
         for order in (graph.by(range(len(graph.tasks))), frugal(graph)):
             try:
@@ -122,7 +143,9 @@ def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule
 
 
 def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
-    """Return the schedule of all tasks in ``order`` on device ``d``; raise `TooLarge` if the device lacks memory."""
+    """Return the schedule of all tasks in ``order`` on device ``d``; raise `TooLarge` if the
+    device lacks memory.
+    """
     board, device = PartialSchedule(graph, bounded=False), graph.cluster.devices[d]
     left, held, peak, at = [len(readers) for readers in graph.readers], 0.0, 0.0, 0.0
     needed, largest = 0.0, 0
@@ -136,7 +159,9 @@ def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
         board.put(i, d, began, at)
         for j in graph.sources[i]:
             left[j] -= 1
-        held -= sum(graph.own[j] for j in (*graph.sources[i], i) if not left[j] and j not in graph.kept)
+        held -= sum(
+            graph.own[j] for j in (*graph.sources[i], i) if not left[j] and j not in graph.kept
+        )
     if graph.tasks and needed > device.memory:
         task = graph.tasks[largest]
         raise TooLarge(task.name, device.name, needed, device.memory, task.parts)
@@ -145,7 +170,8 @@ def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
 
 
 def _fewest(graph: Graph, i: int, room: float) -> int:
-    """Return the smallest number of band slices with which task ``i`` fits into ``room`` bytes of memory.
+    """Return the smallest number of band slices with which task ``i`` fits into ``room`` bytes of
+    memory.
 
     If no allowed number suffices, return the largest allowed number.
     """

@@ -1,4 +1,6 @@
-"""Partial schedule: the tasks placed so far, the idle times of each device, and the memory that each task will use."""
+"""Partial schedule: the tasks placed so far, the idle times of each device, and the memory that
+each task will use.
+"""
 
 from __future__ import annotations
 
@@ -15,28 +17,41 @@ Of = tuple[int, float, int]  #: task of the result, bytes of the result, device
 
 
 class PartialSchedule:
-    """Unfinished schedule: a task is added after the tasks that compute its inputs, and keeps its device and times."""
+    """Unfinished schedule: a task is added after the tasks that compute its inputs, and keeps
+    its device and times.
+    """
 
     def __init__(self, graph: Graph, bounded: bool = True) -> None:
         self.graph, devices, count = graph, graph.cluster.devices, len(graph.tasks)
         self.where, self.parts = [-1] * count, [1] * count
         self.start, self.end = [0.0] * count, [0.0] * count
-        self.free_at: list[float] = [0.0] * count  # time at which the last reader placed so far has its input
+        # time at which the last reader placed so far has its input
+        self.free_at: list[float] = [0.0] * count
         self.left = [len(readers) for readers in graph.readers]
         self.gaps: list[tuple[list[float], list[float]]] = [([0.0], [math.inf]) for _ in devices]
         most = sum(graph.own) + max((graph.work(i, 1) for i in range(count)), default=0.0)
-        sent = sum(max(0.0, math.ceil(s)) for t, sizes in enumerate(graph.sizes) for s in sizes if graph.tasks[t].takes)
-        self.rooms = [MemoryProfile(d.memory) if bounded and d.memory < most + sent else None for d in devices]
-        self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]  # no delay to itself
+        sent = sum(
+            max(0.0, math.ceil(s))
+            for t, sizes in enumerate(graph.sizes)
+            for s in sizes
+            if graph.tasks[t].takes
+        )
+        self.rooms = [
+            MemoryProfile(d.memory) if bounded and d.memory < most + sent else None for d in devices
+        ]
+        # no delay to itself
+        self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]
         self.least = [own + graph.work(i, graph.tasks[i].parts) for i, own in enumerate(graph.own)]
         self.copies: dict[Of, list[Copy]] = {}
         self.placed: list[int] = []
         self.refused: list[tuple[int, int, float]] = []  # task, device, bytes needed there
 
-    # --- where and when -------------------------------------------------------------------------------------------
+    # --- where and when ---------------------------------------------------------------------------
 
     def place(self, i: int, among: Sequence[int]) -> bool:
-        """Place task ``i`` on the device that finishes it first; return False if no device has enough memory."""
+        """Place task ``i`` on the device that finishes it first; return False if no device has
+        enough memory.
+        """
         best, on, begin = math.inf, -1, 0.0
         for d in among:
             room = self.rooms[d]
@@ -57,7 +72,9 @@ class PartialSchedule:
         return any(not self.left[j] for j in self.graph.sources[i]) or bool(self.refused)
 
     def force(self, i: int) -> None:
-        """Place task ``i`` as if a device had enough memory for this task, and record the bytes that the task needs."""
+        """Place task ``i`` as if a device had enough memory for this task, and record the bytes
+        that the task needs.
+        """
         needs = {d: self._needs(i, d) for d in self.graph.able[i] if self.rooms[d] is not None}
         d = min(needs, key=lambda d: (needs[d] - self.graph.cluster.devices[d].memory, d))
         room = self.rooms[d]
@@ -69,14 +86,20 @@ class PartialSchedule:
     def _ready(self, i: int, d: int) -> float:
         """Return the earliest time at which all inputs of task ``i`` can be on device ``d``."""
         end, where, links = self.end, self.where, self.links
-        return max((end[j] + links[where[j]][d].seconds(size) for j, size in self._inputs(i)), default=0.0)
+        return max(
+            (end[j] + links[where[j]][d].seconds(size) for j, size in self._inputs(i)), default=0.0
+        )
 
     def _inputs(self, i: int) -> Iterator[tuple[int, float]]:
-        """Yield each task whose result task ``i`` reads, with the bytes to send if this result is on another device."""
+        """Yield each task whose result task ``i`` reads, with the bytes to send if this result
+        is on another device.
+        """
         return zip(self.graph.sources[i], self.graph.sizes[i], strict=True)
 
     def _slot(self, i: int, d: int, ready: float, seconds: float, best: float) -> float:
-        """Return the earliest start of task ``i`` on device ``d``, or infinity if it cannot end before ``best``."""
+        """Return the earliest start of task ``i`` on device ``d``, or infinity if it cannot end
+        before ``best``.
+        """
         starts, ends = self.gaps[d]
         for gap in range(bisect_left(ends, ready + seconds), len(ends)):
             start = max(starts[gap], ready)
@@ -93,7 +116,8 @@ class PartialSchedule:
     def _fitting(self, i: int, d: int, start: float, seconds: float, end: float) -> float:
         """Return the earliest start at which device ``d`` has enough memory for task ``i``.
 
-        If the task cannot end before ``end``, where the idle gap ends, the returned start is too late for the gap.
+        If the task cannot end before ``end``, where the idle gap ends, the returned start is too
+        late for the gap.
         """
         room, parts = self.rooms[d], self.graph.tasks[i].parts
         if room is None:
@@ -106,28 +130,40 @@ class PartialSchedule:
         return start
 
     def _holds(self, i: int, d: int, start: float, end: float, parts: int) -> list[Hold]:
-        """Return the memory reservations of task ``i`` on device ``d``: result, working memory and copies of inputs."""
+        """Return the memory reservations of task ``i`` on device ``d``: result, working memory
+        and copies of inputs.
+        """
         graph = self.graph
-        holds = [(start, math.inf if graph.held(i) else end, graph.own[i]), (start, end, graph.work(i, parts))]
+        holds = [
+            (start, math.inf if graph.held(i) else end, graph.own[i]),
+            (start, end, graph.work(i, parts)),
+        ]
         for of, leaves in self._arriving(i, d, start):
             spans = without(leaves, end, ((a, until) for a, _, until in self.copies.get(of, ())))
             holds += [(a, b, float(math.ceil(of[1]))) for a, b in spans]
         return holds
 
     def _arriving(self, i: int, d: int, start: float) -> Iterator[tuple[Of, float]]:
-        """Yield each input of task ``i`` that is on another device, with the latest start of the transfer."""
+        """Yield each input of task ``i`` that is on another device, with the latest start of the
+        transfer.
+        """
         for j, size in self._inputs(i):
             if self.where[j] != d:
-                yield (j, size, d), max(start - self.links[self.where[j]][d].seconds(size), self.end[j])
+                yield (
+                    (j, size, d),
+                    max(start - self.links[self.where[j]][d].seconds(size), self.end[j]),
+                )
 
     def _needs(self, i: int, d: int) -> float:
-        """Return the memory (bytes) that device ``d`` needs to run task ``i`` after all tasks scheduled so far."""
+        """Return the memory (bytes) that device ``d`` needs to run task ``i`` after all tasks
+        scheduled so far.
+        """
         room = self.rooms[d]
         assert room is not None
         copies = sum(math.ceil(size) for j, size in self._inputs(i) if self.where[j] != d)
         return room.limit - room.free() + self.least[i] + copies
 
-    # --- records of a placement -----------------------------------------------------------------------------------
+    # --- records of a placement -------------------------------------------------------------------
 
     def _commit(self, i: int, d: int, start: float, end: float) -> None:
         graph, room = self.graph, self.rooms[d]
@@ -151,7 +187,8 @@ class PartialSchedule:
         self.placed.append(i)
 
     def _fewest(self, i: int, d: int, start: float, end: float, room: MemoryProfile) -> int:
-        """Return the smallest number of band slices with which task ``i`` fits into the memory of device ``d``.
+        """Return the smallest number of band slices with which task ``i`` fits into the memory of
+        device ``d``.
 
         The largest allowed number always fits.
         """
@@ -169,13 +206,17 @@ class PartialSchedule:
         starts[gap : gap + 1] = [a for a, _ in left]
         ends[gap : gap + 1] = [b for _, b in left]
 
-    # --- the finished schedule ------------------------------------------------------------------------------------
+    # --- the finished schedule --------------------------------------------------------------------
 
     def too_large(self) -> TooLarge:
-        """Return the error for the first task that fits on no device, with the bytes of memory that would suffice."""
+        """Return the error for the first task that fits on no device, with the bytes of memory
+        that would suffice.
+        """
         graph, (i, d, _) = self.graph, self.refused[0]
         needed, device = max(n for _, on, n in self.refused if on == d), graph.cluster.devices[d]
-        return TooLarge(graph.tasks[i].name, device.name, needed, device.memory, graph.tasks[i].parts)
+        return TooLarge(
+            graph.tasks[i].name, device.name, needed, device.memory, graph.tasks[i].parts
+        )
 
     def schedule(self) -> Schedule:
         """Return the finished schedule; all tasks must have been placed before."""
@@ -184,11 +225,22 @@ class PartialSchedule:
         moves = sorted(self._moves(), key=lambda m: (m.start, m.task, m.device))
         slots = sorted(self._slots(), key=lambda slot: (slot.start, slot.end))
         holds = zip(devices, self._held(), strict=True)
-        peak = {device.name: max((size for _, _, size in stacked(held)), default=0.0) for device, held in holds}
-        return Schedule(tuple(slots), max(self.end, default=0.0), peak, sum(m.bytes for m in moves), tuple(moves))
+        peak = {
+            device.name: max((size for _, _, size in stacked(held)), default=0.0)
+            for device, held in holds
+        }
+        return Schedule(
+            tuple(slots),
+            max(self.end, default=0.0),
+            peak,
+            sum(m.bytes for m in moves),
+            tuple(moves),
+        )
 
     def _bridge(self) -> None:
-        """Avoid a second transfer of a result to a device by keeping the first copy there, if memory allows."""
+        """Avoid a second transfer of a result to a device by keeping the first copy there, if
+        memory allows.
+        """
         for (j, size, d), copies in self.copies.items():
             room, kept = self.rooms[d], copies[:1]
             for copy in copies[1:]:
@@ -225,7 +277,9 @@ class PartialSchedule:
         return held
 
     def _slots(self) -> Iterator[Slot]:
-        """Yield the schedule entry of each task: device, start, end, and the task that delayed the start."""
+        """Yield the schedule entry of each task: device, start, end, and the task that delayed
+        the start.
+        """
         tasks, devices = self.graph.tasks, self.graph.cluster.devices
         before, ended = [-1] * len(devices), dict[float, int]()
         for i in sorted(self.placed, key=self.start.__getitem__):
@@ -237,7 +291,9 @@ class PartialSchedule:
             ended[self.end[i]] = i
 
     def _waited(self, i: int, before: int, other: int) -> int:
-        """Return the task that delayed task ``i``: an input, the previous task, or a task that freed memory."""
+        """Return the task that delayed task ``i``: an input, the previous task, or a task that
+        freed memory.
+        """
         start, d = self.start[i], self.where[i]
         for j, size in self._inputs(i):
             if self.end[j] + self.links[self.where[j]][d].seconds(size) == start:
@@ -249,7 +305,9 @@ class PartialSchedule:
 
 
 def _joined(copies: list[Copy]) -> list[Copy]:
-    """Merge copies of a result that overlap in time on a device, and return the copies in order of time."""
+    """Merge copies of a result that overlap in time on a device, and return the copies in order
+    of time.
+    """
     joined: list[Copy] = []
     for copy in sorted(copies):
         if joined and copy[0] <= joined[-1][2]:

@@ -1,4 +1,6 @@
-"""The parts of a recipe's camera that the protection study needs: lens, mask, sensor, light, and their nodes."""
+"""The parts of a recipe's camera that the protection study needs: lens, mask, sensor, light, and
+their nodes.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +21,23 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.protection.unknown_conditions import Condition
 from neusee.workflows.store.result_store import Store
 
-_NEEDED = ("psf[mask]", "pupil[mask]", "pupil[plain]", "illuminant", "responses", "read[mask]", "well[mask]")
+_NEEDED = (
+    "psf[mask]",
+    "pupil[mask]",
+    "pupil[plain]",
+    "illuminant",
+    "responses",
+    "read[mask]",
+    "well[mask]",
+)
 _LEAST_MASK = 0.9  #: laser suppression ratio above which a recipe has no mask to compare
 
 
 @dataclass(frozen=True)
 class ProtectionCamera:
-    """Lens, mask and sensor of a recipe, as values and parameters from which PSFs of any shade are computed."""
+    """Lens, mask and sensor of a recipe, as values and parameters from which PSFs of any shade
+    are computed.
+    """
 
     recipe: Recipe
     height: Tensor
@@ -39,17 +51,23 @@ class ProtectionCamera:
 
     @classmethod
     def of(cls, recipe: Recipe, store: Store, count: int) -> ProtectionCamera:
-        """Return the camera of a recipe with ``count`` of its bands; raise ValueError for an unsuitable recipe."""
+        """Return the camera of a recipe with ``count`` of its bands; raise ValueError for an
+        unsuitable recipe.
+        """
         _refuse_unsuitable(recipe)
         pupil, plain = (recipe.steps[f"pupil[{arm}]"].wires for arm in ("mask", "plain"))
         names = [str(w) for w in (pupil["height"], plain["height"], pupil["stop"], pupil["bands"])]
         names += ["illuminant", "responses"]
         result = run(recipe, store, dict.fromkeys(names))
         height, flat, stop, bands, illuminant, responses = (result.values[name] for name in names)
-        which = torch.linspace(0, len(bands.centres) - 1, min(count, len(bands.centres))).round().long()
+        which = (
+            torch.linspace(0, len(bands.centres) - 1, min(count, len(bands.centres))).round().long()
+        )
         few = Bands(*(one[which] for one in bands))
         keys = tuple(result.keys[name] for name in names)
-        return cls(recipe, height, flat, stop, few, bands, illuminant[which], responses[:, which], keys)
+        return cls(
+            recipe, height, flat, stop, few, bands, illuminant[which], responses[:, which], keys
+        )
 
     @property
     def lens(self) -> Mapping[str, Any]:
@@ -69,22 +87,49 @@ class ProtectionCamera:
         """Return the noise of a pixel of the recipe's sensor."""
         return PixelNoise(**self.noise, prnu=prnu, residual_glare=residual_glare)
 
-    def psf(self, masked: bool, diameter: float, bands: Bands, condition: Condition | None = None, **more: Any) -> Psf:
-        """Return the PSF with or without the mask, in a stop of a relative ``diameter``, under a condition."""
+    def psf(
+        self,
+        masked: bool,
+        diameter: float,
+        bands: Bands,
+        condition: Condition | None = None,
+        **more: Any,
+    ) -> Psf:
+        """Return the PSF with or without the mask, in a stop of a relative ``diameter``, under a
+        condition.
+        """
         notches = {name: more.pop(name) for name in ("notches", "depth") if name in more}
-        found: Psf = optics.psf(self._front(masked, diameter, bands, condition, **notches), **{**self.lens, **more})
+        found: Psf = optics.psf(
+            self._front(masked, diameter, bands, condition, **notches), **{**self.lens, **more}
+        )
         return found
 
-    def laser_psf(self, masked: bool, diameter: float, line: Bands, condition: Condition, **more: Any) -> Psf:
-        """Return the PSF of a laser from the ``angle`` of its direction, with the light that the lens scatters."""
+    def laser_psf(
+        self, masked: bool, diameter: float, line: Bands, condition: Condition, **more: Any
+    ) -> Psf:
+        """Return the PSF of a laser from the ``angle`` of its direction, with the light that the
+        lens scatters.
+        """
         notches = {name: more.pop(name) for name in ("notches", "depth") if name in more}
-        front, lens = self._front(masked, diameter, line, condition, **notches), {**self.lens, **more}
+        front, lens = (
+            self._front(masked, diameter, line, condition, **notches),
+            {**self.lens, **more},
+        )
         sizes = {name: lens[name] for name in ("focal_length", "pixel_pitch", "angle")}
         whole = float(self.stop.diameter)
-        found: Psf = stray_light(optics.psf(front, **lens), front, surfaces=condition.surfaces, diameter=whole, **sizes)
+        found: Psf = stray_light(
+            optics.psf(front, **lens), front, surfaces=condition.surfaces, diameter=whole, **sizes
+        )
         return found
 
-    def _front(self, masked: bool, diameter: float, bands: Bands, condition: Condition | None, **notches: Any) -> Pupil:
+    def _front(
+        self,
+        masked: bool,
+        diameter: float,
+        bands: Bands,
+        condition: Condition | None,
+        **notches: Any,
+    ) -> Pupil:
         pupil = self.recipe.steps["pupil[mask]"]
         index = self.recipe.steps[str(pupil.wires["index"])]
         height = self.height if masked else self.flat
@@ -102,7 +147,9 @@ class ProtectionCamera:
     def _film(self, condition: Condition) -> Any:
         if not condition.grease:
             return None
-        return dirt(self.stop, grease=condition.grease, rng=torch.Generator().manual_seed(condition.seed))
+        return dirt(
+            self.stop, grease=condition.grease, rng=torch.Generator().manual_seed(condition.seed)
+        )
 
     def laser_line(self, wavelength: float) -> Bands:
         """Return one narrow band at the wavelength of a laser."""
@@ -110,7 +157,9 @@ class ProtectionCamera:
         return Bands(one * wavelength, one * 1e-9, one)
 
     def laser_colour(self, line: Bands) -> Tensor:
-        """Return the response of each channel to a laser relative to the channel that responds most: (channel,)."""
+        """Return the response of each channel to a laser relative to the channel that responds
+        most: (channel,).
+        """
         step = self.recipe.steps["responses"]
         found: Tensor = step.node(line, **step.params)[:, 0].double()
         return found / found.max() if float(found.max()) > 0 else torch.ones_like(found)
@@ -137,13 +186,13 @@ def _refuse_unsuitable(recipe: Recipe) -> None:
     missing = [name for name in _NEEDED if name not in recipe.steps]
     if missing:
         raise ValueError(
-            f"the recipe {recipe.name} has no step {missing[0]}: study a recipe of the camera with the arms plain and "
-            "mask, such as five_half_rings"
+            f"the recipe {recipe.name} has no step {missing[0]}: study a recipe of the camera with"
+            " the arms plain and mask, such as five_half_rings"
         )
     if recipe.steps["pupil[mask]"].wires.get("shade"):
         raise ValueError(
-            "the mask of this recipe is shaded already: choose the mask alone, such as doe=axicon, because the study "
-            "adds filters and stops itself"
+            "the mask of this recipe is shaded already: choose the mask alone, such as doe=axicon,"
+            " because the study adds filters and stops itself"
         )
 
 
@@ -151,5 +200,6 @@ def refuse_no_mask(lsr: float) -> None:
     """Raise ValueError for a mask that lowers the peak too little to compare."""
     if lsr > _LEAST_MASK:
         raise ValueError(
-            f"the mask of this recipe lowers the peak of a laser to {lsr:.3g} only: choose a mask, such as doe=axicon"
+            f"the mask of this recipe lowers the peak of a laser to {lsr:.3g} only: choose a mask,"
+            " such as doe=axicon"
         )

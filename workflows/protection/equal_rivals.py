@@ -1,4 +1,6 @@
-"""Rivals of equal protection: each front gets the grey filter with which the laser does as much harm as elsewhere."""
+"""Rivals of equal protection: each front gets the grey filter with which the laser does as much
+harm as elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,11 @@ MEASURES: Mapping[str, str] = {
     "error": "error of the filtered picture",
     "information": "information",
     "NEQ": "mean log NEQ at low frequencies",
-    **{name: f"detection of {'an' if name == 'edge' else 'a'} {name}" for name in TARGETS if name != "text"},
+    **{
+        name: f"detection of {'an' if name == 'edge' else 'a'} {name}"
+        for name in TARGETS
+        if name != "text"
+    },
     "text": "detection of a line of text",
 }
 CONTRAST = 0.2  #: of the targets
@@ -41,7 +47,9 @@ class Candidate:
     protection: float  #: share of the harm of the clear lens: peak, or heat
 
     def transmittance(self, wanted: float) -> float:
-        """Return the transmittance of the grey filter with which this front protects as ``wanted``; at most 1."""
+        """Return the transmittance of the grey filter with which this front protects as
+        ``wanted``; at most 1.
+        """
         return min(1.0, wanted / self.protection)
 
 
@@ -64,10 +72,16 @@ class Rival:
         return ", ".join(parts) or "open lens"
 
 
-def quiet_picture(found: FrontMeasures, transmittance: float, electrons: float, pixel: PixelNoise) -> dict[str, float]:
-    """Return each of `MEASURES` in dB, more is better, for a frame without a laser at a scene light in e- a pixel."""
+def quiet_picture(
+    found: FrontMeasures, transmittance: float, electrons: float, pixel: PixelNoise
+) -> dict[str, float]:
+    """Return each of `MEASURES` in dB, more is better, for a frame without a laser at a scene
+    light in e- a pixel.
+    """
     amplitude = electrons * transmittance
-    noise: Tensor = noise_variance(amplitude * found.spectrum.light, 0.0, pixel.read_noise, pixel.prnu)[None]
+    noise: Tensor = noise_variance(
+        amplitude * found.spectrum.light, 0.0, pixel.read_noise, pixel.prnu
+    )[None]
     bits = float(information_bits(found.spectrum, amplitude, noise).mean())
     values = {
         "error": -decibels(float(remaining_error(found.spectrum, amplitude, noise).mean())),
@@ -75,14 +89,22 @@ def quiet_picture(found: FrontMeasures, transmittance: float, electrons: float, 
         "NEQ": float(mean_log_neq(found.spectrum, amplitude, noise).mean()) * decibels(math.e),
     }
     for name, energy in found.energy.items():
-        values[name] = 2 * decibels(max(float(detection_snr(energy, amplitude, CONTRAST, noise)), 1e-30))
+        values[name] = 2 * decibels(
+            max(float(detection_snr(energy, amplitude, CONTRAST, noise)), 1e-30)
+        )
     return values
 
 
 def best(
-    candidates: Sequence[Candidate], wanted: float, electrons: float, pixel: PixelNoise, name: str = ""
+    candidates: Sequence[Candidate],
+    wanted: float,
+    electrons: float,
+    pixel: PixelNoise,
+    name: str = "",
 ) -> dict[str, tuple[float, Rival]]:
-    """Return the best value of each of `MEASURES` over candidates of equal protection, and the rival with the value."""
+    """Return the best value of each of `MEASURES` over candidates of equal protection, and the
+    rival with the value.
+    """
     found: dict[str, tuple[float, Rival]] = {}
     for candidate in candidates:
         grey = candidate.transmittance(wanted)
@@ -93,22 +115,34 @@ def best(
 
 
 def gains(
-    masked: Sequence[Candidate], plain: Sequence[Candidate], wanted: float, electrons: float, pixel: PixelNoise
+    masked: Sequence[Candidate],
+    plain: Sequence[Candidate],
+    wanted: float,
+    electrons: float,
+    pixel: PixelNoise,
 ) -> dict[str, float]:
-    """Return by how many dB the best with the mask exceeds the best stop-and-filter of equal protection, by measure."""
+    """Return by how many dB the best with the mask exceeds the best stop-and-filter of equal
+    protection, by measure.
+    """
     mask, rival = (best(each, wanted, electrons, pixel) for each in (masked, plain))
     return {measure: mask[measure][0] - rival[measure][0] for measure in MEASURES}
 
 
-def neq_curve(found: FrontMeasures, transmittance: float, electrons: float, pixel: PixelNoise) -> list[float]:
+def neq_curve(
+    found: FrontMeasures, transmittance: float, electrons: float, pixel: PixelNoise
+) -> list[float]:
     """Return the NEQ in the rings of frequency, averaged over directions, in electrons."""
     amplitude = electrons * transmittance
-    noise = float(noise_variance(amplitude * found.spectrum.light.mean(), 0.0, pixel.read_noise, pixel.prnu))
+    noise = float(
+        noise_variance(amplitude * found.spectrum.light.mean(), 0.0, pixel.read_noise, pixel.prnu)
+    )
     curve: Tensor = amplitude**2 * found.square / noise
     return [float(x) for x in torch.clamp(curve, min=1e-12)]
 
 
 def colour_shift(found: FrontMeasures) -> float:
-    """Return the ratio of the largest to the smallest share of light that the channels receive; 1: no tint."""
+    """Return the ratio of the largest to the smallest share of light that the channels receive;
+    1: no tint.
+    """
     light = found.spectrum.light
     return float(light.max() / light.min().clamp_min(1e-12))

@@ -1,4 +1,5 @@
-"""Fronts, which are a lens with or without the mask in a stop of some diameter, and what is measured of each once.
+"""Fronts, which are a lens with or without the mask in a stop of some diameter, and what is
+measured of each once.
 
 A grey filter needs no front of its own: it scales the light of scene and laser.
 """
@@ -59,7 +60,9 @@ class FrontMeasures:
     spectrum: PictureSpectrum
     energy: Mapping[str, Tensor]  #: by target (channel,)
     peak: float  #: laser suppression ratio at the worst of all bands of the recipe
-    heat: float  #: heat of the hottest pixel relative to the clear lens, at the worst of them; NaN if not asked for
+    #: heat of the hottest pixel relative to the clear lens, at the worst of them; NaN if not asked
+    #: for
+    heat: float
     radius: Tensor  #: (ring,) cycles per pixel
     square: Tensor  #: (ring,) mean of |OTF|**2
     glare: Mapping[int, GlareLevels]  #: by the side of the field in pixels
@@ -87,12 +90,21 @@ class FrontBench:
         code = Code(store.code_memo)
         files = [file_digest(Path(inspect.getfile(one))) for one in _SOURCES]
         files += [file_digest(Path(__file__)), file_digest(Path(inspect.getfile(ProtectionCamera)))]
-        steps = [camera.recipe.steps[name] for name in ("psf[mask]", "pupil[mask]", "index", "responses")
-                 if name in camera.recipe.steps]  # fmt: skip
+        steps = [
+            camera.recipe.steps[name]
+            for name in ("psf[mask]", "pupil[mask]", "index", "responses")
+            if name in camera.recipe.steps
+        ]
         params = [{name: plain(value) for name, value in step.params.items()} for step in steps]
-        self._key = [camera.keys, [code.of(node) for node in camera.nodes], files, params,
-                     camera.bands.centres.tolist(), camera.laser_bands.centres.tolist(),
-                     repr(settings)]  # fmt: skip
+        self._key = [
+            camera.keys,
+            [code.of(node) for node in camera.nodes],
+            files,
+            params,
+            camera.bands.centres.tolist(),
+            camera.laser_bands.centres.tolist(),
+            repr(settings),
+        ]
 
     def measure(self, front: Front, condition: Condition) -> FrontMeasures:
         """Return what is measured of a front under a condition, from the store if it is there."""
@@ -121,7 +133,10 @@ class FrontBench:
             columns = (torch.split(values, 1) for values in bands)
             single = (Bands(*values) for values in zip(*columns, strict=True))
             peaks, heats = zip(*(self._harm_in(front, band) for band in single), strict=True)
-            self._harms[front] = {"peak": torch.stack(peaks).max(), "heat": torch.stack(heats).max()}
+            self._harms[front] = {
+                "peak": torch.stack(peaks).max(),
+                "heat": torch.stack(heats).max(),
+            }
         return self._harms[front]
 
     def _harm_in(self, front: Front, band: Bands) -> tuple[Tensor, Tensor]:
@@ -132,24 +147,35 @@ class FrontBench:
             return peak, torch.tensor(torch.nan, dtype=torch.float64)
         clear = self._psf(Front(False), band, None)
         pitch = self.camera.lens["pixel_pitch"]
-        return peak, metrics.heat_ratio(psf, clear, pixel_pitch=pitch, dwell=self.settings.dwell).max()
+        return (
+            peak,
+            metrics.heat_ratio(psf, clear, pixel_pitch=pitch, dwell=self.settings.dwell).max(),
+        )
 
     def _known(self, front: Front) -> Psf:
-        """Return the PSF that the filter knows, without the unknown conditions; it is computed once."""
+        """Return the PSF that the filter knows, without the unknown conditions; it is computed
+        once.
+        """
         if front not in self._psfs:
             self._psfs[front] = self._psf(front, self.camera.bands, None)
         return self._psfs[front]
 
     def _psf(self, front: Front, bands: Bands, condition: Condition | None, **more: Any) -> Psf:
-        return self.camera.psf(front.masked, front.diameter, bands, condition, **front.notches, **more)
+        return self.camera.psf(
+            front.masked, front.diameter, bands, condition, **front.notches, **more
+        )
 
     def _laser_psf(self, front: Front, line: Bands, condition: Condition, **more: Any) -> Psf:
-        return self.camera.laser_psf(front.masked, front.diameter, line, condition, **front.notches, **more)
+        return self.camera.laser_psf(
+            front.masked, front.diameter, line, condition, **front.notches, **more
+        )
 
     def _glare(self, front: Front, condition: Condition) -> dict[str, Tensor]:
-        """Return the levels of a laser's light over each field, with the light that the lens scatters.
+        """Return the levels of a laser's light over each field, with the light that the lens
+        scatters.
 
-        Wider fields are for a laser on the axis alone, and only as wide as the samples of the pupil carry.
+        Wider fields are for a laser on the axis alone, and only as wide as the samples of the pupil
+        carry.
         """
         camera = self.camera
         line = camera.laser_line(condition.wavelength)

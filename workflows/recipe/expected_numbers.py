@@ -8,18 +8,29 @@ from neusee.workflows.graph.recipe_graph import Recipe, needed
 
 
 def unaffected_expectations(recipe: Recipe, written: Recipe | None) -> Recipe:
-    """Return a recipe without the expected numbers that are affected by the user's changes to ``written``.
+    """Return a recipe without the expected numbers that are affected by the user's changes to
+    ``written``.
 
-    None for ``written`` means that the recipe is not valid without the changes, so that the changes affect everything.
+    None for ``written`` means that the recipe is not valid without the changes, so that the changes
+    affect everything.
     """
     same: set[str] = set()
     for name in needed(recipe, recipe.steps) if written else ():
-        if written and same.issuperset(recipe.steps[name].sources) and _alike(recipe, written, name):
+        if (
+            written
+            and same.issuperset(recipe.steps[name].sources)
+            and _alike(recipe, written, name)
+        ):
             same.add(name)
-    lost = [e for e in recipe.expect if (written is None or e in written.expect) and e.step not in same]
+    lost = [
+        e for e in recipe.expect if (written is None or e in written.expect) and e.step not in same
+    ]
     if not lost:
         return recipe
-    note = f"not compared, because your changes affect these numbers: {', '.join(e.name for e in lost)}"
+    note = (
+        "not compared, because your changes affect these numbers:"
+        f" {', '.join(e.name for e in lost)}"
+    )
     kept = tuple(e for e in recipe.expect if e not in lost)
     return replace(recipe, expect=kept, notes=(*recipe.notes, note))
 

@@ -28,7 +28,9 @@ NAMES = (
 
 
 def exports_of(root: Value, wiring: Wiring) -> dict[str, bool] | None:
-    """Return the names of the data files that a run writes, with True for half floats; None for all files."""
+    """Return the names of the data files that a run writes, with True for half floats; None for
+    all files.
+    """
     given = root.items.get(KEY)
     if given is None:
         return None
@@ -46,7 +48,9 @@ def _named(words: list[Value], wiring: Wiring) -> Iterator[tuple[str, bool]]:
         if word.data is BROKEN:
             continue
         if name not in NAMES:
-            text = f"no file of a run; {nearest(name, NAMES)}: write {ALL}, {NONE} or a list of names"
+            text = (
+                f"no file of a run; {nearest(name, NAMES)}: write {ALL}, {NONE} or a list of names"
+            )
             wiring.refuse(word, f"{KEY} = {word.data}", text)
         elif half and not name.endswith(".exr"):
             wiring.refuse(word, f"{KEY} = {word.data}", "only an .exr file can have half floats")

@@ -1,4 +1,6 @@
-"""Global settings of a recipe: outputs, seed, tolerance, and the numbers that a run is expected to give."""
+"""Global settings of a recipe: outputs, seed, tolerance, and the numbers that a run is expected
+to give.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +15,20 @@ from neusee.workflows.recipe.text.yaml_values import Value, kind
 from neusee.workflows.recipe.wiring import Wiring
 
 _EXPECTED = ("step", "at", "value", "rtol")
-ESTIMATES = "estimates"  #: key of a recipe, false if only proved errors may count towards the tolerance
-_NUMBERS = {"seed": "must be a whole number of 0 or more", "tolerance": "must be a number of 0 or more"}
+#: key of a recipe, false if only proved errors may count towards the tolerance
+ESTIMATES = "estimates"
+_NUMBERS = {
+    "seed": "must be a whole number of 0 or more",
+    "tolerance": "must be a number of 0 or more",
+}
 
 
-def seed_and_tolerance(root: Value, references: References, diagnostics: list[Diagnostic]) -> tuple[int, float]:
-    """Return the random seed and the error tolerance of a recipe; each is 0 if the recipe does not set it."""
+def seed_and_tolerance(
+    root: Value, references: References, diagnostics: list[Diagnostic]
+) -> tuple[int, float]:
+    """Return the random seed and the error tolerance of a recipe; each is 0 if the recipe does
+    not set it.
+    """
     numbers = dict.fromkeys(_NUMBERS, 0)
     for key in (key for key in _NUMBERS if key in root.items):
         value = references.resolve(root.items[key], Scope({}, key))
@@ -30,29 +40,43 @@ def seed_and_tolerance(root: Value, references: References, diagnostics: list[Di
 
 
 def estimates_of(root: Value, references: References, diagnostics: list[Diagnostic]) -> bool:
-    """Return True if a run may use cheaper steps whose error is estimated and not proved, as by default."""
+    """Return True if a run may use cheaper steps whose error is estimated and not proved, as by
+    default.
+    """
     if ESTIMATES not in root.items:
         return True
     value = references.resolve(root.items[ESTIMATES], Scope({}, ESTIMATES))
     if value.data is BROKEN or isinstance(value.data, bool):
         return bool(value.data)
-    diagnostics.append(Diagnostic(value.mark, f"{ESTIMATES} = {value.plain}", "must be true or false"))
+    diagnostics.append(
+        Diagnostic(value.mark, f"{ESTIMATES} = {value.plain}", "must be true or false")
+    )
     return True
 
 
 def outputs_of(root: Value, wiring: Wiring) -> tuple[str, ...]:
-    """Return the names of all copies, such as ``psf[mask]``, of the steps in the recipe key ``outputs``."""
+    """Return the names of all copies, such as ``psf[mask]``, of the steps in the recipe key
+    ``outputs``.
+    """
     given = root.items.get("outputs")
     if given is None or given.data in (None, "", [], {}):
-        if given is not None or not get_close_matches("outputs", map(str, root.items)):  # else reported as unknown
-            wiring.refuse(given or root, "outputs", "no output is requested: write outputs: [STEP, …]")
+        # else reported as unknown
+        if given is not None or not get_close_matches("outputs", map(str, root.items)):
+            wiring.refuse(
+                given or root, "outputs", "no output is requested: write outputs: [STEP, …]"
+            )
         return ()
     if isinstance(given.data, dict):
         wiring.refuse(given, "outputs", "must be a list of steps, not a mapping")
         return ()
     values = given.data if isinstance(given.data, list) else [given]
     resolved = [wiring.references.resolve(value, Scope({}, "outputs")) for value in values]
-    names = (name for value in resolved if value.data is not BROKEN for name in wiring.outputs(value, value.name))
+    names = (
+        name
+        for value in resolved
+        if value.data is not BROKEN
+        for name in wiring.outputs(value, value.name)
+    )
     return tuple(dict.fromkeys(names))
 
 
@@ -72,8 +96,12 @@ def expectations(root: Value, wiring: Wiring) -> tuple[Expectation, ...]:
 def _expectation(name: str, given: Value, wiring: Wiring) -> Expectation | None:
     before = len(wiring.diagnostics)
     values: dict[str, Value] = given.items if isinstance(given.data, dict) else {}
-    unknown = {value: nearest(str(key), _EXPECTED) for key, value in values.items() if key not in _EXPECTED}
-    wiring.diagnostics.extend(Diagnostic(v.key, v.name, f"unknown; {hint}") for v, hint in unknown.items())
+    unknown = {
+        value: nearest(str(key), _EXPECTED) for key, value in values.items() if key not in _EXPECTED
+    }
+    wiring.diagnostics.extend(
+        Diagnostic(v.key, v.name, f"unknown; {hint}") for v, hint in unknown.items()
+    )
     for key in ("step", "value", "rtol"):
         if key not in values and f"did you mean {key}?" not in unknown.values():
             message = f"needs {key}: {{step, value, rtol}} and perhaps at"
@@ -88,7 +116,9 @@ def _expectation(name: str, given: Value, wiring: Wiring) -> Expectation | None:
     at = _indices(values["at"], wiring) if "at" in values else ()
     if len(wiring.diagnostics) > before or not steps:
         return None
-    return Expectation(name, steps[0], at, float(values["value"].data), float(values["rtol"].data), given.key)
+    return Expectation(
+        name, steps[0], at, float(values["value"].data), float(values["rtol"].data), given.key
+    )
 
 
 def _indices(given: Value, wiring: Wiring) -> tuple[int | str, ...]:

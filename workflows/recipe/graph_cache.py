@@ -1,7 +1,8 @@
-"""Cache of the step graphs of recipes; a graph is valid while the steps, their copies and nodes are unchanged.
+"""Cache of the step graphs of recipes; a graph is valid while the steps, their copies and nodes are
+unchanged.
 
-The node and the wires of a step depend on no other values, so that the points of a sweep share one graph. Parameters
-are checked again where they have changed, and files for each point.
+The node and the wires of a step depend on no other values, so that the points of a sweep share one
+graph. Parameters are checked again where they have changed, and files for each point.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from neusee.workflows.recipe.node_families import Own, nodes_of
 from neusee.workflows.recipe.step_declarations import Declared
 from neusee.workflows.recipe.text.yaml_values import Value
 
-Names = tuple[tuple[str, tuple[str, ...] | None], ...]  #: name and items of each block; None for a block without items
+#: name and items of each block; None for a block without items
+Names = tuple[tuple[str, tuple[str, ...] | None], ...]
 
 _MOST = 16  #: largest number of graphs in the cache
 _graphs: dict[tuple[Value | None, Value | None, Names], CachedGraph] = {}  #: by `_key`
@@ -29,27 +31,43 @@ class CachedGraph:
 
     steps: dict[str, Declared]
     absent: dict[str, Value]
-    wires: Mapping[str, Mapping[str, Wire]]  #: by step, for the steps whose wires are not references
+    #: by step, for the steps whose wires are not references
+    wires: Mapping[str, Mapping[str, Wire]]
     memory: GraphMemory = field(default_factory=GraphMemory)
 
 
 def cached_graph(root: Value, own: Own) -> CachedGraph | None:
-    """Return the cached step graph of a recipe, or None if the cache has no valid graph of the recipe.
+    """Return the cached step graph of a recipe, or None if the cache has no valid graph of the
+    recipe.
 
     ``own`` has the families of nodes that the recipe names.
     """
     graph = _graphs.get(_key(root))
     families = functools.cache(functools.partial(nodes_of, own=own))
-    return graph if graph is not None and all(_is_current(step, families) for step in graph.steps.values()) else None
+    return (
+        graph
+        if graph is not None and all(_is_current(step, families) for step in graph.steps.values())
+        else None
+    )
 
 
 def cache_graph(
-    root: Value, steps: dict[str, Declared], absent: dict[str, Value], wires: Mapping[str, Mapping[str, Wire]]
+    root: Value,
+    steps: dict[str, Declared],
+    absent: dict[str, Value],
+    wires: Mapping[str, Mapping[str, Wire]],
 ) -> None:
-    """Add the step graph of a recipe without mistakes to the cache; omit inputs of steps that references set."""
+    """Add the step graph of a recipe without mistakes to the cache; omit inputs of steps that
+    references set.
+    """
     if any(_refers(step.value.items.get("node")) for step in steps.values()):
         return
-    fixed = [name for step in steps.values() if not _refers(step.value.items.get("from")) for name in step.instances]
+    fixed = [
+        name
+        for step in steps.values()
+        if not _refers(step.value.items.get("from"))
+        for name in step.instances
+    ]
     graph = CachedGraph(steps, absent, {name: wires[name] for name in fixed})
     key = _key(root)
     while len(_graphs) >= _MOST:
@@ -63,7 +81,11 @@ def _names(root: Value) -> Names:
 
 
 def _items(block: dict[str | int, Value]) -> tuple[str, ...] | None:
-    return tuple(map(str, block)) if all(isinstance(item.data, dict) for item in block.values()) else None
+    return (
+        tuple(map(str, block))
+        if all(isinstance(item.data, dict) for item in block.values())
+        else None
+    )
 
 
 def _key(root: Value) -> tuple[Value | None, Value | None, Names]:
@@ -72,7 +94,9 @@ def _key(root: Value) -> tuple[Value | None, Value | None, Names]:
 
 
 def _is_current(step: Declared, families: Callable[[str], Mapping[str, Node]]) -> bool:
-    """Return True if the node of a cached step has not been replaced by another node of the same name."""
+    """Return True if the node of a cached step has not been replaced by another node of the same
+    name.
+    """
     family, _, name = str(step.value.items["node"].data).partition(".")
     try:
         return families(family).get(name) is step.node
@@ -83,4 +107,8 @@ def _is_current(step: Declared, families: Callable[[str], Mapping[str, Node]]) -
 def _refers(value: Value | None) -> bool:
     if value is None:
         return False
-    return "${" in value.data if isinstance(value.data, str) else any(map(_refers, value.items.values()))
+    return (
+        "${" in value.data
+        if isinstance(value.data, str)
+        else any(map(_refers, value.items.values()))
+    )

@@ -1,4 +1,6 @@
-"""Loading of a recipe from its name or file and from arguments, with a check that reports all mistakes at once."""
+"""Loading of a recipe from its name or file and from arguments, with a check that reports all
+mistakes at once.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,12 @@ from neusee.workflows.recipe.distributions.mismatch_laws import read_mismatch
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
 from neusee.workflows.recipe.expected_numbers import unaffected_expectations
 from neusee.workflows.recipe.exported_files import exports_of
-from neusee.workflows.recipe.global_settings import estimates_of, expectations, outputs_of, seed_and_tolerance
+from neusee.workflows.recipe.global_settings import (
+    estimates_of,
+    expectations,
+    outputs_of,
+    seed_and_tolerance,
+)
 from neusee.workflows.recipe.graph_cache import CachedGraph, cache_graph, cached_graph
 from neusee.workflows.recipe.known_before_run import CheckedStep, check_steps, refuse_indices
 from neusee.workflows.recipe.node_families import NO_FAMILY, Own, class_context
@@ -51,7 +58,9 @@ SAFETY = "safety"  #: key of the block that an estimate of damage and dazzle rea
 
 @dataclass(frozen=True, slots=True)
 class Titled:
-    """Name of a packaged recipe or of an option of a group, with the title from the first line of its file."""
+    """Name of a packaged recipe or of an option of a group, with the title from the first line
+    of its file.
+    """
 
     name: str
     title: str
@@ -65,23 +74,27 @@ def load(
     first: int = 1,
     **values: Any,
 ) -> Recipe:
-    """Return a packaged recipe, or the recipe in a file whose name ends in ``.yaml``, after a check of all its values.
+    """Return a packaged recipe, or the recipe in a file whose name ends in ``.yaml``, after a check
+    of all its values.
 
         load("first_light", ["sensor.read_noise=20 e-"])
-        load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}, lasers={"green": {"strength": 1e4}})
-        load("first_light", **{"sensor.read_noise": "20 e-", "+lasers.red": {"wavelength": "638 nm", …}})
+        load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}, lasers={"green":
+        {"strength": 1e4}}) load("first_light", **{"sensor.read_noise": "20 e-", "+lasers.red":
+        {"wavelength": "638 nm", …}})
 
-    ``values`` are overrides as Python values, which are applied after ``overrides``; a mapping changes only the values
-    that it names. Paths are relative to ``folder`` (default: the working folder). Messages number ``overrides`` from
-    ``first``. A note names the expected numbers that overrides affect, because these are not compared.
-    Raises `RecipeError` with all mistakes.
+    ``values`` are overrides as Python values, which are applied after ``overrides``; a mapping
+    changes only the values that it names. Paths are relative to ``folder`` (default: the working
+    folder). Messages number ``overrides`` from ``first``. A note names the expected numbers that
+    overrides affect, because these are not compared. Raises `RecipeError` with all mistakes.
     """
     name, beside = os.fspath(name_or_path), Path(folder or ".").absolute()
     changes: tuple[str | Override, ...] = (*overrides, *overrides_of(values, beside))
     composed = compose(name, changes, beside, first)
     recipe = check(composed)
     if recipe.training and recipe.training.cameras:
-        recipe = with_cameras(recipe, composed, lambda words: check(compose(name, [*changes, *words], beside, first)))
+        recipe = with_cameras(
+            recipe, composed, lambda words: check(compose(name, [*changes, *words], beside, first))
+        )
     if recipe.expect and changes:
         recipe = unaffected_expectations(recipe, _as_written(name, beside))
     if recipe.expect and (problems := list(refuse_indices(recipe))):
@@ -90,7 +103,8 @@ def load(
 
 
 def _as_written(name: str, folder: Path) -> Recipe | None:
-    """Return a recipe without the user's overrides, or None if the recipe is not valid without the overrides.
+    """Return a recipe without the user's overrides, or None if the recipe is not valid without the
+    overrides.
 
     The result is cached while the files and nodes of the recipe are unchanged.
     """
@@ -104,14 +118,20 @@ def _as_written(name: str, folder: Path) -> Recipe | None:
 
 @functools.lru_cache(maxsize=16)
 def _checked(composed: Composed, graph: CachedGraph) -> Recipe:
-    """Return a composed recipe after a check of its values; the result is cached by recipe and step graph."""
+    """Return a composed recipe after a check of its values; the result is cached by recipe and
+    step graph.
+    """
     return check(composed)
 
 
 def _settings_blocks(
     composed: Composed, modules: Mapping[str, ModuleType]
-) -> tuple[Composed, Training | None, LiftTraining | None, EvaluateSettings | None, Traceability | None]:
-    """Return a recipe without its blocks of settings, and these; few recipes need the import of their models."""
+) -> tuple[
+    Composed, Training | None, LiftTraining | None, EvaluateSettings | None, Traceability | None
+]:
+    """Return a recipe without its blocks of settings, and these; few recipes need the import of
+    their models.
+    """
     from neusee.workflows.recipe.blocks.evaluate_block import read_evaluate
     from neusee.workflows.recipe.blocks.train_block import read_training
     from neusee.workflows.recipe.blocks.train_lift_block import read_lift_training
@@ -124,12 +144,16 @@ def _settings_blocks(
     from neusee.nodes.calibrate import Traceability
     from neusee.workflows.recipe.blocks.settings_block import read_block
 
-    composed, traceability = read_block(composed, TRACED, Traceability, composed.root.items[TRACED].plain)
+    composed, traceability = read_block(
+        composed, TRACED, Traceability, composed.root.items[TRACED].plain
+    )
     return composed, training, lifting, evaluation, traceability
 
 
 def check(composed: Composed) -> Recipe:
-    """Return a composed recipe after a check of all its values; raise `RecipeError` with all mistakes."""
+    """Return a composed recipe after a check of all its values; raise `RecipeError` with all
+    mistakes.
+    """
     blocks = [composed.root.items[key] for key in BLOCKS if key in composed.root.items]
     mistakes: list[Diagnostic] = []
     own = read_own_families(composed.root, mistakes)
@@ -139,17 +163,25 @@ def check(composed: Composed) -> Recipe:
     composed, uncertain = settle(composed)
     diagnostics = list(composed.diagnostics)
     uncertain = _with_mismatch(composed, uncertain, blocks[0] if training else None, diagnostics)
-    root, references = composed.root, References(composed.root, diagnostics, dict(composed.replaced))
+    root, references = (
+        composed.root,
+        References(composed.root, diagnostics, dict(composed.replaced)),
+    )
     checker = Checker([], own=own.modules)
     checker.files[(KEY,)] = own.places
     graph = cached_graph(root, own.modules)
-    steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, diagnostics, own)
+    steps, absent = (
+        (graph.steps, graph.absent) if graph else declare(root, references, diagnostics, own)
+    )
     wiring, checked = Wiring(root, steps, absent, references, diagnostics), list[CheckedStep]()
     bound = {step.name: step for step in _bind(wiring, checker, graph, checked)}
     loops = _cycles(bound, steps, graph)
     diagnostics += loops
     seed, tolerance = seed_and_tolerance(root, references, checker.diagnostics)
-    estimates, outputs = estimates_of(root, references, checker.diagnostics), outputs_of(root, wiring)
+    estimates, outputs = (
+        estimates_of(root, references, checker.diagnostics),
+        outputs_of(root, wiring),
+    )
     check_steps(checked, checker, None if loops else outputs, graph.memory.forms if graph else None)
     expect, exports = expectations(root, wiring), exports_of(root, wiring)
     safety = _safety(root, references, diagnostics, checker.files)
@@ -161,16 +193,43 @@ def check(composed: Composed) -> Recipe:
     if graph is None:
         cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
     memory = graph.memory if graph else None
-    config = Config(final_values(wiring, bound, checker, uncertain, memory) | dict(settings_of(blocks, checker)))
+    config = Config(
+        final_values(wiring, bound, checker, uncertain, memory) | dict(settings_of(blocks, checker))
+    )
     gone = {name: f"null ({value.mark})" for name, value in absent.items()}
-    notes = (*composed.notes, *own.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
-    args = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, gone, False, estimates
-    recipe = Recipe(*args, uncertain=uncertain, safety=safety, traceability=traceability, exports=exports)
+    notes = (
+        *composed.notes,
+        *own.notes,
+        *checker.notes,
+        *references.notes,
+        *(uncertain.notes if uncertain else ()),
+    )
+    args = (
+        composed.name,
+        composed.title,
+        seed,
+        tolerance,
+        outputs,
+        bound,
+        expect,
+        config,
+        notes,
+        gone,
+        False,
+        estimates,
+    )
+    recipe = Recipe(
+        *args, uncertain=uncertain, safety=safety, traceability=traceability, exports=exports
+    )
     return replace(recipe, training=training, lifting=lifting, evaluation=evaluation)
 
 
-def _cycles(bound: Mapping[str, Step], steps: Mapping[str, Declared], graph: CachedGraph | None) -> list[Diagnostic]:
-    """Return a diagnostic for each cycle of steps; a graph that was found to have none is not searched again."""
+def _cycles(
+    bound: Mapping[str, Step], steps: Mapping[str, Declared], graph: CachedGraph | None
+) -> list[Diagnostic]:
+    """Return a diagnostic for each cycle of steps; a graph that was found to have none is not
+    searched again.
+    """
     sources = tuple(step.sources for step in bound.values())
     if graph and sources in graph.memory.sources:
         return []
@@ -181,19 +240,28 @@ def _cycles(bound: Mapping[str, Step], steps: Mapping[str, Declared], graph: Cac
 
 
 def _with_mismatch(
-    composed: Composed, uncertain: Uncertain | None, block: Value | None, diagnostics: list[Diagnostic]
+    composed: Composed,
+    uncertain: Uncertain | None,
+    block: Value | None,
+    diagnostics: list[Diagnostic],
 ) -> Uncertain | None:
-    """Return the uncertain values of a recipe with the differences that ``train.mismatch`` states, if any."""
+    """Return the uncertain values of a recipe with the differences that ``train.mismatch``
+    states, if any.
+    """
     given = block.child("mismatch") if block else None
     if given is None or not (mismatch := read_mismatch(given, composed.root, diagnostics)):
         return uncertain
-    return replace(uncertain or Uncertain(replace(composed, diagnostics=()), {}, None), mismatch=mismatch)
+    return replace(
+        uncertain or Uncertain(replace(composed, diagnostics=()), {}, None), mismatch=mismatch
+    )
 
 
 def _safety(
     root: Value, references: References, diagnostics: list[Diagnostic], files: dict[Where, Any]
 ) -> Safety | None:
-    """Return the settings in the block ``safety`` of a recipe, or None; few recipes need the import of these."""
+    """Return the settings in the block ``safety`` of a recipe, or None; few recipes need the
+    import of these.
+    """
     if SAFETY not in root.items:
         return None
     from neusee.workflows.recipe.blocks.safety_block import read_safety
@@ -206,10 +274,14 @@ def _causes(problems: list[Diagnostic], own: OwnFamilies) -> list[Diagnostic]:
     return [each for each in problems if own.is_whole or not each.message.startswith(NO_FAMILY)]
 
 
-def _bind(wiring: Wiring, checker: Checker, graph: CachedGraph | None, checked: list[CheckedStep]) -> Iterator[Step]:
-    """Yield every copy of every step with its parameters and inputs, and add each valid copy to ``checked``.
+def _bind(
+    wiring: Wiring, checker: Checker, graph: CachedGraph | None, checked: list[CheckedStep]
+) -> Iterator[Step]:
+    """Yield every copy of every step with its parameters and inputs, and add each valid copy to
+    ``checked``.
 
-    ``graph`` has the inputs of each copy, and the copies that were checked with the same values before.
+    ``graph`` has the inputs of each copy, and the copies that were checked with the same values
+    before.
     """
     known, memory = (graph.wires, graph.memory) if graph else ({}, None)
     for step in wiring.steps.values():
@@ -231,7 +303,9 @@ def _bind(wiring: Wiring, checker: Checker, graph: CachedGraph | None, checked: 
                 continue
             params = checker.read(step.node, given, step.value.key)
             marks = {str(name): value.mark for name, value in given.items.items()}
-            found = Step(name, step.node, params or {}, wires, step.value.key, marks, device, cached)
+            found = Step(
+                name, step.node, params or {}, wires, step.value.key, marks, device, cached
+            )
             if params is not None:
                 checked.append(CheckedStep(found, given, step.value))
                 attempt.remember(name, checked[-1], memory)
@@ -239,7 +313,8 @@ def _bind(wiring: Wiring, checker: Checker, graph: CachedGraph | None, checked: 
 
 
 def families_of(name: str, folder: Path | None = None) -> Own:
-    """Return the modules of the families of nodes that a recipe names, by family, without a check of the recipe.
+    """Return the modules of the families of nodes that a recipe names, by family, without a check
+    of the recipe.
 
     Raises `RecipeError` if a family cannot be read.
     """
@@ -250,11 +325,13 @@ def families_of(name: str, folder: Path | None = None) -> Own:
     return own.modules
 
 
-# --- lists of recipes and groups ------------------------------------------------------------------------------------
+# --- lists of recipes and groups ------------------------------------------------------------------
 
 
 def recipes() -> list[Titled]:
-    """Return names and titles of all recipes that a name finds: those of the user, and the packaged recipes."""
+    """Return names and titles of all recipes that a name finds: those of the user, and the
+    packaged recipes.
+    """
     found: dict[str, Path] = {}
     for folder in shared_folders():
         for path in sorted(folder.glob("*.yaml")):
@@ -263,10 +340,15 @@ def recipes() -> list[Titled]:
 
 
 def groups(beside: Path | None = None) -> dict[str, list[Titled]]:
-    """Return the options of all groups: those in ``beside``, those of the user, and the packaged options."""
+    """Return the options of all groups: those in ``beside``, those of the user, and the packaged
+    options.
+    """
     folders = [folder for folder in (beside, *shared_folders()) if folder]
     return {
-        group: [_titled(next(p for f in folders if (p := f / group / f"{name}.yaml").is_file())) for name in names]
+        group: [
+            _titled(next(p for f in folders if (p := f / group / f"{name}.yaml").is_file()))
+            for name in names
+        ]
         for group, names in groups_of(*folders).items()
     }
 

@@ -15,14 +15,21 @@ from neusee.workflows.recipe.text.yaml_values import Value
 _TRAIN, _CAMERAS = "train", "train.cameras"
 
 
-def with_cameras(recipe: Recipe, composed: Composed, made: Callable[[Sequence[Override]], Recipe]) -> Recipe:
-    """Return a recipe with the recipes of `train.cameras`, which ``made`` loads with the overrides of each.
+def with_cameras(
+    recipe: Recipe, composed: Composed, made: Callable[[Sequence[Override]], Recipe]
+) -> Recipe:
+    """Return a recipe with the recipes of `train.cameras`, which ``made`` loads with the overrides
+    of each.
 
-    The final values state each camera by the values that differ, so that their text needs no groups of options.
-    Raises `RecipeError` with the location of an override, also for one that changes the training.
+    The final values state each camera by the values that differ, so that their text needs no groups
+    of options. Raises `RecipeError` with the location of an override, also for one that changes the
+    training.
     """
     given = composed.root.items[_TRAIN].items["cameras"]
-    cameras = tuple(made([_override("train.cameras=[]", given), *_overrides(each)]) for each in given.items.values())
+    cameras = tuple(
+        made([_override("train.cameras=[]", given), *_overrides(each)])
+        for each in given.items.values()
+    )
     settings = dict(recipe.config.settings)
     stated = [changes(recipe.config, camera.config, _TRAIN) for camera in cameras]
     settings[_CAMERAS] = replace(settings[_CAMERAS], value=stated)
@@ -32,7 +39,9 @@ def with_cameras(recipe: Recipe, composed: Composed, made: Callable[[Sequence[Ov
 def _overrides(camera: Value) -> list[Override]:
     found = [_override(str(value.plain), value) for value in camera.items.values()]
     if wrong := [o for o in found if o.path[0] == _TRAIN]:
-        raise RecipeError(Diagnostic(o.mark, camera.name, f"{o.text} is no setting of a camera") for o in wrong)
+        raise RecipeError(
+            Diagnostic(o.mark, camera.name, f"{o.text} is no setting of a camera") for o in wrong
+        )
     return found
 
 

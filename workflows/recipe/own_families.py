@@ -1,4 +1,6 @@
-"""The list ``nodes`` of a recipe: the files, folders and packages with the user's own families of nodes."""
+"""The list ``nodes`` of a recipe: the files, folders and packages with the user's own families
+of nodes.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ class OwnFamilies:
 
 
 def read_own_families(root: Value, diagnostics: list[Diagnostic]) -> OwnFamilies:
-    """Import what the list ``nodes`` of a recipe names, and return the families; report each mistake at its entry.
+    """Import what the list ``nodes`` of a recipe names, and return the families; report each
+    mistake at its entry.
 
     Importing runs the code. The variable ``NEUSEE_NO_CODE`` refuses that.
     """
@@ -37,7 +40,9 @@ def read_own_families(root: Value, diagnostics: list[Diagnostic]) -> OwnFamilies
     if given is None or given.data is None:
         return found
     if not isinstance(given.data, list):
-        diagnostics.append(Diagnostic(given.mark, KEY, f"must be a list of files and modules, not {kind(given)}"))
+        diagnostics.append(
+            Diagnostic(given.mark, KEY, f"must be a list of files and modules, not {kind(given)}")
+        )
         found.is_whole = False
         return found
     before = len(diagnostics)
@@ -53,10 +58,14 @@ def read_own_families(root: Value, diagnostics: list[Diagnostic]) -> OwnFamilies
         try:
             _add(found, *pair)
         except LookupError as error:
-            diagnostics.append(Diagnostic(entry.mark, f"{entry.name} = {pair[1].data}", str(error.args[0])))
+            diagnostics.append(
+                Diagnostic(entry.mark, f"{entry.name} = {pair[1].data}", str(error.args[0]))
+            )
     found.is_whole = len(diagnostics) == before
     if found.modules:
-        names = ", ".join(str(getattr(module, "__file__", module)) for module in found.modules.values())
+        names = ", ".join(
+            str(getattr(module, "__file__", module)) for module in found.modules.values()
+        )
         found.notes.append(f"reading this recipe ran code: {names}")
     return found
 
@@ -72,7 +81,9 @@ def _pair(entry: Value) -> tuple[str, Value] | None:
 
 
 def _add(found: OwnFamilies, family: str, where: Value) -> None:
-    """Import one entry; raise `LookupError` if that fails or if its family has the name of another one."""
+    """Import one entry; raise `LookupError` if that fails or if its family has the name of
+    another one.
+    """
     folder = Path(where.mark.folder)
     module = import_own(str(where.data), folder)
     name = family or module.__name__.rpartition(".")[2]

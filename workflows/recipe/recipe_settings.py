@@ -1,4 +1,6 @@
-"""Final values of a checked recipe: those that it writes, and the default values of the nodes of its steps."""
+"""Final values of a checked recipe: those that it writes, and the default values of the nodes of
+its steps.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ def final_values(
     uncertain: Uncertain | None,
     memory: GraphMemory | None,
 ) -> dict[str, Setting]:
-    """Return the final values of a recipe by path: the written values and the default values of the steps' nodes."""
+    """Return the final values of a recipe by path: the written values and the default values of
+    the steps' nodes.
+    """
     settings: dict[str, Setting] = {}
     spare = wiring.references.spare
     for key, block in wiring.root.items.items():
@@ -42,12 +46,17 @@ def final_values(
     return settings
 
 
-def _block_settings(block: Value, checker: Checker, memory: GraphMemory | None) -> dict[str, Setting]:
-    """Return the final values of a block by path, those of an earlier check if the block is the same object."""
+def _block_settings(
+    block: Value, checker: Checker, memory: GraphMemory | None
+) -> dict[str, Setting]:
+    """Return the final values of a block by path, those of an earlier check if the block is the
+    same object.
+    """
     known = memory.settings.get(block.path) if memory else None
     same = known is not None and known[0] is block
     found = known[1] if known and same else dict(settings_of([block], checker))
-    if any(setting.path in checker.files for setting in found.values()):  # paths of files may differ
+    # paths of files may differ
+    if any(setting.path in checker.files for setting in found.values()):
         return dict(settings_of([block], checker))
     if memory and not same:
         memory.settings[block.path] = block, found
@@ -63,9 +72,14 @@ def settings_of(blocks: Iterable[Value], checker: Checker) -> Iterator[tuple[str
 
 
 def _defaults(step: Declared, bound: dict[str, Step]) -> Iterator[tuple[str, Setting]]:
-    """Yield the parameters of a step that the recipe does not set, with the default values in SI."""
+    """Yield the parameters of a step that the recipe does not set, with the default values in
+    SI.
+    """
     first = bound.get(step.instances[0]) if step.instances else None
     for name, value in (first.params if first else {}).items():
         if first and name not in first.param_marks:
             path = (*step.value.path, "with", name)
-            yield ".".join(map(str, path)), Setting(value, f"default of {first.node.path}", path, True)
+            yield (
+                ".".join(map(str, path)),
+                Setting(value, f"default of {first.node.path}", path, True),
+            )

@@ -1,4 +1,6 @@
-"""Connections between the steps of a recipe: the steps whose results each step reads, and a check of their types."""
+"""Connections between the steps of a recipe: the steps whose results each step reads, and a
+check of their types.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ _WIRE = re.compile(r"\s*([^\[\]\s]+)\s*(?:\[([^\[\]]*)\])?\s*")
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """The steps of a recipe, and the connections that pass the results of steps to the inputs of other steps."""
+    """The steps of a recipe, and the connections that pass the results of steps to the inputs of
+    other steps.
+    """
 
     root: Value
     steps: Mapping[str, Declared]
@@ -33,7 +37,9 @@ class Wiring:
     diagnostics: list[Diagnostic]
 
     def wires(self, step: Declared, items: tuple[str, ...]) -> dict[str, Wire]:
-        """Return the steps that feed each input of one copy of a step, in the order of the node's inputs."""
+        """Return the steps that feed each input of one copy of a step, in the order of the
+        node's inputs.
+        """
         given = self.references.resolve(step.part("from"), step.scope(self.root, items))
         values = self._by_input(step.node, given) if step.node else None
         if step.node is None or values is None:
@@ -48,7 +54,9 @@ class Wiring:
         return wires
 
     def outputs(self, value: Value, path: str) -> tuple[str, ...]:
-        """Return the names of all copies of the steps that a value of ``outputs`` or ``expect`` names."""
+        """Return the names of all copies of the steps that a value of ``outputs`` or ``expect``
+        names.
+        """
         return self._producers(value, path, {}) or ()
 
     def refuse(self, value: Value, path: str, message: str) -> None:
@@ -65,7 +73,11 @@ class Wiring:
         if given.data is None:
             return {}
         if isinstance(given.data, list):
-            self.refuse(given, given.name, "must be a step's name, or a mapping of inputs to names, not a list")
+            self.refuse(
+                given,
+                given.name,
+                "must be a step's name, or a mapping of inputs to names, not a list",
+            )
             return None
         if not isinstance(given.data, dict):
             if node.inputs:
@@ -75,20 +87,32 @@ class Wiring:
         for name, value in given.data.items():
             if name not in node.inputs:
                 hint = nearest(str(name), node.inputs)
-                self.diagnostics.append(Diagnostic(value.key, value.name, f"{node.path} has no input {name}; {hint}"))
+                self.diagnostics.append(
+                    Diagnostic(value.key, value.name, f"{node.path} has no input {name}; {hint}")
+                )
         return {str(name): value for name, value in given.data.items()}
 
     def _require(self, step: Declared, node: Node, name: str, given: Value) -> None:
-        """Report an input of a node that the step's key ``from`` does not name, unless the input is optional."""
-        if name in node.optional or (name == "stop" and became_input(node.path, map(str, step.part("with").items))):
+        """Report an input of a node that the step's key ``from`` does not name, unless the input
+        is optional.
+        """
+        if name in node.optional or (
+            name == "stop" and became_input(node.path, map(str, step.part("with").items))
+        ):
             return  # the parameters of an old recipe are reported with the step that replaces them
         if not (isinstance(given.data, dict) and _misspelt(name, node, given)):
             mark = given.mark if given.items else step.value.key
             fix = f"write from: {{{name}: STEP}}{self._makers(needs(node, name))}"
-            self.diagnostics.append(Diagnostic(mark, given.name, f"{node.path} needs the input {name}: {fix}"))
+            self.diagnostics.append(
+                Diagnostic(mark, given.name, f"{node.path} needs the input {name}: {fix}")
+            )
 
-    def _wire(self, step: Declared, node: Node, items: tuple[str, ...], name: str, value: Value) -> Wire:
-        """Return the steps that feed an input, from its value in the step's key ``from``, or None for a mistake."""
+    def _wire(
+        self, step: Declared, node: Node, items: tuple[str, ...], name: str, value: Value
+    ) -> Wire:
+        """Return the steps that feed an input, from its value in the step's key ``from``, or
+        None for a mistake.
+        """
         many, path, parsed = takes_many(node, name), f"{step.value.name}.from.{name}", _parse(value)
         null = self.absent.get(parsed[0]) if parsed else None
         if value.data is None or null:
@@ -104,16 +128,25 @@ class Wiring:
         self._agree(node, name, producer, value, path)
         if many:
             return names
-        if set(producer.dims) <= set(here) or (parsed[1] is not None and len(parsed[1]) == len(producer.dims)):
+        if set(producer.dims) <= set(here) or (
+            parsed[1] is not None and len(parsed[1]) == len(producer.dims)
+        ):
             return names[0]
         left = ", ".join(dim for dim in producer.dims if dim not in here)
         example = f"{parsed[0]}[{producer.items[0][0]}]" if producer.items else f"{parsed[0]}[…]"
-        message = f"{node.path} takes one step as {name}; {parsed[0]} is a step for each of {left}: write {example}"
+        message = (
+            f"{node.path} takes one step as {name}; {parsed[0]} is a step for each of {left}: write"
+            f" {example}"
+        )
         self.refuse(value, path, message)
         return None
 
-    def _producers(self, value: Value, path: str, here: Mapping[str, str], makers: str = "") -> tuple[str, ...] | None:
-        """Return the copies of a step that a value names; ``here`` contains the items of the step that reads them."""
+    def _producers(
+        self, value: Value, path: str, here: Mapping[str, str], makers: str = ""
+    ) -> tuple[str, ...] | None:
+        """Return the copies of a step that a value names; ``here`` contains the items of the
+        step that reads them.
+        """
         parsed = _parse(value)
         if parsed is None or parsed[0] not in self.steps:
             self.refuse(value, path, self._unknown(value, makers))
@@ -138,10 +171,16 @@ class Wiring:
         if now := new_name(f"steps.{name}"):
             return f"step {name} is called {now.removeprefix('steps.')} now"
         hint = nearest(name, self.steps)
-        return f"no step {name}; {hint if hint.startswith('did you mean') else f'check the name{makers}'}"
+        return (
+            f"no step {name};"
+            f" {hint if hint.startswith('did you mean') else f'check the name{makers}'}"
+        )
 
-    def _chosen(self, producer: Declared, items: Sequence[str], value: Value, path: str) -> dict[str, str] | None:
-        """Return the items in the brackets of a name such as ``spot[mask,green]``, by the list that contains each item.
+    def _chosen(
+        self, producer: Declared, items: Sequence[str], value: Value, path: str
+    ) -> dict[str, str] | None:
+        """Return the items in the brackets of a name such as ``spot[mask,green]``, by the list that
+        contains each item.
 
         A single item may be in any of the lists of the step.
         """
@@ -155,7 +194,9 @@ class Wiring:
             dim = next((dim for dim in among if item in self._items(dim)), None)
             if dim is None:
                 names = [name for dim in among for name in self._items(dim)]
-                self.refuse(value, path, f"{producer.name} has no item {item}; {nearest(item, names)}")
+                self.refuse(
+                    value, path, f"{producer.name} has no item {item}; {nearest(item, names)}"
+                )
                 return None
             chosen[dim] = item
             left.remove(dim)
@@ -168,21 +209,30 @@ class Wiring:
         """Report a step whose result does not have the type that an input of another step needs."""
         needed, returned = needs(node, name), _returned(producer)
         if returned and needed and not _fits(returned, needed):
-            message = f"{node.path} needs {_a(needed)}; {producer.name} returns {_a(returned)}{self._makers(needed)}"
+            message = (
+                f"{node.path} needs {_a(needed)}; {producer.name} returns"
+                f" {_a(returned)}{self._makers(needed)}"
+            )
             self.refuse(value, path, message)
 
     def _makers(self, needed: Sequence[type]) -> str:
-        """Return a hint that names the steps whose results have a type, or an empty hint for the type ``Tensor``."""
+        """Return a hint that names the steps whose results have a type, or an empty hint for the
+        type ``Tensor``.
+        """
         if not needed or all(n.__name__ == "Tensor" for n in needed):
             return ""
-        makers = [name for s in self.steps.values() if _fits(_returned(s), needed) for name in s.instances]
+        makers = [
+            name for s in self.steps.values() if _fits(_returned(s), needed) for name in s.instances
+        ]
         if not makers:
             return f"; no step returns {_a(needed)}"
         return f"; steps returning {_a(needed)}: {', '.join(makers[:6])}"
 
 
 def _parse(value: Value) -> tuple[str, list[str] | None] | None:
-    """Return the step name and the items in a text such as ``spot[mask,green]``, or None for any other value."""
+    """Return the step name and the items in a text such as ``spot[mask,green]``, or None for any
+    other value.
+    """
     match = _WIRE.fullmatch(value.data) if isinstance(value.data, str) else None
     if match is None:
         return None
@@ -201,7 +251,9 @@ def takes_many(node: Node, name: str) -> bool:
 
 
 def needs(node: Node, name: str) -> tuple[type, ...]:
-    """Return the classes that an input of a node accepts, or an empty tuple for an annotation without classes."""
+    """Return the classes that an input of a node accepts, or an empty tuple for an annotation
+    without classes.
+    """
     hints = _options(node.hints.get(name))
     return tuple(k for h in hints for k in _kinds(get_args(h)[0] if get_origin(h) in _LISTS else h))
 
@@ -224,29 +276,39 @@ def _options(hint: Any) -> list[Any]:
 
 
 def _kinds(hint: Any) -> list[type]:
-    return [option for option in _options(hint) if isinstance(option, type) and option is not object]
+    return [
+        option for option in _options(hint) if isinstance(option, type) and option is not object
+    ]
 
 
 def _a(kinds: Sequence[type]) -> str:
     return "a " + " or ".join(dict.fromkeys(k.__name__ for k in kinds))
 
 
-# --- cycles -----------------------------------------------------------------------------------------------------------
+# --- cycles ---------------------------------------------------------------------------------------
 
 
 def cycles(steps: Mapping[str, Step], marks: Mapping[str, Location]) -> Iterator[Diagnostic]:
     """Yield one diagnostic for each cycle of steps in a recipe, with the lines of these steps."""
     seen: set[frozenset[str]] = set()
-    for loop in _loops({name: [s for s in step.sources if s in steps] for name, step in steps.items()}):
+    for loop in _loops(
+        {name: [s for s in step.sources if s in steps] for name, step in steps.items()}
+    ):
         names = list(dict.fromkeys(name.partition("[")[0] for name in loop))
         if frozenset(names) in seen:
             continue
         seen.add(frozenset(names))
         start = min(range(len(names)), key=lambda n: marks[names[n]])
         names = names[start:] + names[:start]
-        few = names if len(names) <= _NAMED else [*names[: _NAMED - 1], f"({len(names) - _NAMED} more)", names[-1]]
+        few = (
+            names
+            if len(names) <= _NAMED
+            else [*names[: _NAMED - 1], f"({len(names) - _NAMED} more)", names[-1]]
+        )
         where = _lines_of([marks[name] for name in names[:_NAMED]])
-        yield Diagnostic(marks[names[0]], "steps", f"cycle: {' -> '.join([*few, names[0]])} ({where})")
+        yield Diagnostic(
+            marks[names[0]], "steps", f"cycle: {' -> '.join([*few, names[0]])} ({where})"
+        )
 
 
 def _lines_of(marks: list[Location]) -> str:
@@ -256,7 +318,9 @@ def _lines_of(marks: list[Location]) -> str:
 
 
 def _loops(sources: Mapping[str, list[str]]) -> Iterator[list[str]]:
-    """Yield the names of the steps in each cycle, each step before the step that reads its result."""
+    """Yield the names of the steps in each cycle, each step before the step that reads its
+    result.
+    """
     done: set[str] = set()
     for root in sources:
         path: dict[str, Iterator[str]] = {} if root in done else {root: iter(sources[root])}

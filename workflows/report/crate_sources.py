@@ -15,7 +15,8 @@ from neusee import __version__
 
 Entity = dict[str, Any]
 
-CREATOR = "NEUSEE_CREATOR"  #: name of the person who runs neusee, and in <> an address such as an ORCID
+#: name of the person who runs neusee, and in <> an address such as an ORCID
+CREATOR = "NEUSEE_CREATOR"
 LICENCE = "NEUSEE_LICENCE"  #: licence of the results: an address or a text
 
 _BYTES = "application/octet-stream"
@@ -52,15 +53,23 @@ def tools(said: Mapping[str, Any]) -> list[Entity]:
 
 
 def _library(name: str, version: str) -> Entity:
-    """Return the entity of Python or of a package, whose address at the package index has no local version."""
+    """Return the entity of Python or of a package, whose address at the package index has no
+    local version.
+    """
     home = f"https://pypi.org/project/{name}/{version.partition('+')[0]}/"
     home = "https://www.python.org/" if name.lower() == "python" else home
-    about = {"name": name.capitalize() if name == "python" else name, "softwareVersion": version, "url": home}
+    about = {
+        "name": name.capitalize() if name == "python" else name,
+        "softwareVersion": version,
+        "url": home,
+    }
     return {"@id": home, "@type": "SoftwareApplication", **about}
 
 
 def _of_facts(facts: Iterable[Iterable[str]]) -> Iterator[tuple[str, str]]:
-    """Yield name and version of each library in the table of facts of a run, which ends with the machine."""
+    """Yield name and version of each library in the table of facts of a run, which ends with the
+    machine.
+    """
     for name, value in facts:
         if name == "machine":
             return
@@ -68,7 +77,9 @@ def _of_facts(facts: Iterable[Iterable[str]]) -> Iterator[tuple[str, str]]:
 
 
 def inputs(rows: Iterable[Any]) -> tuple[list[Entity], list[Entity]]:
-    """Return an entity for each input file, which is not a part of the folder, and one for each known licence."""
+    """Return an entity for each input file, which is not a part of the folder, and one for each
+    known licence.
+    """
     found: dict[str, Entity] = {}
     licences: list[Entity] = []
     for row in rows:
@@ -88,8 +99,13 @@ def inputs(rows: Iterable[Any]) -> tuple[list[Entity], list[Entity]]:
             "_users": users,
         }
         if entry:
-            licences.append({"@id": entry["address"], "@type": "CreativeWork", "name": entry["licence"]})
-    return [{key: value for key, value in entity.items() if key != "_users"} for entity in found.values()], licences
+            licences.append(
+                {"@id": entry["address"], "@type": "CreativeWork", "name": entry["licence"]}
+            )
+    return [
+        {key: value for key, value in entity.items() if key != "_users"}
+        for entity in found.values()
+    ], licences
 
 
 def _sample(file: str, digest: str) -> dict[str, str] | None:
@@ -98,20 +114,31 @@ def _sample(file: str, digest: str) -> dict[str, str] | None:
 
     row = _samples().get(file)
     try:
-        return row if row and file_digest(Path(str(files("neusee.recipes") / "samples" / file))) == digest else None
+        return (
+            row
+            if row and file_digest(Path(str(files("neusee.recipes") / "samples" / file))) == digest
+            else None
+        )
     except OSError:
         return None
 
 
 @cache
 def _samples() -> dict[str, dict[str, str]]:
-    """Return author and licence of each file that neusee ships, from the table in ``samples/LICENSE.md``."""
+    """Return author and licence of each file that neusee ships, from the table in
+    ``samples/LICENSE.md``.
+    """
     text = (files("neusee.recipes") / "samples" / "LICENSE.md").read_text(encoding="utf-8")
     found = {}
     for line in text.splitlines():
         cells = [cell.strip() for cell in line.strip("|").split(" | ")]
         if len(cells) == 5 and (link := _LINK.fullmatch(cells[3])):
-            row = {"what": cells[1], "author": cells[2], "licence": link["name"], "address": link["address"]}
+            row = {
+                "what": cells[1],
+                "author": cells[2],
+                "licence": link["name"],
+                "address": link["address"],
+            }
             found.update({name: row for name in re.findall("`([^`]+)`", cells[0])})
     return found
 

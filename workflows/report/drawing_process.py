@@ -1,8 +1,10 @@
-"""A process beside that of the run, which draws pictures and encodes images while the steps of the run compute.
+"""A process beside that of the run, which draws pictures and encodes images while the steps of the
+run compute.
 
-matplotlib holds the lock of the interpreter, so that a thread that draws would stop the steps. The process is a fork of
-the run at its start, with one thread, so that it imports nothing again; it reads its jobs from a pipe, and ends when
-the run does. Where a fork is not safe, or for another reason no process answers, the run draws its pictures itself.
+matplotlib holds the lock of the interpreter, so that a thread that draws would stop the steps. The
+process is a fork of the run at its start, with one thread, so that it imports nothing again; it
+reads its jobs from a pipe, and ends when the run does. Where a fork is not safe, or for another
+reason no process answers, the run draws its pictures itself.
 """
 
 from __future__ import annotations
@@ -45,18 +47,24 @@ class DrawingProcess:
     """A forked process that writes one picture at a time; `close` ends the process."""
 
     def __init__(self) -> None:
-        self._turn = threading.Lock()  # a second thread waits until the file of the first is written
+        # a second thread waits until the file of the first is written
+        self._turn = threading.Lock()
         self._next = threading.Lock()  # and is the next then, before the first thread asks again
         context = multiprocessing.get_context("fork")
         self._pipe, there = context.Pipe()
-        with warnings.catch_warnings(), deaf_fork():  # Python 3.12 warns of every fork beside a thread
+        # Python 3.12 warns of every fork beside a thread
+        with warnings.catch_warnings(), deaf_fork():
             warnings.simplefilter("ignore", DeprecationWarning)
-            self._process = context.Process(target=_serve, args=(there, self._pipe), name="neusee draws", daemon=True)
+            self._process = context.Process(
+                target=_serve, args=(there, self._pipe), name="neusee draws", daemon=True
+            )
             self._process.start()
         there.close()
 
     def make(self, path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -> None:
-        """Let the process call ``make(path, **arguments)``; raise `NotDrawn` if the call failed or was not made."""
+        """Let the process call ``make(path, **arguments)``; raise `NotDrawn` if the call failed
+        or was not made.
+        """
         with self._next:
             self._turn.acquire()
         try:
@@ -99,9 +107,11 @@ def _sent(path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -
 
 
 def _packed(value: Any) -> tuple[Any, list[Any], Any]:
-    """Return the layout and the arrays of a value, and None; or a value without tensors at the end, as it is.
+    """Return the layout and the arrays of a value, and None; or a value without tensors at the end,
+    as it is.
 
-    A function that applies the node of a step is such a value; the process that draws has all modules of the run.
+    A function that applies the node of a step is such a value; the process that draws has all
+    modules of the run.
     """
     if not isinstance(value, _WORDS):
         try:
@@ -130,7 +140,9 @@ def _serve(pipe: Connection, other_end: Connection) -> None:
 
 
 def _close_all_but(mine: int) -> None:
-    """Close every file but those of the terminal and ``mine``: a lock of the store ends when its last copy closes."""
+    """Close every file but those of the terminal and ``mine``: a lock of the store ends when its
+    last copy closes.
+    """
     for name in os.listdir("/proc/self/fd"):
         if int(name) > 2 and int(name) != mine:
             with suppress(OSError):

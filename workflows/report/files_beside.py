@@ -1,9 +1,9 @@
 """Pictures and data files of a run, made while later steps compute.
 
-A file is made as soon as the last of its results is there. One thread writes data files, and another leaves pictures
-to the process that draws, so that neither waits for the other. What is made so is found by its key when the report is
-written, and the report makes what is missing; an error is met there again. So nothing of the report depends on this
-module but its time.
+A file is made as soon as the last of its results is there. One thread writes data files, and
+another leaves pictures to the process that draws, so that neither waits for the other. What is made
+so is found by its key when the report is written, and the report makes what is missing; an error is
+met there again. So nothing of the report depends on this module but its time.
 """
 
 from __future__ import annotations
@@ -37,18 +37,22 @@ ROOM = 1 << 27  #: bytes of smaller results that are held for files
 class FilesBeside:
     """Files that are made beside a run; call the object with each result of the run.
 
-    Args: files: the files of a recipe. limit: bytes of memory that the process may use; of these, an eighth at most is
-    held for files, no more than `ROOM` beside one large result, and nothing once half of the limit is in use. With 0
-    no file is made beside the run.
+    Args: files: the files of a recipe. limit: bytes of memory that the process may use; of these,
+            an eighth at most is
+    held for files, no more than `ROOM` beside one large result, and nothing once half of the limit
+    is in use. With 0 no file is made beside the run.
     """
 
-    def __init__(self, files: Callable[[Recipe], Iterable[DerivedFile]], shelf: DerivedFiles, limit: float) -> None:
+    def __init__(
+        self, files: Callable[[Recipe], Iterable[DerivedFile]], shelf: DerivedFiles, limit: float
+    ) -> None:
         self._files, self._shelf = files, shelf
         self._large, self._room = min(LARGE, limit / 32), min(ROOM, limit / 16)
         self._limit = limit
         self._recipe: Recipe | None = None
         self._code = Code(shelf.store.code_memo)
-        self._open: list[tuple[DerivedFile, frozenset[str]]] = []  # files to make, and the steps that they show
+        # files to make, and the steps that they show
+        self._open: list[tuple[DerivedFile, frozenset[str]]] = []
         self._held: dict[str, Any] = {}
         self._busy: set[str] = set()  # files of large results that are being written
         self._writes = ThreadPoolExecutor(1, "neusee files")
@@ -66,10 +70,13 @@ class FilesBeside:
             self._drawer.close()
 
     def __call__(self, recipe: Recipe, keys: Mapping[str, Key], step: str, value: Any) -> None:
-        """Hold the result of a step as long as files need it, and begin the files that need no other result."""
+        """Hold the result of a step as long as files need it, and begin the files that need no
+        other result.
+        """
         if self._limit <= 0:
             return
-        if recipe is not self._recipe:  # the first result, or a run that begins again with a smaller tolerance
+        # the first result, or a run that begins again with a smaller tolerance
+        if recipe is not self._recipe:
             self._begin(recipe)
         shown = {name for _, steps in self._open for name in steps}
         names = [name for name in shown if keys.get(name) == keys[step]]
@@ -82,23 +89,34 @@ class FilesBeside:
         for file, steps in [job for job in self._open if job[1] <= self._held.keys()]:
             self._open.remove((file, steps))
             self._submit(file, recipe, {name: keys[name] for name in steps})
-        self._let_go(names if size > self._large or _bytes_of(list(self._held.values())) > self._room else ())
+        self._let_go(
+            names if size > self._large or _bytes_of(list(self._held.values())) > self._room else ()
+        )
 
-    def add(self, name: str, key: str, make: Callable[..., None], arguments: Mapping[str, Any]) -> None:
+    def add(
+        self, name: str, key: str, make: Callable[..., None], arguments: Mapping[str, Any]
+    ) -> None:
         """Begin a picture that shows no result of a step."""
         if self._drawer is not None:
             self._start(_Job(name, key, ".png", make, arguments), self._draws)
 
-    def draw(self, path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -> Callable[[], None]:
+    def draw(
+        self, path: Path, make: Callable[..., None], arguments: Mapping[str, Any]
+    ) -> Callable[[], None]:
         """Begin a picture that is not stored; return a function that waits for the picture.
 
-        That function draws the picture itself if the process that draws is missing, is busy with another, or failed.
+        That function draws the picture itself if the process that draws is missing, is busy with
+        another, or failed.
         """
         drawer = self._drawer
         begun = None if drawer is None else self._draws.submit(drawer.make, path, make, arguments)
 
         def wait() -> None:
-            if begun is None or (_draws_at_once() and begun.cancel()) or begun.exception() is not None:
+            if (
+                begun is None
+                or (_draws_at_once() and begun.cancel())
+                or begun.exception() is not None
+            ):
                 make(path, **arguments)
 
         return wait
@@ -146,7 +164,14 @@ class FilesBeside:
         drawing = isinstance(file.make, Drawing)
         if drawing and (large or self._drawer is None):
             return
-        job = _Job(file.name, key_of_file(file, found), file.suffix, file.make, arguments, large or file.copied)
+        job = _Job(
+            file.name,
+            key_of_file(file, found),
+            file.suffix,
+            file.make,
+            arguments,
+            large or file.copied,
+        )
         begun = self._start(job, self._draws if drawing else self._writes)
         if large:
             self._busy.add(file.name)
@@ -159,7 +184,8 @@ class FilesBeside:
 
     def _make(self, job: _Job, drawer: DrawingProcess | None) -> None:
         """Write a file here, or let a process write it."""
-        arguments, job.arguments = job.arguments, {}  # so that this object does not hold them until the end
+        # so that this object does not hold them until the end
+        arguments, job.arguments = job.arguments, {}
         if self._shelf.find(job.key, job.suffix) is not None:
             return
 
@@ -185,7 +211,9 @@ class _Job:
 
 
 def _draws_at_once() -> bool:
-    """Return True if this process has imported what drawing needs; the import takes longer than a picture."""
+    """Return True if this process has imported what drawing needs; the import takes longer than
+    a picture.
+    """
     return "matplotlib.figure" in sys.modules
 
 

@@ -1,4 +1,5 @@
-"""The picture of the graph of a run, begun as soon as the state of each step at the end can be foreseen.
+"""The picture of the graph of a run, begun as soon as the state of each step at the end can be
+foreseen.
 
 Where a state is another one in the end, the report draws the graph again, under another key.
 """
@@ -18,9 +19,11 @@ from neusee.workflows.store.result_store import Store
 
 
 class GraphAhead:
-    """A function of each result of a run, which begins the graph when the keys of all steps are known.
+    """A function of each result of a run, which begins the graph when the keys of all steps are
+    known.
 
-    Args: beside: draws the graph. done: the records of the steps that have finished, which the run fills.
+    Args: beside: draws the graph. done: the records of the steps that have finished, which the run
+            fills.
     """
 
     def __init__(self, beside: FilesBeside, store: Store, done: Mapping[str, StepRecord]) -> None:
@@ -30,7 +33,8 @@ class GraphAhead:
 
     def __call__(self, recipe: Recipe, keys: Mapping[str, Key], step: str, value: Any) -> None:
         """Take note of a result; begin the graph, once for each recipe."""
-        if recipe is not self._recipe:  # the first result, or a run that begins again with a smaller tolerance
+        # the first result, or a run that begins again with a smaller tolerance
+        if recipe is not self._recipe:
             self._recipe, self._order = recipe, needed(recipe, wanted(recipe))
         if self._order and len(keys) >= len(self._order):
             for key, arguments in graphs(recipe, self._foreseen(keys)):
@@ -38,7 +42,9 @@ class GraphAhead:
             self._order = ()
 
     def _foreseen(self, keys: Mapping[str, Key]) -> dict[str, str]:
-        """Return the state of each step at the end: what is not stored runs, and equal results are computed once."""
+        """Return the state of each step at the end: what is not stored runs, and equal results
+        are computed once.
+        """
         known = states_of({name: self._done[name] for name in self._order if name in self._done})
         seen, states = set[Key](), dict[str, str]()
         for name in self._order:

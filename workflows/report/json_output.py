@@ -8,7 +8,8 @@ from typing import Any
 
 
 def json_line(document: dict[str, Any]) -> str:
-    """Return the result of a command as one JSON object on one line of ASCII, which each terminal can show.
+    """Return the result of a command as one JSON object on one line of ASCII, which each terminal
+    can show.
 
     A number that is not finite is null.
     """

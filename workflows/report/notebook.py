@@ -1,4 +1,6 @@
-"""HTML views of a recipe and of a run result in a Jupyter notebook, each as one page that loads no other file."""
+"""HTML views of a recipe and of a run result in a Jupyter notebook, each as one page that loads
+no other file.
+"""
 
 from __future__ import annotations
 
@@ -23,20 +25,25 @@ if TYPE_CHECKING:
 
 _LONGEST_WAIT = 2.0  #: s, limit for computing values that the store does not hold
 _WEIGHT = 800_000  #: bytes of base64, limit for all pictures together
-_EDGES = {1: 640, 2: 400}  #: pixels of the longer side, by the number of pictures; 280 for other numbers
+#: pixels of the longer side, by the number of pictures; 280 for other numbers
+_EDGES = {1: 640, 2: 400}
 _NAMES = {"plain": "plain lens", "mask": "with mask"}
 _LONGEST = 100  #: characters of a value in a table, at most
 
 
 def numbers_of(result: Result) -> dict[str, float | list[float]]:
-    """Return the figures of merit of a run by name, as a number or as a list with one number for each band."""
+    """Return the figures of merit of a run by name, as a number or as a list with one number for
+    each band.
+    """
     recipe = result.recipe.unsubstituted or result.recipe
     names = metrics_of(recipe, {*result.keys, *wanted(recipe)})
     absent = [name for name in names if name not in result.values]
     again = recipe.run(result.store, absent, device=result.device).values if absent else {}
     values = {**again, **result.values}
     found: dict[str, list[float]] = {}
-    for step, field, _, number in (row for name in names for row in result_numbers.numbers_of(name, values[name])):
+    for step, field, _, number in (
+        row for name in names for row in result_numbers.numbers_of(name, values[name])
+    ):
         found.setdefault(f"{step}.{field}".rstrip("."), []).append(number)
     return {name: values[0] if len(values) == 1 else values for name, values in found.items()}
 
@@ -54,21 +61,34 @@ def arrays_of(value: Any) -> Any:
         return value._make(items) if hasattr(value, "_make") else tuple(items)
     if isinstance(value, list):
         return [arrays_of(item) for item in value]
-    return {name: arrays_of(item) for name, item in value.items()} if isinstance(value, dict) else value
+    return (
+        {name: arrays_of(item) for name, item in value.items()}
+        if isinstance(value, dict)
+        else value
+    )
 
 
 def result_line(result: Result) -> str:
-    """Return a run result as a line such as ``<result of first_light: restored, raw; 12 run, 3 cached in 0.31 s>``."""
-    return f"<result of {result.recipe.name}: {', '.join(by_family(result.values))}; {_counts(result)}>"
+    """Return a run result as a line such as ``<result of first_light: restored, raw; 12 run, 3
+    cached in 0.31 s>``.
+    """
+    return (
+        f"<result of {result.recipe.name}: {', '.join(by_family(result.values))};"
+        f" {_counts(result)}>"
+    )
 
 
 def result_html(result: Result) -> str:
-    """Return an HTML page with pictures, result table and steps of a run, without values that take over 2 s."""
+    """Return an HTML page with pictures, result table and steps of a run, without values that
+    take over 2 s.
+    """
     values = _at_hand(result, [*_of_table(result), *_of_overview().values()])
     return filled(
         "notebook.html.j2",
         title=result.recipe.name,
-        lines=[line for line in (result.recipe.title, f"{_counts(result)}, on {result.device}") if line],
+        lines=[
+            line for line in (result.recipe.title, f"{_counts(result)}, on {result.device}") if line
+        ],
         look=[f"{d.step}: {c.text}" for d in result.done.values() for c in d.checks if not c.ok],
         pictures=_pictures({**result.values, **values}),
         tables=[*_results(result, values), _outputs(result), _steps(result)],
@@ -87,16 +107,28 @@ def _of_table(result: Result) -> list[str]:
 
 
 def _of_overview() -> dict[str, str]:
-    return {name: need.removeprefix("?") for name, need in FIGURES[0].needs.items() if "*" not in need}
+    return {
+        name: need.removeprefix("?") for name, need in FIGURES[0].needs.items() if "*" not in need
+    }
 
 
 def _at_hand(result: Result, steps: Iterable[str]) -> dict[str, Any]:
-    """Return the results of those ``steps`` that are in the store or can be computed again within 2 s."""
-    held = {name for name, key in result.keys.items() if name in result.values or result.store.has(key)}
-    sources = {name: () if name in held else result.recipe.steps[name].sources for name in result.keys}
+    """Return the results of those ``steps`` that are in the store or can be computed again
+    within 2 s.
+    """
+    held = {
+        name for name, key in result.keys.items() if name in result.values or result.store.has(key)
+    }
+    sources = {
+        name: () if name in held else result.recipe.steps[name].sources for name in result.keys
+    }
     kept: list[str] = []
     for name in dict.fromkeys(steps):
-        missing = [n for n in in_order(sources, [*kept, name]) if n not in held] if name in sources else []
+        missing = (
+            [n for n in in_order(sources, [*kept, name]) if n not in held]
+            if name in sources
+            else []
+        )
         if name in sources and sum(_took(result, n) for n in missing) <= _LONGEST_WAIT:
             kept.append(name)
     absent = [name for name in kept if name not in result.values]
@@ -114,7 +146,9 @@ def _took(result: Result, step: str) -> float:
 
 
 def _results(result: Result, values: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the result table of a run without empty rows and columns, or an empty list if all cells are empty."""
+    """Return the result table of a run without empty rows and columns, or an empty list if all
+    cells are empty.
+    """
     found = table(result.recipe, {name: result.keys[name] for name in values}, values.__getitem__)
     rows = [[row["name"], *row["cells"]] for row in found["rows"] if any(row["cells"])]
     columns = ["", *found["columns"]]
@@ -127,12 +161,17 @@ def _results(result: Result, values: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _outputs(result: Result) -> dict[str, Any]:
-    rows = [[name, result.recipe.steps[name].node.path, *_looks(value)] for name, value in result.values.items()]
+    rows = [
+        [name, result.recipe.steps[name].node.path, *_looks(value)]
+        for name, value in result.values.items()
+    ]
     return _table("Values", ["output", "node", "shape", "type", "from … to"], rows, ["from … to"])
 
 
 def _looks(value: Any) -> tuple[str, str, str]:
-    """Return shape, type and range of a result as text; for a named tuple, its numbers replace the range."""
+    """Return shape, type and range of a result as text; for a named tuple, its numbers replace
+    the range.
+    """
     from neusee.nodes import TensorStats
 
     facts = TensorStats.of(value)
@@ -140,7 +179,9 @@ def _looks(value: Any) -> tuple[str, str, str]:
         return "", type(value).__name__, ""
     if hasattr(value, "_asdict"):
         fields = {name: TensorStats.of(item) for name, item in value._asdict().items()}
-        numbers = ", ".join(f"{name} {f.max:.5g}" for name, f in fields.items() if f and not f.shape)
+        numbers = ", ".join(
+            f"{name} {f.max:.5g}" for name, f in fields.items() if f and not f.shape
+        )
         return ", ".join(fields) if not numbers else "", type(value).__name__, numbers
     span = dict.fromkeys(f"{end:.5g}" for end in (facts.min, facts.max))
     return " × ".join(map(str, facts.shape)) or "number", facts.dtype, " … ".join(span)
@@ -150,22 +191,38 @@ def _steps(result: Result) -> dict[str, Any]:
     rows = []
     for done in result.done.values():
         state = "cached" if done.state == "not needed" else done.state
-        rows.append([done.step, state, f"{done.seconds:.3f}" if done.state == "run" else "", done.why])
-    return _table(f"{len(rows)} steps", ["step", "state", "seconds", "why"], rows, ["seconds"], shown=len(rows) <= 12)
+        rows.append(
+            [done.step, state, f"{done.seconds:.3f}" if done.state == "run" else "", done.why]
+        )
+    return _table(
+        f"{len(rows)} steps",
+        ["step", "state", "seconds", "why"],
+        rows,
+        ["seconds"],
+        shown=len(rows) <= 12,
+    )
 
 
 def _pictures(values: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Encode the truth, raw and restored pictures of a run as PNG, or up to four other images if one is missing."""
+    """Encode the truth, raw and restored pictures of a run as PNG, or up to four other images if
+    one is missing.
+    """
     from neusee.workflows.report.figures.camera_overview import centre, high
 
     needs = _of_overview()
     if all(need in values for need in FIGURES[0].needs.values() if not need.startswith("?")):
         truth = values[needs["truth"]]
         white = high(truth)
-        shown = {name: centre(values[need], truth) / white for name, need in needs.items() if need in values}
+        shown = {
+            name: centre(values[need], truth) / white
+            for name, need in needs.items()
+            if need in values
+        }
     else:
         found = {name: value for name, value in values.items() if _is_picture(value)}
-        shown = {name: image.float() / high(image.float()) for name, image in list(found.items())[:4]}
+        shown = {
+            name: image.float() / high(image.float()) for name, image in list(found.items())[:4]
+        }
     edge = _EDGES.get(len(shown), 280)
     while True:
         pictures = [_picture(_NAMES.get(name, name), image, edge) for name, image in shown.items()]
@@ -201,14 +258,24 @@ def _picture(name: str, linear: Tensor, edge: int) -> dict[str, Any]:
 
 
 def recipe_html(recipe: Recipe) -> str:
-    """Return an HTML page with the outputs, the steps, and the changed and all other parameters of a recipe."""
-    written = {name: s for name, s in recipe.config.settings.items() if not s.default and not name.startswith("steps.")}
+    """Return an HTML page with the outputs, the steps, and the changed and all other parameters
+    of a recipe.
+    """
+    written = {
+        name: s
+        for name, s in recipe.config.settings.items()
+        if not s.default and not name.startswith("steps.")
+    }
     changed = {name: s for name, s in recipe.config.settings.items() if "argument " in s.source}
     lines = [recipe.title, f"gives {', '.join(by_family(recipe.outputs))}"]
     return filled(
         "notebook.html.j2",
         title=recipe.name,
-        lines=[*filter(None, lines), f"seed {recipe.seed}, tolerance {recipe.tolerance:g}", *recipe.notes],
+        lines=[
+            *filter(None, lines),
+            f"seed {recipe.seed}, tolerance {recipe.tolerance:g}",
+            *recipe.notes,
+        ],
         look=[],
         pictures=[],
         tables=[
@@ -220,7 +287,9 @@ def recipe_html(recipe: Recipe) -> str:
 
 
 def _graph(recipe: Recipe) -> dict[str, Any]:
-    """Return a table of the steps of a recipe; ``psf[plain]`` and ``psf[mask]``, copies of one step, share a row."""
+    """Return a table of the steps of a recipe; ``psf[plain]`` and ``psf[mask]``, copies of one
+    step, share a row.
+    """
     rows = []
     for family, names in by_family(recipe.steps).items():
         step = recipe.steps[names[0]]
@@ -228,8 +297,14 @@ def _graph(recipe: Recipe) -> dict[str, Any]:
         title = f"{family} ×{len(names)}" if len(names) > 1 else names[0]
         devices = dict.fromkeys(recipe.steps[n].device for n in names if recipe.steps[n].device)
         rows.append([title, step.node.path, ", ".join(reads), ", ".join(devices)])
-    columns = ["step", "node", "reads", "where"] if any(row[3] for row in rows) else ["step", "node", "reads"]
-    title = f"{len(recipe.steps)} steps of {len({s.node.path for s in recipe.steps.values()})} nodes"
+    columns = (
+        ["step", "node", "reads", "where"]
+        if any(row[3] for row in rows)
+        else ["step", "node", "reads"]
+    )
+    title = (
+        f"{len(recipe.steps)} steps of {len({s.node.path for s in recipe.steps.values()})} nodes"
+    )
     return _table(title, columns, [row[: len(columns)] for row in rows], shown=len(rows) <= 12)
 
 
@@ -237,11 +312,17 @@ def _settings(title: str, settings: Mapping[str, Setting], shown: bool) -> dict[
     rows = []
     for name, setting in settings.items():
         text = flow(setting.value)
-        rows.append([name, text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…", setting.source])
+        rows.append(
+            [name, text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…", setting.source]
+        )
     return _table(title, ["parameter", "value", "from"], rows, shown=shown)
 
 
 def _table(
-    title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[str] = (), shown: bool = True
+    title: str,
+    columns: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    numbers: Sequence[str] = (),
+    shown: bool = True,
 ) -> dict[str, Any]:
     return {"title": title, "columns": columns, "rows": rows, "numbers": numbers, "open": shown}

@@ -1,4 +1,6 @@
-"""Numbers of a run: the expected numbers of the recipe, the result table, and the rows of ``metrics.csv``."""
+"""Numbers of a run: the expected numbers of the recipe, the result table, and the rows of
+``metrics.csv``.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from neusee.workflows.report.contents import BANDS, LINES, TABLE, compared
 from neusee.workflows.report.figures.style import nearest
 
 Value = Callable[[str], Any]  #: a function from the name of a step to the value of the step
-#: Columns of the result table: the result in `TABLE`, its field, the number of this field and a band, and the format
+#: Columns of the result table: the result in `TABLE`, its field, the number of this field and a
+#: band, and the format
 _COLUMNS: Mapping[str, tuple[str, str, Callable[[Tensor, int], Any], str]] = {
     "peak/I_sat": ("peak/I_sat", "", lambda x, band: x.max(), "{:.4g}"),
     "LSR": ("LSR", "", lambda x, band: x.flatten()[min(band, x.numel() - 1)], "{:.3g}"),
@@ -26,37 +29,63 @@ _COLUMNS: Mapping[str, tuple[str, str, Callable[[Tensor, int], Any], str]] = {
 _LEGEND = {
     "LSR": "LSR at {band}",
     "BSR": "BSR, the mean over the bands: the share of the scene's light that stays in the field",
-    "outside": "outside, the mean over the bands: the share of a point's light that falls outside the PSF window",
+    "outside": (
+        "outside, the mean over the bands: the share of a point's light that falls outside the PSF"
+        " window"
+    ),
 }
 _DESIGN_WAVELENGTH = 550e-9  #: m, for the LSR in the result table of a recipe without a laser
 _MOST = 4096  #: elements, at most, of a result whose numbers become rows
 
 
 def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
-    """Compare the numbers that a recipe expects with the numbers from the run, and return one row for each."""
+    """Compare the numbers that a recipe expects with the numbers from the run, and return one
+    row for each.
+    """
     rows = []
     for e in compared(recipe)[0]:
         found: Any = value(e.step)
         for part in e.at:
-            found = getattr(found, part) if isinstance(part, str) and not isinstance(found, dict) else found[part]
+            found = (
+                getattr(found, part)
+                if isinstance(part, str) and not isinstance(found, dict)
+                else found[part]
+            )
         number = float(found)
         ok = abs(number - e.value) <= e.rtol * abs(e.value)
-        rows.append({"name": e.name, "step": e.step, "wanted": e.value, "found": number, "rtol": e.rtol, "ok": ok})
+        rows.append(
+            {
+                "name": e.name,
+                "step": e.step,
+                "wanted": e.value,
+                "found": number,
+                "rtol": e.rtol,
+                "ok": ok,
+            }
+        )
     return rows
 
 
 def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, Any]:
-    """Return the table for plain lens, mask and restored picture, with the rows and columns that have numbers."""
+    """Return the table for plain lens, mask and restored picture, with the rows and columns that
+    have numbers.
+    """
     _, where = _band(recipe, keys, value)
     numbers = arms(recipe, keys, value)
     columns = [column for column in _COLUMNS if any(column in cells for cells in numbers.values())]
-    rows = [{"name": name, "cells": [_text(cells, c) for c in columns]} for name, cells in numbers.items() if cells]
+    rows = [
+        {"name": name, "cells": [_text(cells, c) for c in columns]}
+        for name, cells in numbers.items()
+        if cells
+    ]
     legend = [text.format(band=where) for column, text in _LEGEND.items() if column in columns]
     return {"columns": columns, "rows": rows, "legend": legend}
 
 
 def arms(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, dict[str, float]]:
-    """Return the numbers of the plain lens, of the mask and of the restored picture, by column of the result table."""
+    """Return the numbers of the plain lens, of the mask and of the restored picture, by column
+    of the result table.
+    """
     band, _ = _band(recipe, keys, value)
     numbers: dict[str, dict[str, float]] = {}
     for name, cells in TABLE.items():
@@ -70,13 +99,20 @@ def arms(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, dic
 
 
 def lines_of(recipe: Recipe, keys: Container[str]) -> list[str]:
-    """Return the steps among ``keys`` that give the spectral line of a laser whose strength is not 0."""
-    strengths = {name: recipe.config.values.get(f"lasers.{name[5:-1]}.strength") for name in _lines(recipe, keys)}
+    """Return the steps among ``keys`` that give the spectral line of a laser whose strength is
+    not 0.
+    """
+    strengths = {
+        name: recipe.config.values.get(f"lasers.{name[5:-1]}.strength")
+        for name in _lines(recipe, keys)
+    }
     return [name for name, strength in strengths.items() if strength != 0]
 
 
 def suppressed(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, float]:
-    """Return the LSR of the mask at the wavelength of each laser that shines, by wavelength in nm as text."""
+    """Return the LSR of the mask at the wavelength of each laser that shines, by wavelength in
+    nm as text.
+    """
     step = TABLE["with mask"]["LSR"]
     if step not in keys or BANDS not in keys:
         return {}
@@ -86,18 +122,24 @@ def suppressed(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[st
 
 
 def _field(found: Any, field: str) -> Tensor | None:
-    """Return the field ``field`` of a result, or its first field for an empty name, or None if the field is missing."""
+    """Return the field ``field`` of a result, or its first field for an empty name, or None if
+    the field is missing.
+    """
     fields = {} if found is None else dict(_fields(found))
     return fields.get(field) if field else next(iter(fields.values()), None)
 
 
 def _text(cells: Mapping[str, float], column: str) -> str:
-    """Return a number of the result table as text, or an empty text if the table has no number there."""
+    """Return a number of the result table as text, or an empty text if the table has no number
+    there.
+    """
     return _COLUMNS[column][3].format(cells[column]) if column in cells else ""
 
 
 def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, str]:
-    """Return index and name of the spectral band nearest to the first laser, or to 550 nm if there is no laser."""
+    """Return index and name of the spectral band nearest to the first laser, or to 550 nm if
+    there is no laser.
+    """
     if BANDS not in keys:
         return 0, "the first band"
     lines = _lines(recipe, keys)
@@ -116,17 +158,25 @@ def _lines(recipe: Recipe, keys: Container[str]) -> list[str]:
 
 
 def metrics(recipe: Recipe, keys: Mapping[str, str], value: Value) -> list[list[Any]]:
-    """Return the rows (step, field, index, value) of ``metrics.csv``, one for each number that a metric gave."""
+    """Return the rows (step, field, index, value) of ``metrics.csv``, one for each number that a
+    metric gave.
+    """
     return [row for name in metrics_of(recipe, keys) for row in numbers_of(name, value(name))]
 
 
 def metrics_of(recipe: Recipe, among: Container[str]) -> list[str]:
     """Return the steps in ``among`` whose nodes are metrics, in the order of the recipe."""
-    return [name for name, step in recipe.steps.items() if name in among and step.node.path.startswith("metrics.")]
+    return [
+        name
+        for name, step in recipe.steps.items()
+        if name in among and step.node.path.startswith("metrics.")
+    ]
 
 
 def numbers_of(step: str, found: Any) -> list[list[Any]]:
-    """Return a row (step, field, index, value) for each number in a result of at most 4096 elements."""
+    """Return a row (step, field, index, value) for each number in a result of at most 4096
+    elements.
+    """
     rows: list[list[Any]] = []
     for field, tensor in _fields(found):
         if tensor.numel() <= _MOST and not tensor.is_complex():

@@ -1,7 +1,9 @@
-"""The file ``ro-crate-metadata.json``, which makes a folder of results an RO-Crate that other programs can read.
+"""The file ``ro-crate-metadata.json``, which makes a folder of results an RO-Crate that other
+programs can read.
 
-The crate lists every file of the folder, the recipe, the inputs, the software and the command with its times. It keeps
-RO-Crate 1.1 and the profile Process Run Crate 0.5. The crate is written last, so that it names only files that exist.
+The crate lists every file of the folder, the recipe, the inputs, the software and the command with
+its times. It keeps RO-Crate 1.1 and the profile Process Run Crate 0.5. The crate is written last,
+so that it names only files that exist.
 """
 
 from __future__ import annotations
@@ -29,14 +31,23 @@ from neusee.workflows.report.crate_sources import (
 CRATE = "ro-crate-metadata.json"
 _SPECIFICATION = "https://w3id.org/ro/crate/1.1"
 _PROFILE = "https://w3id.org/ro/wfrun/process/0.5"
-_COMPLETED, _FAILED = "http://schema.org/CompletedActionStatus", "http://schema.org/FailedActionStatus"
+_COMPLETED, _FAILED = (
+    "http://schema.org/CompletedActionStatus",
+    "http://schema.org/FailedActionStatus",
+)
 _FILES = {
     "report.html": "The page with all results; it loads no other file.",
-    "recipe.yaml": "The recipe as it was run: every final value, with its source. It can be run again.",
-    "provenance.json": "What was computed: versions, steps with cache keys and times, checks, inputs with digests.",
+    "recipe.yaml": (
+        "The recipe as it was run: every final value, with its source. It can be run again."
+    ),
+    "provenance.json": (
+        "What was computed: versions, steps with cache keys and times, checks, inputs with digests."
+    ),
     "metrics.csv": "The numbers of the run: step, field, index and value.",
     "timing.csv": "Time and memory of each step.",
-    "code.json": "Digests of the code of each step: its node, and each function of the modules that it uses.",
+    "code.json": (
+        "Digests of the code of each step: its node, and each function of the modules that it uses."
+    ),
     "data/outputs.safetensors": "The values of the outputs of the recipe, as tensors.",
     "sweep.csv": "The results of each point of the sweep.",
     "sweep.yaml": "The axes of the sweep, the state of its points, and the command.",
@@ -47,18 +58,24 @@ _FILES = {
 }
 
 
-def write_crate(folder: Path, name: str, said: Mapping[str, Any], ended: datetime | None = None) -> None:
+def write_crate(
+    folder: Path, name: str, said: Mapping[str, Any], ended: datetime | None = None
+) -> None:
     """Write the crate of a complete folder of results; ``name`` is the final name of the folder.
 
-    ``said`` is what the folder says of its command, such as the content of ``provenance.json``. The file appears by an
-    atomic rename.
+    ``said`` is what the folder says of its command, such as the content of ``provenance.json``. The
+    file appears by an atomic rename.
     """
-    crate = {"@context": f"{_SPECIFICATION}/context", "@graph": _graph(folder, name, said, ended or datetime.now(UTC))}
+    crate = {
+        "@context": f"{_SPECIFICATION}/context",
+        "@graph": _graph(folder, name, said, ended or datetime.now(UTC)),
+    }
     _write(folder, crate)
 
 
 def remove_crate(folder: Path) -> dict[str, Any] | None:
-    """Remove the crate of a folder whose files are about to change, and return its content, or None without a crate.
+    """Remove the crate of a folder whose files are about to change, and return its content, or None
+    without a crate.
 
     A crate that cannot be read is removed as well.
     """
@@ -116,7 +133,12 @@ def _graph(folder: Path, name: str, said: Mapping[str, Any], ended: datetime) ->
 
 
 def _descriptor() -> Entity:
-    return {"@id": CRATE, "@type": "CreativeWork", "conformsTo": {"@id": _SPECIFICATION}, "about": {"@id": "./"}}
+    return {
+        "@id": CRATE,
+        "@type": "CreativeWork",
+        "conformsTo": {"@id": _SPECIFICATION},
+        "about": {"@id": "./"},
+    }
 
 
 def _profile() -> Entity:
@@ -152,13 +174,17 @@ def _action(
 
 
 def _command(said: Mapping[str, Any]) -> str:
-    """Return the command line that a document names, which is a text, a list of words or missing."""
+    """Return the command line that a document names, which is a text, a list of words or
+    missing.
+    """
     found = said.get("command") or said.get("again") or ""
     return found if isinstance(found, str) else " ".join(map(str, found))
 
 
 def _began(said: Mapping[str, Any], ended: datetime) -> datetime | None:
-    """Return the time at which a command began, from the document or from the seconds that it took, if one is known."""
+    """Return the time at which a command began, from the document or from the seconds that it
+    took, if one is known.
+    """
     if said.get("began"):
         return datetime.fromisoformat(said["began"])
     return ended - timedelta(seconds=said["seconds"]) if said.get("seconds") is not None else None
@@ -166,12 +192,17 @@ def _began(said: Mapping[str, Any], ended: datetime) -> datetime | None:
 
 def _description(said: Mapping[str, Any]) -> str:
     kind = said.get("study") or said.get("stage")
-    text = str(said.get("title") or "").strip() or f"Results of the recipe {said.get('recipe') or 'of a run'}."
+    text = (
+        str(said.get("title") or "").strip()
+        or f"Results of the recipe {said.get('recipe') or 'of a run'}."
+    )
     return f"{text} ({kind})" if kind else text
 
 
 def _sizes(folder: Path) -> list[tuple[str, int]]:
-    """Return the path and the size of each file of a folder, without hidden files and without the crate itself."""
+    """Return the path and the size of each file of a folder, without hidden files and without
+    the crate itself.
+    """
     found, todo = [], [folder]
     while todo:
         with os.scandir(todo.pop()) as entries:
@@ -181,7 +212,9 @@ def _sizes(folder: Path) -> list[tuple[str, int]]:
                 if entry.is_dir():
                     todo.append(Path(entry.path))
                 else:
-                    found.append((Path(entry.path).relative_to(folder).as_posix(), entry.stat().st_size))
+                    found.append(
+                        (Path(entry.path).relative_to(folder).as_posix(), entry.stat().st_size)
+                    )
     return sorted((name, size) for name, size in found if name != CRATE)
 
 

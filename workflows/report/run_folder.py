@@ -1,4 +1,6 @@
-"""The folder of a run, which gets its final name when all files are written, and the link ``latest`` to this folder."""
+"""The folder of a run, which gets its final name when all files are written, and the link
+``latest`` to this folder.
+"""
 
 from __future__ import annotations
 
@@ -28,14 +30,20 @@ class NotWritten(OSError):
 
 @dataclass
 class RunFolder:
-    """The folder of a run, which has a temporary path until all files are written, and then its final path."""
+    """The folder of a run, which has a temporary path until all files are written, and then its
+    final path.
+    """
 
     path: Path
-    said: dict[str, Any] = field(default_factory=dict)  #: for the crate: command, recipe, inputs, versions, seconds
-    taken: dict[str, Path] = field(default_factory=dict)  #: by name: the stored file that was added to the folder
+    #: for the crate: command, recipe, inputs, versions, seconds
+    said: dict[str, Any] = field(default_factory=dict)
+    #: by name: the stored file that was added to the folder
+    taken: dict[str, Path] = field(default_factory=dict)
 
     def place(self, name: str) -> Path:
-        """Return the path of a file that is to be written into the folder of a run, and make the folder above it."""
+        """Return the path of a file that is to be written into the folder of a run, and make the
+        folder above it.
+        """
         path = self.path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
@@ -54,7 +62,9 @@ class RunFolder:
             writer.writerows([_plain(cell) for cell in row] for row in rows)
 
     def take(self, name: str, source: Path) -> None:
-        """Add a stored file to the folder of a run as a hard link, or as a copy if the file system refuses the link."""
+        """Add a stored file to the folder of a run as a hard link, or as a copy if the file
+        system refuses the link.
+        """
         path = self.place(name)
         self.taken[name] = source
         try:
@@ -64,27 +74,36 @@ class RunFolder:
 
 
 def writable_folder(out: str | os.PathLike[str]) -> Path:
-    """Return the folder in which a command makes its folder of results; raise ValueError if nothing can be written.
+    """Return the folder in which a command makes its folder of results; raise ValueError if nothing
+    can be written.
 
-    A folder that does not exist yet is not made: the nearest existing folder above it must be writable.
+    A folder that does not exist yet is not made: the nearest existing folder above it must be
+    writable.
     """
     root = existing = Path(out)
     try:
-        existing = next(path for path in (root, *root.absolute().parents) if path.exists() or path.is_symlink())
-        if root.is_symlink() and os.environ.get("NEUSEE_NO_CODE"):  # a stranger's folder may have put it there
+        existing = next(
+            path for path in (root, *root.absolute().parents) if path.exists() or path.is_symlink()
+        )
+        # a stranger's folder may have put it there
+        if root.is_symlink() and os.environ.get("NEUSEE_NO_CODE"):
             raise ValueError(f"{root} is a link, which --no-code does not follow: {_OTHER_FOLDER}")
         if existing.is_dir():
             os.rmdir(tempfile.mkdtemp(prefix=".neusee.", dir=existing))
             return root
         text = f"{existing} is not a folder, so that no results can be written to {root}"
     except OSError as error:
-        text = f"the folder {existing} cannot be written ({error.strerror}), so that {root} cannot hold results"
+        text = (
+            f"the folder {existing} cannot be written ({error.strerror}), so that {root} cannot"
+            " hold results"
+        )
     raise ValueError(f"{text}: {_OTHER_FOLDER}")
 
 
 @contextmanager
 def new_run(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
-    """Create a run folder with a temporary name; rename it after the ``with`` block, or remove it after an error.
+    """Create a run folder with a temporary name; rename it after the ``with`` block, or remove it
+    after an error.
 
     Raises `NotWritten` for an error of a file.
     """
@@ -92,7 +111,10 @@ def new_run(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
         with _folder(root, recipe, key) as run:
             yield run
     except OSError as error:
-        text = f"the folder of results in {root} cannot be written ({error}), and no part of it is left"
+        text = (
+            f"the folder of results in {root} cannot be written ({error}), and no part of it is"
+            " left"
+        )
         raise NotWritten(text) from error
 
 
@@ -127,7 +149,9 @@ def _sweep(root: Path) -> None:
 
 
 def _is_being_written(part: Path) -> bool:
-    """Return True if the process that made an unfinished folder runs on this machine, whatever the clock says."""
+    """Return True if the process that made an unfinished folder runs on this machine, whatever
+    the clock says.
+    """
     number = part.suffixes[-2].removeprefix(".") if len(part.suffixes) > 1 else ""
     try:
         os.kill(int(number), 0)
@@ -139,7 +163,9 @@ def _is_being_written(part: Path) -> bool:
 
 
 def _rename(part: Path, target: Path) -> Path:
-    """Rename the complete folder of a run to the first free name: ``name``, ``name_2``, ``name_3`` …"""
+    """Rename the complete folder of a run to the first free name: ``name``, ``name_2``,
+    ``name_3`` …
+    """
     number = 1
     while True:
         path = target if number == 1 else target.with_name(f"{target.name}_{number}")
@@ -147,13 +173,16 @@ def _rename(part: Path, target: Path) -> Path:
             try:
                 return part.rename(path)
             except OSError:
-                if not path.exists():  # no other run took the name: the file system refused the rename
+                # no other run took the name: the file system refused the rename
+                if not path.exists():
                     raise
         number += 1
 
 
 def _point(root: Path, name: str) -> None:
-    """Make ``latest`` a symbolic link to the folder of a run, or a file with its name if links are not possible."""
+    """Make ``latest`` a symbolic link to the folder of a run, or a file with its name if links
+    are not possible.
+    """
     part = root / f".latest.{os.getpid()}"
     try:
         part.symlink_to(name, target_is_directory=True)
@@ -167,15 +196,21 @@ def _point(root: Path, name: str) -> None:
 
 
 def find_run(where: str, root: Path) -> Path:
-    """Return the folder of a run; ``where`` is ``latest``, the name of a folder in ``root`` or a path."""
+    """Return the folder of a run; ``where`` is ``latest``, the name of a folder in ``root`` or a
+    path.
+    """
     for path in (root / where, Path(where)):
         if path.is_file():
             path = path.with_name(head_of(path, _NAME).decode("utf-8", "replace").strip())
         if (path / "provenance.json").is_file():
             return path
-    raise FileNotFoundError(f"no run at {where}: give the name of a folder in {root}, a path, or `latest`")
+    raise FileNotFoundError(
+        f"no run at {where}: give the name of a folder in {root}, a path, or `latest`"
+    )
 
 
 def _plain(cell: Any) -> Any:
-    """Return a cell with a number of Python in place of one of NumPy, whose text its print options decide."""
+    """Return a cell with a number of Python in place of one of NumPy, whose text its print
+    options decide.
+    """
     return cell.item() if hasattr(cell, "dtype") and not cell.ndim else cell

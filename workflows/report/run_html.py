@@ -1,4 +1,5 @@
-"""The HTML page of a run, from its document and its pictures alone, and the page of an earlier run written again.
+"""The HTML page of a run, from its document and its pictures alone, and the page of an earlier run
+written again.
 
 Neither torch nor a recipe is needed.
 """
@@ -36,16 +37,22 @@ def present_time() -> str:
 
 
 def page(doc: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
-    """Return the report of a run, from its document and pictures, as one HTML page that loads no other file."""
+    """Return the report of a run, from its document and pictures, as one HTML page that loads no
+    other file.
+    """
     inline = {name: base64.b64encode(content).decode() for name, content in pictures.items()}
     shown = {**doc, "figures": [f for f in doc["figures"] if f["name"] in inline]}
     return filled(_TEMPLATE, doc=shown, pictures=inline)
 
 
 def rebuild(folder: Path) -> Path:
-    """Write ``report.html`` of a run again, from the document and the pictures in ``folder``, and return its path."""
+    """Write ``report.html`` of a run again, from the document and the pictures in ``folder``,
+    and return its path.
+    """
     doc = json.loads(text_of(folder / "provenance.json"))
-    pictures = {p.stem: bytes_of(p, sys.maxsize) for p in sorted((folder / "figures").glob("*.png"))}
+    pictures = {
+        p.stem: bytes_of(p, sys.maxsize) for p in sorted((folder / "figures").glob("*.png"))
+    }
     target = folder / "report.html"
     part = folder / ".report.html.part"
     part.write_text(page(doc, pictures), encoding="utf-8")

@@ -56,7 +56,8 @@ _SAMPLING = "The PSF is sampled at the pixel centres; one pixel centre lies on t
 def document(result: Result, command: Sequence[str]) -> dict[str, Any]:
     """Return the report of a run, apart from its pictures, as a document of JSON values.
 
-    It can be made while the last pictures are drawn; `with_pictures` adds what is known only afterwards.
+    It can be made while the last pictures are drawn; `with_pictures` adds what is known only
+    afterwards.
     """
     recipe, done = result.recipe, list(result.done.values())
     found, unchecked = expected(recipe, result.value), _unchecked(recipe)
@@ -75,7 +76,10 @@ def document(result: Result, command: Sequence[str]) -> dict[str, Any]:
         "seed": recipe.seed,
         "counts": state_counts(done),
         **_judgement(found, failed, unchecked),
-        "story": {**story(recipe, result.keys, result.value), **said_of_frame(recipe, result.keys, result.value)},
+        "story": {
+            **story(recipe, result.keys, result.value),
+            **said_of_frame(recipe, result.keys, result.value),
+        },
         "table": table(recipe, result.keys, result.value),
         "metrics": metrics(recipe, result.keys, result.value),
         "notes": [*_sampling(recipe), *recipe.notes, *unchecked_lines(unchecked)],
@@ -83,7 +87,9 @@ def document(result: Result, command: Sequence[str]) -> dict[str, Any]:
         "posterior": told(recipe.uncertain.standings) if recipe.uncertain else [],
         "readings": _readings(recipe),
         "consequences": consequences(recipe.config.values),
-        "left_out": [{"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"],
+        "left_out": [
+            {"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"
+        ],
         "spent": spent(result),
         "spectral": spectral_error(recipe, result.keys, result.value),
         "absent": [{"step": step, "where": where} for step, where in recipe.absent.items()],
@@ -103,25 +109,33 @@ def with_pictures(
     refused: Mapping[str, str],
     warnings: Iterable[str],
 ) -> dict[str, Any]:
-    """Return the document of a run with its pictures, its data files, what is missing of both, and all warnings.
+    """Return the document of a run with its pictures, its data files, what is missing of both, and
+    all warnings.
 
-    ``missing`` and ``refused`` have the reason for each missing picture and data file; a picture without a reason has
-    nothing to show in this recipe.
+    ``missing`` and ``refused`` have the reason for each missing picture and data file; a picture
+    without a reason has nothing to show in this recipe.
     """
     warned = list(dict.fromkeys(warnings))
-    lacking = [{"name": n, "title": _TITLES.get(n, n), "why": why} for n, why in missing.items() if why]
+    lacking = [
+        {"name": n, "title": _TITLES.get(n, n), "why": why} for n, why in missing.items() if why
+    ]
     return {
         **doc,
         "notes": [*doc["notes"], *warned],
         "warnings": warned,
         "figures": _figures(missing, bool(doc["timing"]["ran"])),
-        "missing": [*lacking, *({"name": n, "title": f"data/{n}", "why": why} for n, why in refused.items())],
+        "missing": [
+            *lacking,
+            *({"name": n, "title": f"data/{n}", "why": why} for n, why in refused.items()),
+        ],
         "files": sorted(files),
     }
 
 
 def _judgement(
-    found: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked: Sequence[Mapping[str, str]]
+    found: Sequence[Mapping[str, Any]],
+    failed: Sequence[str],
+    unchecked: Sequence[Mapping[str, str]],
 ) -> dict[str, Any]:
     """Return which expected numbers and checks a run met, and which it missed."""
     return {
@@ -130,9 +144,13 @@ def _judgement(
 
 
 def _comparisons(
-    found: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked: Sequence[Mapping[str, str]]
+    found: Sequence[Mapping[str, Any]],
+    failed: Sequence[str],
+    unchecked: Sequence[Mapping[str, str]],
 ) -> dict[str, Any]:
-    """Return the expected numbers of a run, compared and not compared, the checks that failed, and a verdict."""
+    """Return the expected numbers of a run, compared and not compared, the checks that failed,
+    and a verdict.
+    """
     return {
         "verdict": verdict(found, failed, len(unchecked)),
         "missed": [e["name"] for e in found if not e["ok"]],
@@ -143,16 +161,26 @@ def _comparisons(
 
 
 def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked: int = 0) -> str:
-    """Return a sentence that counts the expected numbers that the run reproduced, and the checks that failed.
+    """Return a sentence that counts the expected numbers that the run reproduced, and the checks
+    that failed.
 
-    ``unchecked`` is the number of expected numbers whose steps no output needs, so that the run has not compared them.
+    ``unchecked`` is the number of expected numbers whose steps no output needs, so that the run has
+    not compared them.
     """
     met = sum(e["ok"] for e in found)
     some = f"{met} of {len(found)} expected numbers within tolerance"
     some += f", {unchecked} more not checked" if unchecked else ""
-    none = f"None of {unchecked} expected numbers checked" if unchecked else "No expected numbers in this recipe"
+    none = (
+        f"None of {unchecked} expected numbers checked"
+        if unchecked
+        else "No expected numbers in this recipe"
+    )
     numbers = some if found else none
-    checks = "every check held" if not failed else f"{len(failed)} check{'s' * (len(failed) > 1)} to look at"
+    checks = (
+        "every check held"
+        if not failed
+        else f"{len(failed)} check{'s' * (len(failed) > 1)} to look at"
+    )
     return f"{numbers}; {checks}."
 
 
@@ -161,15 +189,21 @@ def state_counts(records: Iterable[StepRecord]) -> str:
 
     A step whose result no other step had to load counts as cached.
     """
-    counts = Counter("cached" if done.state == "not needed" else str(done.state) for done in records)
+    counts = Counter(
+        "cached" if done.state == "not needed" else str(done.state) for done in records
+    )
     return (
-        ", ".join(f"{counts[state]} {state}" for state in ("run", "cached", "left out") if counts[state])
+        ", ".join(
+            f"{counts[state]} {state}" for state in ("run", "cached", "left out") if counts[state]
+        )
         or "nothing to do"
     )
 
 
 def shape_of(done: StepRecord) -> str:
-    """Return the shape of a result as ``31 × 512 × 512``, or an empty string if the shape is unknown."""
+    """Return the shape of a result as ``31 × 512 × 512``, or an empty string if the shape is
+    unknown.
+    """
     return " × ".join(map(str, done.facts.shape)) or "number" if done.facts else ""
 
 
@@ -193,7 +227,9 @@ def _step(done: StepRecord, result: Result) -> dict[str, Any]:
 
 
 def _planned(result: Result) -> float | None:
-    """Return the predicted duration of a run in s, or None if the time of a step that ran was not predicted."""
+    """Return the predicted duration of a run in s, or None if the time of a step that ran was
+    not predicted.
+    """
     ran = [done for done in result.done.values() if done.state == "run"]
     if result.schedule is None or any(done.predicted is None for done in ran):
         return None
@@ -202,7 +238,9 @@ def _planned(result: Result) -> float | None:
 
 
 def _remembered(done: StepRecord, about: Mapping[str, Any]) -> StepRecord:
-    """Complete the record of a step that was not computed in this run with the metadata of its stored result."""
+    """Complete the record of a step that was not computed in this run with the metadata of its
+    stored result.
+    """
     checks = tuple(Check(text, ok) for text, ok in about.get("checks", ()))
     why = f"made {about['date'][:16].replace('T', ' ')} UTC"
     return replace(done, why=why, facts=facts_in(about), checks=checks, bytes=about["bytes"])
@@ -211,7 +249,11 @@ def _remembered(done: StepRecord, about: Mapping[str, Any]) -> StepRecord:
 def unit_of(docstring: str) -> str:
     """Return the unit of a node's result from the ``Units:`` line of the docstring of the node."""
     lines = (line.strip() for line in docstring.splitlines())
-    units = next((line for line in lines if line.startswith("Units:")), "Units:").removeprefix("Units:").strip()
+    units = (
+        next((line for line in lines if line.startswith("Units:")), "Units:")
+        .removeprefix("Units:")
+        .strip()
+    )
     before, found, after = units.partition("result ")
     word = re.split(r"[\s,;:]|\.(?:\s|$)", after if found else before, maxsplit=1)[0]
     return word if word in _UNITS else ""
@@ -219,7 +261,11 @@ def unit_of(docstring: str) -> str:
 
 def _sampling(recipe: Recipe) -> list[str]:
     """Return a note on the sampling of the PSF, because every LSR depends on the sampling."""
-    kinds = {step.params.get("sensor") for step in recipe.steps.values() if step.node.path == "optics.psf"}
+    kinds = {
+        step.params.get("sensor")
+        for step in recipe.steps.values()
+        if step.node.path == "optics.psf"
+    }
     if kinds & {"point", "point_as_printed"}:
         return [_SAMPLING]
     return ["The PSF is averaged over each pixel."] if kinds else []
@@ -230,19 +276,28 @@ def _unchecked(recipe: Recipe) -> list[dict[str, str]]:
 
 
 def unchecked_lines(numbers: Sequence[Mapping[str, str]]) -> list[str]:
-    """Return a line that names the expected numbers that a run has not compared, or no line if there are none."""
+    """Return a line that names the expected numbers that a run has not compared, or no line if
+    there are none.
+    """
     names = ", ".join(number["name"] for number in numbers)
-    return [f"not checked, because no output of this run needs their steps: {names}"] if numbers else []
+    return (
+        [f"not checked, because no output of this run needs their steps: {names}"]
+        if numbers
+        else []
+    )
 
 
 def _readings(recipe: Recipe) -> list[dict[str, str]]:
-    """Return a table row for each contradiction in the paper, with the interpretation that the recipe uses."""
+    """Return a table row for each contradiction in the paper, with the interpretation that the
+    recipe uses.
+    """
     values = recipe.config.values
     if not any(path.startswith("reading.") for path in values):
         return []
     texts = ("path", "number", "matter", "reason")
     return [
-        {name: str(getattr(row, name)) for name in texts} | {"value": _written(values[row.path]), "state": state}
+        {name: str(getattr(row, name)) for name in texts}
+        | {"value": _written(values[row.path]), "state": state}
         for row, state in in_force(values)
     ]
 
@@ -255,7 +310,11 @@ def _written(value: Any) -> str:
 def _figures(missing: Mapping[str, str], ran: bool) -> list[dict[str, str]]:
     from neusee.workflows.report.run_pictures import GRAPH, TIMELINE
 
-    shown = [(f.name, f.title, f.caption) for f in FIGURES if f.name not in missing] + [GRAPH] + [TIMELINE] * ran
+    shown = (
+        [(f.name, f.title, f.caption) for f in FIGURES if f.name not in missing]
+        + [GRAPH]
+        + [TIMELINE] * ran
+    )
     return [{"name": n, "title": t, "caption": c, "file": f"figures/{n}.png"} for n, t, c in shown]
 
 

@@ -1,4 +1,6 @@
-"""Pictures of a run, each drawn once and stored under a cache key of the results that the picture shows."""
+"""Pictures of a run, each drawn once and stored under a cache key of the results that the
+picture shows.
+"""
 
 from __future__ import annotations
 
@@ -25,35 +27,47 @@ from neusee.workflows.store.result_store import Store
 GRAPH = (
     "graph",
     "The graph",
-    "Each box is a step; the items of one step share a box. A step stands below the steps that it reads.",
+    (
+        "Each box is a step; the items of one step share a box. A step stands below the steps that"
+        " it reads."
+    ),
 )
 TIMELINE = (
     "timeline",
     "Planned and actual times",
-    "Time and device of each step. Hollow bars show the plan, which uses the times of earlier runs. A step that "
-    "never ran before has no hollow bar.",
+    (
+        "Time and device of each step. Hollow bars show the plan, which uses the times of earlier"
+        " runs. A step that never ran before has no hollow bar."
+    ),
 )
 
 
 @dataclass(frozen=True, slots=True)
 class DerivedFile:
-    """A figure or data file of a run: ``make(path, …)`` that writes it, and the source of each argument."""
+    """A figure or data file of a run: ``make(path, …)`` that writes it, and the source of each
+    argument.
+    """
 
     name: str
     suffix: str
     kind: Sequence[Any]  #: the parts of the key that do not depend on the results
     needs: Mapping[str, str]
     make: Callable[..., None]
-    only_tables: bool = False  #: True for a file that is made only if an argument is a table of the user
-    copied: bool = False  #: True for a file that holds results as they are: it is written as fast as sent elsewhere
+    #: True for a file that is made only if an argument is a table of the user
+    only_tables: bool = False
+    #: True for a file that holds results as they are: it is written as fast as sent elsewhere
+    copied: bool = False
 
 
-Job = tuple[DerivedFile, str, Mapping[str, Found]]  #: a file, its key, and the arguments of its ``make``
+#: a file, its key, and the arguments of its ``make``
+Job = tuple[DerivedFile, str, Mapping[str, Found]]
 
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """The function ``module:function`` that draws a picture, which `files_beside` may call in another process."""
+    """The function ``module:function`` that draws a picture, which `files_beside` may call in
+    another process.
+    """
 
     path: str
 
@@ -63,10 +77,13 @@ class Drawing:
 
 
 def pictures(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
-    """Draw the pictures of a run; return the paths of the pictures, and the reason for each picture that is missing."""
+    """Draw the pictures of a run; return the paths of the pictures, and the reason for each
+    picture that is missing.
+    """
     paths, missing = files_of(figure_files(), result, shelf)
     now, _ = (
-        shelf.find(key, ".png") or shelf.keep(key, ".png", "graph", partial(GRAPH_DRAWING, **arguments))
+        shelf.find(key, ".png")
+        or shelf.keep(key, ".png", "graph", partial(GRAPH_DRAWING, **arguments))
         for key, arguments in graphs(result.recipe, states_of(result.done))
     )
     return {**paths, "graph": now}, missing
@@ -80,11 +97,14 @@ def figure_files() -> Iterator[DerivedFile]:
 
 
 def graphs(recipe: Recipe, states: Mapping[str, str]) -> list[tuple[str, Mapping[str, Any]]]:
-    """Return key and arguments of the graph of a run, and in advance those of the graph of an identical later run.
+    """Return key and arguments of the graph of a run, and in advance those of the graph of an
+    identical later run.
 
     ``states`` has the state of each step, as `states_of` returns it.
     """
-    again = {name: "left out" if state == "left out" else "cached" for name, state in states.items()}
+    again = {
+        name: "left out" if state == "left out" else "cached" for name, state in states.items()
+    }
     sources = {name: list(recipe.steps[name].sources) for name in states}
     return [
         (digest("graph", _drawing_code(), sources, each), {"sources": sources, "states": each})
@@ -93,8 +113,13 @@ def graphs(recipe: Recipe, states: Mapping[str, str]) -> list[tuple[str, Mapping
 
 
 def states_of(done: Mapping[str, StepRecord]) -> dict[str, str]:
-    """Return the state of each step as the graph of a run shows it: a result that no step needed is from the cache."""
-    return {name: "cached" if each.state == "not needed" else str(each.state) for name, each in done.items()}
+    """Return the state of each step as the graph of a run shows it: a result that no step needed
+    is from the cache.
+    """
+    return {
+        name: "cached" if each.state == "not needed" else str(each.state)
+        for name, each in done.items()
+    }
 
 
 def _drawing_code() -> str:
@@ -105,7 +130,8 @@ def _drawing_code() -> str:
 def files_of(
     files: Iterable[DerivedFile], result: Result, shelf: DerivedFiles
 ) -> tuple[dict[str, Path], dict[str, str]]:
-    """Make the figures or data files that the store lacks; return all paths, and the reason for each missing file.
+    """Make the figures or data files that the store lacks; return all paths, and the reason for
+    each missing file.
 
     The reason is empty for a figure of tables where the recipe has none.
     """
@@ -125,7 +151,8 @@ def files_of(
 
 
 def timeline(result: Result) -> dict[str, Any] | None:
-    """Return the arguments of `TIMELINE_DRAWING`: the predicted and the actual times of all steps of a run.
+    """Return the arguments of `TIMELINE_DRAWING`: the predicted and the actual times of all steps
+    of a run.
 
     None if no step ran.
     """
@@ -137,21 +164,32 @@ def timeline(result: Result) -> dict[str, Any] | None:
     known = [done for done in ran if done.predicted is not None]
     plan = result.schedule or Schedule((), 0.0, {}, 0.0)
     slots = {slot.task: slot for slot in plan.slots}
-    # where the time of a step is only a guess, the gap that it leaves in the schedule is no plan to compare with
+    # where the time of a step is only a guess, the gap that it leaves in the schedule is no plan to
+    # compare with
     whole = len(known) == len(ran) and all(done.step in slots for done in known)
     planned = tuple(slots[done.step] for done in known) if whole else _in_turn(known)
     return {"schedule": replace(plan, slots=planned), "rows": rows}
 
 
 def _in_turn(known: Iterable[StepRecord]) -> tuple[Slot, ...]:
-    """Return a schedule of predicted times in which the steps of each device follow each other as they ran."""
+    """Return a schedule of predicted times in which the steps of each device follow each other
+    as they ran.
+    """
     end: dict[str, Slot] = {}
     slots = []
     for done in sorted(known, key=lambda done: done.began):
         lane = done.lane or done.device
         before = end.get(lane)
         start = before.end if before else 0.0
-        slots.append(Slot(done.step, lane, start, start + (done.predicted or 0.0), after=before.task if before else ""))
+        slots.append(
+            Slot(
+                done.step,
+                lane,
+                start,
+                start + (done.predicted or 0.0),
+                after=before.task if before else "",
+            )
+        )
         end[lane] = slots[-1]
     return tuple(slots)
 
@@ -159,7 +197,8 @@ def _in_turn(known: Iterable[StepRecord]) -> tuple[Slot, ...]:
 def arguments_of(
     needs: Mapping[str, str], recipe: Recipe, keys: Mapping[str, str], code: Code, store: Store
 ) -> dict[str, Found]:
-    """Find the source of each argument of a drawing function; omit arguments marked by ``?`` whose step is missing.
+    """Find the source of each argument of a drawing function; omit arguments marked by ``?`` whose
+    step is missing.
 
     Raises `Missing` for another argument whose step is missing.
     """
@@ -178,25 +217,36 @@ def key_of_file(file: DerivedFile, found: Mapping[str, Found]) -> str:
     return digest(*file.kind, [[name, x.identity] for name, x in found.items()])
 
 
-def _made(jobs: Sequence[Job], result: Result, shelf: DerivedFiles, missing: dict[str, str]) -> dict[str, Path]:
-    """Compute the figures or data files that the store lacks from the results of a run, and return all paths."""
+def _made(
+    jobs: Sequence[Job], result: Result, shelf: DerivedFiles, missing: dict[str, str]
+) -> dict[str, Path]:
+    """Compute the figures or data files that the store lacks from the results of a run, and
+    return all paths.
+    """
     paths = {file.name: path for file, key, _ in jobs if (path := shelf.find(key, file.suffix))}
     new = [job for job in jobs if job[0].name not in paths]
     needed = [sorted({step for x in found.values() for step in x.steps}) for _, _, found in new]
     for (file, key, found), values in zip(new, in_turn(needed, result), strict=True):
         arguments = {name: x.make(values) for name, x in found.items()}
         try:
-            paths[file.name] = shelf.keep(key, file.suffix, file.name, partial(file.make, **arguments))
+            paths[file.name] = shelf.keep(
+                key, file.suffix, file.name, partial(file.make, **arguments)
+            )
         except (ValueError, Missing, RuntimeError) as error:
             missing[file.name] = str(error).partition("\n")[0]
     return {file.name: paths[file.name] for file, _, _ in jobs if file.name in paths}
 
 
 def _function(path: str) -> Callable[..., bytes]:
-    """Return the drawing function named ``module:function``, whose module is imported at the first call."""
+    """Return the drawing function named ``module:function``, whose module is imported at the
+    first call.
+    """
     module, _, name = path.partition(":")
-    return lambda **arguments: getattr(importlib.import_module(f"neusee.workflows.{module}"), name)(**arguments)
+    return lambda **arguments: getattr(importlib.import_module(f"neusee.workflows.{module}"), name)(
+        **arguments
+    )
 
 
 GRAPH_DRAWING = Drawing("report.figures.recipe_graph:graph")
-TIMELINE_DRAWING = Drawing("report.figures.gantt:timeline")  # not stored, for no two runs take the same times
+# not stored, for no two runs take the same times
+TIMELINE_DRAWING = Drawing("report.figures.gantt:timeline")

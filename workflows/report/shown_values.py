@@ -1,4 +1,6 @@
-"""Values that the pictures and data files of a run show, in memory only from their first use to their last."""
+"""Values that the pictures and data files of a run show, in memory only from their first use to
+their last.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +17,16 @@ from neusee.workflows.engine.runner import Result, run
 def in_turn(groups: Sequence[Sequence[str]], result: Result) -> Iterator[Mapping[str, Any]]:
     """Yield for each group of steps the values of these steps, on the first device of the run.
 
-    The values of the run itself are used where it has them. Other values are read from the store when their group
-    comes, and the few that the store lacks are computed together before the first group. A value is deleted after
-    the last group that needs it.
+    The values of the run itself are used where it has them. Other values are read from the store
+    when their group comes, and the few that the store lacks are computed together before the first
+    group. A value is deleted after the last group that needs it.
     """
     uses = Counter(step for group in groups for step in group)
-    lacking = [step for step in uses if step not in result.values and not result.store.has(result.keys[step])]
+    lacking = [
+        step
+        for step in uses
+        if step not in result.values and not result.store.has(result.keys[step])
+    ]
     values = dict(_computed(lacking, result))
     for group in groups:
         values |= _read([step for step in group if step not in values], result)
@@ -34,7 +40,9 @@ def in_turn(groups: Sequence[Sequence[str]], result: Result) -> Iterator[Mapping
 
 
 def _read(steps: Iterable[str], result: Result) -> dict[str, Any]:
-    """Return the values of steps from the run, from its store, or computed again if the store has lost them."""
+    """Return the values of steps from the run, from its store, or computed again if the store
+    has lost them.
+    """
     device, found, lost = result.device.partition(",")[0], {}, list[str]()
     for step in steps:
         if step in result.values:
@@ -49,4 +57,8 @@ def _read(steps: Iterable[str], result: Result) -> dict[str, Any]:
 
 
 def _computed(steps: Sequence[str], result: Result) -> Mapping[str, Any]:
-    return run(result.recipe, result.store, sorted(steps), device=result.device).values if steps else {}
+    return (
+        run(result.recipe, result.store, sorted(steps), device=result.device).values
+        if steps
+        else {}
+    )

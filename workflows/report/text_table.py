@@ -16,22 +16,31 @@ def columns(rows: Rows, numbers: str = "<", gap: str = "  ") -> list[str]:
     """
     widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
     forms = [f"{'<' if i == 0 else numbers}{width}" for i, width in enumerate(widths)]
-    return [gap.join(f"{cell:{form}}" for cell, form in zip(row, forms, strict=True)).rstrip() for row in rows]
+    return [
+        gap.join(f"{cell:{form}}" for cell, form in zip(row, forms, strict=True)).rstrip()
+        for row in rows
+    ]
 
 
 def indented(rows: Rows) -> list[str]:
-    """Return an indented line of text for each table row, with numbers aligned right and a dash for an empty cell."""
+    """Return an indented line of text for each table row, with numbers aligned right and a dash
+    for an empty cell.
+    """
     full = [[name, *(cell or "–" for cell in cells)] for name, *cells in rows]
     return [f"  {line}" for line in columns(full, ">", "  ")]
 
 
 def wrapped(text: str) -> list[str]:
     """Return a text as indented lines that are no wider than the terminal."""
-    return textwrap.wrap(text, get_terminal_size().columns, initial_indent="  ", subsequent_indent="  ")
+    return textwrap.wrap(
+        text, get_terminal_size().columns, initial_indent="  ", subsequent_indent="  "
+    )
 
 
 def by_family(names: Iterable[str]) -> dict[str, list[str]]:
-    """Group names of steps by the part before the bracket: ``psf[plain]`` and ``psf[mask]`` belong to ``psf``."""
+    """Group names of steps by the part before the bracket: ``psf[plain]`` and ``psf[mask]``
+    belong to ``psf``.
+    """
     groups: dict[str, list[str]] = {}
     for name in names:
         groups.setdefault(name.partition("[")[0], []).append(name)

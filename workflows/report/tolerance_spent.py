@@ -1,4 +1,6 @@
-"""Account of the numerical errors that a run accepts within its tolerance: omitted and cheaper steps, error bounds."""
+"""Account of the numerical errors that a run accepts within its tolerance: omitted and cheaper
+steps, error bounds.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +23,22 @@ NORM = "root mean square over the largest element"
 
 
 def spent(result: Result) -> dict[str, Any]:
-    """Return the tolerance of a run, with the omitted and the cheaper steps and their errors, as JSON values.
+    """Return the tolerance of a run, with the omitted and the cheaper steps and their errors, as
+    JSON values.
 
-    ``outputs`` has the error that the run states for each output, its kind (proved, estimated, exact or unknown), and
-    the error measured against a run with ``--exact``, if the store has the results of this run: the numbers of the
-    terminal, of the page and of ``study leave-out``. ``bounds`` has the errors that the tolerance limits: of each
-    output, and of each input of a step without an error bound, before one draw of the noise and rounding add to them.
-    ``estimated`` names those of them that count errors which are estimated and not proved.
+    ``outputs`` has the error that the run states for each output, its kind (proved, estimated,
+    exact or unknown), and the error measured against a run with ``--exact``, if the store has the
+    results of this run: the numbers of the terminal, of the page and of ``study leave-out``.
+    ``bounds`` has the errors that the tolerance limits: of each output, and of each input of a step
+    without an error bound, before one draw of the noise and rounding add to them. ``estimated``
+    names those of them that count errors which are estimated and not proved.
     """
     recipe, measured = result.recipe, _measured(result)
     estimated = dependents(recipe, _estimated_roots(result), needed(recipe, recipe.outputs))
     costs = (
-        past_costs(result.store, sizes_of(result.recipe, needed(result.recipe, result.recipe.steps)))
+        past_costs(
+            result.store, sizes_of(result.recipe, needed(result.recipe, result.recipe.steps))
+        )
         if result.recipe.substitutions or _left_out(result)
         else Costs([])
     )
@@ -43,15 +49,22 @@ def spent(result: Result) -> dict[str, Any]:
         "strict": result.recipe.tolerance_scale,
         "exact": result.recipe.exact,
         "bounds": {name: share for name, share in result.proof.held.items() if share > 0},
-        "estimated": [name for name, share in result.proof.held.items() if share > 0 and name in estimated],
+        "estimated": [
+            name for name, share in result.proof.held.items() if share > 0 and name in estimated
+        ],
         "outputs": [_output(result, name, measured.get(name)) for name in recipe.outputs],
         "coverage": COVERAGE,
-        "economies": [_economy(result, costs, each, each.instead in estimated) for each in result.recipe.substitutions],
+        "economies": [
+            _economy(result, costs, each, each.instead in estimated)
+            for each in result.recipe.substitutions
+        ],
         "left_out": [
             {
                 "step": done.step,
                 "bound": done.bound,
-                "estimated": bool(done.bound) and result.recipe.steps[done.step].node.hooks.skip_estimated,
+                "estimated": (
+                    bool(done.bound) and result.recipe.steps[done.step].node.hooks.skip_estimated
+                ),
                 "why": done.why,
                 "full_seconds": _seconds(result, costs, done.step),
             }
@@ -61,7 +74,9 @@ def spent(result: Result) -> dict[str, Any]:
 
 
 def said_of_economies(account: Mapping[str, Any]) -> str:
-    """Return one line of text with the steps that a run replaced or omitted to save time, and the resulting errors."""
+    """Return one line of text with the steps that a run replaced or omitted to save time, and
+    the resulting errors.
+    """
     summed = [
         f"{e['step']} ({_within(e['bound'], e['estimated'])})"
         for e in account["economies"]
@@ -73,14 +88,17 @@ def said_of_economies(account: Mapping[str, Any]) -> str:
 
 
 def said_of_errors(account: Mapping[str, Any]) -> str:
-    """Return one line of text with the errors that a run states for its outputs, by kind, and the measured errors."""
+    """Return one line of text with the errors that a run states for its outputs, by kind, and
+    the measured errors.
+    """
     rows = account["outputs"]
     parts = []
     if proved := [row for row in rows if row["kind"] == "proved"]:
         parts.append(f"{_worst(proved, 'error')} at most, proved")
     if estimated := [row for row in rows if row["kind"] == "estimated"]:
         parts.append(
-            f"{_worst(estimated, 'error')}, an estimate that {account['coverage']:.0%} of errors do not exceed"
+            f"{_worst(estimated, 'error')}, an estimate that {account['coverage']:.0%} of errors do"
+            " not exceed"
         )
     if unknown := [row["output"] for row in rows if row["kind"] == "unknown"]:
         parts.append(f"unknown in {', '.join(unknown)}")
@@ -90,7 +108,9 @@ def said_of_errors(account: Mapping[str, Any]) -> str:
 
 
 def _said_of_measured(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the largest error that was measured beside ``--exact``, and in which outputs, if not in all."""
+    """Return the largest error that was measured beside ``--exact``, and in which outputs, if
+    not in all.
+    """
     measured = [row for row in rows if row["measured"] is not None]
     if not measured:
         return ""
@@ -110,7 +130,11 @@ def _output(result: Result, name: str, measured: float | None) -> dict[str, Any]
 
 
 def _within(bound: float | None, estimated: bool) -> str:
-    return "error unknown" if bound is None else f"{'estimated' if estimated else 'at most'} {bound:.1e}"
+    return (
+        "error unknown"
+        if bound is None
+        else f"{'estimated' if estimated else 'at most'} {bound:.1e}"
+    )
 
 
 def _estimated_roots(result: Result) -> list[str]:
@@ -120,7 +144,9 @@ def _estimated_roots(result: Result) -> list[str]:
     for name in needed(recipe, recipe.outputs):
         hooks, record = recipe.steps[name].node.hooks, result.done.get(name)
         omitted = record is not None and record.state == "left out" and bool(record.bound)
-        if (hooks.skip_estimated and omitted) or (hooks.estimated and result.proof.shares.get(name)):
+        if (hooks.skip_estimated and omitted) or (
+            hooks.estimated and result.proof.shares.get(name)
+        ):
             found.append(name)
     return found
 
@@ -144,11 +170,17 @@ def _economy(result: Result, costs: Costs, each: Substitution, estimated: bool) 
 
 
 def _spent_on(result: Result, each: Substitution) -> float | None:
-    """Return the time in s of all steps that replace a step: the cheaper one, and those that choose and check it.
+    """Return the time in s of all steps that replace a step: the cheaper one, and those that choose
+    and check it.
 
-    A stored result counts with the time in which it was computed; None if the store no longer knows that.
+    A stored result counts with the time in which it was computed; None if the store no longer knows
+    that.
     """
-    seconds = [_made_in(result, done) for name, done in result.done.items() if name.startswith(f"{each.step}.")]
+    seconds = [
+        _made_in(result, done)
+        for name, done in result.done.items()
+        if name.startswith(f"{each.step}.")
+    ]
     known = [each for each in seconds if each is not None]
     return sum(known) if len(known) == len(seconds) else None
 
@@ -161,13 +193,17 @@ def _made_in(result: Result, done: StepRecord) -> float | None:
 
 
 def _seconds(result: Result, costs: Costs, step: str) -> float | None:
-    """Return the predicted time in s of a step that this run replaced or left out, or None if the step never ran."""
+    """Return the predicted time in s of a step that this run replaced or left out, or None if
+    the step never ran.
+    """
     estimate = costs.of(result.recipe.steps[step], ["cpu"])
     return estimate.seconds["cpu"] if estimate.known else None
 
 
 def _measured(result: Result) -> dict[str, float]:
-    """Return the error of each output of a run relative to an exact run, if the store has results of an exact run."""
+    """Return the error of each output of a run relative to an exact run, if the store has
+    results of an exact run.
+    """
     recipe = result.recipe
     if recipe.exact or not (recipe.substitutions or _left_out(result)):
         return {}
@@ -178,12 +214,20 @@ def _measured(result: Result) -> dict[str, float]:
                 found[name] = error_of(result.value(name), result.store.get(full[name]))
             except (KeyError, ValueError):
                 continue  # another process has removed the result
-    same = {name: 0.0 for name in recipe.outputs if full.get(name) == result.keys[name]} if found else {}
-    return {name: {**same, **found}[name] for name in recipe.outputs if name in same or name in found}
+    same = (
+        {name: 0.0 for name in recipe.outputs if full.get(name) == result.keys[name]}
+        if found
+        else {}
+    )
+    return {
+        name: {**same, **found}[name] for name in recipe.outputs if name in same or name in found
+    }
 
 
 def _full_keys(result: Result) -> dict[str, str]:
-    whole: Recipe = replace(result.recipe.unsubstituted or result.recipe, exact=True, substitutions=())
+    whole: Recipe = replace(
+        result.recipe.unsubstituted or result.recipe, exact=True, substitutions=()
+    )
     try:
         return resolve(whole, needed(whole, whole.outputs), result.store, result.device).keys
     except (OSError, LookupError, RunError):

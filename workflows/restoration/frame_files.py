@@ -18,7 +18,9 @@ def named_frames(words: Iterable[str], folder: Path) -> list[Path]:
     for number, word in enumerate(words, 1):
         files = list(_named(folder / Path(word).expanduser()))
         if not files:
-            problems.append(Diagnostic(Location(f"argument {number}"), word, _absent(folder / word)))
+            problems.append(
+                Diagnostic(Location(f"argument {number}"), word, _absent(folder / word))
+            )
         found += files
     if problems:
         raise RecipeError(problems)
@@ -29,7 +31,9 @@ def _named(path: Path) -> Iterator[Path]:
     if path.is_file():
         yield path
     elif path.is_dir():
-        inside = (each for each in path.iterdir() if each.is_file() and not each.name.startswith("."))
+        inside = (
+            each for each in path.iterdir() if each.is_file() and not each.name.startswith(".")
+        )
         yield from sorted(each for each in inside if each.suffix.lower() in FRAME_SUFFIXES)
 
 

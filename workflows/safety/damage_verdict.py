@@ -1,4 +1,6 @@
-"""The verdict of damage behind each protection: one state, one sentence, and a row for each part of the light."""
+"""The verdict of damage behind each protection: one state, one sentence, and a row for each part
+of the light.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ _CONTINUOUS = ("pulse", "mean", "accumulation")
 
 @dataclass(frozen=True)
 class DamageRow:
-    """What is said of one part of the light: where it is beside its threshold, or why no law judges it."""
+    """What is said of one part of the light: where it is beside its threshold, or why no law
+    judges it.
+    """
 
     part: str  #: pulse, mean, accumulation or incubation
     kind: str  #: of damage
@@ -45,10 +49,11 @@ class DamageVerdict:
 
     @property
     def nearest(self) -> DamageRow | None:
-        """Return the row that the verdict names: of its state, the largest ratio; None if no law judges any row.
+        """Return the row that the verdict names: of its state, the largest ratio; None if no law
+        judges any row.
 
-        A verdict that is not judged names the largest ratio of what is judged. Incubation is an assumption: it is
-        named only where no other part has the state of the verdict.
+        A verdict that is not judged names the largest ratio of what is judged. Incubation is an
+        assumption: it is named only where no other part has the state of the verdict.
         """
         candidates = self._candidates()
         largest = max((row.ratio for row in candidates), default=0.0)
@@ -87,14 +92,22 @@ def damage_verdicts(
     """Yield the verdict of damage behind each option; none if damage is not asked for."""
     for option in options:
         parts = limit_parts(safety, option, exposures, draws)
-        judged = [each for each in findings if each.option == option.name and each.limit.effect == "damage"]
+        judged = [
+            each
+            for each in findings
+            if each.option == option.name and each.limit.effect == "damage"
+        ]
         rows = tuple(_rows(parts, judged, continuous=not exposures.beams[0].is_pulsed))
         if rows:
             yield DamageVerdict(option.name, worst_state(row.state for row in rows), rows)
 
 
-def _rows(parts: Sequence[DamagePart], findings: Sequence[Finding], continuous: bool) -> Iterator[DamageRow]:
-    """Yield the row of each part; the findings are those of the parts with a threshold, in their order."""
+def _rows(
+    parts: Sequence[DamagePart], findings: Sequence[Finding], continuous: bool
+) -> Iterator[DamageRow]:
+    """Yield the row of each part; the findings are those of the parts with a threshold, in their
+    order.
+    """
     waiting = iter(findings)
     for part in parts:
         finding = next(waiting) if part.threshold is not None else None
@@ -105,6 +118,8 @@ def _rows(parts: Sequence[DamagePart], findings: Sequence[Finding], continuous: 
 
 
 def state_of_finding(finding: Finding) -> State:
-    """Return where the exposure at the distance of the recipe is beside a limit of damage, with what is uncertain."""
+    """Return where the exposure at the distance of the recipe is beside a limit of damage, with
+    what is uncertain.
+    """
     assert finding.ratios is not None
     return state_of(finding.ratios.low, finding.ratios.high, finding.limit.open_below)

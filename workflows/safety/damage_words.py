@@ -33,17 +33,25 @@ STATES = {
 
 
 def verdict(found: Estimate) -> list[str]:
-    """Return the verdict of damage behind the plain lens, and a sentence for each limit of dazzle behind it."""
+    """Return the verdict of damage behind the plain lens, and a sentence for each limit of
+    dazzle behind it.
+    """
     lens = found.options[0].name
     damage = [damage_sentence(each, found) for each in found.damage if each.option == lens]
-    dazzle = [each for each in found.findings if each.option == lens and each.limit.effect != "damage"]
+    dazzle = [
+        each for each in found.findings if each.option == lens and each.limit.effect != "damage"
+    ]
     return damage + [
-        f"{each.limit.name}: exceeded {'from ' if each.zones.zones else ''}{zones_text(each.zones)}." for each in dazzle
+        f"{each.limit.name}: exceeded"
+        f" {'from ' if each.zones.zones else ''}{zones_text(each.zones)}."
+        for each in dazzle
     ]
 
 
 def damage_sentence(verdict: DamageVerdict, found: Estimate) -> str:
-    """Return the verdict of damage behind one protection in W/cm2 or J/cm2, with the distances of the worst part."""
+    """Return the verdict of damage behind one protection in W/cm2 or J/cm2, with the distances
+    of the worst part.
+    """
     at = f"at {metres(found.safety.laser.distance)} behind the {verdict.option}"
     nearest = verdict.nearest
     if nearest is None or nearest.finding is None:
@@ -53,7 +61,10 @@ def damage_sentence(verdict: DamageVerdict, found: Estimate) -> str:
         return f"Damage is expected {at}: {near} {zones}"
     if verdict.state == "not judged":
         parts = " and the ".join(dict.fromkeys(row.part for row in verdict.unjudged))
-        text = f"Damage is not judged {at}, because no law judges the {parts}: {verdict.unjudged[0].reason}."
+        text = (
+            f"Damage is not judged {at}, because no law judges the {parts}:"
+            f" {verdict.unjudged[0].reason}."
+        )
         if nearest.state == "not judged":
             return text
         return f"{text} Of what is judged, {near} {zones}".rstrip()
@@ -70,22 +81,31 @@ def _compared(row: DamageRow, found: Estimate) -> str:
     exposure = scaled(finding.exposure.value * _PER_CM2, unit)
     threshold = with_ends(finding.at_sensor, unit, _PER_CM2)
     kind = "first damage" if finding.limit.kind == "point" else finding.limit.kind
-    return f"{part} of {exposure} on the sensor is {times(finding)} the threshold of {kind}, {threshold}."
+    return (
+        f"{part} of {exposure} on the sensor is {times(finding)} the threshold of {kind},"
+        f" {threshold}."
+    )
 
 
 def times(finding: Finding) -> str:
-    """Return the ratio of exposure to limit with its interval, such as ``0.34 (0.1 to 1.1) times``."""
+    """Return the ratio of exposure to limit with its interval, such as ``0.34 (0.1 to 1.1)
+    times``.
+    """
     spread = finding.ratios
     if spread is not None and finding.limit.open_below:
         return f"at least {plain(f'{spread.low:.3g}')} times"
     if spread is None or spread.high <= spread.low * (1 + _SAME):
         return f"{plain(f'{finding.ratio:.3g}')} times"
-    ratio, low, high = (plain(text) for text in (f"{finding.ratio:.3g}", f"{spread.low:.2g}", f"{spread.high:.2g}"))
+    ratio, low, high = (
+        plain(text) for text in (f"{finding.ratio:.3g}", f"{spread.low:.2g}", f"{spread.high:.2g}")
+    )
     return f"{ratio} ({low} to {high}) times"
 
 
 def _zones(verdict: DamageVerdict, finding: Finding) -> str:
-    """Return where the worst part of the light exceeds its threshold; nothing where a part is not judged."""
+    """Return where the worst part of the light exceeds its threshold; nothing where a part is
+    not judged.
+    """
     if finding.zones.zones:
         return f"It exceeds the threshold from {zones_text(finding.zones)}."
     if verdict.unjudged or finding.limit.open_below:
@@ -93,7 +113,8 @@ def _zones(verdict: DamageVerdict, finding: Finding) -> str:
     if finding.zones.reach is None:
         return "It exceeds the threshold nowhere."
     return (
-        f"It exceeds the threshold nowhere at the nominal values, but in some draws out to {end(finding.zones.reach)}."
+        "It exceeds the threshold nowhere at the nominal values, but in some draws out to"
+        f" {end(finding.zones.reach)}."
     )
 
 
@@ -115,7 +136,10 @@ def zone_rows(found: Estimate) -> list[list[str]]:
     partial = {verdict.option for verdict in found.damage if verdict.unjudged}
     rows = [_zone_cells(each, each.option in partial) for each in found.findings]
     for verdict in found.damage:
-        rows += [[verdict.option, f"damage: {row.part}", "not judged", "–", "–"] for row in _without_limit(verdict)]
+        rows += [
+            [verdict.option, f"damage: {row.part}", "not judged", "–", "–"]
+            for row in _without_limit(verdict)
+        ]
     return rows
 
 
@@ -130,7 +154,9 @@ def _unjudged_cells(verdict: DamageVerdict, row: DamageRow) -> list[str]:
 
 
 def _limit_cells(finding: Finding) -> list[str]:
-    """Return the row of a limit, for damage with the ratio's bracket and where the exposure is beside the limit."""
+    """Return the row of a limit, for damage with the ratio's bracket and where the exposure is
+    beside the limit.
+    """
     cells = limit_cells(finding)
     if finding.limit.effect != "damage" or finding.ratios is None:
         return cells
@@ -141,7 +167,9 @@ def _limit_cells(finding: Finding) -> list[str]:
 
 
 def _zone_cells(finding: Finding, partial: bool) -> list[str]:
-    """Return the row of a limit in the table of distances; without device data it has no probabilities."""
+    """Return the row of a limit in the table of distances; without device data it has no
+    probabilities.
+    """
     zones = finding.zones
     text = zones_text(zones)
     if finding.limit.effect == "damage" and not zones.zones and partial:

@@ -1,4 +1,6 @@
-"""An example of the dead pixels in a raw frame of the median device: points, lines, crosses and lost frames."""
+"""An example of the dead pixels in a raw frame of the median device: points, lines, crosses and
+lost frames.
+"""
 
 from __future__ import annotations
 
@@ -36,10 +38,11 @@ class DeadPixels:
 def damaged_frames(
     safety: Safety, spots: Sequence[Spot], findings: Sequence[Finding], exposures: Exposures
 ) -> Iterator[DeadPixels]:
-    """Yield the frame behind each protection whose spot is known, at one distance for all; none if nothing is damaged.
+    """Yield the frame behind each protection whose spot is known, at one distance for all; none if
+    nothing is damaged.
 
-    The distance is that of the recipe if the laser damages the median device there behind the plain lens, else the
-    largest at which it does.
+    The distance is that of the recipe if the laser damages the median device there behind the plain
+    lens, else the largest at which it does.
     """
     damage = [finding for finding in findings if finding.limit.effect == "damage"]
     reached = _reached(damage, exposures)
@@ -52,13 +55,21 @@ def damaged_frames(
         if spot.pitch > pitch:  # samples that miss pixels say nothing of them
             continue
         hit = _hit(spot, pitch, damage, exposures, at)
-        yield _frame(spot.option, float(exposures.distances[at]), hit, _half_width(hit), safety.settings.damage.device)
+        yield _frame(
+            spot.option,
+            float(exposures.distances[at]),
+            hit,
+            _half_width(hit),
+            safety.settings.damage.device,
+        )
 
 
 def _hit(
     spot: Spot, pitch: float, damage: Sequence[Finding], exposures: Exposures, at: int
 ) -> list[tuple[str, FloatArray]]:
-    """Return the kinds of damage that are reached behind one protection at a distance, with the places of each."""
+    """Return the kinds of damage that are reached behind one protection at a distance, with the
+    places of each.
+    """
     behind = [finding for finding in damage if finding.option == spot.option]
     places = [_above(spot, pitch, float(_ratio(finding, exposures)[at])) for finding in behind]
     kinds = [finding.limit.kind for finding in behind]
@@ -72,7 +83,9 @@ def _half_width(hit: Sequence[tuple[str, FloatArray]]) -> int:
 
 
 def _reached(damage: Sequence[Finding], exposures: Exposures) -> set[int]:
-    """Return the indices of the distances at which a limit of damage is exceeded behind the plain lens."""
+    """Return the indices of the distances at which a limit of damage is exceeded behind the
+    plain lens.
+    """
     plain = [each for each in damage if each.option == "plain lens"]
     indices = [np.flatnonzero(_ratio(each, exposures) >= 1) for each in plain]
     return set(np.concatenate(indices).tolist()) if indices else set()
@@ -86,13 +99,17 @@ def _ratio(finding: Finding, exposures: Exposures) -> FloatArray:
 
 
 def _above(spot: Spot, pitch: float, ratio: float) -> FloatArray:
-    """Return the places (pixel, (y, x)) from the spot of the pixels in which a sample exceeds the limit."""
+    """Return the places (pixel, (y, x)) from the spot of the pixels in which a sample exceeds
+    the limit.
+    """
     middle = np.array(spot.light.shape) // 2
     samples = np.argwhere(spot.light * ratio >= 1) - middle
     return np.unique(np.round(samples * spot.pitch / pitch).astype(int), axis=0)
 
 
-def _frame(option: str, distance: float, hit: Sequence[tuple[str, FloatArray]], half: int, device: str) -> DeadPixels:
+def _frame(
+    option: str, distance: float, hit: Sequence[tuple[str, FloatArray]], half: int, device: str
+) -> DeadPixels:
     pattern = torch.zeros(2 * half + 1, 2 * half + 1, dtype=torch.uint8)
     others = any(kind != "frame" for kind, _ in hit)
     for kind, places in hit:
@@ -105,4 +122,6 @@ def _frame(option: str, distance: float, hit: Sequence[tuple[str, FloatArray]], 
     damage = SpotDamage._make([*[none] * 8, pattern])
     drawn = damaged_pixels(raw, [damage], full_well=float(_WHITE), gain=1.0, bits=10, device=device)
     kinds = tuple(kind for kind in KINDS if kind in {kind for kind, _ in hit})
-    return DeadPixels(option, distance, kinds, int((pattern > 0).sum()), drawn[0].double().numpy() / _WHITE)
+    return DeadPixels(
+        option, distance, kinds, int((pattern > 0).sum()), drawn[0].double().numpy() / _WHITE
+    )

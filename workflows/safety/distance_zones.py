@@ -1,4 +1,6 @@
-"""Intervals of distance in which an exposure exceeds a limit, for nominal values and for random draws of them."""
+"""Intervals of distance in which an exposure exceeds a limit, for nominal values and for random
+draws of them.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ _ROUNDED = 1e-9  #: relative rounding of the logarithm of a distance
 
 @dataclass(frozen=True)
 class Spread:
-    """A number with the interval that contains 90 % of its draws; all three are equal if nothing is uncertain."""
+    """A number with the interval that contains 90 % of its draws; all three are equal if nothing
+    is uncertain.
+    """
 
     value: float
     low: float
@@ -44,20 +48,28 @@ class Zone:
 
 @dataclass(frozen=True)
 class Zones:
-    """The intervals of distance in which a limit is exceeded, none or several, and how sure each statement is."""
+    """The intervals of distance in which a limit is exceeded, none or several, and how sure each
+    statement is.
+    """
 
     zones: tuple[Zone, ...]  #: at the nominal values
     none: float  #: share of the draws without any zone
-    alike: float  #: share of the draws with as many zones as the nominal values; ends between zones are from these
-    reach: Spread | None  #: largest distance of any zone, over the draws that have one; None without such a draw
-    inside: float  #: share of the draws in which the limit is exceeded at the distance of the recipe
+    #: share of the draws with as many zones as the nominal values; ends between zones are from
+    #: these
+    alike: float
+    #: largest distance of any zone, over the draws that have one; None without such a draw
+    reach: Spread | None
+    #: share of the draws in which the limit is exceeded at the distance of the recipe
+    inside: float
 
 
 def crossings(distances: FloatArray, ratio: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the near and the far ends (draw, zone) of the intervals in which ``ratio`` (draw, distance) is at least 1.
+    """Return the near and the far ends (draw, zone) of the intervals in which ``ratio`` (draw,
+    distance) is at least 1.
 
-    Ends between two distances are interpolated in the logarithms. Rows with fewer zones than others end with NaN. A
-    zone that begins before the first distance, or ends beyond the last, has this distance as its end.
+    Ends between two distances are interpolated in the logarithms. Rows with fewer zones than others
+    end with NaN. A zone that begins before the first distance, or ends beyond the last, has this
+    distance as its end.
     """
     with np.errstate(divide="ignore"):
         height = np.log(np.maximum(ratio, 1e-300))
@@ -69,7 +81,9 @@ def crossings(distances: FloatArray, ratio: FloatArray) -> tuple[FloatArray, Flo
 
 
 def _placed(at: FloatArray, height: FloatArray, marks: NDArray[np.bool_], step: int) -> FloatArray:
-    """Return the distance (draw, zone) where the height crosses 0 beside each marked sample, on the side ``step``."""
+    """Return the distance (draw, zone) where the height crosses 0 beside each marked sample, on
+    the side ``step``.
+    """
     row, column = np.nonzero(marks)
     other = np.clip(column + step, 0, len(at) - 1)
     inner, outer = height[row, column], height[row, other]
@@ -82,13 +96,18 @@ def _placed(at: FloatArray, height: FloatArray, marks: NDArray[np.bool_], step: 
 
 
 def zones_of(
-    distances: FloatArray, nominal: FloatArray, drawn: FloatArray, at: float, asked: tuple[float, float] | None = None
+    distances: FloatArray,
+    nominal: FloatArray,
+    drawn: FloatArray,
+    at: float,
+    asked: tuple[float, float] | None = None,
 ) -> Zones:
-    """Return the zones of a limit from the ratio of exposure to limit: nominal (distance,), drawn (draw, distance).
+    """Return the zones of a limit from the ratio of exposure to limit: nominal (distance,), drawn
+    (draw, distance).
 
-    Zones lie between the two distances ``asked``, whether or not the distance ``at`` of the recipe does. The outer
-    ends, such as the farthest distance, have the interval of all draws that have a zone; ends between two zones have
-    that of the draws with as many zones as the nominal values.
+    Zones lie between the two distances ``asked``, whether or not the distance ``at`` of the recipe
+    does. The outer ends, such as the farthest distance, have the interval of all draws that have a
+    zone; ends between two zones have that of the draws with as many zones as the nominal values.
     """
     within = _at(distances, drawn, at) >= 1
     if asked is not None:
@@ -99,7 +118,8 @@ def zones_of(
     count = (~np.isnan(starts)).sum(1)
     alike = count == len(near)
     furthest = np.nanmax(stops[count > 0], 1) if (count > 0).any() else np.zeros(0)
-    first, last = starts[count > 0, :1].ravel(), len(near) - 1  # outer ends are those of every draw with a zone
+    # outer ends are those of every draw with a zone
+    first, last = starts[count > 0, :1].ravel(), len(near) - 1
     zones = tuple(
         Zone(
             Spread.of(float(near[i]), _column(starts[alike], i) if i else first),
@@ -109,8 +129,14 @@ def zones_of(
         )
         for i in range(len(near))
     )
-    reach = Spread.of(float(far.max()) if len(far) else float(np.median(furthest)), furthest) if furthest.size else None
-    return Zones(zones, float((count == 0).mean()), float(alike.mean()), reach, float(within.mean()))
+    reach = (
+        Spread.of(float(far.max()) if len(far) else float(np.median(furthest)), furthest)
+        if furthest.size
+        else None
+    )
+    return Zones(
+        zones, float((count == 0).mean()), float(alike.mean()), reach, float(within.mean())
+    )
 
 
 def _column(ends: FloatArray, zone: int) -> FloatArray:
@@ -125,5 +151,9 @@ def _at(distances: FloatArray, ratio: FloatArray, at: float) -> FloatArray:
 
 
 def sampled(first: float, last: float, also: Sequence[float] = (), count: int = 600) -> FloatArray:
-    """Return distances from ``first`` to ``last`` at equal ratios, with the distances ``also`` among them."""
-    return np.unique(np.concatenate([np.geomspace(first, last, count), np.asarray(also, np.float64)]))
+    """Return distances from ``first`` to ``last`` at equal ratios, with the distances ``also``
+    among them.
+    """
+    return np.unique(
+        np.concatenate([np.geomspace(first, last, count), np.asarray(also, np.float64)])
+    )

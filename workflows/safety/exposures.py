@@ -1,4 +1,6 @@
-"""Exposure at the lens and on the sensor over the distance, for nominal values and for draws of uncertain ones."""
+"""Exposure at the lens and on the sensor over the distance, for nominal values and for draws of
+uncertain ones.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ from neusee.workflows.safety.distance_zones import sampled
 from neusee.workflows.safety.uncertain_values import SettingDraws
 
 Emission = Literal["continuous", "single pulse", "pulse train"]
-WITHIN = 0.01  #: relative change of the defocus over which the largest peak counts: that of half a step of distance
+#: relative change of the defocus over which the largest peak counts: that of half a step of
+#: distance
+WITHIN = 0.01
 _ROUNDED = 1e-9  #: rounding of the logarithm of a distance
 _DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
 
@@ -48,26 +52,34 @@ class Option:
     passing: float = 1.0  #: transmittance of a filter
     peak: float = 1.0  #: peak of the PSF over that of the clear lens, at the distance of the recipe
     masked: bool = False  #: whether the mask is in front of the lens
-    heated: float | None = None  #: diameter of the heated spot over that of the clear lens; None: not known
-    scene: float | None = None  #: share of the scene's light that a filter passes; None: as much as of the laser's
+    #: diameter of the heated spot over that of the clear lens; None: not known
+    heated: float | None = None
+    #: share of the scene's light that a filter passes; None: as much as of the laser's
+    scene: float | None = None
 
     def scene_share(self, diameter: float) -> float:
-        """Return the share of the scene's light that reaches the sensor, for a lens of ``diameter`` m."""
+        """Return the share of the scene's light that reaches the sensor, for a lens of
+        ``diameter`` m.
+        """
         filtered = self.passing if self.scene is None else self.scene
         return filtered * stopped_share(diameter, self.diameter or diameter)
 
-    peaks: tuple[tuple[float, float], ...] = ()  #: distance in m, and the peak there over that of the lens in focus
-    misses: tuple[float, ...] = ()  #: of the logarithm of the peak between two of these distances, counted upward
+    #: distance in m, and the peak there over that of the lens in focus
+    peaks: tuple[tuple[float, float], ...] = ()
+    #: of the logarithm of the peak between two of these distances, counted upward
+    misses: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
 class Exposures:
-    """Shares of the laser's power per m2 over the distance; times power or pulse energy they are exposures.
+    """Shares of the laser's power per m2 over the distance; times power or pulse energy they are
+    exposures.
 
     Every array is (1 + draw or 1, distance), and row 0 has the nominal values.
     """
 
-    distances: FloatArray  #: (distance,) m, at equal ratios; the distance of the recipe is one of them
+    #: (distance,) m, at equal ratios; the distance of the recipe is one of them
+    distances: FloatArray
     lens: FloatArray  #: on the axis at the lens
     sensor: Mapping[str, FloatArray]  #: by option, at the peak on the sensor
     spot: Mapping[str, FloatArray]  #: m, by option, diameter of the spot that heats the sensor
@@ -75,14 +87,17 @@ class Exposures:
     through: Mapping[str, FloatArray]  #: by option, share of the power that reaches the sensor
     fill: Mapping[str, FloatArray]  #: by option, (D / (2 w))^2
     waves: Mapping[str, FloatArray]  #: by option, defocus at the rim of the lens
-    tables: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)  #: of `Area`, made when asked
+    #: of `Area`, made when asked
+    tables: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def at(self, distance: float) -> int:
         """Return the index of one of the distances."""
         return int(np.argmin(np.abs(self.distances - distance)))
 
     def emitted(self, quantity: Literal["irradiance", "fluence"]) -> FloatArray:
-        """Return the mean power in W, or the energy of a pulse in J, of the nominal values and of each draw."""
+        """Return the mean power in W, or the energy of a pulse in J, of the nominal values and
+        of each draw.
+        """
         field = "power" if quantity == "irradiance" else "pulse_energy"
         return np.array([getattr(beam, field) for beam in self.beams], np.float64)[:, None]
 
@@ -95,9 +110,13 @@ def emission_of(beam: Beam) -> Emission:
 
 
 def compute_exposures(
-    safety: Safety, draws: SettingDraws, options: tuple[Option, ...], distances: FloatArray | None = None
+    safety: Safety,
+    draws: SettingDraws,
+    options: tuple[Option, ...],
+    distances: FloatArray | None = None,
 ) -> Exposures:
-    """Return the exposures at the lens and behind each option; raise `RecipeError` for a draw that is no beam.
+    """Return the exposures at the lens and behind each option; raise `RecipeError` for a draw that
+    is no beam.
 
     Without ``distances`` they are those of the settings and of the recipe.
     """
@@ -108,18 +127,27 @@ def compute_exposures(
     lens = _column(draws, "lens.transmittance", safety.settings.lens.transmittance)
     focal_length = _column(draws, "lens.focal_length", safety.settings.lens.focal_length)
     diameter = _column(draws, "lens.diameter", safety.settings.lens.diameter)
-    columns: dict[str, dict[str, FloatArray]] = {name: {} for name in ("sensor", "spot", "through", "fill", "waves")}
+    columns: dict[str, dict[str, FloatArray]] = {
+        name: {} for name in ("sensor", "spot", "through", "fill", "waves")
+    }
     for option in options:
-        aperture: Any = diameter if option.diameter is None else torch.minimum(diameter, torch.tensor(option.diameter))
+        aperture: Any = (
+            diameter
+            if option.diameter is None
+            else torch.minimum(diameter, torch.tensor(option.diameter))
+        )
         waves = _waves(safety.settings.lens, beam, where, aperture)
         passing = lens * option.passing * air
         focused: Any = sensor_density(beam, where, aperture, focal_length, 1.0)
-        density = focused * _at_width(option, beams[0], beam_radius(beam, where)) if option.masked else (
-            density_in_spot(beam, where, aperture, focal_length, waves, WITHIN)
-        )  # fmt: skip
+        density = (
+            focused * _at_width(option, beams[0], beam_radius(beam, where))
+            if option.masked
+            else (density_in_spot(beam, where, aperture, focal_length, waves, WITHIN))
+        )
         columns["sensor"][option.name] = (density * passing).numpy()
         heated: Any = (
-            heated_diameter(beam, where, aperture, focal_length) * _widened(option, density / focused)
+            heated_diameter(beam, where, aperture, focal_length)
+            * _widened(option, density / focused)
             if option.masked
             else heated_in_spot(beam, where, aperture, focal_length, waves, density)
         )
@@ -141,9 +169,11 @@ def compute_exposures(
 
 
 def _widened(option: Option, peak: Any) -> Any:
-    """Return the heated spot over that of the clear lens in focus, an upper bound, from the peak over that lens's.
+    """Return the heated spot over that of the clear lens in focus, an upper bound, from the peak
+    over that lens's.
 
-    The width behind a mask at the distance of the recipe is `Option.heated`, so that the rest counts here alone.
+    The width behind a mask at the distance of the recipe is `Option.heated`, so that the rest
+    counts here alone.
     """
     defocused = (peak / option.peak).clamp_max(1.0)
     widest = widest_heated_diameter(torch.ones_like(defocused), defocused)
@@ -166,10 +196,11 @@ def _waves(lens: Lens, beam: Beam, where: Any, aperture: Any) -> Any:
 
 
 def _at_width(option: Option, nominal: Beam, radius: Any) -> Any:
-    """Return the peak behind a mask over that of the clear lens in focus, for beams of a 1/e2 radius at the lens.
+    """Return the peak behind a mask over that of the clear lens in focus, for beams of a 1/e2
+    radius at the lens.
 
-    A beam that is drawn has the peak of the nominal beam at the distance where the nominal beam is as wide. Nearer than
-    the first peak the ratio is 1, which no mask exceeds.
+    A beam that is drawn has the peak of the nominal beam at the distance where the nominal beam is
+    as wide. Nearer than the first peak the ratio is 1, which no mask exceeds.
     """
     if not option.peaks:
         return option.peak
@@ -181,7 +212,9 @@ def _at_width(option: Option, nominal: Beam, radius: Any) -> Any:
 
 
 def _uneven(safety: Safety, draws: SettingDraws, at: FloatArray) -> FloatArray:
-    """Return the factor (1 + draw or 1, distance) of hot spots and of turbulent air on every irradiance."""
+    """Return the factor (1 + draw or 1, distance) of hot spots and of turbulent air on every
+    irradiance.
+    """
     beam = safety.settings.beam
     factor = draws.column("beam.hot_spots", beam.hot_spots)[:, None]
     if not np.ptp(factor):
@@ -189,25 +222,36 @@ def _uneven(safety: Safety, draws: SettingDraws, at: FloatArray) -> FloatArray:
     if beam.cn2 is None:
         return factor
     turbulence = torch.from_numpy(draws.column("beam.cn2", beam.cn2)[:, None])
-    moments: Any = scintillation(safety.laser.wavelength, torch.from_numpy(at), turbulence, beam.worst)
+    moments: Any = scintillation(
+        safety.laser.wavelength, torch.from_numpy(at), turbulence, beam.worst
+    )
     return np.asarray(factor * moments.numpy(), np.float64)
 
 
 def _beams(safety: Safety, draws: SettingDraws) -> list[Beam]:
     """Return the beam of the nominal values and of each draw."""
-    drawn = {name: draws.values[f"laser.{name}"] for name in BEAM if f"laser.{name}" in draws.values}
+    drawn = {
+        name: draws.values[f"laser.{name}"] for name in BEAM if f"laser.{name}" in draws.values
+    }
     found = [safety.laser.beam()]
     try:
         for i in range(draws.count):
-            found.append(safety.laser.beam({name: float(x[i]) for name, x in drawn.items()}) if drawn else found[0])
+            found.append(
+                safety.laser.beam({name: float(x[i]) for name, x in drawn.items()})
+                if drawn
+                else found[0]
+            )
     except ParameterError as error:
         value = safety.values.get(f"laser.{error.parameter}", next(iter(safety.values.values())))
-        raise RecipeError([Diagnostic(value.mark, value.name, f"the value is drawn, but {error}")]) from None
+        raise RecipeError(
+            [Diagnostic(value.mark, value.name, f"the value is drawn, but {error}")]
+        ) from None
     return found
 
 
 def _stacked(beams: tuple[Beam, ...]) -> Beam:
-    """Return one beam whose quantities are columns (1 + draw, 1), with which the formulas of a beam compute as well.
+    """Return one beam whose quantities are columns (1 + draw, 1), with which the formulas of a beam
+    compute as well.
 
     A column of equal values has one row.
     """
@@ -222,12 +266,16 @@ def _short(values: FloatArray) -> Any:
 
 
 def _column(draws: SettingDraws, name: str, nominal: float) -> Any:
-    """Return the nominal value and the draws of a setting as a column (1 + draw, 1), or as one row if all are equal."""
+    """Return the nominal value and the draws of a setting as a column (1 + draw, 1), or as one
+    row if all are equal.
+    """
     return _short(draws.column(name, nominal))
 
 
 def _air(safety: Safety, draws: SettingDraws, at: FloatArray) -> FloatArray:
-    """Return the transmittance of the air (1 + draw, distance), from that of one metre: even air has equal metres."""
+    """Return the transmittance of the air (1 + draw, distance), from that of one metre: even air
+    has equal metres.
+    """
     laser = safety.laser
     if laser.air_transmittance is not None:
         whole = draws.column("laser.air_transmittance", laser.air_transmittance)[:, None]
@@ -247,8 +295,9 @@ def options_of(
 ) -> tuple[Option, ...]:
     """Return the plain lens and the protections that the settings name.
 
-    ``mask`` is the peak behind the mask at the distance of the recipe, ``peaks`` are those over the distance, and
-    ``misses`` how much the logarithm of a peak between two distances may be higher than interpolated.
+    ``mask`` is the peak behind the mask at the distance of the recipe, ``peaks`` are those over the
+    distance, and ``misses`` how much the logarithm of a peak between two distances may be higher
+    than interpolated.
     """
     protection = safety.settings.protection
     found = [Option("plain lens")]

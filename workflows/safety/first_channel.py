@@ -1,4 +1,6 @@
-"""The colour channel that a laser saturates first, from the responses that a step of the recipe computes."""
+"""The colour channel that a laser saturates first, from the responses that a step of the recipe
+computes.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ _UNSEEN = 1e-3  #: relative response below which no channel counts as seeing a l
 
 
 def with_channels(recipe: Recipe, safety: Safety, store: Store | None) -> Safety:
-    """Return the settings with the channels of the sensor at the laser, where the settings name a step of responses.
+    """Return the settings with the channels of the sensor at the laser, where the settings name a
+    step of responses.
 
     Raises `RecipeError` for a step that does not exist or is of another node.
     """
@@ -30,20 +33,26 @@ def with_channels(recipe: Recipe, safety: Safety, store: Store | None) -> Safety
     step = _step(recipe, safety, named)
     line = recipe.steps[str(step.wires["bands"])]
     if line.node.path != _LINE:
-        raise _refused(safety, f"the step {step.name} is not of a laser line: name a step that reads one")
+        raise _refused(
+            safety, f"the step {step.name} is not of a laser line: name a step that reads one"
+        )
     result = run(recipe, store, [step.name])
     largest = float(result[step.name].max())
     return replace(safety, channels=LaserChannels(line, step, largest, str(result.keys[step.name])))
 
 
 def _step(recipe: Recipe, safety: Safety, named: str) -> Step:
-    """Return the step of responses, completed by the laser if the step has a copy for each laser."""
+    """Return the step of responses, completed by the laser if the step has a copy for each
+    laser.
+    """
     name = next((each for each in (named, f"{named}[{safety.name}]") if each in recipe.steps), None)
     if name is None:
         raise _refused(safety, unknown_step(named, recipe.steps))
     step = recipe.steps[name]
     if step.node.path != _RESPONSES:
-        raise _refused(safety, f"the step {name} is of the node {step.node.path}: name a step of {_RESPONSES}")
+        raise _refused(
+            safety, f"the step {name} is of the node {step.node.path}: name a step of {_RESPONSES}"
+        )
     return step
 
 
@@ -60,7 +69,8 @@ def sees(channels: LaserChannels | None) -> bool:
 def channel_saturation(
     channels: LaserChannels, wavelength: float, electrons: float, sensor: Mapping[str, float]
 ) -> float:
-    """Return the irradiance in W/m2 at which the channel that saturates first is full, for a laser of a wavelength.
+    """Return the irradiance in W/m2 at which the channel that saturates first is full, for a laser
+    of a wavelength.
 
     ``sensor`` has the quantum efficiency, the pixel pitch and the exposure.
     """
@@ -68,4 +78,6 @@ def channel_saturation(
     params = {**channels.responses.params}
     if params.get("quantum_efficiency") is not None:  # what an absolute table is relative to
         params["quantum_efficiency"] = sensor["quantum_efficiency"]
-    return line_saturation(line, channels.responses.node(line, **params), electrons=electrons, **sensor)
+    return line_saturation(
+        line, channels.responses.node(line, **params), electrons=electrons, **sensor
+    )

@@ -7,16 +7,27 @@ from collections.abc import Iterator, Sequence
 from neusee.workflows.safety.safety_words import scaled
 from neusee.workflows.safety.what_helps import MET, PictureCost, Remedy
 
-COLUMNS = ("limit", "means", "at the limit", "in 95 % of the draws", "light of the scene", "SNR of the feature", "note")
+COLUMNS = (
+    "limit",
+    "means",
+    "at the limit",
+    "in 95 % of the draws",
+    "light of the scene",
+    "SNR of the feature",
+    "note",
+)
 _DENSITY = "OD "
-EXPLAINED = """Damage, saturation and contrast are three problems, and each is solved apart, for the plain lens at the
-    distance of the recipe. A density, a stop or an exposure is the one that brings the laser to the limit; in brackets
-    is the middle 90 % of the draws, and beside it the value that holds in 95 % of them. The light of the scene is what
-    is left of it in a pixel with that value."""
+EXPLAINED = """Damage, saturation and contrast are three problems, and each is solved apart, for the
+    plain lens at the distance of the recipe. A density, a stop or an exposure is the one that
+    brings the laser to the limit; in brackets is the middle 90 % of the draws, and beside it the
+    value that holds in 95 % of them. The light of the scene is what is left of it in a pixel with
+    that value."""
 
 
 def table(remedies: Sequence[Remedy]) -> list[list[str]]:
-    """Return a row for each means against each limit, and a single row for a limit that is met without any."""
+    """Return a row for each means against each limit, and a single row for a limit that is met
+    without any.
+    """
     rows = []
     for limit in dict.fromkeys(each.limit for each in remedies):
         known = [each for each in remedies if each.limit == limit]
@@ -48,7 +59,9 @@ def _value(remedy: Remedy) -> str:
         return MET
     if remedy.value is None:
         return "not judged" if remedy.reason.startswith("not judged") else "none helps"
-    middle, low, high = (_number(remedy.means, x) for x in (remedy.value.value, remedy.value.low, remedy.value.high))
+    middle, low, high = (
+        _number(remedy.means, x) for x in (remedy.value.value, remedy.value.low, remedy.value.high)
+    )
     low, high = low.removeprefix(_DENSITY), high.removeprefix(_DENSITY)
     return middle if low == high == middle.removeprefix(_DENSITY) else f"{middle} ({low} to {high})"
 
@@ -97,7 +110,9 @@ def _picture_notes(remedy: Remedy) -> Iterator[str]:
 
 
 def sentences(remedies: Sequence[Remedy]) -> Iterator[str]:
-    """Yield that an exposure never changes damage, and each limit against which no grey filter and no stop helps."""
+    """Yield that an exposure never changes damage, and each limit against which no grey filter
+    and no stop helps.
+    """
     if any(each.problem == "damage" for each in remedies):
         yield "An exposure never changes damage."
     for limit in dict.fromkeys(each.limit for each in remedies):

@@ -1,8 +1,9 @@
-"""Light of the faintest of a number of pixels, over the distance: core and veil of the spot, ranked on the sensor.
+"""Light of the faintest of a number of pixels, over the distance: core and veil of the spot, ranked
+on the sensor.
 
-A level is the share of the light that passes the lens, in the faintest of the N brightest pixels. It is computed at the
-rungs of a ladder of distances, for some defoci and spots around the nominal ones and some shares of scatter, and
-interpolated between these in logarithms.
+A level is the share of the light that passes the lens, in the faintest of the N brightest pixels.
+It is computed at the rungs of a ladder of distances, for some defoci and spots around the nominal
+ones and some shares of scatter, and interpolated between these in logarithms.
 """
 
 from __future__ import annotations
@@ -26,13 +27,16 @@ from neusee.workflows.recipe.distributions.shapes import FloatArray
 from neusee.workflows.safety.distance_ladder import interpolated, miss_between
 from neusee.workflows.safety.uncertain_values import SettingDraws
 
-ASSUMED = 1.5  #: factor of one standard deviation of a share of scatter that the recipe does not state
+#: factor of one standard deviation of a share of scatter that the recipe does not state
+ASSUMED = 1.5
 _CERTAIN = 0.02  #: largest range of a logarithm that is taken as one value
 _ROUNDED = 1e-9  #: rounding of the logarithm of a distance
 _STREAM = 9_001  #: of the random numbers of the assumed share
-_STEPS = 600  #: levels at which pixels with light from elsewhere are counted, of groups and between them
+#: levels at which pixels with light from elsewhere are counted, of groups and between them
+_STEPS = 600
 _FAINTEST = 1e-12  #: of the brightest level, below which no level stands between those of groups
-_OWN_RIM = 0.1  #: share of the core in the light of a pixel beyond the window from which the radial law decides it
+#: share of the core in the light of a pixel beyond the window from which the radial law decides it
+_OWN_RIM = 0.1
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,8 @@ class Veil:
 
     share: FloatArray  #: (1 + draw or 1,) of the light that passes the lens
     assumed: bool  #: whether the recipe states none
-    light: Callable[[FloatArray], FloatArray]  #: of the distance in pixels, in a pixel, for the nominal share
+    #: of the distance in pixels, in a pixel, for the nominal share
+    light: Callable[[FloatArray], FloatArray]
 
 
 def veil_of(safety: Safety, draws: SettingDraws) -> Veil | None:
@@ -67,7 +72,9 @@ def veil_of(safety: Safety, draws: SettingDraws) -> Veil | None:
     return Veil(share, assumed, light)
 
 
-def _share(safety: Safety, draws: SettingDraws, scatter: Scatter, total: float) -> tuple[FloatArray, bool]:
+def _share(
+    safety: Safety, draws: SettingDraws, scatter: Scatter, total: float
+) -> tuple[FloatArray, bool]:
     """Return the share of the light that is scattered, with draws, and whether it is assumed."""
     if scatter.surfaces is not None:
         return np.array([total]), False
@@ -86,7 +93,9 @@ class Grid:
 
     @classmethod
     def around(cls, values: FloatArray, per_unit: float) -> Grid:
-        """Return a grid that holds values: one point if they are alike, else ``per_unit`` points a unit, at least 3."""
+        """Return a grid that holds values: one point if they are alike, else ``per_unit`` points
+        a unit, at least 3.
+        """
         low, high = float(values.min()), float(values.max())
         if high - low < _CERTAIN:
             return cls(values.ravel()[:1].astype(np.float64))
@@ -113,27 +122,40 @@ class Grid:
 
 @dataclass(frozen=True)
 class Levels:
-    """Logarithms of levels at the rungs of a ladder and at points of grids, for several numbers of pixels."""
+    """Logarithms of levels at the rungs of a ladder and at points of grids, for several numbers
+    of pixels.
+    """
 
     rungs: FloatArray  #: (rung,) logarithm of the distance
     grids: tuple[Grid, ...]
     values: FloatArray  #: (rung, point of each grid ..., rank)
-    beyond: FloatArray  #: of the same shape: share of the pixels whose light is that of the radial law
+    #: of the same shape: share of the pixels whose light is that of the radial law
+    beyond: FloatArray
     misses: tuple[float, ...] = ()  #: of a logarithm between two rungs, counted upward
-    most: FloatArray | None = None  #: (rank,) logarithm of a bound, which counts nearer than the first rung
+    #: (rank,) logarithm of a bound, which counts nearer than the first rung
+    most: FloatArray | None = None
 
     def at(self, place: FloatArray, others: Sequence[FloatArray], ranks: slice) -> FloatArray:
-        """Return the logarithms of levels (..., rank); ``place`` is the logarithm of the distance."""
+        """Return the logarithms of levels (..., rank); ``place`` is the logarithm of the
+        distance.
+        """
         weights = [grid.weights(values) for grid, values in zip(self.grids, others, strict=True)]
-        size = np.broadcast_shapes(place.shape, *(part.shape for parts in weights for part in parts))
+        size = np.broadcast_shapes(
+            place.shape, *(part.shape for parts in weights for part in parts)
+        )
         clipped = np.broadcast_to(np.clip(place, self.rungs[0], self.rungs[-1]), size)
         total = np.zeros((*size, len(range(*ranks.indices(self.values.shape[-1])))))
         for point in itertools.product(*(range(len(grid.points)) for grid in self.grids)):
-            weight = functools.reduce(np.multiply, (part[index] for part, index in zip(weights, point, strict=True)))
+            weight = functools.reduce(
+                np.multiply, (part[index] for part, index in zip(weights, point, strict=True))
+            )
             weight = np.broadcast_to(weight, size)
-            rows = np.flatnonzero(weight.any(axis=1))  # a draw lies between two points of a grid, and needs no others
+            # a draw lies between two points of a grid, and needs no others
+            rows = np.flatnonzero(weight.any(axis=1))
             chosen: Any = (slice(None), *point, ranks)
-            total[rows] += weight[rows, :, None] * interpolated(self.rungs, self.values[chosen], clipped[rows])
+            total[rows] += weight[rows, :, None] * interpolated(
+                self.rungs, self.values[chosen], clipped[rows]
+            )
         total += miss_between(self.rungs, self.misses, clipped)[..., None]
         if self.most is None:
             return total
@@ -151,12 +173,18 @@ class Counted:
 
 
 def levels_of(
-    groups: BrightPixels, shape: tuple[int, int], ranks: FloatArray, veil: Veil | None, shares: FloatArray, smooth: bool
+    groups: BrightPixels,
+    shape: tuple[int, int],
+    ranks: FloatArray,
+    veil: Veil | None,
+    shares: FloatArray,
+    smooth: bool,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the logarithms of the levels (share, rank) of groups of pixels.
 
-    The second array is the share of the counted pixels that lie beyond the window of a PSF, and whose light the radial
-    law of `with_frame` decides. ``shares`` are those of the scattered light; without a veil there is one row.
+    The second array is the share of the counted pixels that lie beyond the window of a PSF, and
+    whose light the radial law of `with_frame` decides. ``shares`` are those of the scattered light;
+    without a veil there is one row.
     """
     whole = with_frame(groups, shape)
     radius, pixels = whole.radius.numpy(), whole.pixels.numpy()
@@ -177,7 +205,9 @@ def levels_of(
 
 
 def _as_they_are(light: FloatArray, pixels: FloatArray, guessed: NDArray[np.bool_]) -> Counted:
-    """Return the counts at the levels of groups of pixels; ``guessed`` marks those of the radial law."""
+    """Return the counts at the levels of groups of pixels; ``guessed`` marks those of the radial
+    law.
+    """
     order = np.argsort(-light)
     return Counted(
         light=light[order],
@@ -187,8 +217,12 @@ def _as_they_are(light: FloatArray, pixels: FloatArray, guessed: NDArray[np.bool
     )
 
 
-def _with_hidden(light: FloatArray, pixels: FloatArray, added: NDArray[np.bool_], hidden: float) -> Counted:
-    """Return the largest counts when light from elsewhere falls on the pixels that are ``added`` to the window."""
+def _with_hidden(
+    light: FloatArray, pixels: FloatArray, added: NDArray[np.bool_], hidden: float
+) -> Counted:
+    """Return the largest counts when light from elsewhere falls on the pixels that are ``added``
+    to the window.
+    """
     levels = _steps(np.sort(light)[::-1])
     own = np.argsort(-light[~added])
     rising, total = -light[~added][own], np.append(0.0, np.cumsum(pixels[~added][own]))
@@ -199,7 +233,9 @@ def _with_hidden(light: FloatArray, pixels: FloatArray, added: NDArray[np.bool_]
 
 
 def _steps(levels: FloatArray) -> FloatArray:
-    """Return falling levels: some of the given ones, and others at equal ratios, for gaps between these."""
+    """Return falling levels: some of the given ones, and others at equal ratios, for gaps
+    between these.
+    """
     picked = levels[np.unique(np.linspace(0, len(levels) - 1, _STEPS).astype(int))]
     top = max(float(levels[0]), 1e-280)
     between = np.geomspace(max(float(levels[-1]), _FAINTEST * top), top, _STEPS)
@@ -208,15 +244,22 @@ def _steps(levels: FloatArray) -> FloatArray:
 
 
 def _at_ranks(ranks: FloatArray, counted: Counted) -> FloatArray:
-    """Return the logarithms of the light at ranks, from the count up to the end of each group; a group is as bright."""
+    """Return the logarithms of the light at ranks, from the count up to the end of each group; a
+    group is as bright.
+    """
     first = np.minimum(counted.count - counted.alike + 1, counted.count)
     place = np.maximum.accumulate(np.stack([first, counted.count], 1).ravel())
-    found: FloatArray = np.interp(np.log(ranks), np.log(place), np.repeat(np.log(counted.light + 1e-300), 2))
+    found: FloatArray = np.interp(
+        np.log(ranks), np.log(place), np.repeat(np.log(counted.light + 1e-300), 2)
+    )
     return found
 
 
-def _lit_at_most(light: FloatArray, pixels: FloatArray, hidden: float, levels: FloatArray) -> FloatArray:
-    """Return how many pixels have at least each level, at most, when light from elsewhere is added to their own.
+def _lit_at_most(
+    light: FloatArray, pixels: FloatArray, hidden: float, levels: FloatArray
+) -> FloatArray:
+    """Return how many pixels have at least each level, at most, when light from elsewhere is added
+    to their own.
 
     It is dealt out where least of it is needed: to the brightest pixels first.
     """

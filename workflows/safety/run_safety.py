@@ -20,7 +20,14 @@ from neusee.workflows.safety.dazzle_curves import Dazzled
 from neusee.workflows.safety.dead_pixels import DeadPixels
 from neusee.workflows.safety.distance_zones import Spread
 from neusee.workflows.safety.light_levels import Veil
-from neusee.workflows.safety.safety_estimate import CERTIFICATE, Estimate, Finding, Prepared, complete, prepare
+from neusee.workflows.safety.safety_estimate import (
+    CERTIFICATE,
+    Estimate,
+    Finding,
+    Prepared,
+    complete,
+    prepare,
+)
 from neusee.workflows.safety.safety_page import report
 from neusee.workflows.safety.safety_text import paragraphs
 from neusee.workflows.safety.worksheet import worksheet_page
@@ -30,13 +37,16 @@ from neusee.workflows.store.result_store import Store
 
 @dataclass(frozen=True)
 class Assessment:
-    """A finished estimate as the store keeps it: its document, its text for a terminal, and its page with pictures."""
+    """A finished estimate as the store keeps it: its document, its text for a terminal, and its
+    page with pictures.
+    """
 
     document: dict[str, Any]
     paragraphs: list[list[str]]
     title: str
     lead: str
-    sections: list[dict[str, Any]]  #: as `Section`, with the marks as a list of row, column and mark
+    #: as `Section`, with the marks as a list of row, column and mark
+    sections: list[dict[str, Any]]
     pictures: dict[str, bytes]
     rows: list[list[Any]]  #: of limits.csv, the header first
     worksheet: str  #: of worksheet.html, to print
@@ -45,7 +55,9 @@ class Assessment:
     def report(self) -> StudyReport:
         """Return the page of the estimate with its files."""
         sections = [
-            Section(**{**each, "marks": {(row, column): mark for row, column, mark in each["marks"]}})
+            Section(
+                **{**each, "marks": {(row, column): mark for row, column, mark in each["marks"]}}
+            )
             for each in self.sections
         ]
         return StudyReport(
@@ -58,15 +70,21 @@ class Assessment:
         )
 
 
-def assess(recipe: Recipe, store: Store, out: Path, command: Sequence[str]) -> tuple[Path, Assessment]:
-    """Estimate damage, dazzle and eye exposure, or take the estimate from the store, and write the folder.
+def assess(
+    recipe: Recipe, store: Store, out: Path, command: Sequence[str]
+) -> tuple[Path, Assessment]:
+    """Estimate damage, dazzle and eye exposure, or take the estimate from the store, and write the
+    folder.
 
-    Raises `RecipeError` for a recipe that cannot be estimated, and `RunError` if a step of its mask fails.
+    Raises `RecipeError` for a recipe that cannot be estimated, and `RunError` if a step of its mask
+    fails.
     """
     run = StudyRun("safety", recipe, command)
     prepared = prepare(recipe, store)
     key = key_of(recipe, prepared, store)
-    found = compute_once(store, key, Assessment, lambda: _assessed(complete(recipe, prepared)), {"step": "safety"})
+    found = compute_once(
+        store, key, Assessment, lambda: _assessed(complete(recipe, prepared)), {"step": "safety"}
+    )
     return run.write(out, key, run.document(found.document), found.report, "safety"), found
 
 
@@ -76,17 +94,41 @@ def _as_text(groups: BrightPixels) -> list[str]:
 
 
 def key_of(recipe: Recipe, prepared: Prepared, store: Store) -> str:
-    """Return the key of an estimate: values, draws, laws, what the steps say of lens and mask, and the code."""
+    """Return the key of an estimate: values, draws, laws, what the steps say of lens and mask,
+    and the code.
+    """
     code = Code(store.code_memo)
-    modules = [code.digest(f"neusee.nodes.{family}") for family in ("flare", "laser", "sensor", "spectra")]
+    modules = [
+        code.digest(f"neusee.nodes.{family}") for family in ("flare", "laser", "sensor", "spectra")
+    ]
     draws = {name: values.tobytes().hex() for name, values in prepared.draws.values.items()}
     spots = [(each.option, each.pitch, each.light.tobytes().hex()) for each in prepared.spots]
-    ranked = [(each.arm, each.distances, each.misses, list(map(_as_text, each.groups))) for each in prepared.ranked]
+    ranked = [
+        (each.arm, each.distances, each.misses, list(map(_as_text, each.groups)))
+        for each in prepared.ranked
+    ]
     options = [*map(asdict, prepared.options), prepared.peaks.outside if prepared.peaks else ()]
     laws = [tuple(law) for law in prepared.safety.laws]
     channels = prepared.safety.channels.key if prepared.safety.channels else ""
-    values = (recipe.name, recipe.title, recipe.config.to_yaml(), recipe.seed, prepared.safety.settings.draws)
-    key = digest("safety", values, draws, spots, ranked, options, laws, channels, modules, engine("safety.run_safety"))
+    values = (
+        recipe.name,
+        recipe.title,
+        recipe.config.to_yaml(),
+        recipe.seed,
+        prepared.safety.settings.draws,
+    )
+    key = digest(
+        "safety",
+        values,
+        draws,
+        spots,
+        ranked,
+        options,
+        laws,
+        channels,
+        modules,
+        engine("safety.run_safety"),
+    )
     code.save()
     return key
 
@@ -97,7 +139,8 @@ def _assessed(found: Estimate) -> Assessment:
     pictures = {name: picture for name, picture in page.pictures.items() if picture}
     header, rows = page.tables["limits.csv"]
     sections = [
-        {**vars(each), "marks": [[*place, mark] for place, mark in each.marks.items()]} for each in page.sections
+        {**vars(each), "marks": [[*place, mark] for place, mark in each.marks.items()]}
+        for each in page.sections
     ]
     plain = [list(header), *(list(row) for row in rows)]
     return Assessment(

@@ -1,4 +1,6 @@
-"""Estimate of damage, dazzle and eye exposure by a laser: limits, exposures and intervals of distance."""
+"""Estimate of damage, dazzle and eye exposure by a laser: limits, exposures and intervals of
+distance.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,12 @@ from neusee.workflows.safety.exposures import (
     emission_of,
     options_of,
 )
-from neusee.workflows.safety.eye_findings import EyeDazzleFinding, EyeFinding, eye_dazzle_finding, eye_finding
+from neusee.workflows.safety.eye_findings import (
+    EyeDazzleFinding,
+    EyeFinding,
+    eye_dazzle_finding,
+    eye_finding,
+)
 from neusee.workflows.safety.first_channel import sees, with_channels
 from neusee.workflows.safety.lens_of_recipe import refuse_other_lens
 from neusee.workflows.safety.light_levels import Veil, veil_of
@@ -49,15 +56,19 @@ CERTIFICATE = "An estimate, no certificate: neusee decides nothing about eyes or
 
 @dataclass(frozen=True)
 class Finding:
-    """What one limit says behind one option: the limit at the lens, the exposure, and the zones of distance."""
+    """What one limit says behind one option: the limit at the lens, the exposure, and the zones
+    of distance.
+    """
 
     option: str
     limit: Limit
     at_sensor: Spread  #: the limit at the peak on the sensor
     at_lens: Spread  #: the limit at the lens at the distance of the recipe: MPE_S or MDE_S
-    exposure: Spread  #: at the peak on the sensor at the distance of the recipe, in the quantity of the limit
+    #: at the peak on the sensor at the distance of the recipe, in the quantity of the limit
+    exposure: Spread
     ratio: float  #: nominal exposure over the nominal limit
-    probability: Spread | None  #: of damage to a device drawn from all; None where the spread of devices is unknown
+    #: of damage to a device drawn from all; None where the spread of devices is unknown
+    probability: Spread | None
     zones: Zones
     curve: FloatArray  #: (3, distance) of the limit at the lens: nominal, 5 % and 95 %
     ratios: Spread | None = None  #: ``ratio`` with its interval
@@ -81,8 +92,10 @@ class Estimate:
     dazzled: tuple[Dazzled, ...] = ()  #: behind each protection for which the dazzled area is known
     dead: tuple[DeadPixels, ...] = ()  #: examples of damage in a raw frame
     ranked: tuple[Ranked, ...] = ()
-    damage: tuple[DamageVerdict, ...] = ()  #: behind each protection; empty if damage is not asked for
-    helps: tuple[Remedy, ...] = ()  #: filter, notch, stop or exposure for each limit behind the plain lens
+    #: behind each protection; empty if damage is not asked for
+    damage: tuple[DamageVerdict, ...] = ()
+    #: filter, notch, stop or exposure for each limit behind the plain lens
+    helps: tuple[Remedy, ...] = ()
     peaks: Peaks | None = None
     veil: Veil | None = None
 
@@ -93,23 +106,29 @@ class Estimate:
 
     @property
     def mean_at_lens(self) -> float:
-        """Return the nominal irradiance at the lens at the distance of the recipe, the mean over one exposure, W/m2."""
+        """Return the nominal irradiance at the lens at the distance of the recipe, the mean over
+        one exposure, W/m2.
+        """
         mean = mean_in_frame(self.exposures, self.safety.settings.sensor.exposure or 1.0)
         return float(mean[0, 0] * self.exposures.lens[0, self.at])
 
 
 def estimate(recipe: Recipe, store: Store | None = None) -> Estimate:
-    """Return the estimate of a recipe with a block ``safety``; the peak behind the mask comes from the store if it can.
+    """Return the estimate of a recipe with a block ``safety``; the peak behind the mask comes from
+    the store if it can.
 
-    Raises `RecipeError` for a recipe without the block, for a distribution with values that are not allowed and for a
-    step that does not exist, all before anything is computed, and `RunError` if a step of the mask fails.
+    Raises `RecipeError` for a recipe without the block, for a distribution with values that are not
+    allowed and for a step that does not exist, all before anything is computed, and `RunError` if a
+    step of the mask fails.
     """
     return complete(recipe, prepare(recipe, store))
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """Everything that decides an estimate: settings, draws, and what the steps of the recipe say of lens and mask."""
+    """Everything that decides an estimate: settings, draws, and what the steps of the recipe say
+    of lens and mask.
+    """
 
     safety: Safety
     draws: SettingDraws
@@ -128,7 +147,11 @@ def prepare(recipe: Recipe, store: Store | None) -> Prepared:
     spots = spots_of(recipe, safety, store)
     ranked = ranked_of(recipe, safety, store)
     peaks = peaks_of(recipe, safety, store)
-    options = options_of(safety, peaks.here, peaks.along, peaks.misses) if peaks else options_of(safety, None)
+    options = (
+        options_of(safety, peaks.here, peaks.along, peaks.misses)
+        if peaks
+        else options_of(safety, None)
+    )
     return Prepared(safety, draws, with_heated_spots(options, spots), spots, ranked, peaks)
 
 
@@ -137,7 +160,9 @@ def complete(recipe: Recipe, prepared: Prepared) -> Estimate:
     safety, draws, options = prepared.safety, prepared.draws, prepared.options
     exposures = compute_exposures(safety, draws, options)
     known = {option.name: area_of(safety, option, prepared.ranked) for option in options}
-    areas = tuple(area for area in known.values() if isinstance(area, Area)) if _dazzles(safety) else ()
+    areas = (
+        tuple(area for area in known.values() if isinstance(area, Area)) if _dazzles(safety) else ()
+    )
     findings = tuple(_findings(safety, draws, options, exposures, areas))
     verdicts = tuple(damage_verdicts(safety, options, exposures, draws, findings))
     eye = eye_finding(safety, exposures)
@@ -179,9 +204,14 @@ def _dazzles(safety: Safety) -> bool:
 
 
 def settings_of(recipe: Recipe) -> Safety:
-    """Return the settings of a recipe's block ``safety``; raise `RecipeError` for a recipe without them."""
+    """Return the settings of a recipe's block ``safety``; raise `RecipeError` for a recipe
+    without them.
+    """
     if recipe.safety is None:
-        text = "the recipe does not say what to estimate: add the block safety, as in the recipe safety_pointer"
+        text = (
+            "the recipe does not say what to estimate: add the block safety, as in the recipe"
+            " safety_pointer"
+        )
         raise RecipeError([Diagnostic(Location(recipe.name), "safety", text)])
     return recipe.safety
 
@@ -204,7 +234,10 @@ def _finding(safety: Safety, option: Option, limit: Limit, exposures: Exposures)
     per_power, at = exposures.sensor[option.name], exposures.at(safety.laser.distance)
     light = emitted(safety, limit, exposures)
     limits = limit.values * limit.devices * np.ones((len(light), per_power.shape[1]))
-    ratio, at_lens = limit_ratio(safety, option.name, limit, exposures), limits * exposures.lens / per_power
+    ratio, at_lens = (
+        limit_ratio(safety, option.name, limit, exposures),
+        limits * exposures.lens / per_power,
+    )
     here = light[:, 0] * per_power[:, at]
     return Finding(
         option.name,
@@ -214,7 +247,13 @@ def _finding(safety: Safety, option: Option, limit: Limit, exposures: Exposures)
         _spread(here),
         float(ratio[0, at]),
         _probability(limit, ratio[1:, at] * limit.devices[1:, 0]),
-        zones_of(exposures.distances, ratio[0], ratio[1:], safety.laser.distance, safety.settings.distances),
+        zones_of(
+            exposures.distances,
+            ratio[0],
+            ratio[1:],
+            safety.laser.distance,
+            safety.settings.distances,
+        ),
         np.stack([at_lens[0], *np.quantile(at_lens[1:], QUANTILES, axis=0)]),
         _spread(ratio[:, at]),
     )
@@ -226,7 +265,8 @@ def _spread(values: FloatArray) -> Spread:
 
 
 def _probability(limit: Limit, ratio: FloatArray) -> Spread | None:
-    """Return the share of devices that are damaged, with the interval from everything but the device.
+    """Return the share of devices that are damaged, with the interval from everything but the
+    device.
 
     ``ratio`` (draw,) is that of the exposure to the limit of the median device.
     """

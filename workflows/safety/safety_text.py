@@ -11,13 +11,30 @@ from neusee.workflows.safety import safety_words as words
 from neusee.workflows.safety.damage_words import damage_sentence, limit_rows, zone_rows
 from neusee.workflows.safety.safety_estimate import CERTIFICATE, Estimate, Finding
 
-Paragraphs = Sequence[Sequence[str]]  #: lines that stay as they are, or a single text that is wrapped
+#: lines that stay as they are, or a single text that is wrapped
+Paragraphs = Sequence[Sequence[str]]
 
 
 def paragraphs(found: Estimate) -> list[list[str]]:
-    """Return the verdict, the tables of limits and distances, the eye, and the sources, before lines are wrapped."""
-    parts = [[f"{found.recipe.name}: {found.recipe.title}", CERTIFICATE, ""], [words.laser_text(found)]]
-    steps = (_damage, _limits, _dazzled_area, _helps, _eye, _unsaid, _counted, _intervals, _sources, _eye_sources)
+    """Return the verdict, the tables of limits and distances, the eye, and the sources, before
+    lines are wrapped.
+    """
+    parts = [
+        [f"{found.recipe.name}: {found.recipe.title}", CERTIFICATE, ""],
+        [words.laser_text(found)],
+    ]
+    steps = (
+        _damage,
+        _limits,
+        _dazzled_area,
+        _helps,
+        _eye,
+        _unsaid,
+        _counted,
+        _intervals,
+        _sources,
+        _eye_sources,
+    )
     for step in steps:
         parts += step(found)
     return parts
@@ -42,7 +59,11 @@ def _dazzled_area(found: Estimate) -> Iterator[list[str]]:
     if not found.dazzled:
         return
     here = words.metres(found.safety.laser.distance)
-    yield _table(f"dazzled area at {here}", words.DAZZLE_COLUMNS, [words.dazzled_cells(area) for area in found.dazzled])
+    yield _table(
+        f"dazzled area at {here}",
+        words.DAZZLE_COLUMNS,
+        [words.dazzled_cells(area) for area in found.dazzled],
+    )
     text = words.enlarged_text(found)
     if text:
         yield [text]

@@ -15,9 +15,22 @@ _SAME = 0.01  #: relative width of an interval that is not written
 _NEVER = 1e-4  #: smallest share that is written as a number
 UNITS = {"irradiance": "W", "fluence": "J"}
 
-LIMIT_COLUMNS = ("protection", "limit", "on the sensor", "of it now", "limit at the lens", "probability")
+LIMIT_COLUMNS = (
+    "protection",
+    "limit",
+    "on the sensor",
+    "of it now",
+    "limit at the lens",
+    "probability",
+)
 DAZZLE_COLUMNS = ("protection", "saturated pixels", "of the picture", "times the plain lens")
-ZONE_COLUMNS = ("protection", "limit", "exceeded from … to …", "probability of nowhere", "probability here")
+ZONE_COLUMNS = (
+    "protection",
+    "limit",
+    "exceeded from … to …",
+    "probability of nowhere",
+    "probability here",
+)
 
 
 def scaled(value: float, unit: str) -> str:
@@ -28,11 +41,17 @@ def scaled(value: float, unit: str) -> str:
     text = f"{value / 10.0**power:.3g}"
     if float(text) >= 1000 and power < 12:
         power, text = power + 3, f"{value / 10.0 ** (power + 3):.3g}"
-    return f"{float(text):g} {_PREFIXES[power]}{unit}" if 0.1 <= float(text) < 1e4 else f"{value:.3g} {unit}"
+    return (
+        f"{float(text):g} {_PREFIXES[power]}{unit}"
+        if 0.1 <= float(text) < 1e4
+        else f"{value:.3g} {unit}"
+    )
 
 
 def with_ends(spread: Spread, unit: str, factor: float = 1.0) -> str:
-    """Return a number with the interval of its draws in brackets, or alone if nothing is uncertain."""
+    """Return a number with the interval of its draws in brackets, or alone if nothing is
+    uncertain.
+    """
     middle = scaled(factor * spread.value, unit)
     if math.isclose(spread.low, spread.high, rel_tol=_SAME):
         return middle
@@ -43,7 +62,9 @@ def with_ends(spread: Spread, unit: str, factor: float = 1.0) -> str:
 
 
 def plain(number: str) -> str:
-    """Return a number of three digits without an exponent where this is short, such as 1020 for 1.02e+03."""
+    """Return a number of three digits without an exponent where this is short, such as 1020 for
+    1.02e+03.
+    """
     return f"{float(number):.0f}" if "e+" in number and abs(float(number)) < 1e5 else number
 
 
@@ -67,7 +88,9 @@ def zone_text(zone: Zone) -> str:
 
 
 def zones_text(zones: Zones) -> str:
-    """Return the zones of a limit as text; without one at the nominal values, how far one reaches in some draws."""
+    """Return the zones of a limit as text; without one at the nominal values, how far one
+    reaches in some draws.
+    """
     if zones.zones:
         return "; ".join(map(zone_text, zones.zones))
     if zones.reach is None:
@@ -87,7 +110,9 @@ def share(value: float) -> str:
 
 
 def probability(finding: Finding) -> str:
-    """Return the probability that a device is damaged, with its interval; a dash where no probability is stated."""
+    """Return the probability that a device is damaged, with its interval; a dash where no
+    probability is stated.
+    """
     spread = finding.probability
     if spread is None:
         return "–" if finding.limit.effect == "dazzle" else "not known: no spread published"
@@ -96,19 +121,32 @@ def probability(finding: Finding) -> str:
 
 
 def limit_cells(finding: Finding) -> list[str]:
-    """Return the row of a limit: protection, limit, limit on the sensor, its share that is reached, at the lens."""
+    """Return the row of a limit: protection, limit, limit on the sensor, its share that is
+    reached, at the lens.
+    """
     unit = UNITS[finding.limit.quantity]
     now = f"{plain(f'{finding.ratio:.2g}')} times" if finding.ratio >= 1 else f"{finding.ratio:.2g}"
     sensor = with_ends(finding.at_sensor, f"{unit}/cm²", _PER_CM2)
     return [
-        finding.option, finding.limit.name, sensor, now, with_ends(finding.at_lens, f"{unit}/m²"), probability(finding),
-    ]  # fmt: skip
+        finding.option,
+        finding.limit.name,
+        sensor,
+        now,
+        with_ends(finding.at_lens, f"{unit}/m²"),
+        probability(finding),
+    ]
 
 
 def zone_cells(finding: Finding) -> list[str]:
     """Return the row of a limit in the table of distances."""
     zones = finding.zones
-    return [finding.option, finding.limit.name, zones_text(zones), share(zones.none), share(zones.inside)]
+    return [
+        finding.option,
+        finding.limit.name,
+        zones_text(zones),
+        share(zones.none),
+        share(zones.inside),
+    ]
 
 
 def eye_text(eye: EyeFinding) -> str:
@@ -117,9 +155,10 @@ def eye_text(eye: EyeFinding) -> str:
     each = " of each pulse" if eye.quantity == "fluence" else ""
     now = "exceeds" if eye.exposure.value > eye.limit else "does not exceed"
     return (
-        f"The eye may receive {scaled(eye.limit, unit)}{each} for {eye.duration:g} s (MPE); here it receives "
-        f"{with_ends(eye.exposure, unit)}, which {now} the limit. The nominal ocular hazard distance (NOHD) is "
-        f"{end(eye.distance)} in clear air. A distance that is safe for a camera may blind people."
+        f"The eye may receive {scaled(eye.limit, unit)}{each} for {eye.duration:g} s (MPE); here it"
+        f" receives {with_ends(eye.exposure, unit)}, which {now} the limit. The nominal ocular"
+        f" hazard distance (NOHD) is {end(eye.distance)} in clear air. A distance that is safe for"
+        " a camera may blind people."
     )
 
 
@@ -127,17 +166,25 @@ def laser_text(found: Estimate) -> str:
     """Return the laser, its distance and its exposure at the lens in one sentence."""
     beam, at = found.exposures.beams[0], found.at
     train = f" at {scaled(beam.repetition_rate, 'Hz')}" if beam.repetition_rate else ""
-    light = f"{scaled(beam.power, 'W')}" if beam.power and not beam.pulse_energy else (
-        f"pulses of {scaled(beam.pulse_energy or 0.0, 'J')} in {scaled(beam.pulse_duration or 0.0, 's')}{train}"
-    )  # fmt: skip
+    light = (
+        f"{scaled(beam.power, 'W')}"
+        if beam.power and not beam.pulse_energy
+        else (
+            f"pulses of {scaled(beam.pulse_energy or 0.0, 'J')} in "
+            f"{scaled(beam.pulse_duration or 0.0, 's')}{train}"
+        )
+    )
     quantity = "fluence" if beam.is_pulsed else "irradiance"
-    here = found.exposures.emitted("fluence" if beam.is_pulsed else "irradiance")[:, 0] * found.exposures.lens[:, at]
+    here = (
+        found.exposures.emitted("fluence" if beam.is_pulsed else "irradiance")[:, 0]
+        * found.exposures.lens[:, at]
+    )
     spread = Spread.of(float(here[0]), here[1:])
     each = " a pulse" if beam.is_pulsed else ""
     return (
-        f"{found.safety.name}: {found.emission}, {light}, {beam.wavelength * 1e9:.4g} nm, divergence "
-        f"{scaled(beam.divergence, 'rad')}, at {metres(found.safety.laser.distance)}: "
-        f"{with_ends(spread, UNITS[quantity] + '/m²')}{each} at the lens."
+        f"{found.safety.name}: {found.emission}, {light}, {beam.wavelength * 1e9:.4g} nm,"
+        f" divergence {scaled(beam.divergence, 'rad')}, at {metres(found.safety.laser.distance)}:"
+        f" {with_ends(spread, UNITS[quantity] + '/m²')}{each} at the lens."
     )
 
 
@@ -149,9 +196,9 @@ def intervals_text(found: Estimate) -> str:
     if not found.damage:
         return f"{text}:{named.removesuffix(';')}." if named else f"{text}; nothing is."
     return (
-        f"{text}:{named} the thresholds of damage. A published threshold has a bracket and no probability: a third of "
-        "the draws each takes its lower end, its middle and its upper end. A law with data of devices is drawn from "
-        "its spread."
+        f"{text}:{named} the thresholds of damage. A published threshold has a bracket and no"
+        " probability: a third of the draws each takes its lower end, its middle and its upper"
+        " end. A law with data of devices is drawn from its spread."
     )
 
 
@@ -160,7 +207,12 @@ def dazzled_cells(each: Dazzled) -> list[str]:
     low, high = (_pixels(x) for x in (each.pixels.low, each.pixels.high))
     number = _pixels(each.pixels.value)
     text = number if low == high else f"{number} ({low} to {high})"
-    return [each.option, text, share(each.share), "–" if each.times is None else f"{each.times:.3g}"]
+    return [
+        each.option,
+        text,
+        share(each.share),
+        "–" if each.times is None else f"{each.times:.3g}",
+    ]
 
 
 def _pixels(number: float) -> str:
@@ -171,7 +223,9 @@ def _pixels(number: float) -> str:
 
 
 def enlarged_text(found: Estimate) -> str:
-    """Return whether the mask makes the dazzled area larger than the plain lens, and by how much; empty: not known."""
+    """Return whether the mask makes the dazzled area larger than the plain lens, and by how
+    much; empty: not known.
+    """
     parts = [text for text in (_counted_text(found), _sooner_text(found)) if text]
     mask = _both(found)[1]
     larger = mask.times > 1 if mask and mask.times else any("less light" in text for text in parts)
@@ -180,7 +234,9 @@ def enlarged_text(found: Estimate) -> str:
 
 def _both(found: Estimate) -> tuple[Dazzled | None, Dazzled | None]:
     """Return the dazzled area behind the plain lens and behind the mask."""
-    return next(iter(found.dazzled), None), next((each for each in found.dazzled if each.masked), None)
+    return next(iter(found.dazzled), None), next(
+        (each for each in found.dazzled if each.masked), None
+    )
 
 
 def _counted_text(found: Estimate) -> str:
@@ -189,21 +245,36 @@ def _counted_text(found: Estimate) -> str:
     if plain is None or mask is None:
         return ""
     counts = (
-        f"{_pixels(mask.pixels.value)} pixels behind the mask and {_pixels(plain.pixels.value)} behind the plain lens"
+        f"{_pixels(mask.pixels.value)} pixels behind the mask and {_pixels(plain.pixels.value)}"
+        " behind the plain lens"
     )
     times = "" if mask.times is None else f", {mask.times:.3g} times as many"
     return f"At {metres(found.safety.laser.distance)} the laser fills {counts}{times}."
 
 
 def _sooner_text(found: Estimate) -> str:
-    """Return by how much less light at the lens the stated share of the picture is lost behind the mask."""
+    """Return by how much less light at the lens the stated share of the picture is lost behind
+    the mask.
+    """
     plain, mask = _both(found)
     limits = [
-        next((f for f in found.findings if each and f.option == each.option and f.limit.effect == "dazzle"), None)
+        next(
+            (
+                f
+                for f in found.findings
+                if each and f.option == each.option and f.limit.effect == "dazzle"
+            ),
+            None,
+        )
         for each in (plain, mask)
     ]
     if limits[0] is None or limits[1] is None:
         return ""
     factor = limits[0].at_lens.value / limits[1].at_lens.value
-    compared = f"{factor:.3g} times less light" if factor > 1 else f"{1 / factor:.3g} times more light"
-    return f"Behind the mask {compared} at the lens than behind the plain lens gives: {limits[1].limit.name}."
+    compared = (
+        f"{factor:.3g} times less light" if factor > 1 else f"{1 / factor:.3g} times more light"
+    )
+    return (
+        f"Behind the mask {compared} at the lens than behind the plain lens gives:"
+        f" {limits[1].limit.name}."
+    )

@@ -1,7 +1,8 @@
 """The spot of a laser behind lens and mask at several distances, from the steps of the recipe.
 
-The steps of a spot are run again with another distance in the step of the wavefront: taper and curvature of the beam at
-that distance, through lens and mask. Results are kept in the store, by their distance.
+The steps of a spot are run again with another distance in the step of the wavefront: taper and
+curvature of the beam at that distance, through lens and mask. Results are kept in the store, by
+their distance.
 """
 
 from __future__ import annotations
@@ -39,35 +40,46 @@ _WIDENINGS = 2  #: doublings of the window of a spot that lacks light
 _MOST = 17  #: spots behind one arm
 _FINEST = 1.3  #: factor of the distance between two spots, at least
 _DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
-_TURN = 0.25  #: largest phase step of the wavefront between two samples of the pupil, in turns; the mask adds its own
+#: largest phase step of the wavefront between two samples of the pupil, in turns; the mask adds its
+#: own
+_TURN = 0.25
 _DIM = 3.0  #: half-widths at 1/e2 of the irradiance beyond which the beam in the pupil is dark
 
 
 @dataclass(frozen=True)
 class Ranked:
-    """The pixels of the sensor behind lens or mask at several distances, in shares of the light through the lens."""
+    """The pixels of the sensor behind lens or mask at several distances, in shares of the light
+    through the lens.
+    """
 
     arm: str  #: ``plain`` or ``mask``
     distances: tuple[float, ...]  #: m, rising
     groups: tuple[BrightPixels, ...]  #: at each distance
     error: float  #: largest error of a level by interpolation between the distances
-    misses: tuple[float, ...] = ()  #: of the logarithm of a level, by gap between two distances, counted upward
+    #: of the logarithm of a level, by gap between two distances, counted upward
+    misses: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
 class Peaks:
-    """The peak behind the mask, over that of the clear lens in focus with the same beam, at several distances."""
+    """The peak behind the mask, over that of the clear lens in focus with the same beam, at
+    several distances.
+    """
 
     here: float  #: at the distance of the recipe, over the peak of the clear lens without taper
     along: tuple[tuple[float, float], ...]  #: distance in m, and ratio
     error: float  #: largest error of the ratio by interpolation
-    misses: tuple[float, ...] = ()  #: of the logarithm of the ratio, by gap between two distances, counted upward
-    outside: tuple[tuple[float, float], ...] = ()  #: distance in m, and share of the light that counts as the peak
+    #: of the logarithm of the ratio, by gap between two distances, counted upward
+    misses: tuple[float, ...] = ()
+    #: distance in m, and share of the light that counts as the peak
+    outside: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True)
 class _Runs:
-    """Runs of the steps of a recipe at one distance after the other, which read the code of the steps once."""
+    """Runs of the steps of a recipe at one distance after the other, which read the code of the
+    steps once.
+    """
 
     recipe: Recipe
     safety: Safety
@@ -81,15 +93,21 @@ class _Runs:
         return cls(recipe, safety, opened, RunSeries.begun(opened))
 
     def of(self, recipe: Recipe, outputs: Sequence[str]) -> Result:
-        """Return the result of steps of a recipe that differs from that of the series in its parameters."""
+        """Return the result of steps of a recipe that differs from that of the series in its
+        parameters.
+        """
         return run(recipe, self.store, outputs, series=self.series)
 
 
 def ranked_of(recipe: Recipe, safety: Safety, store: Store | None) -> tuple[Ranked, ...]:
-    """Return the pixels of the steps that the settings name; raise `RecipeError` for a step of another kind."""
+    """Return the pixels of the steps that the settings name; raise `RecipeError` for a step of
+    another kind.
+    """
     protection = safety.settings.protection
     named = {
-        arm: step for arm, step in protection.pixels if step is not None and (arm, protection.mask) != ("mask", None)
+        arm: step
+        for arm, step in protection.pixels
+        if step is not None and (arm, protection.mask) != ("mask", None)
     }
     if safety.settings.dazzle is None or not named:
         return ()
@@ -128,7 +146,9 @@ def peaks_of(recipe: Recipe, safety: Safety, store: Store | None) -> Peaks | Non
 
 @dataclass(frozen=True)
 class _Peak:
-    """The peak of a spot over that of the clear lens without taper, and what may be brighter outside its window."""
+    """The peak of a spot over that of the clear lens without taper, and what may be brighter
+    outside its window.
+    """
 
     inside: float  #: the window
     unseen: float  #: share of the light of the beam that may be in one spot outside
@@ -136,14 +156,17 @@ class _Peak:
 
     @property
     def most(self) -> float:
-        """Return the highest peak that there may be: unseen light in as sharp a spot as that of the clear lens."""
+        """Return the highest peak that there may be: unseen light in as sharp a spot as that of
+        the clear lens.
+        """
         return max(self.inside, self.unseen * self.focused)
 
 
 def _peak(runs: _Runs, recipe: Recipe, step: str, distance: float) -> _Peak:
     """Return the largest value of a step; of `metrics.lsr` that of the spot between its samples.
 
-    A window that lacks light which may hold a higher peak is doubled, as far as the samples of the pupil carry it.
+    A window that lacks light which may hold a higher peak is doubled, as far as the samples of the
+    pupil carry it.
     """
     has_taper = _wavefront_of(recipe, step) is not None
     beam, diameter = runs.safety.laser.beam(), runs.safety.settings.lens.diameter
@@ -152,7 +175,9 @@ def _peak(runs: _Runs, recipe: Recipe, step: str, distance: float) -> _Peak:
     if psf is None:
         return _Peak(float(runs.of(recipe, [step])[step].max()), 0.0, _focused(fill))
     peak = _peak_of(runs.of(recipe, [psf])[psf], fill)
-    window = next((each.name for each in _upstream(recipe, psf) if each.node.path == "optics.psf"), None)
+    window = next(
+        (each.name for each in _upstream(recipe, psf) if each.node.path == "optics.psf"), None
+    )
     for _ in range(_WIDENINGS):
         if window is None or peak.most <= peak.inside:
             break
@@ -170,7 +195,9 @@ def _peak_of(psf: Psf, fill: float) -> _Peak:
     passing = _passing(fill)
     bands = list(zip(psf.intensity, psf.clear_peak.tolist(), strict=True))
     inside = max(float(band.max() * summit_gain(band)) / clear for band, clear in bands)
-    return _Peak(inside, max(float(unseen_light(band, passing)) for band, _ in bands), _focused(fill))
+    return _Peak(
+        inside, max(float(unseen_light(band, passing)) for band, _ in bands), _focused(fill)
+    )
 
 
 def _mask_step(recipe: Recipe, safety: Safety) -> str:
@@ -181,17 +208,27 @@ def _mask_step(recipe: Recipe, safety: Safety) -> str:
 
 
 def _psf_of(recipe: Recipe, step: str) -> str | None:
-    """Return the name of the PSF whose peak a step of `metrics.lsr` is; None for a step of another node."""
-    return str(recipe.steps[step].wires["psf"]) if recipe.steps[step].node.path == "metrics.lsr" else None
+    """Return the name of the PSF whose peak a step of `metrics.lsr` is; None for a step of
+    another node.
+    """
+    return (
+        str(recipe.steps[step].wires["psf"])
+        if recipe.steps[step].node.path == "metrics.lsr"
+        else None
+    )
 
 
 def _passing(fill: float) -> float:
-    """Return the light of a Gaussian beam through the lens over that of an even one with the irradiance of its axis."""
+    """Return the light of a Gaussian beam through the lens over that of an even one with the
+    irradiance of its axis.
+    """
     return 1.0 if fill < 1e-9 else -math.expm1(-2 * fill) / (2 * fill)
 
 
 def _focused(fill: float) -> float:
-    """Return the peak of a Gaussian beam in focus over that of an even one with the irradiance of its axis."""
+    """Return the peak of a Gaussian beam in focus over that of an even one with the irradiance
+    of its axis.
+    """
     return 1.0 if fill < 1e-9 else (-math.expm1(-fill) / fill) ** 2
 
 
@@ -204,7 +241,9 @@ def _ranked(runs: _Runs, arm: str, step: str) -> Ranked:
     beside = _psf_beside(recipe, safety, arm, step)
 
     def level(distance: float) -> FloatArray:
-        pixels = BrightPixels(*runs.of(at_distance(recipe, safety, step, distance), [step, *beside])[step])
+        pixels = BrightPixels(
+            *runs.of(at_distance(recipe, safety, step, distance), [step, *beside])[step]
+        )
         passing = _passing(fill_at(beam, lens.diameter, distance))
         groups[distance] = pixels._replace(
             light=pixels.light / passing,
@@ -218,15 +257,21 @@ def _ranked(runs: _Runs, arm: str, step: str) -> Ranked:
         return Ranked(arm, (safety.laser.distance,), (groups[safety.laser.distance],), math.inf)
     spots = _refined(_first(safety, recipe, step), level, _MOST)
     error = max(spots.misses, default=0.0)
-    return Ranked(arm, spots.distances, tuple(groups[at] for at in spots.distances), error, spots.misses)
+    return Ranked(
+        arm, spots.distances, tuple(groups[at] for at in spots.distances), error, spots.misses
+    )
 
 
 def _psf_beside(recipe: Recipe, safety: Safety, arm: str, step: str) -> list[str]:
-    """Return the PSF of the peak behind the mask, if it needs the pupil of a step of pixels, which one run shares."""
+    """Return the PSF of the peak behind the mask, if it needs the pupil of a step of pixels,
+    which one run shares.
+    """
     if arm != "mask" or safety.settings.protection.mask is None:
         return []
     psf = _psf_of(recipe, _mask_step(recipe, safety))
-    shares = psf is not None and _wavefront_of(recipe, psf) == _wavefront_of(recipe, step) is not None
+    shares = (
+        psf is not None and _wavefront_of(recipe, psf) == _wavefront_of(recipe, step) is not None
+    )
     return [psf] if psf is not None and shares else []
 
 
@@ -246,7 +291,9 @@ def _log_level(groups: BrightPixels, safety: Safety, veil: Veil | None) -> Float
 
 
 def _first(safety: Safety, recipe: Recipe, step: str) -> list[float]:
-    """Return the first distances of spots: from the nearest one that the samples of the pupil carry to a far one."""
+    """Return the first distances of spots: from the nearest one that the samples of the pupil
+    carry to a far one.
+    """
     beam, lens = safety.laser.beam(), safety.settings.lens
     far = far_distance(beam, lens.diameter)
     near = min(max(safety.settings.distances[0], _carried(safety, recipe, step)), far)
@@ -257,7 +304,9 @@ def _first(safety: Safety, recipe: Recipe, step: str) -> list[float]:
 
 
 def _carried(safety: Safety, recipe: Recipe, step: str) -> float:
-    """Return the shortest distance in m at which the samples of the pupil carry the curvature of the beam."""
+    """Return the shortest distance in m at which the samples of the pupil carry the curvature of
+    the beam.
+    """
     from neusee.nodes.laser import beam_radius, curvature_radius
 
     pupil = _pupils(recipe, step)[0]
@@ -281,12 +330,17 @@ class _Refined:
 
 
 def _refined(
-    distances: Sequence[float], value: Callable[[float], FloatArray], most: int, close: float = _CLOSE
+    distances: Sequence[float],
+    value: Callable[[float], FloatArray],
+    most: int,
+    close: float = _CLOSE,
 ) -> _Refined:
-    """Return values (logarithms) at distances, and at the middles of the gaps in which interpolation misses most.
+    """Return values (logarithms) at distances, and at the middles of the gaps in which
+    interpolation misses most.
 
-    A middle shows how much its gap missed. Each half is then counted with as much, until its own middle is known: the
-    peak behind a mask has kinks, where another lobe becomes the brightest. Gaps that miss no more than ``close`` stay.
+    A middle shows how much its gap missed. Each half is then counted with as much, until its own
+    middle is known: the peak behind a mask has kinks, where another lobe becomes the brightest.
+    Gaps that miss no more than ``close`` stay.
     """
     known = {distance: value(distance) for distance in distances}
     misses = dict.fromkeys(itertools.pairwise(distances), math.inf)
@@ -308,9 +362,11 @@ def _refined(
 
 
 def at_distance(recipe: Recipe, safety: Safety, step: str, distance: float) -> Recipe:
-    """Return the recipe with another distance of the laser in the wavefront on which a step depends.
+    """Return the recipe with another distance of the laser in the wavefront on which a step
+    depends.
 
-    A lens that is focused on a distance, or on the laser, has the defocus of its pupil changed with it.
+    A lens that is focused on a distance, or on the laser, has the defocus of its pupil changed with
+    it.
     """
     wavefront = _wavefront_of(recipe, step)
     assert wavefront is not None
@@ -356,17 +412,28 @@ def _upstream(recipe: Recipe, step: str) -> Iterator[Step]:
 
 
 def _step(recipe: Recipe, safety: Safety, arm: str, named: str) -> str:
-    """Return the name of a step of ranked pixels; raise `RecipeError` for another node, and for another sensor."""
+    """Return the name of a step of ranked pixels; raise `RecipeError` for another node, and for
+    another sensor.
+    """
     setting, sensor = f"protection.pixels.{arm}", safety.settings.sensor
     step = step_of(recipe, safety, setting, named, arm)
     given, params = recipe.steps[step], recipe.steps[step].params
     value, text = safety.values[setting], ""
     if given.node.path != _RANKS:
         text = f"the step {step} is of the node {given.node.path}: name a step of {_RANKS}"
-    elif not math.isclose(params["pixel_pitch"], sensor.pixel_pitch) or tuple(params["shape"]) != sensor.shape:
-        text = f"the step {step} has another sensor: give it safety.sensor.pixel_pitch and safety.sensor.shape"
+    elif (
+        not math.isclose(params["pixel_pitch"], sensor.pixel_pitch)
+        or tuple(params["shape"]) != sensor.shape
+    ):
+        text = (
+            f"the step {step} has another sensor: give it safety.sensor.pixel_pitch and"
+            " safety.sensor.shape"
+        )
     elif any(each.node.path == "flare.stray_light" for each in _upstream(recipe, step)):
-        text = f"the step {step} has stray light, which the estimate adds itself: rank the PSF before flare.stray_light"
+        text = (
+            f"the step {step} has stray light, which the estimate adds itself: rank the PSF before"
+            " flare.stray_light"
+        )
     if text:
         raise RecipeError([Diagnostic(value.mark, value.name, text)])
     return step

@@ -1,4 +1,6 @@
-"""Run of a recipe, and the folder of the run: page, pictures, numbers, data files and provenance."""
+"""Run of a recipe, and the folder of the run: page, pictures, numbers, data files and
+provenance.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 @dataclass(frozen=True)
 class Simulation:
-    """A finished run: the path of its folder, the content of its file ``provenance.json``, and its stored files."""
+    """A finished run: the path of its folder, the content of its file ``provenance.json``, and
+    its stored files.
+    """
 
     folder: Path
     document: dict[str, Any]
@@ -65,9 +69,11 @@ def simulate(
     memory: int | None = None,
     anew: Sequence[str] = (),
 ) -> Simulation:
-    """Run a recipe and write the folder ``runs/<date>_<recipe>_<key>/``; after an error no folder remains.
+    """Run a recipe and write the folder ``runs/<date>_<recipe>_<key>/``; after an error no folder
+    remains.
 
-    The steps ``anew``, and all that follow from them, are computed although their results are stored.
+    The steps ``anew``, and all that follow from them, are computed although their results are
+    stored.
     """
     finished: dict[str, StepRecord] = {}
     began = timestamp()
@@ -92,7 +98,9 @@ def simulate(
             graph(*result)
 
         result = run(recipe, store, wanted(recipe), told, device, executor, memory, show, anew=anew)
-        result = replace(result, done={name: finished.get(name, done) for name, done in result.done.items()})
+        result = replace(
+            result, done={name: finished.get(name, done) for name, done in result.done.items()}
+        )
         key = digest([[name, result.keys[name]] for name in wanted(result.recipe)])
         with limited(memory_limit(memory)), _watched(), new_run(runs, recipe.name, key) as folder:
             folder.said = {"began": began}
@@ -102,7 +110,9 @@ def simulate(
 
 @contextmanager
 def _watched() -> Iterator[None]:
-    """Raise `NotWritten` if the memory of the process exceeds its limit while the report is written."""
+    """Raise `NotWritten` if the memory of the process exceeds its limit while the report is
+    written.
+    """
     try:
         with guarded():
             yield
@@ -123,7 +133,9 @@ def _write(
     caught: Sequence[warnings.WarningMessage],
     beside: FilesBeside,
 ) -> dict[str, Any]:
-    """Write the folder of a run: all that shows no picture while the last pictures are drawn, and then the page."""
+    """Write the folder of a run: all that shows no picture while the last pictures are drawn,
+    and then the page.
+    """
     bars, finish = folder.path / "figures" / "timeline.png", _last_pictures(result, folder, beside)
     doc = run_page.document(result, command)
     folder.write("code.json", code_text(result))
@@ -134,7 +146,9 @@ def _write(
     finish()
     drawn, missing = pictures(result, shelf)
     files, refused = exports(result, shelf)
-    doc = run_page.with_pictures(doc, files, missing, refused, (str(warning.message) for warning in caught))
+    doc = run_page.with_pictures(
+        doc, files, missing, refused, (str(warning.message) for warning in caught)
+    )
     folder.said |= doc
     for name, path in drawn.items():
         folder.take(f"figures/{name}.png", path)
@@ -142,12 +156,16 @@ def _write(
         folder.take(f"data/{name}", path)
     shown = {**drawn, **({"timeline": bars} if bars.exists() else {})}
     folder.write("provenance.json", run_html.document_text(doc))
-    folder.write("report.html", run_html.page(doc, {name: path.read_bytes() for name, path in shown.items()}))
+    folder.write(
+        "report.html", run_html.page(doc, {name: path.read_bytes() for name, path in shown.items()})
+    )
     return doc
 
 
 def _last_pictures(result: Result, folder: RunFolder, beside: FilesBeside) -> Callable[[], None]:
-    """Begin the pictures that show no result of a step; return a function that waits for all pictures and files."""
+    """Begin the pictures that show no result of a step; return a function that waits for all
+    pictures and files.
+    """
     times = timeline(result)
     bars = folder.place("figures/timeline.png")
     wait = beside.draw(bars, TIMELINE_DRAWING, times) if times else None
@@ -163,6 +181,11 @@ def _last_pictures(result: Result, folder: RunFolder, beside: FilesBeside) -> Ca
 
 
 def recipe_text(recipe: Recipe) -> str:
-    """Return the recipe as YAML that can be run again: all final values, with the source of each as a comment."""
-    head = f"# {recipe.title or recipe.name}\n# Final values; the comment after each value names its source.\n"
+    """Return the recipe as YAML that can be run again: all final values, with the source of each
+    as a comment.
+    """
+    head = (
+        f"# {recipe.title or recipe.name}\n# Final values; the comment after each value names its"
+        " source.\n"
+    )
     return head + recipe.config.to_yaml()

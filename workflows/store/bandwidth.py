@@ -1,4 +1,6 @@
-"""Read and write speed of a store of results, measured in normal use and saved in a file of the store."""
+"""Read and write speed of a store of results, measured in normal use and saved in a file of the
+store.
+"""
 
 from __future__ import annotations
 
@@ -29,11 +31,15 @@ class Speeds:
         self._written: dict[Direction, float] = {}
 
     def seconds(self, way: Direction, size: float) -> float:
-        """Return the predicted time in seconds for reading or writing ``size`` bytes in the store."""
+        """Return the predicted time in seconds for reading or writing ``size`` bytes in the
+        store.
+        """
         return _setup(way, size) + size / self._speed(way)
 
     def learn(self, way: Direction, size: int, seconds: float) -> None:
-        """Update the estimated read or write speed of the store with the measured ``seconds`` of one transfer."""
+        """Update the estimated read or write speed of the store with the measured ``seconds`` of
+        one transfer.
+        """
         if size < LARGE:
             return
         newest = size / max(seconds - _setup(way, size), 1e-6)
@@ -42,7 +48,10 @@ class Speeds:
         if not written / _NEWS < self._now[way] < written * _NEWS:
             self._written = dict(self._now)
             with suppress(OSError):
-                self._disk.replace(_FILE, seal_record("speeds", {str(way): speed for way, speed in self._now.items()}))
+                self._disk.replace(
+                    _FILE,
+                    seal_record("speeds", {str(way): speed for way, speed in self._now.items()}),
+                )
 
     def _speed(self, way: Direction) -> float:
         if not self._now:

@@ -1,8 +1,10 @@
-"""Removal of values from a store beyond its size budget; values that save the least time per byte go first.
+"""Removal of values from a store beyond its size budget; values that save the least time per byte
+go first.
 
-The weight of a value halves for every week between its last use and the newest use in the store; today's date does not
-matter. Pinned values stay. The metadata of an evicted value stay as its receipt, so that origin and cost remain known.
-A process that reads the value at that moment keeps its memory map.
+The weight of a value halves for every week between its last use and the newest use in the store;
+today's date does not matter. Pinned values stay. The metadata of an evicted value stay as its
+receipt, so that origin and cost remain known. A process that reads the value at that moment keeps
+its memory map.
 """
 
 from __future__ import annotations
@@ -36,10 +38,18 @@ class Candidate:
 
 
 def chosen(candidates: Iterable[Candidate], excess: float) -> list[Candidate]:
-    """Return the stored values to remove so that ``excess`` bytes or more are freed, the least valuable value first."""
+    """Return the stored values to remove so that ``excess`` bytes or more are freed, the least
+    valuable value first.
+    """
     evictable = [c for c in candidates if c.size > 0]
     newest = max((c.used for c in evictable), default=0.0)
-    evictable.sort(key=lambda c: (max(c.seconds, 0.0) / c.size * 2 ** ((c.used - newest) / _HALF), c.used, c.key))
+    evictable.sort(
+        key=lambda c: (
+            max(c.seconds, 0.0) / c.size * 2 ** ((c.used - newest) / _HALF),
+            c.used,
+            c.key,
+        )
+    )
     going, freed = list[Candidate](), 0
     for candidate in evictable:
         if freed >= excess:
@@ -53,8 +63,12 @@ def chosen(candidates: Iterable[Candidate], excess: float) -> list[Candidate]:
     return going
 
 
-def evict(disk: Disk, among: Iterable[Candidate], excess: float, dry: bool) -> tuple[list[Candidate], list[Candidate]]:
-    """Delete stored values until ``excess`` bytes are freed; return the deleted and the undeletable values."""
+def evict(
+    disk: Disk, among: Iterable[Candidate], excess: float, dry: bool
+) -> tuple[list[Candidate], list[Candidate]]:
+    """Delete stored values until ``excess`` bytes are freed; return the deleted and the
+    undeletable values.
+    """
     left, gone, refused = {c.key: c for c in among}, list[Candidate](), list[Candidate]()
     while excess > 0 and (batch := chosen(left.values(), excess)):
         for candidate in batch:
@@ -68,7 +82,9 @@ def evict(disk: Disk, among: Iterable[Candidate], excess: float, dry: bool) -> t
 
 
 class CacheBudget:
-    """Comparison of the size of a store with its size budget, without a count of all bytes at each write."""
+    """Comparison of the size of a store with its size budget, without a count of all bytes at
+    each write.
+    """
 
     def __init__(self, disk: Disk, budget: int) -> None:
         self._disk, self.budget = disk, budget
@@ -95,11 +111,14 @@ def total(disk: Disk) -> int:
     return sum(size for _, size, _ in files(disk))
 
 
-def candidates(disk: Disk, pinned: Collection[str], read_seconds: Callable[[float], float]) -> Iterator[Candidate]:
-    """Yield every stored value that may be evicted, with the number of bytes that its eviction frees.
+def candidates(
+    disk: Disk, pinned: Collection[str], read_seconds: Callable[[float], float]
+) -> Iterator[Candidate]:
+    """Yield every stored value that may be evicted, with the number of bytes that its eviction
+    frees.
 
-    The bytes of a band are divided among the values that use the band. A result that this program does not read saves
-    no time.
+    The bytes of a band are divided among the values that use the band. A result that this program
+    does not read saves no time.
     """
     sizes, changes = dict[str, int](), dict[str, float]()
     for path, size, changed in files(disk):
@@ -127,7 +146,9 @@ class _StoredValue:
 def _stored_value(
     disk: Disk, key: str, sizes: Mapping[str, int], read_seconds: Callable[[float], float]
 ) -> _StoredValue | None:
-    """Return what is known of a stored value, or None if its metadata are unreadable or a receipt."""
+    """Return what is known of a stored value, or None if its metadata are unreadable or a
+    receipt.
+    """
     payload = sizes.get(f"{key}.safetensors", 0)
     try:
         about = metadata.read(disk, key)
@@ -136,7 +157,9 @@ def _stored_value(
         inline = sum(len(tensor[-1]) for tensor in about.get("tensors") or ())
         derived = sizes.get(about.get("file") or "", 0)
         saved = float(about.get("seconds") or 0.0) - read_seconds(float(about.get("bytes") or 0))
-        return _StoredValue(key, payload + inline + derived, saved, frozenset(metadata.bands(about)))
+        return _StoredValue(
+            key, payload + inline + derived, saved, frozenset(metadata.bands(about))
+        )
     except NotRead:
         return _StoredValue(key, payload + sizes.get(f"{key}.json", 0), 0.0, frozenset())
     except UNREADABLE:
@@ -164,7 +187,9 @@ def drop(disk: Disk, key: str) -> bool:
 
 
 def _write_receipt(disk: Disk, key: str, about: Metadata) -> None:
-    """Record in the metadata of a value that the value was evicted; on a full disk, delete the metadata."""
+    """Record in the metadata of a value that the value was evicted; on a full disk, delete the
+    metadata.
+    """
     try:
         metadata.write(disk, key, metadata.receipt(about), over=True)
     except OSError as error:
@@ -183,7 +208,9 @@ def _delete_files(disk: Disk, key: str, about: Metadata) -> None:
 
 
 def files(disk: Disk) -> Iterator[tuple[str, int, float]]:
-    """Yield the path, size and time of last change of every file that counts against the size budget of a store."""
+    """Yield the path, size and time of last change of every file that counts against the size
+    budget of a store.
+    """
     for base in (disk.folder, f"{disk.folder}/files", f"{disk.folder}/bands"):
         for entry in below(base):
             with suppress(OSError):

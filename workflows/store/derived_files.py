@@ -1,4 +1,5 @@
-"""Files derived from results, such as pictures, stored by key so that a second run reuses the files.
+"""Files derived from results, such as pictures, stored by key so that a second run reuses the
+files.
 
 The files are in the folder ``files/`` of the store; their checksums are results of the store.
 """
@@ -33,19 +34,24 @@ _FAST = xxhash.xxh3_128
 
 
 class DerivedFiles:
-    """Files derived from results, in the folder of a store, or in a temporary folder if the store cannot be written."""
+    """Files derived from results, in the folder of a store, or in a temporary folder if the
+    store cannot be written.
+    """
 
     def __init__(self, store: Store) -> None:
         self.store = store
         self.folder = store.root / "files"
         self._spare = ""  # a temporary folder, which goes with this object
         self._failing = threading.Lock()  # two threads make files
-        self._fresh: dict[Path, tuple[int, ...]] = {}  # what the system said of each file when it was right
+        # what the system said of each file when it was right
+        self._fresh: dict[Path, tuple[int, ...]] = {}
 
     def find(self, key: str, suffix: str) -> Path | None:
-        """Return the path of the derived file ``key``, or None if it is missing, or has a wrong name or checksum.
+        """Return the path of the derived file ``key``, or None if it is missing, or has a wrong
+        name or checksum.
 
-        A file that this object has written or compared is not compared again while it is the same to the system.
+        A file that this object has written or compared is not compared again while it is the same
+        to the system.
         """
         from torch import Tensor
 
@@ -61,10 +67,11 @@ class DerivedFiles:
         return None
 
     def keep(self, key: str, suffix: str, what: str, write: Callable[[Path], None]) -> Path:
-        """Let ``write`` write a file beside its final path, rename the file, and store its checksum; return its path.
+        """Let ``write`` write a file beside its final path, rename the file, and store its
+        checksum; return its path.
 
-        The file is read-only. If the folder cannot be written, or the file not be read again, it is written into a
-        temporary folder.
+        The file is read-only. If the folder cannot be written, or the file not be read again, it is
+        written into a temporary folder.
         """
         try:
             path, found = self._compared(key, suffix, write)
@@ -90,8 +97,12 @@ class DerivedFiles:
     def _path(self, key: str, suffix: str) -> Path:
         return self.folder / key[:2] / f"{key}{suffix}"
 
-    def _compared(self, key: str, suffix: str, write: Callable[[Path], None]) -> tuple[Path, Tensor]:
-        """Return the path of a file that is written now, and the digest of what the device gives back of it."""
+    def _compared(
+        self, key: str, suffix: str, write: Callable[[Path], None]
+    ) -> tuple[Path, Tensor]:
+        """Return the path of a file that is written now, and the digest of what the device gives
+        back of it.
+        """
         path = self._written(key, suffix, write)
         return path, _digest(path, "sha256" if secrets() else _FAST)
 
@@ -120,11 +131,15 @@ def _state(path: Path) -> tuple[int, ...]:
 
 
 def _is_right(path: Path, kept: Tensor) -> bool:
-    """Return True if a file has the digest that was stored: SHA-256, or the faster xxh3 where nothing is signed."""
+    """Return True if a file has the digest that was stored: SHA-256, or the faster xxh3 where
+    nothing is signed.
+    """
     import torch
 
     signed = len(kept) == _SHA256
-    return (signed or not secrets()) and torch.equal(kept, _digest(path, "sha256" if signed else _FAST))
+    return (signed or not secrets()) and torch.equal(
+        kept, _digest(path, "sha256" if signed else _FAST)
+    )
 
 
 def _digest(path: Path, how: Any) -> Tensor:

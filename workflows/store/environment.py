@@ -1,4 +1,6 @@
-"""Settings of a store from environment variables: the folder, the mode of checksum comparison and the budget."""
+"""Settings of a store from environment variables: the folder, the mode of checksum comparison
+and the budget.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +15,17 @@ Verify = Literal["always", "sampled", "never"]
 
 
 def default_root() -> Path:
-    """Return the default folder of a store: ``$NEUSEE_CACHE``, ``cache/`` of the checkout or ``~/.cache/neusee``.
+    """Return the default folder of a store: ``$NEUSEE_CACHE``, ``cache/`` of the checkout or
+    ``~/.cache/neusee``.
 
-    The first of these folders that is set or exists is used. Raises `ValueError` if the variable contains a URL.
+    The first of these folders that is set or exists is used. Raises `ValueError` if the variable
+    contains a URL.
     """
     if value := os.environ.get("NEUSEE_CACHE"):
         if "://" in value:
-            raise ValueError(f"NEUSEE_CACHE is {value!r}, which is not a folder: open a URL with `open_store`")
+            raise ValueError(
+                f"NEUSEE_CACHE is {value!r}, which is not a folder: open a URL with `open_store`"
+            )
         return Path(value)
     here = Path.cwd()
     for folder in (here, *here.parents):
@@ -29,7 +35,9 @@ def default_root() -> Path:
 
 
 def _is_checkout(folder: Path) -> bool:
-    """Return True for a checkout of neusee; with ``--no-code``, a stranger's folder that looks like one is none."""
+    """Return True for a checkout of neusee; with ``--no-code``, a stranger's folder that looks
+    like one is none.
+    """
     project = folder / "pyproject.toml"
     if not project.is_file() or 'name = "neusee"' not in project.read_text("utf-8"):
         return False
@@ -37,7 +45,8 @@ def _is_checkout(folder: Path) -> bool:
 
 
 def verify_mode(mode: str | None) -> Verify:
-    """Return the mode of checksum comparison: ``mode`` if given, else ``$NEUSEE_CACHE_VERIFY``, else ``always``.
+    """Return the mode of checksum comparison: ``mode`` if given, else ``$NEUSEE_CACHE_VERIFY``,
+    else ``always``.
 
     Raises `ValueError` for an unknown mode.
     """
@@ -49,7 +58,8 @@ def verify_mode(mode: str | None) -> Verify:
 
 
 def budget_bytes(budget: int | None) -> int | None:
-    """Return the budget of a store in bytes: ``budget`` if given, else ``$NEUSEE_CACHE_BUDGET``, else None.
+    """Return the budget of a store in bytes: ``budget`` if given, else ``$NEUSEE_CACHE_BUDGET``,
+    else None.
 
     Raises `ValueError` for an invalid size.
     """

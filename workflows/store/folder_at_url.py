@@ -1,7 +1,8 @@
-"""A shared folder that is named by a URL (``file:///shared/neusee``), with the care that a folder of others needs.
+"""A shared folder that is named by a URL (``file:///shared/neusee``), with the care that a folder
+of others needs.
 
-What is no regular file is never waited for or read, and what one user of a group makes the others may use. A folder
-that this user may only read is never written to.
+What is no regular file is never waited for or read, and what one user of a group makes the others
+may use. A folder that this user may only read is never written to.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from neusee.workflows.keys.regular_file import bytes_of, opened
 
 
 class FolderAtUrl:
-    """The file system of a folder of a store at a URL, with the calls of fsspec that `RemoteFiles` makes."""
+    """The file system of a folder of a store at a URL, with the calls of fsspec that
+    `RemoteFiles` makes.
+    """
 
     protocol = ("file", "local")
 
@@ -36,10 +39,15 @@ class FolderAtUrl:
         with os.scandir(path) as found:
             if not detail:
                 return [entry.path for entry in found]
-            return [{"name": each.path, "mtime": each.stat(follow_symlinks=False).st_mtime} for each in found]
+            return [
+                {"name": each.path, "mtime": each.stat(follow_symlinks=False).st_mtime}
+                for each in found
+            ]
 
     def cat_file(self, path: str) -> bytes:
-        """Return the bytes of a regular file; raise `NotRegular` for anything else, and for a file that is too long."""
+        """Return the bytes of a regular file; raise `NotRegular` for anything else, and for a
+        file that is too long.
+        """
         return bytes_of(path)
 
     def get_file(self, path: str, to: str) -> None:
@@ -60,7 +68,9 @@ class FolderAtUrl:
         inherit(to, self._root, 0o444)
 
     def mv(self, path: str, to: str) -> None:
-        """Rename a file to a name that something else may have; raise `IsADirectoryError` for a folder."""
+        """Rename a file to a name that something else may have; raise `IsADirectoryError` for a
+        folder.
+        """
         try:
             os.replace(path, to)
         except OSError:
@@ -73,6 +83,8 @@ class FolderAtUrl:
         os.unlink(path)
 
     def makedirs(self, path: str, exist_ok: bool = True) -> None:
-        """Make a folder with the group and the permissions of the root, and the missing ones above it."""
+        """Make a folder with the group and the permissions of the root, and the missing ones
+        above it.
+        """
         make_folders(self._root, self._root)
         make_folders(path, self._root)

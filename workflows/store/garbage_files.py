@@ -1,7 +1,7 @@
 """Orphan files: files of a store that belong to no result and are removed by `neusee cache gc`.
 
-The present metadata, read under the lock, decide whether a file is in use; the age of the file does not. Only a file
-whose owner cannot be determined is kept for an hour.
+The present metadata, read under the lock, decide whether a file is in use; the age of the file does
+not. Only a file whose owner cannot be determined is kept for an hour.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ _WEEK = 7 * 86400.0  #: s for which a damaged entry is kept for inspection
 
 
 def sweep(disk: Disk, dry: bool = False) -> list[tuple[str, int]]:
-    """Remove the files of a store that belong to no result, or only list them if ``dry``; return paths and sizes."""
+    """Remove the files of a store that belong to no result, or only list them if ``dry``; return
+    paths and sizes.
+    """
     if not os.path.isdir(disk.folder):
         return []
     gone = disk.sweep(dry, _WEEK) if os.path.isdir(f"{disk.folder}/tmp") else []
@@ -37,7 +39,9 @@ def sweep(disk: Disk, dry: bool = False) -> list[tuple[str, int]]:
 
 
 def removed(disk: Disk, find: Find, dry: bool) -> list[tuple[str, int]]:
-    """Remove the files that ``find`` yields, or only list them if ``dry``; return the path and size of each file."""
+    """Remove the files that ``find`` yields, or only list them if ``dry``; return the path and
+    size of each file.
+    """
     gone = []
     with suppress(OSError):
         orphans = list(find(disk))  # without the lock; ``find`` decides again under the lock
@@ -71,13 +75,17 @@ def _is_not_read(disk: Disk, key: str) -> bool:
 
 
 def _payloads(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Yield the files of tensors to which no metadata refer; skip a file whose metadata cannot be read."""
+    """Yield the files of tensors to which no metadata refer; skip a file whose metadata cannot
+    be read.
+    """
     for entry in below(disk.folder):
         key, _, suffix = entry.name.partition(".")
         if suffix == "safetensors":
             with suppress(*UNREADABLE):
                 try:
-                    orphan = _HAS_PAYLOAD not in _raw(disk, key) and not metadata.read(disk, key).get("payload")
+                    orphan = _HAS_PAYLOAD not in _raw(disk, key) and not metadata.read(
+                        disk, key
+                    ).get("payload")
                 except FileNotFoundError:
                     orphan = True
                 if orphan:
@@ -85,7 +93,8 @@ def _payloads(disk: Disk) -> Iterator[os.DirEntry[str]]:
 
 
 def bands(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Yield the band files that no stored value uses, or nothing if metadata of another user cannot be read.
+    """Yield the band files that no stored value uses, or nothing if metadata of another user cannot
+    be read.
 
     The bands of results of another format version count as used.
     """
@@ -112,10 +121,15 @@ def _raw(disk: Disk, key: str) -> bytes:
 
 
 def _files(disk: Disk) -> Iterator[os.DirEntry[str]]:
-    """Yield old files such as pictures from results, if they are half-written or no metadata refer to them."""
+    """Yield old files such as pictures from results, if they are half-written or no metadata
+    refer to them.
+    """
     for entry in below(f"{disk.folder}/files"):
         try:
-            needed = not entry.name.startswith(".") and metadata.read(disk, entry.name[:32]).get("file") == entry.name
+            needed = (
+                not entry.name.startswith(".")
+                and metadata.read(disk, entry.name[:32]).get("file") == entry.name
+            )
         except UNREADABLE:
             needed = False
         if not needed and _age(entry) > OLD:

@@ -1,7 +1,8 @@
-"""Journal of a store: one line for every finished result, so that a query reads one file instead of all results.
+"""Journal of a store: one line for every finished result, so that a query reads one file instead of
+all results.
 
-No result depends on the journal. Each line is one write and has its own seal; a line that is torn, damaged or out of
-range is skipped. A journal that is missing or
+No result depends on the journal. Each line is one write and has its own seal; a line that is torn,
+damaged or out of range is skipped. A journal that is missing or
 damaged is rebuilt from the metadata of the results.
 """
 
@@ -37,14 +38,21 @@ _TOTALS = re.compile(rb'^%s([^"]+)".*?,"bytes":(\d*).*?,"kept":(true|false)' % _
 def row_of(key: str, about: Row) -> Row:
     """Return the journal line for the result ``key`` with the metadata ``about``."""
     node = (about.get("origin") or {}).get("node")
-    return {"key": key, **{f: about.get(f) for f in _FIELDS}, "node": node, "kept": metadata.is_kept(about)}
+    return {
+        "key": key,
+        **{f: about.get(f) for f in _FIELDS},
+        "node": node,
+        "kept": metadata.is_kept(about),
+    }
 
 
 class Journal:
     """Journal of one store: a file with one line for each finished result, the newest line last."""
 
     def __init__(self, disk: Disk, others: Callable[[], Iterable[tuple[str, Row]]] = tuple) -> None:
-        """Open the journal of a store; ``others`` yields key and metadata of each result without its own file."""
+        """Open the journal of a store; ``others`` yields key and metadata of each result without
+        its own file.
+        """
         self._disk, self._others, self._guard = disk, others, threading.RLock()
         self._path = f"{disk.folder}/journal.jsonl"
         self._rows: list[Row] = []
@@ -52,7 +60,9 @@ class Journal:
         self._forget()
 
     def append(self, key: str, about: Row) -> None:
-        """Append the line of a result to the journal; ignore a failure, because no result depends on the journal."""
+        """Append the line of a result to the journal; ignore a failure, because no result
+        depends on the journal.
+        """
         with suppress(OSError):
             try:
                 append(self._path, b"\n" + seal_record("journal", row_of(key, about)))
@@ -63,13 +73,15 @@ class Journal:
     def rows(self) -> list[Row]:
         """Return every line of the journal as a dict, which the caller must not change.
 
-        The fields of a line are key, step, recipe, node, seconds, bytes, device, peak, size, date and kept.
+        The fields of a line are key, step, recipe, node, seconds, bytes, device, peak, size, date
+        and kept.
         """
         self._read()
         return self._rows
 
     def latest(self) -> list[Row]:
-        """Return the newest lines of the journal: all of a short one, and some thousand of a long one.
+        """Return the newest lines of the journal: all of a short one, and some thousand of a long
+        one.
 
         The time that this takes does not grow with the number of results.
         """
@@ -77,7 +89,8 @@ class Journal:
         return self._rows
 
     def totals(self) -> tuple[int, int, int]:
-        """Return the number of stored results, their bytes, and the number of results without a stored value.
+        """Return the number of stored results, their bytes, and the number of results without a
+        stored value.
 
         The lines are counted without a check of their seals.
         """
@@ -102,10 +115,13 @@ class Journal:
         """Record in the journal that the values of ``keys`` are no longer stored."""
         with self._guard:
             self._read()
-            self._replace([{**row, "kept": False} if row["key"] in keys else row for row in self._rows])
+            self._replace(
+                [{**row, "kept": False} if row["key"] in keys else row for row in self._rows]
+            )
 
     def compact(self) -> None:
-        """Rewrite the journal with the newest line of each existing result, and mark the evicted values.
+        """Rewrite the journal with the newest line of each existing result, and mark the evicted
+        values.
 
         Lines are copied as they are, so that a long journal needs little memory.
         """
@@ -143,7 +159,11 @@ class Journal:
         """Return the date and the line of a result, which is ``line`` if that is right."""
         if line is not None and kept == (NO_VALUE not in line):
             return "", line
-        row = row_of(key, metadata.read(self._disk, key)) if line is None else unseal_record("journal", line)
+        row = (
+            row_of(key, metadata.read(self._disk, key))
+            if line is None
+            else unseal_record("journal", line)
+        )
         return str(row["date"]), seal_record("journal", {**row, "kept": kept})
 
     def _forget(self) -> None:
@@ -158,7 +178,8 @@ class Journal:
                 self._read_new_lines(whole)
 
     def _read_new_lines(self, whole: bool) -> None:
-        """Read the lines added to the journal file since the last call; rebuild a missing or damaged file.
+        """Read the lines added to the journal file since the last call; rebuild a missing or
+        damaged file.
 
         If ``whole`` is False, the first call reads the end of the file alone.
         """
@@ -178,11 +199,17 @@ class Journal:
             return self._rebuild()
         self._head, self._offset = head, start + len(raw)
         self._rows += _parsed(raw)
-        if self._whole and len(self._rows) > _SPARE and len(self._rows) > 2 * len({row["key"] for row in self._rows}):
+        if (
+            self._whole
+            and len(self._rows) > _SPARE
+            and len(self._rows) > 2 * len({row["key"] for row in self._rows})
+        ):
             self._replace(list({row["key"]: row for row in self._rows}.values()))
 
     def _first_byte(self, file: BinaryIO, head: int, whole: bool) -> int:
-        """Return where the first read begins: after the first line, or at the start of a line near the end."""
+        """Return where the first read begins: after the first line, or at the start of a line
+        near the end.
+        """
         size = os.fstat(file.fileno()).st_size
         if whole or size - head <= _LATEST:
             return head
@@ -199,7 +226,9 @@ class Journal:
         self._replace(sorted(rows, key=lambda row: str(row["date"])))
 
     def _replace(self, rows: list[Row]) -> None:
-        """Replace the journal file by the lines ``rows``; a line that another process adds meanwhile may be lost."""
+        """Replace the journal file by the lines ``rows``; a line that another process adds
+        meanwhile may be lost.
+        """
         self._forget()
         self._replace_lines([seal_record("journal", row) for row in rows])
         self._rows = rows
@@ -229,12 +258,18 @@ def _is_row(row: Row) -> bool:
     if not row.keys() >= _NAMES:
         return False
     key, node = row["key"], row["node"]
-    known = isinstance(key, str) and key.isalnum() and (node is None or is_text(node)) and row["kept"] is not None
+    known = (
+        isinstance(key, str)
+        and key.isalnum()
+        and (node is None or is_text(node))
+        and row["kept"] is not None
+    )
     return known and all(row[name] is None or is_right(row[name]) for name, is_right in _CHECKED)
 
 
 def _opened(path: str, flags: int) -> int:
-    """Open the journal, which is a regular file, without following a symbolic link; never wait for a pipe.
+    """Open the journal, which is a regular file, without following a symbolic link; never wait for
+    a pipe.
 
     Raises `OSError` for anything else, such as a device that never ends.
     """

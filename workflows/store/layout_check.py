@@ -1,7 +1,7 @@
 """Check of the layout of a stored value, which is data that anybody may have written.
 
-A layout is a tree of small dicts, each with one kind: ``tensor``, ``bytes``, ``stacked``, ``class``, ``tuple``,
-``list``, ``dict`` or ``value``. The check knows no class and makes no value.
+A layout is a tree of small dicts, each with one kind: ``tensor``, ``bytes``, ``stacked``,
+``class``, ``tuple``, ``list``, ``dict`` or ``value``. The check knows no class and makes no value.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from typing import Any, TypeGuard
 from neusee.workflows.keys.seal import OtherFormat
 
 DEEPEST = 50  #: levels of a layout
-_BAND = re.compile(r"[0-9A-Za-z]{2}[0-9A-Za-z-]{0,100}(\.[0-9]{1,6})?")  #: a name without a folder in it
+#: a name without a folder in it
+_BAND = re.compile(r"[0-9A-Za-z]{2}[0-9A-Za-z-]{0,100}(\.[0-9]{1,6})?")
 _DIGITS = re.compile(r"[0-9a-f]{32}")
 _KINDS = ("tensor", "bytes", "stacked", "class", "tuple", "list", "dict", "value")
 
@@ -21,7 +22,8 @@ _KINDS = ("tensor", "bytes", "stacked", "class", "tuple", "list", "dict", "value
 def checked_layout(layout: Any) -> dict[str, str]:
     """Return the checksum (xxh3) of every band file that a layout names, by the name of the band.
 
-    Raises `OtherFormat` for a kind of layout that this program does not know, and `ValueError` for any other mistake.
+    Raises `OtherFormat` for a kind of layout that this program does not know, and `ValueError` for
+    any other mistake.
     """
     bands: dict[str, str] = {}
     todo: list[tuple[Any, int]] = [(layout, 0)]
@@ -31,7 +33,9 @@ def checked_layout(layout: Any) -> dict[str, str]:
             raise ValueError("the layout of the value is not a tree of mappings, or is too deep")
         known = [kind for kind in _KINDS if kind in item]
         if len(known) != 1 or len(item) != 1 + ("class" in item):
-            raise OtherFormat(f"its layout has a kind that is not known: {', '.join(map(str, item))[:80]}")
+            raise OtherFormat(
+                f"its layout has a kind that is not known: {', '.join(map(str, item))[:80]}"
+            )
         todo += [(inner, depth + 1) for inner in _inner(known[0], item, bands)]
     return bands
 
@@ -58,9 +62,13 @@ def _inner(kind: str, item: dict[str, Any], bands: dict[str, str]) -> Iterable[A
 
 
 def _stacked(body: Any) -> dict[str, str]:
-    _expect(isinstance(body, dict) and body.keys() == {"names", "xxh3", "dtype", "shape"}, "stacked")
+    _expect(
+        isinstance(body, dict) and body.keys() == {"names", "xxh3", "dtype", "shape"}, "stacked"
+    )
     names, sums, shape = body["names"], body["xxh3"], body["shape"]
-    _expect(isinstance(body["dtype"], str) and is_shape(shape) and isinstance(names, list), "stacked")
+    _expect(
+        isinstance(body["dtype"], str) and is_shape(shape) and isinstance(names, list), "stacked"
+    )
     if bad := [name for name in names if not is_band(name)]:
         raise ValueError(f"{str(bad[0])[:60]!r} is not the name of a band file")
     _expect(isinstance(sums, list) and all(map(is_checksum, sums)), "stacked")

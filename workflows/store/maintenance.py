@@ -1,4 +1,6 @@
-"""Maintenance of a store: protection and eviction of values, removal of orphan files, and a check for damage."""
+"""Maintenance of a store: protection and eviction of values, removal of orphan files, and a
+check for damage.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ class Swept:
     """Summary of a clean-up of a store, which was either done or only simulated."""
 
     evicted: tuple[str, ...]  #: keys whose values were evicted
-    refused: tuple[str, ...]  #: keys whose values cannot be deleted, for example because another user owns them
+    #: keys whose values cannot be deleted, for example because another user owns them
+    refused: tuple[str, ...]
     freed: int  #: bytes of evicted values and of orphan files
     orphans: int  #: number of orphan files, which belonged to no result
     left: int  #: bytes that remain
@@ -37,7 +40,8 @@ class Checked:
 
 
 class Maintained(Protocol):
-    """Base class of `Store` with the methods for maintenance, such as eviction and a check for damage.
+    """Base class of `Store` with the methods for maintenance, such as eviction and a check for
+    damage.
 
     `Store` defines the members that are declared first.
     """
@@ -53,14 +57,16 @@ class Maintained(Protocol):
     def put_aside(self, key: str, error: Exception) -> None: ...
 
     def gc(self, budget: int | None = None, dry: bool = False) -> Swept:
-        """Remove files that belong to no result, and evict values until the store has at most ``budget`` bytes.
+        """Remove files that belong to no result, and evict values until the store has at most
+        ``budget`` bytes.
 
         A ``budget`` of None means the budget of the store.
         """
         budget = self.budget if budget is None else budget
         before = total(self.disk)
         orphans = dict(garbage_files.sweep(self.disk, dry))
-        uncounted = (f"{self.disk.folder}/tmp/", f"{self.disk.folder}/bad/")  # files outside the budget
+        # files outside the budget
+        uncounted = (f"{self.disk.folder}/tmp/", f"{self.disk.folder}/bad/")
         outside = sum(size for path, size in orphans.items() if path.startswith(uncounted))
         left = before - (sum(orphans.values()) - outside)
         gone, refused = self.make_room(left - budget, dry) if budget is not None else ([], [])
@@ -68,13 +74,21 @@ class Maintained(Protocol):
         if not dry:
             self.journal.compact()
         freed = max(before - after, 0) + outside
-        return Swept(tuple(c.key for c in gone), tuple(c.key for c in refused), freed, len(orphans), after)
+        return Swept(
+            tuple(c.key for c in gone), tuple(c.key for c in refused), freed, len(orphans), after
+        )
 
-    def make_room(self, excess: float, dry: bool = False) -> tuple[list[Candidate], list[Candidate]]:
-        """Delete stored values until ``excess`` bytes are freed; return the deleted and the undeletable values."""
+    def make_room(
+        self, excess: float, dry: bool = False
+    ) -> tuple[list[Candidate], list[Candidate]]:
+        """Delete stored values until ``excess`` bytes are freed; return the deleted and the
+        undeletable values.
+        """
         if excess <= 0:
             return [], []
-        gone, refused = evict(self.disk, candidates(self.disk, self.pinned(), self.read_seconds), excess, dry)
+        gone, refused = evict(
+            self.disk, candidates(self.disk, self.pinned(), self.read_seconds), excess, dry
+        )
         if gone and not dry:
             garbage_files.removed(self.disk, garbage_files.bands, dry)
             for candidate in gone:
@@ -82,9 +96,11 @@ class Maintained(Protocol):
         return gone, refused
 
     def check(self) -> Iterator[Checked]:
-        """Yield the outcome of a check of every stored result; move damaged results to the folder ``bad/``.
+        """Yield the outcome of a check of every stored result; move damaged results to the folder
+        ``bad/``.
 
-        The check reads every value and compares every checksum. It needs no type of a value, so it imports no node.
+        The check reads every value and compares every checksum. It needs no type of a value, so it
+        imports no node.
 
         The mode ``verify`` of the store has no effect on this check.
         """
@@ -105,10 +121,16 @@ class Maintained(Protocol):
             yield Checked(key, about, problem)
 
     def pin(self, key: str) -> None:
-        """Protect the stored value of ``key`` from eviction. Raises `OSError` if the folder cannot be written."""
+        """Protect the stored value of ``key`` from eviction. Raises `OSError` if the folder
+        cannot be written.
+        """
         self.disk.prepare()
         self.disk.make_folder(f"{self.disk.folder}/pins")
-        os.close(os.open(f"{self.disk.folder}/pins/{key}", os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW, 0o666))
+        os.close(
+            os.open(
+                f"{self.disk.folder}/pins/{key}", os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW, 0o666
+            )
+        )
 
     def unpin(self, key: str) -> None:
         """Allow the eviction of the value of ``key`` again."""

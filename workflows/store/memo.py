@@ -1,4 +1,6 @@
-"""Values that are computed only once: a value is read from the store, or computed and then stored."""
+"""Values that are computed only once: a value is read from the store, or computed and then
+stored.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +18,21 @@ T = TypeVar("T")
 
 
 def compute_once(
-    store: Store, key: str, kind: type[T], compute: Callable[[], T], about: Metadata, *, small: bool = False
+    store: Store,
+    key: str,
+    kind: type[T],
+    compute: Callable[[], T],
+    about: Metadata,
+    *,
+    small: bool = False,
 ) -> T:
-    """Return the value that ``store`` has under ``key``, or compute and store the value if it is missing.
+    """Return the value that ``store`` has under ``key``, or compute and store the value if it is
+    missing.
 
-    Args: kind: the type of the value. A dataclass is stored as the dict of its fields. about: metadata of the value,
-    which get the date and the seconds that ``compute`` took. small: whether to store the value with `Store.put_small`.
+    Args: kind: the type of the value. A dataclass is stored as the dict of its fields. about:
+            metadata of the value,
+    which get the date and the seconds that ``compute`` took. small: whether to store the value with
+    `Store.put_small`.
     """
     with suppress(KeyError):
         kept = store.get(key, dict if is_dataclass(kind) else kind)
@@ -32,7 +43,14 @@ def compute_once(
             store.put_aside(key, error)
     began = time.perf_counter()
     value = compute()
-    spent: Metadata = {"seconds": time.perf_counter() - began, "date": datetime.now(UTC).isoformat(timespec="seconds")}
+    spent: Metadata = {
+        "seconds": time.perf_counter() - began,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
     keep = store.put_small if small else store.put
-    keep(key, asdict(value) if is_dataclass(value) and not isinstance(value, type) else value, spent | about)
+    keep(
+        key,
+        asdict(value) if is_dataclass(value) and not isinstance(value, type) else value,
+        spent | about,
+    )
     return value

@@ -1,4 +1,6 @@
-"""Metadata of a result: one line of JSON that describes the result and ends with its own checksum."""
+"""Metadata of a result: one line of JSON that describes the result and ends with its own
+checksum.
+"""
 
 from __future__ import annotations
 
@@ -15,27 +17,42 @@ from neusee.workflows.store.shared_folder import Disk, entries, read_file
 
 Metadata = dict[str, Any]
 INLINE = 4096  #: bytes of tensors up to which a result is stored inside its JSON
-UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, ArithmeticError, MemoryError)
+UNREADABLE = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    RuntimeError,
+    ArithmeticError,
+    MemoryError,
+)
 _USED = 3600.0  #: smallest time in s between two records of the use of a value
 _TOP = re.compile("[0-9a-f]{2}")
 _OF_THE_VALUE = ("layout", "payload", "tensors", "bands")
 
 
 def read(disk: Disk, key: str) -> Metadata:
-    """Return the metadata of ``key``; raise one of the errors in `UNREADABLE` if the file is missing or damaged.
+    """Return the metadata of ``key``; raise one of the errors in `UNREADABLE` if the file is
+    missing or damaged.
 
-    Raises `NotRead` for the metadata of another format version, or without the signature that is asked for.
+    Raises `NotRead` for the metadata of another format version, or without the signature that is
+    asked for.
     """
     return unseal_of("result", key, read_file(disk.path(key, "json")))
 
 
 def unseal_of(kind: Kind, key: str, raw: bytes) -> Metadata:
-    """Return the metadata that `seal_record` wrote for ``key``; raise `ValueError` for the metadata of another key."""
+    """Return the metadata that `seal_record` wrote for ``key``; raise `ValueError` for the
+    metadata of another key.
+    """
     return checked_fields(unseal_record(kind, raw), key)
 
 
 def write(disk: Disk, key: str, about: Metadata, over: bool) -> bool:
-    """Write the metadata of ``key``; if ``over`` is False, keep an existing file and return False."""
+    """Write the metadata of ``key``; if ``over`` is False, keep an existing file and return
+    False.
+    """
     path = disk.path(key, "json")
     with disk.temporary(key) as (part, file):
         file.write(seal_record("result", about))
@@ -47,7 +64,8 @@ def write(disk: Disk, key: str, about: Metadata, over: bool) -> bool:
 
 
 def _read_whole(disk: Disk, key: str) -> Metadata:
-    """Return the metadata of the result ``key`` after a check that its file of tensors has the right size.
+    """Return the metadata of the result ``key`` after a check that its file of tensors has the
+    right size.
 
     Raises an error in `UNREADABLE` if a file is missing or damaged.
     """
@@ -66,10 +84,11 @@ def _read_whole(disk: Disk, key: str) -> Metadata:
 
 
 def find(disk: Disk, key: str) -> Metadata | None:
-    """Return the metadata of ``key``, or None if there are none; raise an error in `UNREADABLE` for damaged metadata.
+    """Return the metadata of ``key``, or None if there are none; raise an error in `UNREADABLE` for
+    damaged metadata.
 
-    Damaged metadata are read a second time before the result counts as damaged, because another process may be
-    renaming the file at that moment.
+    Damaged metadata are read a second time before the result counts as damaged, because another
+    process may be renaming the file at that moment.
     """
     for _ in range(2):
         try:
@@ -102,7 +121,9 @@ def record_use(disk: Disk, key: str) -> None:
 
 
 def is_kept(about: Metadata | None) -> TypeGuard[Metadata]:
-    """Return True if the metadata of a result describe a stored value, not an evicted or unsaved value."""
+    """Return True if the metadata of a result describe a stored value, not an evicted or unsaved
+    value.
+    """
     return about is not None and bool(about.get("kept", True))
 
 
@@ -117,19 +138,28 @@ def receipt(about: Metadata) -> Metadata:
 
 
 def names(disk: Disk) -> Iterator[str]:
-    """Yield the cache key of every result of a store in ascending order; follow no symbolic link."""
+    """Yield the cache key of every result of a store in ascending order; follow no symbolic
+    link.
+    """
     for folder in _folders(disk):
         found = (entry.name.rpartition(".") for entry in entries(folder.path))
-        yield from sorted(key for key, _, suffix in found if suffix == "json" and key[:2] == folder.name)
+        yield from sorted(
+            key for key, _, suffix in found if suffix == "json" and key[:2] == folder.name
+        )
 
 
 def _folders(disk: Disk) -> list[os.DirEntry[str]]:
     found = [entry for entry in entries(disk.folder) if _TOP.fullmatch(entry.name)]
-    return sorted((entry for entry in found if entry.is_dir(follow_symlinks=False)), key=lambda entry: entry.name)
+    return sorted(
+        (entry for entry in found if entry.is_dir(follow_symlinks=False)),
+        key=lambda entry: entry.name,
+    )
 
 
 def each(disk: Disk) -> Iterator[tuple[str, Metadata]]:
-    """Yield the key and the metadata of every result of a store; skip metadata that cannot be read."""
+    """Yield the key and the metadata of every result of a store; skip metadata that cannot be
+    read.
+    """
     for key in names(disk):
         with suppress(*UNREADABLE):
             yield key, read(disk, key)

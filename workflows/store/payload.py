@@ -18,14 +18,17 @@ if TYPE_CHECKING:
 
     from neusee.workflows.store.band_files import Blobs
 
-_SAMPLED = 1 / 20  #: fraction of the loads that mode ``sampled`` verifies although the file has not been touched
-_draw = random.Random()  # a separate generator, so that loads do not change the random numbers of a user
+#: fraction of the loads that mode ``sampled`` verifies although the file has not been touched
+_SAMPLED = 1 / 20
+# a separate generator, so that loads do not change the random numbers of a user
+_draw = random.Random()
 
 
 def described(
     key: str, value: Any, about: Metadata, blobs: Blobs | None = None
 ) -> tuple[Metadata, list[Tensor], dict[str, str]]:
-    """Return the metadata of a new value, the tensors that need a file, and the checksums of its bands by name.
+    """Return the metadata of a new value, the tensors that need a file, and the checksums of its
+    bands by name.
 
     Small tensors are part of the metadata.
     """
@@ -47,14 +50,19 @@ def written(file: IO[bytes], tensors: list[Tensor]) -> Metadata:
     from neusee.workflows.store import serialization
 
     sha256 = hashlib.sha256() if secrets() else None
-    xxh3 = serialization.write(file, tensors, sha256) if sha256 else serialization.write(file, tensors)
+    xxh3 = (
+        serialization.write(file, tensors, sha256) if sha256 else serialization.write(file, tensors)
+    )
     file.flush()
     os.fsync(file.fileno())
     return {"size": file.tell(), "xxh3": xxh3} | ({"sha256": sha256.hexdigest()} if sha256 else {})
 
 
-def load(disk: Disk, about: Metadata, verify: str, blobs: Blobs, typed: bool = True) -> tuple[Any, int]:
-    """Return the value that the metadata ``about`` describe, and the number of bytes compared with the checksum.
+def load(
+    disk: Disk, about: Metadata, verify: str, blobs: Blobs, typed: bool = True
+) -> tuple[Any, int]:
+    """Return the value that the metadata ``about`` describe, and the number of bytes compared with
+    the checksum.
 
     Only bytes of the payload file are counted. With ``typed=False``, named tuples are plain tuples.
 
@@ -69,9 +77,12 @@ def load(disk: Disk, about: Metadata, verify: str, blobs: Blobs, typed: bool = T
         path = disk.path(about["key"], "safetensors")
         stamp = stamp_of(path)
         if stamp[1] != payload["size"]:
-            raise ValueError(f"the file of tensors has {stamp[1]} bytes instead of {payload['size']} bytes")
+            raise ValueError(
+                f"the file of tensors has {stamp[1]} bytes instead of {payload['size']} bytes"
+            )
         due = check or (verify == "sampled" and stamp != payload.get("stamp"))
-        sha256 = (payload.get("sha256", ""),) if secrets() else ()  # whatever ``verify`` says: the checksum has no key
+        # whatever ``verify`` says: the checksum has no key
+        sha256 = (payload.get("sha256", ""),) if secrets() else ()
         tensors = serialization.read(path, payload["xxh3"] if due else None, *sha256)
         compared = payload["size"] if due else 0
     if bands and verify == "sampled" and not check:
@@ -88,7 +99,8 @@ def check_kind(value: Any, kind: Any) -> None:
 
 
 def stamp_of(path: str) -> list[int]:
-    """Return the inode, size and times (ns) of a file; any write to the file changes one of these numbers.
+    """Return the inode, size and times (ns) of a file; any write to the file changes one of these
+    numbers.
 
     Raises `ValueError` for what is no file, such as a pipe.
     """

@@ -1,4 +1,6 @@
-"""Owner of a file: a process on a machine, with a check that the process still runs. The check uses no clock."""
+"""Owner of a file: a process on a machine, with a check that the process still runs. The check
+uses no clock.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +21,17 @@ class Owner:
 
     host: str  #: digest of the machine, its present boot and its namespace of process numbers
     pid: int
-    began: str  #: start time in ticks since the machine's boot; empty if the system does not give the time
+    #: start time in ticks since the machine's boot; empty if the system does not give the time
+    began: str
 
     def __str__(self) -> str:
         return f"{self.host}-{self.pid}-{self.began}"
 
     @property
     def state(self) -> State:
-        """Return the process state: ``alive``, ``dead`` (ended or stopped) or ``foreign`` (on another machine)."""
+        """Return the process state: ``alive``, ``dead`` (ended or stopped) or ``foreign`` (on
+        another machine).
+        """
         if self.host != host():
             return "foreign"
         if self.pid == os.getpid():
@@ -41,10 +46,16 @@ class Owner:
 
 
 def owner_of(text: str) -> Owner | None:
-    """Return the process that a text such as ``<host>-<number>-<start time>`` names, or None for any other text."""
+    """Return the process that a text such as ``<host>-<number>-<start time>`` names, or None for
+    any other text.
+    """
     host, _, rest = text.partition("-")
     pid, _, began = rest.partition("-")
-    return Owner(host, int(pid), began) if len(host) == 12 and pid.isdecimal() and len(pid) < 12 else None
+    return (
+        Owner(host, int(pid), began)
+        if len(host) == 12 and pid.isdecimal() and len(pid) < 12
+        else None
+    )
 
 
 def me() -> Owner:
@@ -62,7 +73,9 @@ def _me(pid: int) -> Owner:
 
 @cache
 def host() -> str:
-    """Return a digest of this machine and its present boot; two containers of the same name have different digests."""
+    """Return a digest of this machine and its present boot; two containers of the same name have
+    different digests.
+    """
     parts = [os.uname().nodename]
     with suppress(OSError):  # a system without these files
         with open("/proc/sys/kernel/random/boot_id") as file:
@@ -74,7 +87,8 @@ def host() -> str:
 def _process(pid: int) -> tuple[str, str]:
     """Return the state and the start time of a process from ``/proc``."""
     with open(f"/proc/{pid}/stat", "rb") as file:
-        fields = file.read().rpartition(b")")[2].split()  # behind the name, which may hold any character
+        # behind the name, which may hold any character
+        fields = file.read().rpartition(b")")[2].split()
     if len(fields) < 20:
         raise ValueError(f"the file /proc/{pid}/stat is incomplete")
     return fields[0].decode(), fields[19].decode()

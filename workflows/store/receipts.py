@@ -1,4 +1,6 @@
-"""Receipts of one store, the metadata of results without a value: a file is read again only after it has changed."""
+"""Receipts of one store, the metadata of results without a value: a file is read again only
+after it has changed.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,9 @@ from neusee.workflows.store.shared_folder import Disk
 
 
 class Receipts:
-    """The metadata files of one store, of which those of receipts are remembered with the stamp of their file."""
+    """The metadata files of one store, of which those of receipts are remembered with the stamp
+    of their file.
+    """
 
     def __init__(self, disk: Disk) -> None:
         self._disk = disk
@@ -23,7 +27,8 @@ class Receipts:
         try:
             stamp = stamp_of(self._disk.path(key, "json"))
         except (OSError, ValueError):
-            return metadata.find(self._disk, key)  # which tells what is wrong with the file, or that there is none
+            # which tells what is wrong with the file, or that there is none
+            return metadata.find(self._disk, key)
         if key in self._read and self._read[key][0] == stamp:
             return self._read[key][1]
         about = metadata.find(self._disk, key)

@@ -1,10 +1,12 @@
-"""A store at a URL that many machines share, on any file system of fsspec, with a local folder for copies.
+"""A store at a URL that many machines share, on any file system of fsspec, with a local folder for
+copies.
 
-The local folder (the local layer) is an ordinary `Store`. It stores each value that is read from the URL; a new value
-is stored in the local layer and at the URL. At the URL, a payload has its checksum in its name and is complete before
-the metadata that name the payload, so that two writers of one key cannot mix their files. Leases, pins and the size
-budget belong to the local layer alone: two machines may compute the same key, and the first result stays. After a
-failure of the URL, a run issues one warning and continues with the local layer.
+The local folder (the local layer) is an ordinary `Store`. It stores each value that is read from
+the URL; a new value is stored in the local layer and at the URL. At the URL, a payload has its
+checksum in its name and is complete before the metadata that name the payload, so that two writers
+of one key cannot mix their files. Leases, pins and the size budget belong to the local layer alone:
+two machines may compute the same key, and the first result stays. After a failure of the URL, a run
+issues one warning and continues with the local layer.
 """
 
 from __future__ import annotations
@@ -32,9 +34,11 @@ from neusee.workflows.store.result_store import Store
 
 
 def open_store(where: str | Path | None = None) -> Store:
-    """Open the store at a folder or a URL (``s3://bucket/name``); None means ``$NEUSEE_CACHE`` or the default folder.
+    """Open the store at a folder or a URL (``s3://bucket/name``); None means ``$NEUSEE_CACHE`` or
+    the default folder.
 
-    Raises `ValueError` for an unknown scheme, and `ModuleNotFoundError` if the package for the scheme is missing.
+    Raises `ValueError` for an unknown scheme, and `ModuleNotFoundError` if the package for the
+    scheme is missing.
     """
     where = os.environ.get("NEUSEE_CACHE") or None if where is None else where
     if isinstance(where, str) and "://" in where:
@@ -43,7 +47,9 @@ def open_store(where: str | Path | None = None) -> Store:
 
 
 def local_layer(url: str) -> Path:
-    """Return the local folder for copies from ``url``: ``$NEUSEE_CACHE_LOCAL`` or a folder in ``~/.cache/neusee``."""
+    """Return the local folder for copies from ``url``: ``$NEUSEE_CACHE_LOCAL`` or a folder in
+    ``~/.cache/neusee``.
+    """
     if folder := os.environ.get("NEUSEE_CACHE_LOCAL"):
         return Path(folder)
     return Path.home() / ".cache" / "neusee" / digest(url.rstrip("/"))[:16]
@@ -53,7 +59,12 @@ class RemoteStore(Store):
     """A local `Store` that reads missing results from ``url`` and also writes its results there."""
 
     def __init__(
-        self, url: str, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
+        self,
+        url: str,
+        root: Path | str | None = None,
+        *,
+        verify: Verify | None = None,
+        budget: int | None = None,
     ) -> None:
         self.url, self._remote = url, RemoteFiles(url)
         self._seen: dict[Key, Metadata] = {}  # metadata read from the URL
@@ -65,25 +76,33 @@ class RemoteStore(Store):
         return partial(type(self), self.url, self.root, verify=self.verify, budget=self.budget), ()
 
     def about(self, key: Key) -> Metadata | None:
-        """Return the metadata of a result from the local folder or the URL, without reading the value."""
+        """Return the metadata of a result from the local folder or the URL, without reading the
+        value.
+        """
         here = super().about(key)
         return here if is_kept(here) else self._remote_metadata(key) or here
 
     def get(self, key: Key, kind: Any = Any) -> Any:
-        """Return the value of ``key``; raise `KeyError` if neither the local folder nor the URL has the value."""
+        """Return the value of ``key``; raise `KeyError` if neither the local folder nor the URL
+        has the value.
+        """
         if not self._is_local(key):
             self._fetch_value(key)
         return super().get(key, kind)
 
     def put_aside(self, key: Key, error: Exception) -> None:
-        """Move the local files of a damaged result to ``bad/``; the second time, do not use its copy at the URL."""
+        """Move the local files of a damaged result to ``bad/``; the second time, do not use its
+        copy at the URL.
+        """
         super().put_aside(key, error)
         if key in self._failed:
             self._give_up(key)
         self._failed.add(key)
 
     def put(self, key: Key, value: Any, about: Metadata) -> bool:
-        """Store a value locally and at the URL; return False if the value cannot be stored locally."""
+        """Store a value locally and at the URL; return False if the value cannot be stored
+        locally.
+        """
         stored = super().put(key, value, about)
         if stored:
             self._send(key)
@@ -92,17 +111,27 @@ class RemoteStore(Store):
     def put_receipt(self, key: Key, about: Metadata) -> bool:
         """Store the metadata of a result without its value, locally and at the URL."""
         stored = super().put_receipt(key, about)
-        if stored and not self._remote.exists(_receipt_name(key)) and not self._remote.exists(f"{key}.json"):
-            self._remote.write(_receipt_name(key), seal_record("receipt at a URL", receipt({"key": key, **about})))
+        if (
+            stored
+            and not self._remote.exists(_receipt_name(key))
+            and not self._remote.exists(f"{key}.json")
+        ):
+            self._remote.write(
+                _receipt_name(key), seal_record("receipt at a URL", receipt({"key": key, **about}))
+            )
         return stored
 
     def entries(self) -> Iterator[tuple[Key, Metadata]]:
-        """Yield every key with its metadata: first the local results, then the results that are only at the URL."""
+        """Yield every key with its metadata: first the local results, then the results that are
+        only at the URL.
+        """
         here = set()
         for key, about in super().entries():
             here.add(key)
             yield key, about
-        there = sorted({name.partition(".")[0] for name in self._remote.names() if ".json" in name} - here)
+        there = sorted(
+            {name.partition(".")[0] for name in self._remote.names() if ".json" in name} - here
+        )
         with ThreadPoolExecutor(16) as pool:
             for key, remote in zip(there, pool.map(self._remote_metadata, there), strict=True):
                 if remote is not None:
@@ -118,16 +147,24 @@ class RemoteStore(Store):
         return is_kept(super().about(key))
 
     def _remote_metadata(self, key: Key, look: bool = False) -> Metadata | None:
-        """Return the metadata of a result at the URL; if ``look`` is True, request an unlisted file too."""
+        """Return the metadata of a result at the URL; if ``look`` is True, request an unlisted
+        file too.
+        """
         value, note = f"{key}.json", _receipt_name(key)
-        if key not in self._broken and (look or self._remote.exists(value)) and not is_kept(self._seen.get(key)):
+        if (
+            key not in self._broken
+            and (look or self._remote.exists(value))
+            and not is_kept(self._seen.get(key))
+        ):
             self._read_metadata(key, value, "result at a URL")
         if key not in self._seen and self._remote.exists(note):
             self._read_metadata(key, note, "receipt at a URL")
         return self._seen.get(key)
 
     def _read_metadata(self, key: Key, name: str, kind: Kind) -> None:
-        """Read the metadata file ``name`` at the URL; damaged metadata count as missing, after a warning."""
+        """Read the metadata file ``name`` at the URL; damaged metadata count as missing, after a
+        warning.
+        """
         raw = self._remote.read(name)
         if raw is not None:
             try:
@@ -139,19 +176,25 @@ class RemoteStore(Store):
                 self._distrust(key, error)
 
     def _fetch_value(self, key: Key) -> None:
-        """Copy the value of a key from the URL into the local folder; after a failure, do not fetch this key again."""
+        """Copy the value of a key from the URL into the local folder; after a failure, do not
+        fetch this key again.
+        """
         about = self._remote_metadata(key, look=True)
         try:
             if is_kept(about) and not self._value_fetched(key, about):
                 self._give_up(key)
         except OSError as error:
             self._give_up(key)
-            self._remote.warn(f"{self.root} cannot keep copies of {self.url} ({error}): set NEUSEE_CACHE_LOCAL")
+            self._remote.warn(
+                f"{self.root} cannot keep copies of {self.url} ({error}): set NEUSEE_CACHE_LOCAL"
+            )
         except UNREADABLE as error:
             self._distrust(key, error)
 
     def _value_fetched(self, key: Key, about: Metadata) -> bool:
-        """Copy a value from the URL into the local folder after a check of every byte; return False if a copy fails."""
+        """Copy a value from the URL into the local folder after a check of every byte; return
+        False if a copy fails.
+        """
         from neusee.workflows.store.serialization import blobs_in
 
         payload, bands = about["payload"], blobs_in(about["layout"])
@@ -161,7 +204,9 @@ class RemoteStore(Store):
             if payload and not self._fetched(_payload_name(key, payload["xxh3"]), part, payload):
                 return False
             with ThreadPoolExecutor(16) as pool:
-                if not all(pool.map(self._remote.fetch, starmap(_band_name, missing.items()), parts)):
+                if not all(
+                    pool.map(self._remote.fetch, starmap(_band_name, missing.items()), parts)
+                ):
                     return False
             with self.disk.lock():
                 if not self._is_local(key):
@@ -176,7 +221,9 @@ class RemoteStore(Store):
         return part
 
     def _named(self, parts: dict[str, str], bands: dict[str, str]) -> None:
-        """Give band files that were copied from the URL their final names; raise `ValueError` for a wrong checksum."""
+        """Give band files that were copied from the URL their final names; raise `ValueError`
+        for a wrong checksum.
+        """
         for name, part in parts.items():
             self.disk.make_folder(str(self.blobs.root))
             self.disk.link(part, self.blobs.path(name))
@@ -185,7 +232,9 @@ class RemoteStore(Store):
             self.blobs.read([name], (1, *blob.shape), blob.dtype, xxh3=[xxh3])
 
     def _described(self, key: Key, about: Metadata, part: str) -> None:
-        """Give the copied file of tensors of a value its final name, and write the metadata with local time stamps."""
+        """Give the copied file of tensors of a value its final name, and write the metadata with
+        local time stamps.
+        """
         about = dict(about)
         if about["payload"]:
             path = self.disk.path(key, "safetensors")
@@ -207,13 +256,19 @@ class RemoteStore(Store):
             xxh3, size = hashlib.file_digest(file, xxhash.xxh3_128).hexdigest(), file.tell()
             os.fsync(file.fileno())
             file.seek(0)
-            signed = not secrets() or hashlib.file_digest(file, "sha256").hexdigest() == payload.get("sha256")
+            signed = not secrets() or hashlib.file_digest(
+                file, "sha256"
+            ).hexdigest() == payload.get("sha256")
         if (size, xxh3) != (payload["size"], payload["xxh3"]) or not signed:
-            raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
+            raise ValueError(
+                "checksum mismatch: the stored bytes have changed since they were written"
+            )
         return True
 
     def _send(self, key: Key) -> None:
-        """Copy a local value to the URL, the large files before the metadata; copy nothing for an evicted value."""
+        """Copy a local value to the URL, the large files before the metadata; copy nothing for
+        an evicted value.
+        """
         name, over = f"{key}.json", key in self._broken
         if not over and self._remote.exists(name):
             return
@@ -224,7 +279,10 @@ class RemoteStore(Store):
             return
         with ThreadPoolExecutor(16) as pool:
             sent = pool.map(
-                lambda to: (not over and self._remote.exists(to)) or self._remote.send(files[to], to), files
+                lambda to: (
+                    (not over and self._remote.exists(to)) or self._remote.send(files[to], to)
+                ),
+                files,
             )
             if not all(sent):
                 return
@@ -232,7 +290,9 @@ class RemoteStore(Store):
             self._broken.discard(key)
 
     def _files(self, key: Key, about: Metadata) -> dict[str, str]:
-        """Return the local paths of the payload and band files of a value, by the name of each file at the URL."""
+        """Return the local paths of the payload and band files of a value, by the name of each
+        file at the URL.
+        """
         from neusee.workflows.store.serialization import blobs_in
 
         paths = {}
@@ -248,7 +308,9 @@ class RemoteStore(Store):
 
     def _distrust(self, key: Key, error: Exception) -> None:
         self._give_up(key)
-        warnings.warn(f"the result {key} at {self.url} is damaged ({error}) and is not used", stacklevel=4)
+        warnings.warn(
+            f"the result {key} at {self.url} is damaged ({error}) and is not used", stacklevel=4
+        )
 
 
 def _receipt_name(key: Key) -> str:

@@ -1,10 +1,12 @@
-"""Store of results: a folder with the files ``<key>.json`` and ``<key>.safetensors`` of each result.
+"""Store of results: a folder with the files ``<key>.json`` and ``<key>.safetensors`` of each
+result.
 
-The JSON holds the metadata of a result (the parts of its key, layout, statistics, checks, seconds, versions) and the
-whole value of a small result. Of an evicted or unsaved value only the metadata remain, called a receipt. A checksum
-covers every byte and is compared at each load. A result that fails the comparison is moved away with one warning and
-counts as missing. A result gets its final name when it is complete, so that a killed process leaves no incomplete
-result. If the folder cannot be written, a run issues one warning and continues.
+The JSON holds the metadata of a result (the parts of its key, layout, statistics, checks, seconds,
+versions) and the whole value of a small result. Of an evicted or unsaved value only the metadata
+remain, called a receipt. A checksum covers every byte and is compared at each load. A result that
+fails the comparison is moved away with one warning and counts as missing. A result gets its final
+name when it is complete, so that a killed process leaves no incomplete result. If the folder cannot
+be written, a run issues one warning and continues.
 """
 
 from __future__ import annotations
@@ -46,13 +48,19 @@ class Store(Warned, Maintained):
     """
 
     def __init__(
-        self, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
+        self,
+        root: Path | str | None = None,
+        *,
+        verify: Verify | None = None,
+        budget: int | None = None,
     ) -> None:
-        """Open the store in the folder ``root``; environment variables such as $NEUSEE_CACHE replace missing arguments.
+        """Open the store in the folder ``root``; environment variables such as $NEUSEE_CACHE
+        replace missing arguments.
 
-        ``verify="always"`` compares the checksum of every payload that is loaded. ``"sampled"`` compares the checksum
-        of a file that was touched after its last write, and otherwise at one load in twenty. ``"never"`` compares no
-        such checksum. The checksum of the JSON and the size of every payload are always compared.
+        ``verify="always"`` compares the checksum of every payload that is loaded. ``"sampled"``
+        compares the checksum of a file that was touched after its last write, and otherwise at one
+        load in twenty. ``"never"`` compares no such checksum. The checksum of the JSON and the size
+        of every payload are always compared.
         """
         self.root = default_root() if root is None else Path(root)
         self.verify: Verify = verify_mode(verify)
@@ -70,7 +78,8 @@ class Store(Warned, Maintained):
         self._used: set[str] = set()
         self._missed: set[str] = set()
 
-    def __reduce__(self) -> tuple[Any, ...]:  # another process receives the path and opens the store
+    # another process receives the path and opens the store
+    def __reduce__(self) -> tuple[Any, ...]:
         return partial(type(self), self.root, verify=self.verify, budget=self.budget), ()
 
     @cached_property
@@ -85,7 +94,9 @@ class Store(Warned, Maintained):
         return is_kept(self.about(key))
 
     def about(self, key: str) -> Metadata | None:
-        """Return the metadata of a result, or None; the field ``kept`` tells whether the value is stored as well."""
+        """Return the metadata of a result, or None; the field ``kept`` tells whether the value
+        is stored as well.
+        """
         about = self._known.get(key)
         if is_kept(about):
             return about
@@ -106,7 +117,9 @@ class Store(Warned, Maintained):
         return about
 
     def asked(self) -> dict[str, Metadata | None]:
-        """Return the metadata of each result that this process asked for so far; None for one that is missing."""
+        """Return the metadata of each result that this process asked for so far; None for one
+        that is missing.
+        """
         return {**dict.fromkeys(self._missed | self._lost), **self._known}
 
     def loaded(self) -> set[str]:
@@ -133,19 +146,27 @@ class Store(Warned, Maintained):
         raise KeyError(key)
 
     def put(self, key: str, value: Any, about: Metadata) -> bool:
-        """Store a value and its metadata; return False if the folder is not writable or the budget is too small."""
+        """Store a value and its metadata; return False if the folder is not writable or the
+        budget is too small.
+        """
         return self._try(self._write, key, value, about)
 
     def put_receipt(self, key: str, about: Metadata) -> bool:
-        """Store the metadata of a result without its value, unless the value or its metadata are stored already."""
+        """Store the metadata of a result without its value, unless the value or its metadata are
+        stored already.
+        """
         return self._try(self._write_receipt, key, about)
 
     def put_small(self, key: str, value: Any, about: Metadata) -> bool:
-        """Store a small value in the common file of small values; for a larger value, store only the metadata."""
+        """Store a small value in the common file of small values; for a larger value, store only
+        the metadata.
+        """
         return self._try(self._write_small, key, value, about)
 
     def entries(self) -> Iterator[tuple[str, Metadata]]:
-        """Yield key and metadata of every result in the order of the keys, also of results without a stored value."""
+        """Yield key and metadata of every result in the order of the keys, also of results
+        without a stored value.
+        """
         small, before = self.brief.keys(), ""
         for key in heapq.merge(metadata.names(self.disk), sorted(small)):
             about = self._listed(key, key in small) if key != before else None
@@ -154,7 +175,8 @@ class Store(Warned, Maintained):
                 yield key, about
 
     def _listed(self, key: str, small: bool) -> Metadata | None:
-        """Return the metadata of a result as `about`, but remember nothing, so that a list of any length takes no room.
+        """Return the metadata of a result as `about`, but remember nothing, so that a list of any
+        length takes no room.
 
         ``small`` tells whether the common file of small results has a line of the result.
         """
@@ -168,28 +190,38 @@ class Store(Warned, Maintained):
             return self.about(key)  # missing meanwhile, damaged or not read
 
     def claim(self, key: str) -> Lease | None:
-        """Return the lease of ``key``, the right to compute its result, or None while a running process holds it."""
+        """Return the lease of ``key``, the right to compute its result, or None while a running
+        process holds it.
+        """
         return self._leases.claim(key)
 
     def read_seconds(self, size: float) -> float:
-        """Return the predicted time in seconds for loading ``size`` bytes, based on earlier loads from this store."""
+        """Return the predicted time in seconds for loading ``size`` bytes, based on earlier
+        loads from this store.
+        """
         return self._speeds.seconds("read", size)
 
     def write_seconds(self, size: float) -> float:
-        """Return the predicted time in seconds for storing ``size`` bytes, based on earlier writes to this store."""
+        """Return the predicted time in seconds for storing ``size`` bytes, based on earlier
+        writes to this store.
+        """
         return self._speeds.seconds("write", size)
 
     def _again(self, key: str) -> Metadata | None:
-        """Read the metadata of a result again; return None if the metadata were removed or cannot be read."""
+        """Read the metadata of a result again; return None if the metadata were removed or
+        cannot be read.
+        """
         self._known.pop(key, None)
         with suppress(*UNREADABLE):
             return metadata.read(self.disk, key)
         return None
 
     def load(self, about: Metadata, verify: str, kind: Any = Any) -> Any:
-        """Return the value that the metadata ``about`` describe; raise an error in `UNREADABLE` if it is damaged.
+        """Return the value that the metadata ``about`` describe; raise an error in `UNREADABLE` if
+        it is damaged.
 
-        For the ``kind`` None the named tuples in the value are plain tuples, so that no type need be known.
+        For the ``kind`` None the named tuples in the value are plain tuples, so that no type need
+        be known.
         """
         began = time.perf_counter()
         value, size = payload.load(self.disk, about, verify, self.blobs, kind is not None)
@@ -199,13 +231,17 @@ class Store(Warned, Maintained):
         return value
 
     def _use(self, key: str) -> None:
-        """Record the use of a value as the modification time of its JSON file, at most once an hour."""
+        """Record the use of a value as the modification time of its JSON file, at most once an
+        hour.
+        """
         if key not in self._used:
             self._used.add(key)
             record_use(self.disk, key)
 
     def _try(self, write: Callable[..., bool], key: str, *arguments: Any) -> bool:
-        """Return the result of ``write``, called again if a folder was removed; on failure, return False and warn."""
+        """Return the result of ``write``, called again if a folder was removed; on failure,
+        return False and warn.
+        """
         try:
             try:
                 return write(key, *arguments)
@@ -243,7 +279,9 @@ class Store(Warned, Maintained):
         return is_kept(entry)
 
     def _write_parts(self, key: str, entry: Metadata, tensors: list[Tensor], banded: Any) -> None:
-        """Write the large files of a value, then the metadata that name the files; keep a value stored earlier."""
+        """Write the large files of a value, then the metadata that name the files; keep a value
+        stored earlier.
+        """
         with self.disk.temporary(key) as (part, file):
             if tensors:
                 entry["payload"] = payload.written(file, tensors)
@@ -264,7 +302,9 @@ class Store(Warned, Maintained):
         self._known[key] = entry
 
     def _write_receipt(self, key: str, about: Metadata) -> bool:
-        """Write the metadata of a result without its value, unless the store has metadata of the result."""
+        """Write the metadata of a result without its value, unless the store has metadata of the
+        result.
+        """
         entry = metadata.receipt({"key": key, **about})
         if self.about(key) is None and metadata.write(self.disk, key, entry, over=False):
             self._known[key] = entry
@@ -278,12 +318,19 @@ class Store(Warned, Maintained):
 
     def _put_aside(self, key: str, error: Exception) -> None:
         self.put_aside(key, error)
-        if isinstance(error, OSError) and not isinstance(error, FileNotFoundError | PermissionError):
-            return self.report_failure(error, "read")  # the device fails, of which one warning is enough
-        warnings.warn(f"the stored result {key} is damaged ({error}) and counts as missing", stacklevel=5)
+        if isinstance(error, OSError) and not isinstance(
+            error, FileNotFoundError | PermissionError
+        ):
+            # the device fails, of which one warning is enough
+            return self.report_failure(error, "read")
+        warnings.warn(
+            f"the stored result {key} is damaged ({error}) and counts as missing", stacklevel=5
+        )
 
     def put_aside(self, key: str, error: Exception) -> None:
-        """Move the files of a damaged result to ``bad/`` for inspection; a file of another user stays."""
+        """Move the files of a damaged result to ``bad/`` for inspection; a file of another user
+        stays.
+        """
         self._known.pop(key, None)
         self._lost.add(key)
         unreadable = isinstance(error, OSError) and not isinstance(error, FileNotFoundError)

@@ -1,8 +1,9 @@
 """Format of a stored value: a layout in JSON, and the tensors in one safetensors file.
 
-The file is written from the memory of the tensors and read through a memory map, so that neither writing nor reading
-makes a copy. Each tensor begins at a multiple of 64 bytes like a newly allocated tensor, so that a kernel uses the same
-code path for a stored value and a computed value. The layout of a `Stacked` tensor names one band file for each slice.
+The file is written from the memory of the tensors and read through a memory map, so that neither
+writing nor reading makes a copy. Each tensor begins at a multiple of 64 bytes like a newly
+allocated tensor, so that a kernel uses the same code path for a stored value and a computed value.
+The layout of a `Stacked` tensor names one band file for each slice.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from neusee.workflows.store.stored_types import is_registered, made, stored_type
 
 _PIECE = 1 << 18  #: bytes of a file that are read at once
 _ALIGN = 64
-_FILLER = "_"  #: first letter of the names of padding entries, which fill up to the next multiple of `_ALIGN`
+#: first letter of the names of padding entries, which fill up to the next multiple of `_ALIGN`
+_FILLER = "_"
 _DTYPES = {
     torch.float64: "F64",
     torch.float32: "F32",
@@ -50,12 +52,15 @@ _NAMES = {name: dtype for dtype, name in _DTYPES.items()}
 
 
 def each_tensor(change: Callable[[Tensor], Tensor], value: Any) -> Any:
-    """Return ``value`` with the function ``change`` applied once to every distinct tensor in ``value``."""
+    """Return ``value`` with the function ``change`` applied once to every distinct tensor in
+    ``value``.
+    """
     return _change(value, change, {})
 
 
 def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tensor]) -> Any:
-    """Return ``item`` with ``change`` applied to its tensors; ``done`` has the changed tensors by identity.
+    """Return ``item`` with ``change`` applied to its tensors; ``done`` has the changed tensors by
+    identity.
 
     A nested function would hold the tensors until garbage collection.
     """
@@ -68,7 +73,9 @@ def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tenso
         return item._make(items) if hasattr(item, "_make") else tuple(items)
     if isinstance(item, list):
         return [_change(i, change, done) for i in item]
-    return {k: _change(v, change, done) for k, v in item.items()} if isinstance(item, dict) else item
+    return (
+        {k: _change(v, change, done) for k, v in item.items()} if isinstance(item, dict) else item
+    )
 
 
 def tensors_in(value: Any) -> list[Tensor]:
@@ -79,9 +86,11 @@ def tensors_in(value: Any) -> list[Tensor]:
 
 
 def settle(value: Any) -> Any:
-    """Return ``value`` as if read from the store: contiguous tensors that hold no memory beyond their own elements.
+    """Return ``value`` as if read from the store: contiguous tensors that hold no memory beyond
+    their own elements.
 
-    They have no attributes and no class of a user, and want a gradient only where gradients are recorded.
+    They have no attributes and no class of a user, and want a gradient only where gradients are
+    recorded.
     """
     return each_tensor(_settled, value)
 
@@ -90,13 +99,17 @@ def _settled(x: Tensor) -> Tensor:
     x = _bare(x).resolve_conj().resolve_neg().contiguous()
     try:
         spare = x.untyped_storage().nbytes() > x.nbytes
-    except NotImplementedError:  # a tensor inside a transform of torch.func has no memory of its own
+    except (
+        NotImplementedError
+    ):  # a tensor inside a transform of torch.func has no memory of its own
         spare = False
     return x.clone(memory_format=torch.contiguous_format) if spare else x
 
 
 def forget_attributes(x: Tensor) -> None:
-    """Take from a tensor what was attached to it: a step that reads it from the store does not see that either."""
+    """Take from a tensor what was attached to it: a step that reads it from the store does not
+    see that either.
+    """
     if type(x) is Tensor and vars(x):
         vars(x).clear()
 
@@ -128,9 +141,11 @@ class _Listed:
 
 
 def pack(value: Any, blobs: Blobs | None = None) -> tuple[Any, list[Tensor]]:
-    """Return the JSON layout of ``value`` and its tensors; write `Stacked` tensors to the folder ``blobs`` if given.
+    """Return the JSON layout of ``value`` and its tensors; write `Stacked` tensors to the folder
+    ``blobs`` if given.
 
-    Raises `TypeError` for a value that cannot be stored, and `OSError` if ``blobs`` cannot be written.
+    Raises `TypeError` for a value that cannot be stored, and `OSError` if ``blobs`` cannot be
+    written.
     """
     listed = _Listed()
     return _layout(value, listed, blobs), listed.tensors
@@ -142,41 +157,73 @@ def _layout(item: Any, listed: _Listed, blobs: Blobs | None) -> dict[str, Any]:
     if isinstance(item, Tensor):
         return {"tensor": listed.add(item)}
     if isinstance(item, bytes):
-        return {"bytes": listed.add(torch.frombuffer(bytearray(item), dtype=torch.uint8) if item else torch.empty(0))}
+        return {
+            "bytes": listed.add(
+                torch.frombuffer(bytearray(item), dtype=torch.uint8) if item else torch.empty(0)
+            )
+        }
     if isinstance(item, tuple):
         items = [_layout(i, listed, blobs) for i in item]
-        return {"tuple": items} if type(item) is tuple else {"class": _class_name(item), "items": items}
+        return (
+            {"tuple": items}
+            if type(item) is tuple
+            else {"class": _class_name(item), "items": items}
+        )
     if isinstance(item, list):
         return {"list": [_layout(i, listed, blobs) for i in item]}
     if isinstance(item, dict) and all(isinstance(k, str) for k in item):
         return {"dict": {k: _layout(v, listed, blobs) for k, v in item.items()}}
     if item is None or isinstance(item, bool | int | float | str):
         return {"value": item}
-    raise TypeError(f"a step must return tensors, numbers, strings, bytes or collections of these, not {type(item)}")
+    raise TypeError(
+        "a step must return tensors, numbers, strings, bytes or collections of these, not"
+        f" {type(item)}"
+    )
 
 
 def _stack_layout(item: Stacked, blobs: Blobs) -> dict[str, Any]:
     written = blobs.write_all(item.names, item.tensor.unbind())
     kind = str(item.tensor.dtype).removeprefix("torch.")
-    return {"stacked": {"names": list(item.names), "xxh3": written, "dtype": kind, "shape": list(item.tensor.shape)}}
+    return {
+        "stacked": {
+            "names": list(item.names),
+            "xxh3": written,
+            "dtype": kind,
+            "shape": list(item.tensor.shape),
+        }
+    }
 
 
 def unpack(
-    layout: Any, tensors: list[Tensor], blobs: Blobs | None = None, verify: bool = True, typed: bool = True
+    layout: Any,
+    tensors: list[Tensor],
+    blobs: Blobs | None = None,
+    verify: bool = True,
+    typed: bool = True,
 ) -> Any:
-    """Return the value that `pack` turned into ``layout`` and ``tensors``; ``typed=False`` gives plain tuples.
+    """Return the value that `pack` turned into ``layout`` and ``tensors``; ``typed=False`` gives
+    plain tuples.
 
-    Raises `UnknownType` for a named tuple that is not in the registry of `stored_types`, and `ValueError` for a layout
-    that `pack` did not write or a damaged band.
+    Raises `UnknownType` for a named tuple that is not in the registry of `stored_types`, and
+    `ValueError` for a layout that `pack` did not write or a damaged band.
     """
     checked_layout(layout)
     return _unpacked(layout, tensors, blobs, verify, typed)
 
 
-def _unpacked(layout: dict[str, Any], tensors: list[Tensor], blobs: Blobs | None, verify: bool, typed: bool) -> Any:
+def _unpacked(
+    layout: dict[str, Any], tensors: list[Tensor], blobs: Blobs | None, verify: bool, typed: bool
+) -> Any:
     if "class" in layout or "tuple" in layout:
-        items = [_unpacked(i, tensors, blobs, verify, typed) for i in layout["items" if "class" in layout else "tuple"]]
-        return made(stored_type(layout["class"]), items) if typed and "class" in layout else tuple(items)
+        items = [
+            _unpacked(i, tensors, blobs, verify, typed)
+            for i in layout["items" if "class" in layout else "tuple"]
+        ]
+        return (
+            made(stored_type(layout["class"]), items)
+            if typed and "class" in layout
+            else tuple(items)
+        )
     ((kind, body),) = layout.items()
     if kind in ("tensor", "bytes"):
         if body >= len(tensors):
@@ -184,11 +231,19 @@ def _unpacked(layout: dict[str, Any], tensors: list[Tensor], blobs: Blobs | None
         return tensors[body] if kind == "tensor" else _bytes(tensors[body])
     if kind == "stacked":
         if blobs is None:
-            raise ValueError("the value has band files: give the folder of the band files as ``blobs``")
-        return blobs.read(body["names"], body["shape"], dtype_of(body["dtype"]), verify, body["xxh3"])
+            raise ValueError(
+                "the value has band files: give the folder of the band files as ``blobs``"
+            )
+        return blobs.read(
+            body["names"], body["shape"], dtype_of(body["dtype"]), verify, body["xxh3"]
+        )
     if kind == "list":
         return [_unpacked(i, tensors, blobs, verify, typed) for i in body]
-    return {k: _unpacked(v, tensors, blobs, verify, typed) for k, v in body.items()} if kind == "dict" else body
+    return (
+        {k: _unpacked(v, tensors, blobs, verify, typed) for k, v in body.items()}
+        if kind == "dict"
+        else body
+    )
 
 
 def _bytes(x: Tensor) -> bytes:
@@ -198,21 +253,29 @@ def _bytes(x: Tensor) -> bytes:
 
 
 def blobs_in(layout: Any) -> dict[str, str]:
-    """Return the checksum (xxh3) of every band file that the layout of a value names, by the name of the band."""
+    """Return the checksum (xxh3) of every band file that the layout of a value names, by the
+    name of the band.
+    """
     return checked_layout(layout)
 
 
 def _class_name(item: tuple[Any, ...]) -> str:
-    """Return the name of the class of a named tuple in the registry; raise `TypeError` for any other class."""
+    """Return the name of the class of a named tuple in the registry; raise `TypeError` for any
+    other class.
+    """
     kind = type(item)
     if not is_registered(kind):
-        known = "annotate the node's result with it" if hasattr(item, "_fields") else "use a NamedTuple"
+        known = (
+            "annotate the node's result with it" if hasattr(item, "_fields") else "use a NamedTuple"
+        )
         raise TypeError(f"{kind.__module__}.{kind.__qualname__} cannot be stored: {known}")
     return type_name(kind)
 
 
 def to_text(x: Tensor) -> list[Any]:
-    """Return a small tensor as four JSON values: type, shape, True for a complex tensor, and the bytes as text."""
+    """Return a small tensor as four JSON values: type, shape, True for a complex tensor, and the
+    bytes as text.
+    """
     return [*_kind(x), base64.b64encode(bytes_of(x)).decode()]
 
 
@@ -239,7 +302,9 @@ def write(file: IO[bytes], tensors: list[Tensor], also: Any = None) -> str:
 
 
 def _parts(tensors: list[Tensor]) -> Iterator[bytes | memoryview]:
-    """Yield the bytes of a safetensors file: the length of the header, the header, and the padded tensors."""
+    """Yield the bytes of a safetensors file: the length of the header, the header, and the
+    padded tensors.
+    """
     header: dict[str, Any] = {"__metadata__": {}}
     end = 0
     for i, x in enumerate(tensors):
@@ -248,7 +313,11 @@ def _parts(tensors: list[Tensor]) -> Iterator[bytes | memoryview]:
         header[str(i)] = {"dtype": kind, "shape": shape, "data_offsets": [end, end + x.nbytes]}
         end += x.nbytes
         if pad := -end % _ALIGN:
-            header[f"{_FILLER}{i}"] = {"dtype": "U8", "shape": [pad], "data_offsets": [end, end + pad]}
+            header[f"{_FILLER}{i}"] = {
+                "dtype": "U8",
+                "shape": [pad],
+                "data_offsets": [end, end + pad],
+            }
             end += pad
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-(8 + len(text)) % _ALIGN)
@@ -260,10 +329,11 @@ def _parts(tensors: list[Tensor]) -> Iterator[bytes | memoryview]:
 
 
 def read(path: str, expected: str | None, sha256: str | None = None) -> list[Tensor]:
-    """Map the tensors in a safetensors file into memory, or copy them if another user could change them.
+    """Map the tensors in a safetensors file into memory, or copy them if another user could change
+    them.
 
-    Compare the file with the checksum ``expected`` and the digest ``sha256`` if given. Raises `ValueError` for a file
-    that differs, or that `write` did not write.
+    Compare the file with the checksum ``expected`` and the digest ``sha256`` if given. Raises
+    `ValueError` for a file that differs, or that `write` did not write.
     """
     wanted: list[tuple[Any, str | None]] = [(xxhash.xxh3_128, expected), (hashlib.sha256, sha256)]
     digests = [function() for function, text in wanted if text is not None]
@@ -273,7 +343,8 @@ def read(path: str, expected: str | None, sha256: str | None = None) -> list[Ten
             for digest in digests:
                 digest.update(data)
         else:
-            # read and not mapped: where a device fails, a read raises an error, and a look into a map ends the process
+            # read and not mapped: where a device fails, a read raises an error, and a look into a
+            # map ends the process
             digests_of(file, *digests)
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
     found = [digest.hexdigest() for digest in digests]
@@ -313,7 +384,9 @@ def _entry(data: Any, start: int, entry: Any, kind: Any) -> Tensor:
         raise ValueError("the header of the file of tensors is not what was written")
     x = _tensor(data, start + offsets[0], entry.get("dtype"), entry.get("shape"), kind == "complex")
     if offsets[1] - offsets[0] != x.nbytes:
-        raise ValueError(f"a tensor of {x.nbytes} bytes is stored as {offsets[1] - offsets[0]} bytes")
+        raise ValueError(
+            f"a tensor of {x.nbytes} bytes is stored as {offsets[1] - offsets[0]} bytes"
+        )
     return x
 
 
@@ -325,7 +398,9 @@ def _kind(x: Tensor) -> tuple[str, list[int], bool]:
 
 
 def tensor_kind(x: Tensor) -> str:
-    """Return the name that safetensors gives to the type of a tensor; raise ValueError for a type without a name."""
+    """Return the name that safetensors gives to the type of a tensor; raise ValueError for a
+    type without a name.
+    """
     name = "C64" if x.dtype == torch.complex64 else _DTYPES.get(x.dtype)
     if name is None:
         raise ValueError(f"safetensors has no name for {x.dtype}")
@@ -333,14 +408,22 @@ def tensor_kind(x: Tensor) -> str:
 
 
 def _tensor(data: Any, offset: int, kind: Any, shape: Any, is_complex: bool) -> Tensor:
-    """Return the tensor at an offset of ``data``; raise `ValueError` if type, shape or size cannot be right."""
+    """Return the tensor at an offset of ``data``; raise `ValueError` if type, shape or size
+    cannot be right.
+    """
     dtype = _NAMES.get(kind) if isinstance(kind, str) else None
     if dtype is None or not is_shape(shape) or not is_count(count := math.prod(shape)):
-        raise ValueError(f"a stored tensor has the type {str(kind)[:20]} and the shape {str(shape)[:60]}")
+        raise ValueError(
+            f"a stored tensor has the type {str(kind)[:20]} and the shape {str(shape)[:60]}"
+        )
     if is_complex and (shape[-1:] != [2] or not dtype.is_floating_point or dtype.itemsize < 2):
         raise ValueError(f"a complex tensor is stored as {kind} of the shape {shape}")
     if offset + count * dtype.itemsize > len(data):
         raise ValueError(f"a stored tensor of {count} elements is longer than its file")
-    flat = torch.frombuffer(data, dtype=dtype, count=count, offset=offset) if count else torch.empty(0, dtype=dtype)
+    flat = (
+        torch.frombuffer(data, dtype=dtype, count=count, offset=offset)
+        if count
+        else torch.empty(0, dtype=dtype)
+    )
     x = flat.reshape(shape)
     return torch.view_as_complex(x) if is_complex else x

@@ -1,8 +1,8 @@
 """A folder to which many processes and many users write at the same time.
 
-A file is complete before it gets its final name; until then its temporary name contains the owner. The next writer
-removes the temporary files of killed processes without using the clock. Folders, and the few files to which all
-processes write, copy the permissions of the root.
+A file is complete before it gets its final name; until then its temporary name contains the owner.
+The next writer removes the temporary files of killed processes without using the clock. Folders,
+and the few files to which all processes write, copy the permissions of the root.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ from neusee.workflows.store.process_owner import me, owner_of
 
 MOST_READ = 64 << 20  #: bytes of metadata that are read at once
 OLD = 3600.0  #: s after which a temporary file of another machine counts as abandoned
-_PATIENCE = 10.0  #: s to wait for the lock; its owner may be stopped, and a run without the lock may only repeat work
-_LINKLESS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  #: errors of a file system without hard links
+#: s to wait for the lock; its owner may be stopped, and a run without the lock may only repeat work
+_PATIENCE = 10.0
+#: errors of a file system without hard links
+_LINKLESS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 _count = itertools.count()
 
 
@@ -34,7 +36,8 @@ class Disk:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.folder = os.fspath(root)  # text, because building a path object takes as long as the look-up itself
+        # text, because building a path object takes as long as the look-up itself
+        self.folder = os.fspath(root)
         self._ready = False
 
     def path(self, key: str, suffix: str) -> str:
@@ -50,12 +53,16 @@ class Disk:
             self._ready = True
 
     def forget(self) -> None:
-        """Let the next write make the folder of temporary files again, after another process has removed it."""
+        """Let the next write make the folder of temporary files again, after another process has
+        removed it.
+        """
         self._ready = False
 
     @contextmanager
     def temporary(self, name: str) -> Iterator[tuple[str, IO[bytes]]]:
-        """Yield the path and handle of a new temporary file; delete the file later unless the caller renamed it."""
+        """Yield the path and handle of a new temporary file; delete the file later unless the
+        caller renamed it.
+        """
         self.prepare()
         part = f"{self.folder}/tmp/{name}.{me()}.{next(_count)}"
         try:
@@ -67,7 +74,9 @@ class Disk:
                 os.unlink(part)
 
     def replace(self, name: str, raw: bytes) -> None:
-        """Replace the shared file ``name`` in the root folder of the store by a file with the content ``raw``."""
+        """Replace the shared file ``name`` in the root folder of the store by a file with the
+        content ``raw``.
+        """
         with self.temporary(name) as (part, file):
             file.write(raw)
             file.flush()
@@ -75,7 +84,9 @@ class Disk:
             self.rename(part, f"{self.folder}/{name}")
 
     def rename(self, part: str, path: str) -> None:
-        """Rename a complete file to its final name, and replace what has that name; a folder is put aside."""
+        """Rename a complete file to its final name, and replace what has that name; a folder is
+        put aside.
+        """
         try:
             os.replace(part, path)
         except FileNotFoundError:
@@ -104,18 +115,23 @@ class Disk:
         return True
 
     def make_folder(self, folder: str) -> None:
-        """Make a folder with write permission for every user who may write in the root folder of the store."""
+        """Make a folder with write permission for every user who may write in the root folder of
+        the store.
+        """
         make_folders(folder, self.folder)
 
     def share(self, path: str, mask: int = 0o666) -> None:
-        """Give other users the permissions on ``path`` that they have on the root folder of the store."""
+        """Give other users the permissions on ``path`` that they have on the root folder of the
+        store.
+        """
         inherit(path, self.folder, mask)
 
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Hold the lock of the store during a ``with`` block.
 
-        The block runs without the lock if the file system has no locks or the wait exceeds `_PATIENCE` seconds.
+        The block runs without the lock if the file system has no locks or the wait exceeds
+        `_PATIENCE` seconds.
         """
         self.prepare()
         file = self._lock_file()
@@ -128,7 +144,9 @@ class Disk:
             os.close(file)
 
     def _lock_file(self) -> int:
-        """Open the file of the lock without waiting; what is no file is removed first, if this user may."""
+        """Open the file of the lock without waiting; what is no file is removed first, if this
+        user may.
+        """
         path, careful = f"{self.folder}/tmp/.lock", os.O_NOFOLLOW | os.O_NONBLOCK
         with suppress(OSError):
             if not stat.S_ISREG(os.lstat(path).st_mode):
@@ -157,23 +175,30 @@ class Disk:
         return gone
 
     def unlink(self, path: str) -> None:
-        """Delete a file below the root folder; raise `OSError` if a folder on the way there is a symbolic link."""
+        """Delete a file below the root folder; raise `OSError` if a folder on the way there is a
+        symbolic link.
+        """
         with self._opened_folder(path) as (folder, name):
             os.unlink(name, dir_fd=folder)
 
     def put_aside(self, path: str) -> None:
-        """Move a damaged file to the folder ``bad/`` for inspection, if this user may; follow no symbolic link."""
+        """Move a damaged file to the folder ``bad/`` for inspection, if this user may; follow no
+        symbolic link.
+        """
         with suppress(OSError):
             self.make_folder(f"{self.folder}/bad")
-            with self._opened_folder(path) as (folder, name), self._opened_folder(f"{self.folder}/bad/_") as (to, _):
+            with (
+                self._opened_folder(path) as (folder, name),
+                self._opened_folder(f"{self.folder}/bad/_") as (to, _),
+            ):
                 os.replace(name, name, src_dir_fd=folder, dst_dir_fd=to)
 
     @contextmanager
     def _opened_folder(self, path: str) -> Iterator[tuple[int, str]]:
         """Yield the opened folder of a file below the root, and the name of the file.
 
-        Each folder is opened in the one above it, so that no symbolic link leads out of the root, however late it is
-        put there. Raises `OSError` for a symbolic link.
+        Each folder is opened in the one above it, so that no symbolic link leads out of the root,
+        however late it is put there. Raises `OSError` for a symbolic link.
         """
         *folders, name = path.removeprefix(f"{self.folder}/").split("/")
         if {"", ".", ".."} & {*folders, name}:
@@ -181,7 +206,9 @@ class Disk:
         opened = [os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)]
         try:
             for each in folders:
-                opened.append(os.open(each, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=opened[-1]))
+                opened.append(
+                    os.open(each, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=opened[-1])
+                )
             yield opened[-1], name
         finally:
             for file in opened:
@@ -189,12 +216,15 @@ class Disk:
 
 
 def append(path: str, raw: bytes, flags: int = 0) -> int:
-    """Append bytes to a file in one write; return the number of written bytes. ``flags`` are flags of `os.open`.
+    """Append bytes to a file in one write; return the number of written bytes. ``flags`` are flags
+    of `os.open`.
 
     A symbolic link or a pipe is deleted, and counts as a missing file.
     """
     try:
-        file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | flags, 0o666)
+        file = os.open(
+            path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | flags, 0o666
+        )
     except OSError as error:
         if error.errno not in (errno.ELOOP, errno.ENXIO):
             raise
@@ -207,7 +237,8 @@ def append(path: str, raw: bytes, flags: int = 0) -> int:
 
 
 def read_file(path: str, most: int = MOST_READ) -> bytes:
-    """Return the bytes of a file; raise `ValueError` for what is no file or has more than ``most`` bytes.
+    """Return the bytes of a file; raise `ValueError` for what is no file or has more than ``most``
+    bytes.
 
     A pipe or a device in place of the file never makes the caller wait.
     """
@@ -217,7 +248,11 @@ def read_file(path: str, most: int = MOST_READ) -> bytes:
         if not stat.S_ISREG(about.st_mode) or about.st_size > most:
             raise ValueError(f"{path} is not a file of at most {most} bytes")
         raw = os.read(file, about.st_size)
-        while len(raw) != about.st_size and (more := os.read(file, most + 1 - len(raw))) and len(raw) <= most:
+        while (
+            len(raw) != about.st_size
+            and (more := os.read(file, most + 1 - len(raw)))
+            and len(raw) <= most
+        ):
             raw += more
         return raw
     finally:
@@ -230,7 +265,9 @@ def open_now(path: str, flags: int) -> int:
 
 
 def entries(folder: str) -> list[os.DirEntry[str]]:
-    """Return the files and folders in a folder, or an empty list for a symbolic link or an unreadable folder."""
+    """Return the files and folders in a folder, or an empty list for a symbolic link or an
+    unreadable folder.
+    """
     try:
         if os.path.islink(folder):
             return []
@@ -241,7 +278,9 @@ def entries(folder: str) -> list[os.DirEntry[str]]:
 
 
 def below(base: str) -> Iterator[os.DirEntry[str]]:
-    """Yield the files in those subfolders of ``base`` whose names have two letters; follow no symbolic link."""
+    """Yield the files in those subfolders of ``base`` whose names have two letters; follow no
+    symbolic link.
+    """
     for folder in sorted(entries(base), key=lambda entry: entry.name):
         if len(folder.name) == 2 and folder.is_dir(follow_symlinks=False):
             yield from entries(folder.path)
@@ -258,7 +297,9 @@ def _locked(file: int) -> bool:
 
 
 def _abandoned(entry: os.DirEntry[str], patience: float) -> bool:
-    """Return True if the owner of a temporary file is dead, or if the owner is unknown and the file is old."""
+    """Return True if the owner of a temporary file is dead, or if the owner is unknown and the
+    file is old.
+    """
     words = entry.name.split(".")
     shows_owner = words[-1] == "lease" or words[0] == "badge"
     if words[-1] == "lease" and entry.is_file(follow_symlinks=False):
@@ -267,5 +308,7 @@ def _abandoned(entry: os.DirEntry[str], patience: float) -> bool:
     owner = next(filter(None, map(owner_of, words)), None)
     state = owner.state if owner else "foreign"
     if state == "foreign":
-        return time.time() - entry.stat(follow_symlinks=False).st_mtime > (patience if shows_owner else OLD)
+        return time.time() - entry.stat(follow_symlinks=False).st_mtime > (
+            patience if shows_owner else OLD
+        )
     return state == "dead"

@@ -1,8 +1,9 @@
-"""Small results as lines of one common file, for results that are computed faster than a file is written.
+"""Small results as lines of one common file, for results that are computed faster than a file is
+written.
 
-A line is one write. A line that is torn or fails its checksum is ignored; the loss of a line costs less than a
-millisecond of computation. All processes see the lines of each other, because a look-up of a key that is not known
-reads the lines added since the last look-up.
+A line is one write. A line that is torn or fails its checksum is ignored; the loss of a line costs
+less than a millisecond of computation. All processes see the lines of each other, because a look-up
+of a key that is not known reads the lines added since the last look-up.
 """
 
 from __future__ import annotations
@@ -30,11 +31,14 @@ class SmallResults:
         self._disk, self._guard = disk, threading.Lock()
         self._path = f"{disk.folder}/brief.jsonl"
         self._lines: dict[str, bytes] = {}
-        self._read: dict[str, tuple[bytes, Metadata]] = {}  # lines that were read, with their metadata
+        # lines that were read, with their metadata
+        self._read: dict[str, tuple[bytes, Metadata]] = {}
         self._file, self._offset = 0, 0
 
     def find(self, key: str) -> Metadata | None:
-        """Return the metadata of the small result ``key``, or None if its line is missing or damaged."""
+        """Return the metadata of the small result ``key``, or None if its line is missing or
+        damaged.
+        """
         if key not in self._lines:
             self._read_new_lines()
         with suppress(*UNREADABLE):  # also a KeyError if the key has no line
@@ -71,7 +75,8 @@ class SmallResults:
         return set(self._lines)
 
     def compact(self) -> None:
-        """Rewrite the file of small results with only its newest lines; lines added meanwhile may be lost.
+        """Rewrite the file of small results with only its newest lines; lines added meanwhile may
+        be lost.
 
         The new file has at most half of `MOST` bytes.
         """
@@ -86,12 +91,16 @@ class SmallResults:
             self._disk.replace("brief.jsonl", b"".join(b"\n" + raw for raw in reversed(kept)))
 
     def _write(self, raw: bytes, flags: int = 0) -> None:
-        """Append a line break and a line to the file, so that an incomplete line of a killed process stays separate."""
+        """Append a line break and a line to the file, so that an incomplete line of a killed
+        process stays separate.
+        """
         if append(self._path, b"\n" + raw, flags) != len(raw) + 1:
             raise OSError(f"{self._path}: the disk has no space left to record a result")
 
     def _read_new_lines(self) -> None:
-        """Read the lines added to the file of small results since the last call, or all lines of a replaced file."""
+        """Read the lines added to the file of small results since the last call, or all lines of
+        a replaced file.
+        """
         try:
             stat = os.stat(self._path)
         except OSError:

@@ -1,9 +1,10 @@
-"""Registry of the named tuples that a stored value may contain, by the name that a stored value gives.
+"""Registry of the named tuples that a stored value may contain, by the name that a stored value
+gives.
 
-The registry has the named tuples of `neusee.nodes.values`, and those in the annotations of the inputs and the result
-of each node that this process has defined or imported. A name that a stored value gives is only looked up here, so
-that no content of a store imports a module or chooses a function. A recipe imports its nodes, hence also the types of
-the values that it makes and reads.
+The registry has the named tuples of `neusee.nodes.values`, and those in the annotations of the
+inputs and the result of each node that this process has defined or imported. A name that a stored
+value gives is only looked up here, so that no content of a store imports a module or chooses a
+function. A recipe imports its nodes, hence also the types of the values that it makes and reads.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ _all_nodes: list[tuple[Node, ...]] = [()]  #: those of the last look
 
 
 class UnknownType(ValueError):
-    """Error for a stored value that names a type outside the registry; the value counts as missing."""
+    """Error for a stored value that names a type outside the registry; the value counts as
+    missing.
+    """
 
 
 def type_name(kind: type) -> str:
@@ -35,10 +38,14 @@ def type_name(kind: type) -> str:
 
 
 def stored_type(name: str) -> NamedTupleType:
-    """Return the named tuple with the name ``name`` in the registry; raise `UnknownType` for any other name."""
+    """Return the named tuple with the name ``name`` in the registry; raise `UnknownType` for any
+    other name.
+    """
     _update()
     if name not in _types:
-        raise UnknownType(f"{name!r} is not the type of an input or a result of a node that this process knows")
+        raise UnknownType(
+            f"{name!r} is not the type of an input or a result of a node that this process knows"
+        )
     return _types[name]
 
 
@@ -51,7 +58,8 @@ def is_registered(kind: type) -> bool:
 def made(kind: NamedTupleType, items: list[Any]) -> Any:
     """Return a named tuple with the fields ``items``, without a call of its class.
 
-    Raises `ValueError` for a wrong number of fields, or for a field that does not fit its annotation.
+    Raises `ValueError` for a wrong number of fields, or for a field that does not fit its
+    annotation.
     """
     names: tuple[str, ...] = kind._fields  # type: ignore[attr-defined]
     if len(items) != len(names):
@@ -64,7 +72,9 @@ def made(kind: NamedTupleType, items: list[Any]) -> Any:
 
 
 def fits(value: Any, kind: Any) -> bool:
-    """Return True if a value has the annotated type ``kind``; a type that no stored value has allows every value."""
+    """Return True if a value has the annotated type ``kind``; a type that no stored value has
+    allows every value.
+    """
     origin, inner = get_origin(kind), get_args(kind)
     if origin is typing.Annotated:
         return fits(value, inner[0])

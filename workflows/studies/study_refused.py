@@ -2,4 +2,6 @@
 
 
 class StudyRefused(ValueError):
-    """Error for a study whose recipe or options leave nothing to study; the message names the remedy."""
+    """Error for a study whose recipe or options leave nothing to study; the message names the
+    remedy.
+    """

@@ -1,4 +1,6 @@
-"""Axes of a parameter sweep, written as in Hydra such as ``a=1,2,3``, and the combinations of their values."""
+"""Axes of a parameter sweep, written as in Hydra such as ``a=1,2,3``, and the combinations of
+their values.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ class Coordinate:
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """An axis of a sweep: a parameter or a group of a recipe, with the list of values for the sweep."""
+    """An axis of a sweep: a parameter or a group of a recipe, with the list of values for the
+    sweep.
+    """
 
     name: str
     coordinates: tuple[Coordinate, ...]
@@ -53,7 +57,9 @@ class Point:
     @property
     def shown(self) -> str:
         """Return the point of a sweep as text, such as ``sensor.read_noise=5 e-, doe=axicon``."""
-        return ", ".join(f"{name}={c.shown}" for name, c in zip(self.axes, self.coordinates, strict=True))
+        return ", ".join(
+            f"{name}={c.shown}" for name, c in zip(self.axes, self.coordinates, strict=True)
+        )
 
 
 def read_words(words: Sequence[str | Override], folder: Path, first: int = 1) -> list[Argument]:
@@ -63,16 +69,21 @@ def read_words(words: Sequence[str | Override], folder: Path, first: int = 1) ->
 
     Messages number the arguments from ``first``.
     """
-    return _every(partial(_read_word, word, number, folder) for number, word in enumerate(words, first))
+    return _every(
+        partial(_read_word, word, number, folder) for number, word in enumerate(words, first)
+    )
 
 
 def read_axes(axes: Mapping[str, str | Iterable[Any]], folder: Path) -> list[Argument]:
-    """Read the axes of a sweep, whose values are either Python lists or texts in the notation of the command line."""
+    """Read the axes of a sweep, whose values are either Python lists or texts in the notation of
+    the command line.
+    """
     return _every(partial(_read_axis, name, values, folder) for name, values in axes.items())
 
 
 def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
-    """Return the points of a sweep: all combinations of values, or, if ``paired``, the n-th values of all axes.
+    """Return the points of a sweep: all combinations of values, or, if ``paired``, the n-th values
+    of all axes.
 
     The last axis varies fastest.
     """
@@ -85,11 +96,13 @@ def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
     return [_point(number, place, arguments, axes) for number, place in enumerate(places, 1)]
 
 
-# --- arguments ------------------------------------------------------------------------------------------------------
+# --- arguments ------------------------------------------------------------------------------------
 
 
 def _every(readers: Iterable[Callable[[], _T]]) -> list[_T]:
-    """Call each function and return the results; raise one `RecipeError` that lists the mistakes from all calls."""
+    """Call each function and return the results; raise one `RecipeError` that lists the mistakes
+    from all calls.
+    """
     results: list[_T] = []
     diagnostics: list[Diagnostic] = []
     for read in readers:
@@ -126,10 +139,18 @@ def _read_axis(name: str, values: str | Iterable[Any], folder: Path) -> Axis:
         return _axis(name, _values(values, f"{name}={values}", mark), mark)
     listed = values.tolist() if hasattr(values, "tolist") else values
     if isinstance(listed, Mapping) or not isinstance(listed, Iterable):
-        raise RecipeError([Diagnostic(mark, name, f"give the axis a list of values, not {type(values).__name__}")])
+        raise RecipeError(
+            [Diagnostic(mark, name, f"give the axis a list of values, not {type(values).__name__}")]
+        )
     coordinates = tuple(_coordinate(name, value, folder) for value in listed)
     if not coordinates:
-        raise RecipeError([Diagnostic(mark, name, "the axis has an empty list of values: give at least one value")])
+        raise RecipeError(
+            [
+                Diagnostic(
+                    mark, name, "the axis has an empty list of values: give at least one value"
+                )
+            ]
+        )
     return Axis(name, coordinates, mark)
 
 
@@ -142,44 +163,72 @@ def _values(text: str, path: str, mark: Location) -> list[str]:
 
 def _coordinate(name: str, value: Any, folder: Path) -> Coordinate:
     changes = tuple(overrides_of({name: value}, folder))
-    alone = changes[0].value if len(changes) == 1 and changes[0].path == tuple(name.split(".")) else None
+    alone = (
+        changes[0].value
+        if len(changes) == 1 and changes[0].path == tuple(name.split("."))
+        else None
+    )
     plain = value if alone is None else alone.plain
     return Coordinate(plain if isinstance(plain, str) else flow(plain), plain, changes)
 
 
 def _axis(name: str, values: Sequence[str], mark: Location) -> Axis:
     coordinates = []
-    for text, change in zip(values, _every(partial(read_override, f"{name}={v}", mark) for v in values), strict=True):
+    for text, change in zip(
+        values, _every(partial(read_override, f"{name}={v}", mark) for v in values), strict=True
+    ):
         assert change.value is not None
         plain = change.value.plain
         coordinates.append(Coordinate(plain if isinstance(plain, str) else text, plain, (change,)))
     return Axis(name, tuple(coordinates), mark)
 
 
-# --- combinations ---------------------------------------------------------------------------------------------------
+# --- combinations ---------------------------------------------------------------------------------
 
 
 def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
-    """Yield the mistakes in the axes of a sweep, such as a repeated name, a repeated value or too many points."""
+    """Yield the mistakes in the axes of a sweep, such as a repeated name, a repeated value or
+    too many points.
+    """
     if not axes:
-        yield Diagnostic(Location("sweep"), "", "the sweep has no axis: write a=1,2 or a='linspace(450 nm, 650 nm, 5)'")
+        yield Diagnostic(
+            Location("sweep"),
+            "",
+            "the sweep has no axis: write a=1,2 or a='linspace(450 nm, 650 nm, 5)'",
+        )
     first: dict[str, Axis] = {}
     for axis in axes:
         if first.setdefault(axis.name, axis) is not axis:
-            yield Diagnostic(axis.mark, axis.name, f"axis {axis.name} is also in {first[axis.name].mark}: remove one")
-        twice = [value for value, count in Counter(c.shown for c in axis.coordinates).items() if count > 1]
+            yield Diagnostic(
+                axis.mark,
+                axis.name,
+                f"axis {axis.name} is also in {first[axis.name].mark}: remove one",
+            )
+        twice = [
+            value
+            for value, count in Counter(c.shown for c in axis.coordinates).items()
+            if count > 1
+        ]
         if twice:
-            yield Diagnostic(axis.mark, axis.name, f"the value {twice[0]} appears twice on the axis: remove one")
+            yield Diagnostic(
+                axis.mark, axis.name, f"the value {twice[0]} appears twice on the axis: remove one"
+            )
         there, here = len(axes[0].coordinates), len(axis.coordinates)
         if paired and there != here:
             text = f"has {here} values, and {axes[0].name} ({axes[0].mark}) has {there}"
-            yield Diagnostic(axis.mark, axis.name, f"{text}: give paired axes the same number of values")
+            yield Diagnostic(
+                axis.mark, axis.name, f"{text}: give paired axes the same number of values"
+            )
     product = 1 if paired else math.prod(len(axis.coordinates) for axis in axes)
     if product > MOST:
-        yield Diagnostic(Location("sweep"), "", f"a sweep of {product} points is too long: at most {MOST} points")
+        yield Diagnostic(
+            Location("sweep"), "", f"a sweep of {product} points is too long: at most {MOST} points"
+        )
 
 
-def _point(number: int, place: tuple[int, ...], arguments: Sequence[Argument], axes: Sequence[Axis]) -> Point:
+def _point(
+    number: int, place: tuple[int, ...], arguments: Sequence[Argument], axes: Sequence[Axis]
+) -> Point:
     coordinates = tuple(axis.coordinates[i] for axis, i in zip(axes, place, strict=True))
     here = iter(coordinates)
     changes = (next(here).overrides if isinstance(a, Axis) else (a,) for a in arguments)

@@ -1,4 +1,6 @@
-"""Recipes of the points of a sweep, each kept as its differences from the recipe of the first point."""
+"""Recipes of the points of a sweep, each kept as its differences from the recipe of the first
+point.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from neusee.workflows.graph.recipe_graph import Recipe
 
 @dataclass(frozen=True, slots=True)
 class Same:
-    """The newest step and value of each name that was equal to that of the first recipe, though another object."""
+    """The newest step and value of each name that was equal to that of the first recipe, though
+    another object.
+    """
 
     steps: dict[str, Any] = field(default_factory=dict)
     values: dict[str, Any] = field(default_factory=dict)
@@ -21,7 +25,9 @@ class Same:
 
 @dataclass(frozen=True, slots=True)
 class KeptRecipe:
-    """A checked recipe in little memory: the steps, values and fields that differ from those of another recipe."""
+    """A checked recipe in little memory: the steps, values and fields that differ from those of
+    another recipe.
+    """
 
     first: Recipe
     steps: Mapping[str, Any]
@@ -36,7 +42,9 @@ class KeptRecipe:
         """
         same = same or Same()
         others = {
-            f.name: value for f in fields(Recipe) if (value := getattr(recipe, f.name)) is not getattr(first, f.name)
+            f.name: value
+            for f in fields(Recipe)
+            if (value := getattr(recipe, f.name)) is not getattr(first, f.name)
         }
         steps = _changed(recipe.steps, first.steps, same.steps)
         values = _changed(recipe.config.settings, first.config.settings, same.values)
@@ -54,8 +62,11 @@ class KeptRecipe:
         return replace(same, **{"steps": steps, "config": Config(values), **self.others})
 
 
-def _changed(mapping: Mapping[str, Any], first: Mapping[str, Any], same: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the entries of a mapping that are not equal to those of ``first``, or None if the keys differ.
+def _changed(
+    mapping: Mapping[str, Any], first: Mapping[str, Any], same: dict[str, Any]
+) -> dict[str, Any] | None:
+    """Return the entries of a mapping that are not equal to those of ``first``, or None if the keys
+    differ.
 
     The entries ``same`` are known to be equal, and those found equal are added.
     """
@@ -73,7 +84,9 @@ def _changed(mapping: Mapping[str, Any], first: Mapping[str, Any], same: dict[st
 
 
 def _equal(one: Any, other: Any) -> bool:
-    """Return True for equal values that are also written alike, unlike 0.0 and -0.0, or 1, 1.0 and True."""
+    """Return True for equal values that are also written alike, unlike 0.0 and -0.0, or 1, 1.0
+    and True.
+    """
     with suppress(Exception):  # values such as arrays, whose comparison has no single answer
         return bool(one == other) and repr(one) == repr(other)
     return False

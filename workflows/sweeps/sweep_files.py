@@ -1,4 +1,6 @@
-"""The results of a sweep as an `xarray.Dataset`, whose named dimensions are the axes of the sweep."""
+"""The results of a sweep as an `xarray.Dataset`, whose named dimensions are the axes of the
+sweep.
+"""
 
 from __future__ import annotations
 
@@ -24,19 +26,27 @@ def require_xarray(asked_by: str) -> None:
 
 
 def dataset(
-    outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn], paired: bool, about: Mapping[str, str]
+    outcomes: Sequence[PointOutcome],
+    columns: Sequence[AxisColumn],
+    paired: bool,
+    about: Mapping[str, str],
 ) -> Any:
-    """Return the results of a sweep as an `xarray.Dataset` whose dimensions are the axes, with coordinates in SI units.
+    """Return the results of a sweep as an `xarray.Dataset` whose dimensions are the axes, with
+    coordinates in SI units.
 
-    Paired axes give the one dimension ``point``. A result of several numbers has the further dimension
-    ``<result> index``. A point that failed or did not run is NaN; ``ran`` is true at points that have numbers.
+    Paired axes give the one dimension ``point``. A result of several numbers has the further
+    dimension ``<result> index``. A point that failed or did not run is NaN; ``ran`` is true at
+    points that have numbers.
     """
     import numpy
     import xarray
 
     shape = (len(columns[0].si),) if paired else tuple(len(c.si) for c in columns)
     dims = ("point",) if paired else tuple(c.name for c in columns)
-    coords = {c.name: ("point" if paired else c.name, list(c.si), {"units": c.unit} if c.unit else {}) for c in columns}
+    coords = {
+        c.name: ("point" if paired else c.name, list(c.si), {"units": c.unit} if c.unit else {})
+        for c in columns
+    }
     ran, seconds = numpy.zeros(shape, bool), numpy.full(shape, numpy.nan)
     arrays: dict[str, Any] = {}
     taken = {"ran", "seconds", *coords}
@@ -50,7 +60,10 @@ def dataset(
             if name not in arrays:
                 arrays[name] = numpy.full((*shape, *more), numpy.nan)
             arrays[name][(*place, index or 0) if more else place] = value
-    results = {name: ((*dims, f"{name} index") if name in long else dims, array) for name, array in arrays.items()}
+    results = {
+        name: ((*dims, f"{name} index") if name in long else dims, array)
+        for name, array in arrays.items()
+    }
     own = {"ran": (dims, ran), "seconds": (dims, seconds, {"units": "s"})}
     return xarray.Dataset({**results, **own}, coords, dict(about))
 
@@ -67,6 +80,8 @@ def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[s
 
 
 def _variable(step: str, part: str, taken: Collection[str]) -> str:
-    """Return the name of a result in the `xarray.Dataset`, different from the names of all coordinates."""
+    """Return the name of a result in the `xarray.Dataset`, different from the names of all
+    coordinates.
+    """
     name = f"{step}.{part}".rstrip(".").replace("/", "_")
     return f"{name} (result)" if name in taken else name

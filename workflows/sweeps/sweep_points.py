@@ -1,6 +1,8 @@
-"""The runs of a sweep: all points are checked first, and then run, in worker processes or one after another.
+"""The runs of a sweep: all points are checked first, and then run, in worker processes or one after
+another.
 
-Every point is composed and checked before the first point runs. A point keeps what differs from the first point.
+Every point is composed and checked before the first point runs. A point keeps what differs from the
+first point.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 PointState = Literal["run", "cached", "failed"]
 OnError = Literal["continue", "stop"]
-ResultNumber = tuple[str, str, int | str, float]  #: step, field, index (empty for a single number), value
+#: step, field, index (empty for a single number), value
+ResultNumber = tuple[str, str, int | str, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +53,9 @@ class CheckedPoint:
 
 @dataclass(frozen=True, slots=True)
 class PointOutcome:
-    """The outcome of one point of a sweep: the resulting numbers, or the error that stopped the run."""
+    """The outcome of one point of a sweep: the resulting numbers, or the error that stopped the
+    run.
+    """
 
     point: Point
     state: PointState  #: ``cached``: no step had to run
@@ -63,12 +68,15 @@ class PointOutcome:
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """The checked points of a sweep, in the order in which they run, with the known computing times."""
+    """The checked points of a sweep, in the order in which they run, with the known computing
+    times.
+    """
 
     recipe: Recipe  #: the recipe of the first point
     checked: tuple[CheckedPoint, ...]
     costs: dict[str, float]  #: seconds by step, of steps that ran before
-    work: tuple[float, ...]  #: work of each point without stored results, in seconds, or in steps if no step ran before
+    #: work of each point without stored results, in seconds, or in steps if no step ran before
+    work: tuple[float, ...]
     notes: tuple[str, ...]
     series: RunSeries  #: with the digests of the code of all nodes, the same for all points
 
@@ -78,7 +86,12 @@ class SweepPlan:
 
 
 def plan_sweep(
-    recipe: str, points: Sequence[Point], folder: Path, store: Store, paired: bool = False, device: str = "cpu"
+    recipe: str,
+    points: Sequence[Point],
+    folder: Path,
+    store: Store,
+    paired: bool = False,
+    device: str = "cpu",
 ) -> SweepPlan:
     """Check all points of a sweep and choose the order in which the points run.
 
@@ -91,7 +104,9 @@ def plan_sweep(
     costs = _costs(store)
     in_turn = [checked[i] for i in best_order([c.job for c in checked], costs, paired)]
     work = work_left([c.job for c in in_turn], costs, store.has)
-    return SweepPlan(checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes), checker.series)
+    return SweepPlan(
+        checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes), checker.series
+    )
 
 
 def outcomes(
@@ -105,9 +120,9 @@ def outcomes(
 ) -> Generator[PointOutcome, None, None]:
     """Run the points of a sweep, and yield the outcome of each point as it ends.
 
-    Several ``workers`` are processes with one thread each, and one worker is this process. A point that fails in a
-    worker runs again here. With ``on_error="stop"``, the first error is raised after the outcome of its point is
-    yielded.
+    Several ``workers`` are processes with one thread each, and one worker is this process. A point
+    that fails in a worker runs again here. With ``on_error="stop"``, the first error is raised
+    after the outcome of its point is yielded.
     """
     clock = _Clock(plan.work)
     memory = partial(memory_limit, None, workers)
@@ -135,7 +150,9 @@ def outcomes(
 
 
 class _Found(NamedTuple):
-    """What the run of one point of a sweep gave, and the warning of a store that cannot be written."""
+    """What the run of one point of a sweep gave, and the warning of a store that cannot be
+    written.
+    """
 
     state: PointState
     seconds: float
@@ -162,7 +179,11 @@ def _found(
 
 def _failed(point: Point, error: Exception, seconds: float, left: float) -> PointOutcome:
     step = error.step if isinstance(error, RunError) else ""
-    message = str(error) if isinstance(error, RunError | RecipeError) else f"{type(error).__name__}: {error}"
+    message = (
+        str(error)
+        if isinstance(error, RunError | RecipeError)
+        else f"{type(error).__name__}: {error}"
+    )
     return PointOutcome(point, "failed", seconds, step=step, message=message, left=left)
 
 
@@ -175,19 +196,28 @@ def _costs(store: Store) -> dict[str, float]:
 
 
 class _Clock:
-    """Prediction of the remaining time of a sweep from the time that its finished points took, however many at once."""
+    """Prediction of the remaining time of a sweep from the time that its finished points took,
+    however many at once.
+    """
 
     def __init__(self, work: Sequence[float]) -> None:
-        least = sum(work) / 100 / len(work) or 1.0  # reading the numbers of a stored point also takes time
+        # reading the numbers of a stored point also takes time
+        least = sum(work) / 100 / len(work) or 1.0
         self.work = [max(one, least) for one in work]
         self.todo, self.done, self.points = sum(self.work), 0.0, len(self.work)
         self.began = time.perf_counter()
 
     def left(self, number: int) -> float:
-        """Record that a point of a sweep has ended, and return the predicted seconds of all remaining points."""
+        """Record that a point of a sweep has ended, and return the predicted seconds of all
+        remaining points.
+        """
         work, self.points = self.work[number], self.points - 1
         self.todo, self.done = self.todo - work, self.done + work
-        return max(self.todo, 0.0) * (time.perf_counter() - self.began) / self.done if self.points else 0.0
+        return (
+            max(self.todo, 0.0) * (time.perf_counter() - self.began) / self.done
+            if self.points
+            else 0.0
+        )
 
 
 class _Checker:
@@ -203,13 +233,17 @@ class _Checker:
         self._equal = Same()
 
     def every(self, points: Sequence[Point]) -> Iterator[CheckedPoint]:
-        """Yield each point that passes all checks, and add the mistakes of the other points to ``diagnostics``."""
+        """Yield each point that passes all checks, and add the mistakes of the other points to
+        ``diagnostics``.
+        """
         composer = Composer(self.recipe, self.folder)
         for point in points:
             try:
                 recipe = check(composer.compose(point.overrides))
                 self.first = self.first or recipe
-                yield CheckedPoint(point, KeptRecipe.of(recipe, self.first, self._equal), self._job(point, recipe))
+                yield CheckedPoint(
+                    point, KeptRecipe.of(recipe, self.first, self._equal), self._job(point, recipe)
+                )
             except RecipeError as error:
                 self.diagnostics += error.diagnostics
         self.series.known_keys.code.save()
@@ -221,7 +255,9 @@ class _Checker:
         for name in needed(recipe, recipe.outputs):
             step = recipe.steps[name]
             try:
-                found = self.series.known_keys.of(step, keys, recipe.seed, place(step, self.device))[0]
+                found = self.series.known_keys.of(
+                    step, keys, recipe.seed, place(step, self.device)
+                )[0]
                 keys[name] = self._once(found)
             except (OSError, LookupError, TypeError) as error:
                 raise RecipeError([Diagnostic(step.mark, name, str(error))]) from error
@@ -230,5 +266,7 @@ class _Checker:
         return PointJob(point.place, keys, graph, recipe.outputs)
 
     def _once(self, key: Key) -> Key:
-        """Return the same string object for equal cache keys, which saves memory because points share most keys."""
+        """Return the same string object for equal cache keys, which saves memory because points
+        share most keys.
+        """
         return str(self._same.setdefault(key, key))

@@ -12,12 +12,15 @@ if TYPE_CHECKING:
     from neusee.workflows.sweeps.axes import Axis, Point
     from neusee.workflows.sweeps.sweep_points import PointOutcome, ResultNumber
 
-AFTER = ("status", "step", "field", "index", "value", "seconds", "cached", "message")  #: columns after the axes
+#: columns after the axes
+AFTER = ("status", "step", "field", "index", "value", "seconds", "cached", "message")
 
 
 @dataclass(frozen=True, slots=True)
 class AxisColumn:
-    """Table column of one axis of a sweep; its header has a unit if all values have the same physical dimension."""
+    """Table column of one axis of a sweep; its header has a unit if all values have the same
+    physical dimension.
+    """
 
     name: str
     header: str
@@ -27,7 +30,8 @@ class AxisColumn:
 
 
 def column(axis: Axis) -> AxisColumn:
-    """Return the table column of an axis of a sweep: numbers in their common unit, or in SI units if units differ.
+    """Return the table column of an axis of a sweep: numbers in their common unit, or in SI units
+    if units differ.
 
     Words are unchanged.
     """
@@ -38,7 +42,13 @@ def column(axis: Axis) -> AxisColumn:
         si, unit = tuple(q.si for q in quantities), quantities[0].si_unit
         if len({q.unit for q in quantities}) > 1:
             return AxisColumn(axis.name, f"{header} ({unit})", si, si, unit)
-        return AxisColumn(axis.name, f"{header} ({quantities[0].unit})", tuple(q.number for q in quantities), si, unit)
+        return AxisColumn(
+            axis.name,
+            f"{header} ({quantities[0].unit})",
+            tuple(q.number for q in quantities),
+            si,
+            unit,
+        )
     if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
         return AxisColumn(axis.name, header, tuple(values), tuple(map(float, values)), "")
     words = tuple(c.shown for c in axis.coordinates)
@@ -57,11 +67,13 @@ def _quantity(value: Any) -> _Quantity | None:
     match = units._NUMBER.fullmatch(value.strip()) if isinstance(value, str) else None
     for si_unit, scale in units._SCALE.items():
         if match and match[2].strip() in scale:
-            return _Quantity(float(match[1]), match[2].strip(), units.read_quantity(value, si_unit), si_unit)
+            return _Quantity(
+                float(match[1]), match[2].strip(), units.read_quantity(value, si_unit), si_unit
+            )
     return None
 
 
-# --- rows -----------------------------------------------------------------------------------------------------------
+# --- rows -----------------------------------------------------------------------------------------
 
 
 def header(columns: Sequence[AxisColumn]) -> list[str]:
@@ -70,7 +82,8 @@ def header(columns: Sequence[AxisColumn]) -> list[str]:
 
 
 def rows_of(outcome: PointOutcome, columns: Sequence[AxisColumn]) -> Iterator[list[Any]]:
-    """Yield the table rows of one point of a sweep: one row for each number, or a single row without a number.
+    """Yield the table rows of one point of a sweep: one row for each number, or a single row
+    without a number.
 
     A point has no numbers if it failed or if its results have none.
     """
@@ -82,25 +95,33 @@ def rows_of(outcome: PointOutcome, columns: Sequence[AxisColumn]) -> Iterator[li
 
 
 def headline(numbers: Sequence[ResultNumber]) -> dict[str, str]:
-    """Return each result of one point of a sweep as text: a single number, or the range of the numbers of an array.
+    """Return each result of one point of a sweep as text: a single number, or the range of the
+    numbers of an array.
 
     Single numbers come first.
     """
     results: dict[str, list[float]] = {}
     for step, part, _, value in numbers:
         results.setdefault(f"{step}.{part}".rstrip("."), []).append(value)
-    return {name: _range_of(values) for name, values in sorted(results.items(), key=lambda item: len(item[1]) > 1)}
+    return {
+        name: _range_of(values)
+        for name, values in sorted(results.items(), key=lambda item: len(item[1]) > 1)
+    }
 
 
 def wide(outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> list[list[str]]:
-    """Return the rows of a text table of a sweep: a header, then one row for each point with its results."""
+    """Return the rows of a text table of a sweep: a header, then one row for each point with its
+    results.
+    """
     results = [headline(outcome.numbers) for outcome in outcomes]
     names = list(dict.fromkeys(name for result in results for name in result))
     rows = [["point", *(c.header for c in columns), *names, "state", "seconds"]]
     for outcome, result in zip(outcomes, results, strict=True):
         cells = [cell_text(cell) for cell in point_cells(outcome.point, columns)]
         values = [result.get(name, "") for name in names]
-        rows.append([str(outcome.point.number), *cells, *values, outcome.state, f"{outcome.seconds:.3f}"])
+        rows.append(
+            [str(outcome.point.number), *cells, *values, outcome.state, f"{outcome.seconds:.3f}"]
+        )
     return rows
 
 

@@ -1,7 +1,7 @@
 """Lists and ranges that are written as text, such as ``1,2,3`` and ``linspace(450 nm, 650 nm, 5)``.
 
-Commas in quotes or brackets do not separate values, so that ``[1, 2]`` is one value. Numbers of a range are computed
-exactly: ``range(0, 1, 0.1)`` has the value 0.3, not 0.30000000000000004.
+Commas in quotes or brackets do not separate values, so that ``[1, 2]`` is one value. Numbers of a
+range are computed exactly: ``range(0, 1, 0.1)`` has the value 0.3, not 0.30000000000000004.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ _EXACT = 10**15  #: smaller whole numbers are written without a decimal point
 
 
 def split(text: str) -> list[str]:
-    """Split a text at the commas outside of quotes and brackets; raise `ValueError` for an unclosed bracket."""
+    """Split a text at the commas outside of quotes and brackets; raise `ValueError` for an
+    unclosed bracket.
+    """
     parts, waiting = [""], list[str]()
     for token in _TOKEN.findall(text):
         if token == "," and not waiting:
@@ -40,7 +42,9 @@ def split(text: str) -> list[str]:
 
 
 def values_of(text: str) -> list[str]:
-    """Return the values of a list or a range as YAML texts; raise `ValueError` if the text is malformed."""
+    """Return the values of a list or a range as YAML texts; raise `ValueError` if the text is
+    malformed.
+    """
     parts = split(text)
     if len(parts) > 1 and not all(part.strip() for part in parts):
         raise ValueError("a value is missing before or after a comma")
@@ -53,19 +57,24 @@ def spans(text: str) -> bool:
 
 
 def _spanned(text: str) -> list[str]:
-    """Return the values of a range such as ``range(4)``, or else the text itself as the only value."""
+    """Return the values of a range such as ``range(4)``, or else the text itself as the only
+    value.
+    """
     function = _function(text)
     if function is None:
         return [text.strip()]
     name, arguments = function
     try:
-        return _FUNCTIONS[name]([part.strip() for part in split(arguments)] if arguments.strip() else [])
+        return _FUNCTIONS[name](
+            [part.strip() for part in split(arguments)] if arguments.strip() else []
+        )
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
 
 
 def _function(text: str) -> tuple[str, str] | None:
-    """Return the name and the arguments of a range such as ``range(4)``, or None if the text is not a range.
+    """Return the name and the arguments of a range such as ``range(4)``, or None if the text is not
+    a range.
 
     Raises `ValueError` if the name is misspelt.
     """
@@ -112,20 +121,32 @@ _FUNCTIONS = {"range": _range, "linspace": _linspace, "logspace": _logspace}
 
 
 def _ends(arguments: list[str], example: str) -> tuple[list[Fraction], str, int]:
-    """Return the first and the last value of a range, their common unit, and the number of values."""
+    """Return the first and the last value of a range, their common unit, and the number of
+    values.
+    """
     if len(arguments) != 3:
-        raise ValueError(f"write the first value, the last value and the number of values: {example}")
+        raise ValueError(
+            f"write the first value, the last value and the number of values: {example}"
+        )
     numbers, unit = _numbers(arguments[:2])
     if not re.fullmatch(r"\+?\d{1,9}", arguments[2]):
-        raise ValueError(f"the number of values must be a whole number of at least 1, not {arguments[2] or 'nothing'}")
+        raise ValueError(
+            "the number of values must be a whole number of at least 1, not"
+            f" {arguments[2] or 'nothing'}"
+        )
     return numbers, unit, _count(int(arguments[2]))
 
 
 def _count(count: int) -> int:
     if count < 1:
-        raise ValueError("the range is empty: change its first value, its last value or the number of values")
+        raise ValueError(
+            "the range is empty: change its first value, its last value or the number of values"
+        )
     if count > MOST:
-        raise ValueError(f"the range has {count if count < _EXACT else 'too many'} values: an axis has at most {MOST}")
+        raise ValueError(
+            f"the range has {count if count < _EXACT else 'too many'} values: an axis has at most"
+            f" {MOST}"
+        )
     return count
 
 

@@ -1,7 +1,9 @@
-"""Error propagation: upper bounds on the effect of omitted and approximated steps, from node to node.
+"""Error propagation: upper bounds on the effect of omitted and approximated steps, from node to
+node.
 
 A node computes the error of its result from the errors of its inputs (`Node.propagate_error`).
-After a node without this hook no error bound is known; the errors of its inputs must meet the tolerance instead.
+After a node without this hook no error bound is known; the errors of its inputs must meet the
+tolerance instead.
 """
 
 from __future__ import annotations
@@ -20,17 +22,21 @@ from neusee.workflows.tolerance.skip_decision import FactsOf
 _Input = ErrorBound | list[ErrorBound] | None
 _EXACT = ErrorBound(0.0)
 Kind = Literal["exact", "proved", "estimated", "unknown"]
-COVERAGE = 0.95  #: share of the estimated errors that are at least as large as the error, over random recipes
+#: share of the estimated errors that are at least as large as the error, over random recipes
+COVERAGE = 0.95
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorBounds:
     """Upper bounds on the errors of results, each relative to the largest element of the result."""
 
-    shares: Mapping[str, float] = field(default_factory=dict)  #: by step; infinite where a node gives no bound
-    held: Mapping[str, float] = field(default_factory=dict)  #: of outputs, and of the inputs of nodes without bounds
-    #: the errors that a run states for these results: with what one draw of the noise adds, and an estimate of what
-    #: rounding to digital numbers adds; the tolerance does not limit these additions
+    #: by step; infinite where a node gives no bound
+    shares: Mapping[str, float] = field(default_factory=dict)
+    #: of outputs, and of the inputs of nodes without bounds
+    held: Mapping[str, float] = field(default_factory=dict)
+    #: the errors that a run states for these results: with what one draw of the noise adds, and an
+    #: estimate of what rounding to digital numbers adds; the tolerance does not limit these
+    #: additions
     stated: Mapping[str, float] = field(default_factory=dict)
     estimated: frozenset[str] = frozenset()  #: steps whose stated error counts an estimate
 
@@ -45,13 +51,17 @@ class ErrorBounds:
         return error if math.isfinite(error) else None
 
     def worst_stated(self, steps: Iterable[str]) -> float | None:
-        """Return the largest error that a run states for the results of ``steps``, or None if one is unknown."""
+        """Return the largest error that a run states for the results of ``steps``, or None if
+        one is unknown.
+        """
         errors = [self.stated_of(step) for step in steps]
         known = [error for error in errors if error is not None]
         return max(known, default=0.0) if len(known) == len(errors) else None
 
     def kind_of(self, step: str) -> Kind:
-        """Return whether the error that a run states for a step is a proved bound or an estimate."""
+        """Return whether the error that a run states for a step is a proved bound or an
+        estimate.
+        """
         error = self.stated_of(step)
         if error is None:
             return "unknown"
@@ -65,9 +75,13 @@ class ErrorBounds:
         return max(self.held.values(), default=0.0)
 
     def over(self, recipe: Recipe) -> float:
-        """Return the largest ratio of an error bound to the error limit in ``recipe``; infinity if a limit is 0."""
+        """Return the largest ratio of an error bound to the error limit in ``recipe``; infinity
+        if a limit is 0.
+        """
         shares = [(share, recipe.limit(name)) for name, share in self.held.items() if share > 0]
-        return max((share / limit if limit > 0 else math.inf for share, limit in shares), default=0.0)
+        return max(
+            (share / limit if limit > 0 else math.inf for share, limit in shares), default=0.0
+        )
 
 
 class ToleranceNotProven(Exception):
@@ -104,7 +118,9 @@ def unbounded_steps(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
 
 
 def _may_err(step: Step) -> bool:
-    """Return True if the result of a step may be approximate, or left out, where its inputs are exact."""
+    """Return True if the result of a step may be approximate, or left out, where its inputs are
+    exact.
+    """
     return step.node.hooks.approximation_error is not None or step.node.hooks.skip_bound is not None
 
 
@@ -113,15 +129,23 @@ def _bounds_its_error(step: Step, recipe: Recipe) -> bool:
 
 
 def _propagates(step: Step, recipe: Recipe) -> bool:
-    """Return True if the node of a step tells how errors pass through it, by a bound or by an estimate in use."""
+    """Return True if the node of a step tells how errors pass through it, by a bound or by an
+    estimate in use.
+    """
     hooks = step.node.hooks
     return hooks.propagate_error is not None and (recipe.estimates or not hooks.estimated)
 
 
 def proof(
-    recipe: Recipe, order: Iterable[str], wanted: Iterable[str], done: Callable[[str], StepRecord], facts_of: FactsOf
+    recipe: Recipe,
+    order: Iterable[str],
+    wanted: Iterable[str],
+    done: Callable[[str], StepRecord],
+    facts_of: FactsOf,
 ) -> ErrorBounds:
-    """Return the error bounds of all results of a run, derived from known statistics without computing a step."""
+    """Return the error bounds of all results of a run, derived from known statistics without
+    computing a step.
+    """
     bounds: dict[str, ErrorBound] = {}
     held: dict[str, float] = {}
     for name in order:
@@ -139,7 +163,9 @@ def proof(
     held |= {name: shares[name] for name in wanted if math.isfinite(shares.get(name, math.inf))}
     final = bounds | _of_one_picture(recipe, bounds, done, facts_of)
     stated = {name: final[name].share for name in held}
-    return ErrorBounds(shares, held, stated, frozenset(name for name, bound in final.items() if bound.estimated))
+    return ErrorBounds(
+        shares, held, stated, frozenset(name for name, bound in final.items() if bound.estimated)
+    )
 
 
 def _bound(
@@ -150,9 +176,11 @@ def _bound(
     recipe: Recipe,
     one_draw: bool = False,
 ) -> ErrorBound | None:
-    """Return the error bound of a step's result from the ``known`` bounds of its inputs, or None if it is exact.
+    """Return the error bound of a step's result from the ``known`` bounds of its inputs, or None if
+    it is exact.
 
-    The bound is the root mean square over all draws of the noise, or with ``one_draw`` that of a single draw.
+    The bound is the root mean square over all draws of the noise, or with ``one_draw`` that of a
+    single draw.
     """
     own = _own(step, done, facts_of, one_draw)
     sources = [known[source] for source in step.sources if source in known]
@@ -168,10 +196,14 @@ def _bound(
 
 
 def _together(carried: ErrorBound, own: ErrorBound | None, facts: TensorStats | None) -> ErrorBound:
-    """Return the sum of the error that a step takes from its inputs and of the error that it adds."""
+    """Return the sum of the error that a step takes from its inputs and of the error that it
+    adds.
+    """
     if own is None:
         return replace(carried, stats=facts)
-    peak = None if own.peak is None else own.peak + carried.peak if carried.peak is not None else None
+    peak = (
+        None if own.peak is None else own.peak + carried.peak if carried.peak is not None else None
+    )
     return ErrorBound(
         carried.rms + own.rms,
         stats=facts,
@@ -182,9 +214,14 @@ def _together(carried: ErrorBound, own: ErrorBound | None, facts: TensorStats | 
 
 
 def _of_one_picture(
-    recipe: Recipe, bounds: Mapping[str, ErrorBound], done: Callable[[str], StepRecord], facts_of: FactsOf
+    recipe: Recipe,
+    bounds: Mapping[str, ErrorBound],
+    done: Callable[[str], StepRecord],
+    facts_of: FactsOf,
 ) -> dict[str, ErrorBound]:
-    """Return the bounds of ``bounds`` that are larger for one draw of the noise, and by rounding to digital numbers."""
+    """Return the bounds of ``bounds`` that are larger for one draw of the noise, and by rounding
+    to digital numbers.
+    """
     larger: dict[str, ErrorBound] = {}
     for name, before in bounds.items():
         step, record = recipe.steps[name], done(name)
@@ -192,7 +229,9 @@ def _of_one_picture(
         chance = hooks.skip_draw if omitted else hooks.propagate_draw or hooks.rounding_error
         if chance is None and larger.keys().isdisjoint(step.sources):
             continue
-        bound = _bound(step, {**bounds, **larger}, record, facts_of, recipe, one_draw=True) or before
+        bound = (
+            _bound(step, {**bounds, **larger}, record, facts_of, recipe, one_draw=True) or before
+        )
         if hooks.rounding_error is not None and not omitted:
             bound = _with_rounding(step, bound)
         larger[name] = bound
@@ -209,8 +248,12 @@ def _with_rounding(step: Step, bound: ErrorBound) -> ErrorBound:
     return replace(bound, rms=bound.rms + added, scattered=bound.scattered + added, estimated=True)
 
 
-def _own(step: Step, done: StepRecord, facts_of: FactsOf, one_draw: bool = False) -> ErrorBound | None:
-    """Return the error that a step adds by its own approximation or omission, in the unit of its result."""
+def _own(
+    step: Step, done: StepRecord, facts_of: FactsOf, one_draw: bool = False
+) -> ErrorBound | None:
+    """Return the error that a step adds by its own approximation or omission, in the unit of its
+    result.
+    """
     omitted, hooks = done.state == "left out", step.node.hooks
     share = done.bound if omitted else done.error and done.error[0]
     if not share or (facts := facts_of(done.step)) is None:
@@ -223,17 +266,23 @@ def _own(step: Step, done: StepRecord, facts_of: FactsOf, one_draw: bool = False
     if omitted and one_draw and hooks.skip_draw is not None:
         rms *= hooks.skip_draw(facts, **step.params)
     if omitted:
-        return ErrorBound(rms, estimated=hooks.skip_estimated, scattered=rms if step.node.random else 0.0)
+        return ErrorBound(
+            rms, estimated=hooks.skip_estimated, scattered=rms if step.node.random else 0.0
+        )
     return ErrorBound(rms, peak=done.error[1] if done.error else None, estimated=hooks.estimated)
 
 
 def _carried(
-    step: Step, inputs: list[_Input], result: TensorStats | None, hook: Callable[..., float | ErrorBound] | None
+    step: Step,
+    inputs: list[_Input],
+    result: TensorStats | None,
+    hook: Callable[..., float | ErrorBound] | None,
 ) -> ErrorBound:
-    """Return the error of a step's result that errors of its inputs cause; infinite where no ``hook`` bounds it.
+    """Return the error of a step's result that errors of its inputs cause; infinite where no
+    ``hook`` bounds it.
 
-    The approximation of a step may count cheaper forms of its inputs, but never what was left out of the inputs: the
-    step cannot know of it.
+    The approximation of a step may count cheaper forms of its inputs, but never what was left out
+    of the inputs: the step cannot know of it.
     """
     hooks, errors = step.node.hooks, list(_flat(inputs))
     if not any(error.rms for error in errors):
@@ -254,14 +303,20 @@ def _carried(
 def _passed(
     step: Step, hook: Callable[..., float | ErrorBound], inputs: list[_Input], result: TensorStats
 ) -> ErrorBound:
-    """Return the error that a hook of a node finds for the errors of the inputs; exact for exact inputs."""
+    """Return the error that a hook of a node finds for the errors of the inputs; exact for exact
+    inputs.
+    """
     if not any(error.rms for error in _flat(inputs)):
         return ErrorBound(0.0, peak=0.0)
     try:
         error = hook(*inputs, result=result, **step.params)
     except Exception as problem:
         raise RunError(step, [], problem) from problem
-    return error if isinstance(error, ErrorBound) else ErrorBound(float(error), peak=0.0 if error == 0 else None)
+    return (
+        error
+        if isinstance(error, ErrorBound)
+        else ErrorBound(float(error), peak=0.0 if error == 0 else None)
+    )
 
 
 def _parts(inputs: list[_Input], *, scattered: bool) -> list[_Input]:
@@ -271,7 +326,10 @@ def _parts(inputs: list[_Input], *, scattered: bool) -> list[_Input]:
         rms = error.scattered if scattered else max(error.rms - error.scattered, 0.0)
         return replace(error, rms=rms, scattered=0.0)
 
-    return [[part(error) for error in given] if isinstance(given, list) else given and part(given) for given in inputs]
+    return [
+        [part(error) for error in given] if isinstance(given, list) else given and part(given)
+        for given in inputs
+    ]
 
 
 def _gathered(wire: Wire, bounds: Mapping[str, ErrorBound]) -> _Input:

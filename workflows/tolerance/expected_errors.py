@@ -1,9 +1,11 @@
-"""Errors that the cheaper steps of a plan are expected to leave in the outputs, found before anything runs.
+"""Errors that the cheaper steps of a plan are expected to leave in the outputs, found before
+anything runs.
 
-A tolerance is relative to the largest digital number. Where the full well or the converter cuts off most of the light,
-an error that is small beside the brightest pixel of the image is large beside that number. Nodes tell the range of
-their result from their parameters (`Node.expected_range`), and the errors of the plan are carried through these ranges
-as `proof` carries the errors of a run through its results. A run still proves its errors from what it computed.
+A tolerance is relative to the largest digital number. Where the full well or the converter cuts off
+most of the light, an error that is small beside the brightest pixel of the image is large beside
+that number. Nodes tell the range of their result from their parameters (`Node.expected_range`), and
+the errors of the plan are carried through these ranges as `proof` carries the errors of a run
+through its results. A run still proves its errors from what it computed.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from neusee.workflows.tolerance.zero_effect_steps import UNKNOWN
 
 
 def expected_excess(recipe: Recipe, wanted: Iterable[str], used: float = 1.0) -> float:
-    """Return the expected ratio of the largest error of the outputs ``wanted`` to its limit; 0 if nothing is known.
+    """Return the expected ratio of the largest error of the outputs ``wanted`` to its limit; 0 if
+    nothing is known.
 
     Each cheaper step of ``recipe`` is expected to err by the share ``used`` of what it may err by.
     """
@@ -40,7 +43,9 @@ def expected_excess(recipe: Recipe, wanted: Iterable[str], used: float = 1.0) ->
 
 
 def _record(step: Step, within: Mapping[str, float], ranges: _Ranges) -> StepRecord:
-    """Return the record that a step is expected to have: left out, or with the error of a cheaper step."""
+    """Return the record that a step is expected to have: left out, or with the error of a
+    cheaper step.
+    """
     bound = ranges.left_out.get(step.name)
     if bound is not None:
         return StepRecord(step.name, "left out", "", 0.0, "", bound=bound)
@@ -50,7 +55,9 @@ def _record(step: Step, within: Mapping[str, float], ranges: _Ranges) -> StepRec
 
 
 class _Ranges:
-    """Expected statistics of the results of a recipe, as far as the nodes tell them, and the steps to leave out."""
+    """Expected statistics of the results of a recipe, as far as the nodes tell them, and the
+    steps to leave out.
+    """
 
     def __init__(self, recipe: Recipe, order: Iterable[str]) -> None:
         self.known: dict[str, TensorStats] = {}
@@ -69,7 +76,10 @@ class _Ranges:
         if hooks.skip_bound is not None and all(source in self.known for source in step.sources):
             decision = self._budget.verdict(step, step.params, self.known.get)
             if decision.left_out:
-                self.known[step.name], self.left_out[step.name] = self.known[decision.instead], decision.bound
+                self.known[step.name], self.left_out[step.name] = (
+                    self.known[decision.instead],
+                    decision.bound,
+                )
                 return
         try:
             low, high = hooks.expected_range(*inputs, **step.params)
@@ -82,4 +92,8 @@ class _Ranges:
     def _of(self, wire: Wire) -> Any:
         if wire is None:
             return None
-        return self.known.get(wire, UNKNOWN) if isinstance(wire, str) else [self.known.get(n, UNKNOWN) for n in wire]
+        return (
+            self.known.get(wire, UNKNOWN)
+            if isinstance(wire, str)
+            else [self.known.get(n, UNKNOWN) for n in wire]
+        )

@@ -1,4 +1,6 @@
-"""Decision whether a step is left out: the bound on the effect of the step is compared with the tolerance."""
+"""Decision whether a step is left out: the bound on the effect of the step is compared with the
+tolerance.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ _NO_BOUND = float("inf")
 
 @dataclass(frozen=True, slots=True)
 class SkipDecision:
-    """Decision whether a step is left out, with the bound on its effect, the reason, and the step to use instead."""
+    """Decision whether a step is left out, with the bound on its effect, the reason, and the
+    step to use instead.
+    """
 
     bound: float
     left_out: bool
@@ -27,7 +31,9 @@ class SkipDecision:
 
 
 class _Later:
-    """Statistics of a result, obtained only when the calculation of an error bound reads one of these statistics."""
+    """Statistics of a result, obtained only when the calculation of an error bound reads one of
+    these statistics.
+    """
 
     __slots__ = ("_find", "_seen")
 
@@ -41,23 +47,39 @@ class _Later:
         return getattr(facts, name)
 
 
-def judge(step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: float) -> SkipDecision:
-    """Decide whether ``step`` may be left out; ``facts_of`` returns the statistics of the result of a named step."""
+def judge(
+    step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: float
+) -> SkipDecision:
+    """Decide whether ``step`` may be left out; ``facts_of`` returns the statistics of the result
+    of a named step.
+    """
     node, first = step.node, step.wires.get(step.node.inputs[0])
     if node.hooks.skip_bound is None or not isinstance(first, str):
-        return SkipDecision(_NO_BOUND, False, "the step has no input that could replace its result", "")
+        return SkipDecision(
+            _NO_BOUND, False, "the step has no input that could replace its result", ""
+        )
     seen: list[TensorStats] = []
     facts = [_facts(step.wires.get(name), facts_of, seen) for name in node.inputs]
     try:
-        bound = float(node.hooks.skip_bound(*facts, **{name: _number(value) for name, value in params.items()}))
+        bound = float(
+            node.hooks.skip_bound(
+                *facts, **{name: _number(value) for name, value in params.items()}
+            )
+        )
     except RunError:
         raise
     except Exception as error:
         raise RunError(step, [], error) from error
     if not all(f.finite for f in seen):
-        return SkipDecision(_NO_BOUND, False, "its input is not finite, so its effect has no bound", first)
+        return SkipDecision(
+            _NO_BOUND, False, "its input is not finite, so its effect has no bound", first
+        )
     known = bound < _NO_BOUND
-    why = f"changes at most {bound:.2g}, tolerance {tolerance:.2g}" if known else "its effect has no bound"
+    why = (
+        f"changes at most {bound:.2g}, tolerance {tolerance:.2g}"
+        if known
+        else "its effect has no bound"
+    )
     return SkipDecision(bound, bound <= tolerance, why, first)
 
 

@@ -1,4 +1,5 @@
-"""Removal of steps with zero effect, such as a laser without power, ghosts without energy or a clean window.
+"""Removal of steps with zero effect, such as a laser without power, ghosts without energy or a
+clean window.
 
 Such steps are found from parameters alone, before the run: a step whose node bounds its result by 0
 (`Node.zero_bound`) is removed from the inputs to which it would add nothing.
@@ -13,7 +14,8 @@ from typing import Any
 from neusee.nodes import TensorStats
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Substitution, Wire
 
-_DARK = TensorStats((), "float32", 0.0, 0.0, 0.0, 0, True)  #: statistics of a result that is 0 everywhere
+#: statistics of a result that is 0 everywhere
+_DARK = TensorStats((), "float32", 0.0, 0.0, 0.0, 0, True)
 
 
 class _Unknown:
@@ -27,7 +29,9 @@ UNKNOWN = _Unknown()
 
 
 def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
-    """Disconnect steps whose result must be 0 and return the recipe; ``order`` lists each step after its inputs."""
+    """Disconnect steps whose result must be 0 and return the recipe; ``order`` lists each step
+    after its inputs.
+    """
     dark: dict[str, None] = {}
     changed: dict[str, Step] = {}
     for name in order:
@@ -42,11 +46,15 @@ def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
     why = "its parameters make its result 0"
     new = tuple(Substitution(name, "", 0.0, why) for name in dark if name not in known)
     steps, whole = {**recipe.steps, **changed}, recipe.unsubstituted or recipe
-    return replace(recipe, steps=steps, substitutions=(*recipe.substitutions, *new), unsubstituted=whole)
+    return replace(
+        recipe, steps=steps, substitutions=(*recipe.substitutions, *new), unsubstituted=whole
+    )
 
 
 def _nothing(step: Step, dark: Mapping[str, None]) -> bool:
-    """Return True if the result of a step must be 0 when the results of the steps in ``dark`` are 0."""
+    """Return True if the result of a step must be 0 when the results of the steps in ``dark``
+    are 0.
+    """
     if step.node.hooks.zero_bound is None:
         return False
     inputs = [_known(step.wires.get(name), dark) for name in step.node.inputs]
@@ -78,5 +86,7 @@ def without(step: Step, dark: Mapping[str, None]) -> dict[str, Wire]:
             kept = [i for i, name in enumerate(wire) if name not in dark]
             for name in group:
                 listed = wires.get(name)
-                wires[name] = tuple(listed[i] for i in kept) if isinstance(listed, tuple) else listed
+                wires[name] = (
+                    tuple(listed[i] for i in kept) if isinstance(listed, tuple) else listed
+                )
     return wires

@@ -1,7 +1,9 @@
-"""The camera of a training as it is, which differs for each picture from what the restorer is told of it.
+"""The camera of a training as it is, which differs for each picture from what the restorer is told
+of it.
 
-The true values are drawn about those of the recipe. The steps before the frame compute with the truth; the restorer
-reads copies of the steps that tell it optics and lasers, and the copies keep the values of the recipe.
+The true values are drawn about those of the recipe. The steps before the frame compute with the
+truth; the restorer reads copies of the steps that tell it optics and lasers, and the copies keep
+the values of the recipe.
 """
 
 from __future__ import annotations
@@ -27,7 +29,9 @@ _STREAM = (5, 4)  #: of the draws of a picture
 
 @dataclass(frozen=True)
 class CameraMismatch:
-    """The differences between camera and recipe of a training, and the parameters that have them; empty for none."""
+    """The differences between camera and recipe of a training, and the parameters that have
+    them; empty for none.
+    """
 
     differences: Mapping[str, Difference]  #: by path; y and x of a direction are two
     moved: Mapping[str, tuple[tuple[Index, str], ...]]  #: by ``step.parameter``, indices and paths
@@ -37,15 +41,22 @@ class CameraMismatch:
     def of(cls, recipe: Recipe, settings: Training) -> CameraMismatch:
         """Find the parameters of the camera that a recipe's ``train.mismatch`` changes.
 
-        Raises: `RecipeError` for a value that no step before the frame reads, or that has draws which are not valid.
+        Raises: `RecipeError` for a value that no step before the frame reads, or that has draws
+                which are not valid.
         """
         given = recipe.uncertain.mismatch if recipe.uncertain else {}
         if not given:
             return cls({}, {}, {})
         if FRAME not in recipe.steps:
-            raise _mistake(given, next(iter(given)), f"the recipe has no step {FRAME}, which is the frame of a camera")
+            raise _mistake(
+                given,
+                next(iter(given)),
+                f"the recipe has no step {FRAME}, which is the frame of a camera",
+            )
         directions = {path: one for path, one in given.items() if path.rpartition(".")[2] == ANGLE}
-        inputs = _inputs(recipe, {path: one for path, one in given.items() if path not in directions})
+        inputs = _inputs(
+            recipe, {path: one for path, one in given.items() if path not in directions}
+        )
         moved = dict(inputs.readers) if inputs else {}
         probes = inputs.theta(_probes(inputs)) if inputs else {}
         differences = {path: one for path, one in given.items() if path not in directions}
@@ -56,13 +67,17 @@ class CameraMismatch:
             differences |= {f"{path} {axis}": one for axis in _AXES}
         if learnt := [name for name in moved if name.rpartition(".")[0] == settings.learn]:
             path = moved[learnt[0]][0][1]
-            raise _mistake(given, path, f"{settings.learn} is trained, so that its parameters have no effect")
+            raise _mistake(
+                given, path, f"{settings.learn} is trained, so that its parameters have no effect"
+            )
         return cls(differences, moved, probes)
 
     def camera(self, recipe: Recipe, outputs: Sequence[str], psf: str) -> tuple[Recipe, str]:
-        """Return the recipe with copies of what the makers of the ``outputs`` are told, and the copy of the PSF step.
+        """Return the recipe with copies of what the makers of the ``outputs`` are told, and the
+        copy of the PSF step.
 
-        Until they are drawn, the true values are the probes, so that no step counts as one without effect.
+        Until they are drawn, the true values are the probes, so that no step counts as one without
+        effect.
         """
         moved = {name for name in self.moved if _has(recipe, name)}
         if not moved:
@@ -86,7 +101,9 @@ class CameraMismatch:
         return {path: column[0] for path, column in draw_laws(laws, 1, [*seed, *_STREAM]).items()}
 
     def truth(self, theta: Mapping[str, Any], drawn: Mapping[str, float]) -> dict[str, Any]:
-        """Return the true values of those parameters of ``theta``, by ``step.parameter``, that differ from belief."""
+        """Return the true values of those parameters of ``theta``, by ``step.parameter``, that
+        differ from belief.
+        """
         found = {}
         for reader, inputs in self.moved.items():
             if reader in theta:
@@ -98,7 +115,9 @@ class CameraMismatch:
 
 
 def _inputs(recipe: Recipe, given: Mapping[str, Difference]) -> Inputs | None:
-    """Return the values of the camera that differ, with the parameters before the frame that read them."""
+    """Return the values of the camera that differ, with the parameters before the frame that
+    read them.
+    """
     if not given:
         return None
     assert recipe.uncertain is not None
@@ -109,10 +128,17 @@ def _inputs(recipe: Recipe, given: Mapping[str, Difference]) -> Inputs | None:
         try:
             Inputs.of(replace(recipe, uncertain=one), [FRAME], negligible=None)
         except ValueError as error:
-            text = "no step before the frame reads it" if str(error).startswith("no output") else str(error)
+            text = (
+                "no step before the frame reads it"
+                if str(error).startswith("no output")
+                else str(error)
+            )
             raise _mistake(given, path, text) from error
     inputs = Inputs.of(within, [FRAME], negligible=None)
-    ends = [[one.of(one.own, float(one.law.at(np.array(z)))) for one in given.values()] for z in (-_FAR, _FAR)]
+    ends = [
+        [one.of(one.own, float(one.law.at(np.array(z)))) for one in given.values()]
+        for z in (-_FAR, _FAR)
+    ]
     inputs.checked(np.array(ends))
     return inputs
 
@@ -125,13 +151,17 @@ def _probes(inputs: Inputs) -> dict[str, float]:
 
 
 def _towards(recipe: Recipe, given: Mapping[str, Difference], path: str) -> list[str]:
-    """Return the parameters before the frame that turn the light of the laser whose direction has the path."""
+    """Return the parameters before the frame that turn the light of the laser whose direction
+    has the path.
+    """
     laser = path.removeprefix("lasers.").removesuffix(f".{ANGLE}")
     source, order = f"direction[{laser}]", needed(recipe, [FRAME])
     found = [
-        f"{name}.{ANGLE}" for name in order
-        if recipe.steps[name].wires.get("direction") == source and ANGLE in recipe.steps[name].params
-    ]  # fmt: skip
+        f"{name}.{ANGLE}"
+        for name in order
+        if recipe.steps[name].wires.get("direction") == source
+        and ANGLE in recipe.steps[name].params
+    ]
     if not found:
         raise _mistake(given, path, "no step before the frame reads this direction")
     return found

@@ -12,7 +12,9 @@ from neusee.workflows.recipe.blocks.train_block import KEY, Training
 
 
 def require_exports(net: Restorer, settings: Training) -> None:
-    """Raise ValueError before a training whose network cannot be exported as ``train.export`` asks."""
+    """Raise ValueError before a training whose network cannot be exported as ``train.export``
+    asks.
+    """
     for kind in settings.export:
         try:
             require_exportable(net, f".{kind}")
@@ -21,7 +23,9 @@ def require_exports(net: Restorer, settings: Training) -> None:
 
 
 def write_exports(folder: Path, net: Restorer, settings: Training) -> None:
-    """Write the best network of a training, or the last one if no state is the best, as ``train.export`` asks."""
+    """Write the best network of a training, or the last one if no state is the best, as
+    ``train.export`` asks.
+    """
     if not settings.export:
         return
     from safetensors.torch import load_file

@@ -1,4 +1,6 @@
-"""Photographs that a training never sees, and how well the network restores them while it is trained."""
+"""Photographs that a training never sees, and how well the network restores them while it is
+trained.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ from neusee.workflows.training.training_pictures import HELD_OUT, Sample
 CONFIDENCE = 0.9  #: of the interval of a mean over photographs
 _METRICS = ("PSNR", "L1", "SSIM")
 _SCORE = "held_out_PSNR"  #: the number by which the best state is chosen
-#: columns of the loss table: network, input of the network, and the PSNR that the network adds to its input
+#: columns of the loss table: network, input of the network, and the PSNR that the network adds to
+#: its input
 COLUMNS = tuple(
     f"{who}_{metric}{end}"
     for who, names in (("held_out", _METRICS), ("input", _METRICS), ("gain", _METRICS[:1]))
@@ -45,17 +48,27 @@ class Split:
 
     def __str__(self) -> str:
         if not self.held_out:
-            return f"trains on {len(self.trained.paths)} photographs; none is held out, so that no state is the best"
+            return (
+                f"trains on {len(self.trained.paths)} photographs; none is held out, so that no"
+                " state is the best"
+            )
         text = f"trains on {len(self.trained.paths)} photographs; {len(self.held_out)} are held out"
-        return text if len(self.judged) == len(self.held_out) else f"{text}, of which {len(self.judged)} are restored"
+        return (
+            text
+            if len(self.judged) == len(self.held_out)
+            else f"{text}, of which {len(self.judged)} are restored"
+        )
 
 
 def split(recipe: Recipe, settings: Training, photographs: Photographs) -> Split:
-    """Set photographs aside by their content, so that every process, stage and later start has the same split.
+    """Set photographs aside by their content, so that every process, stage and later start has the
+    same split.
 
-    Equal files stay together, whatever their names. Without a folder of photographs nothing is held out.
+    Equal files stay together, whatever their names. Without a folder of photographs nothing is held
+    out.
 
-    Raises ValueError for a folder with fewer than two different photographs, unless ``train.held_out`` is null.
+    Raises ValueError for a folder with fewer than two different photographs, unless
+    ``train.held_out`` is null.
     """
     photographs = by_content(photographs)
     if not holds_out(settings):
@@ -69,15 +82,22 @@ def split(recipe: Recipe, settings: Training, photographs: Photographs) -> Split
     count = min(max(1, round(settings.held_out * len(alike))), len(alike) - 1)
     chosen = [alike[digest] for digest in sorted(alike)[:count]]
     away = {path for paths in chosen for path in paths}
-    trained = replace(photographs, paths=tuple(path for path in photographs.paths if path not in away))
+    trained = replace(
+        photographs, paths=tuple(path for path in photographs.paths if path not in away)
+    )
     one_each = [paths[0] for paths in chosen][: settings.held_out_pictures]
     judged = tuple(path for path in one_each if _readable(path, trained))
     return Split(trained, tuple(path for paths in chosen for path in paths), judged)
 
 
 def by_content(photographs: Photographs) -> Photographs:
-    """Return the photographs in the order of their digests, so that the pictures drawn depend on no name."""
-    return replace(photographs, paths=tuple(sorted(photographs.paths, key=lambda path: (file_digest(path), path))))
+    """Return the photographs in the order of their digests, so that the pictures drawn depend on
+    no name.
+    """
+    return replace(
+        photographs,
+        paths=tuple(sorted(photographs.paths, key=lambda path: (file_digest(path), path))),
+    )
 
 
 def holds_out(settings: Training) -> bool:
@@ -86,7 +106,9 @@ def holds_out(settings: Training) -> bool:
 
 
 def _readable(path: Path, photographs: Photographs) -> bool:
-    """Return True if a photograph can be decoded; note the reason in ``photographs`` if it cannot."""
+    """Return True if a photograph can be decoded; note the reason in ``photographs`` if it
+    cannot.
+    """
     try:
         Photographs((path,)).crop((1, 1), 0, 0)
     except ValueError as error:
@@ -99,13 +121,13 @@ def _too_few(recipe: Recipe, settings: Training, count: int) -> str:
     given = recipe.config.settings.get(f"{KEY}.photographs")
     found = "1 photograph" if count == 1 else f"{count} photographs, all equal"
     return (
-        f"{given.source if given else recipe.name}   {KEY}.photographs   the folder {settings.photographs} holds "
-        f"{found}, and {KEY}.held_out: {settings.held_out} sets photographs aside for the validation: add photographs, "
-        f"or write {KEY}.held_out=null"
+        f"{given.source if given else recipe.name}   {KEY}.photographs   the folder"
+        f" {settings.photographs} holds {found}, and {KEY}.held_out: {settings.held_out} sets"
+        f" photographs aside for the validation: add photographs, or write {KEY}.held_out=null"
     )
 
 
-# --- validation -------------------------------------------------------------------------------------------------------
+# --- validation -----------------------------------------------------------------------------------
 
 
 class Validation:
@@ -117,7 +139,8 @@ class Validation:
 
     @torch.no_grad()
     def __call__(self, net: nn.Module, samples: Samples, shared: Shared, fixed: bool) -> Losses:
-        """Return means over the held-out photographs with their intervals, by column of the loss table.
+        """Return means over the held-out photographs with their intervals, by column of the loss
+        table.
 
         Pictures behind a ``fixed`` mask are computed once and kept in the memory of the processor.
         """
@@ -131,15 +154,25 @@ class Validation:
                 found |= {f"{i} {who}_{name}": x for name, x in _quality(estimate, truth).items()}
         net.train(trains)
         each, count = samples.repeats, len(self.photographs)
-        names = [f"{i} {who}_{n}" for i in range(count * each) for who in ("held_out", "input") for n in _METRICS]
+        names = [
+            f"{i} {who}_{n}"
+            for i in range(count * each)
+            for who in ("held_out", "input")
+            for n in _METRICS
+        ]
         return summary(_by_photograph(self.mesh.numbers(found, names, self.device), each), count)
 
-    def _pictures(self, samples: Samples, shared: Shared, fixed: bool) -> Iterator[tuple[int, Sample]]:
-        if fixed and self._kept is not None:  # empty in a process without a picture, which must not wait for others
+    def _pictures(
+        self, samples: Samples, shared: Shared, fixed: bool
+    ) -> Iterator[tuple[int, Sample]]:
+        # empty in a process without a picture, which must not wait for others
+        if fixed and self._kept is not None:
             yield from self._kept.items()
             return
         kept: dict[int, Sample] = {}
-        for i, sample in samples.batch(shared, HELD_OUT, 0, len(self.photographs) * samples.repeats):
+        for i, sample in samples.batch(
+            shared, HELD_OUT, 0, len(self.photographs) * samples.repeats
+        ):
             if fixed:
                 kept[i] = replace(sample, picture=sample.picture.cpu(), truth=sample.truth.cpu())
             yield i, sample
@@ -147,7 +180,9 @@ class Validation:
 
 
 def _by_photograph(found: Mapping[str, float], each: int) -> dict[str, float]:
-    """Return the means over the ``each`` pictures of a photograph, from numbers named such as ``0 held_out_PSNR``."""
+    """Return the means over the ``each`` pictures of a photograph, from numbers named such as
+    ``0 held_out_PSNR``.
+    """
     means: dict[str, float] = {}
     for name, value in found.items():
         number, _, what = name.partition(" ")
@@ -157,13 +192,19 @@ def _by_photograph(found: Mapping[str, float], each: int) -> dict[str, float]:
 
 
 def _quality(estimate: Tensor, truth: Tensor) -> dict[str, float]:
-    """Return PSNR, L1 and SSIM of the pictures (n, 3, y, x) of one photograph, each a mean over the pictures."""
+    """Return PSNR, L1 and SSIM of the pictures (n, 3, y, x) of one photograph, each a mean over
+    the pictures.
+    """
     each = [metrics.quality(e.float(), t.float()) for e, t in zip(estimate, truth, strict=True)]
-    return {name: sum(float(getattr(q, name.lower())) for q in each) / len(each) for name in _METRICS}
+    return {
+        name: sum(float(getattr(q, name.lower())) for q in each) / len(each) for name in _METRICS
+    }
 
 
 def summary(found: Mapping[str, float], count: int) -> Losses:
-    """Return means and intervals over ``count`` photographs from numbers named such as ``0 held_out_PSNR``."""
+    """Return means and intervals over ``count`` photographs from numbers named such as ``0
+    held_out_PSNR``.
+    """
     columns = {
         f"{who}_{name}": [found[f"{i} {who}_{name}"] for i in range(count)]
         for who in ("held_out", "input")
@@ -181,7 +222,9 @@ def summary(found: Mapping[str, float], count: int) -> Losses:
 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the mean of independent numbers, and its 90 % interval from Student's t distribution (NaN for one)."""
+    """Return the mean of independent numbers, and its 90 % interval from Student's t
+    distribution (NaN for one).
+    """
     x = np.asarray(values, dtype=np.float64)
     if len(x) < 2:
         return float(x.mean()), math.nan, math.nan
@@ -191,7 +234,7 @@ def interval(values: Sequence[float]) -> tuple[float, float, float]:
     return float(x.mean()), float(x.mean()) - half, float(x.mean()) + half
 
 
-# --- the best state ---------------------------------------------------------------------------------------------------
+# --- the best state -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -219,7 +262,9 @@ class Best:
 
 
 def facts(parts: Split, rows: Sequence[Mapping[str, str]], patience: int | None) -> dict[str, Any]:
-    """Return what `training.json` says of the held-out photographs, the best state and the end of stage 2."""
+    """Return what `training.json` says of the held-out photographs, the best state and the end
+    of stage 2.
+    """
     names = {"held_out": [str(path) for path in parts.held_out], "judged": len(parts.judged)}
     best = Best.of(rows, 2)
     if not best.iterations:
@@ -231,7 +276,9 @@ def facts(parts: Split, rows: Sequence[Mapping[str, str]], patience: int | None)
 
 
 def score_of(found: Losses) -> float:
-    """Return the number by which the best state is chosen, with the digits that the loss table keeps."""
+    """Return the number by which the best state is chosen, with the digits that the loss table
+    keeps.
+    """
     return float(f"{found[_SCORE]:.6g}")
 
 
@@ -239,8 +286,15 @@ def said(found: Losses, better: bool) -> str:
     """Return one line of text about a validation."""
 
     def shown(name: str) -> str:
-        both = f" ({found[f'{name}_low']:.2f} to {found[f'{name}_high']:.2f})" if f"{name}_low" in found else ""
+        both = (
+            f" ({found[f'{name}_low']:.2f} to {found[f'{name}_high']:.2f})"
+            if f"{name}_low" in found
+            else ""
+        )
         return f"{found[name]:.2f} dB{both}"
 
-    text = f"held-out PSNR {shown('held_out_PSNR')}, input {found['input_PSNR']:.2f} dB, gain {shown('gain_PSNR')}"
+    text = (
+        f"held-out PSNR {shown('held_out_PSNR')}, input {found['input_PSNR']:.2f} dB, gain"
+        f" {shown('gain_PSNR')}"
+    )
     return f"{text}, the best so far" if better else text

@@ -1,9 +1,11 @@
-"""Training pictures of a network that needs what the Wiener filter knows: the filter is solved once for each picture.
+"""Training pictures of a network that needs what the Wiener filter knows: the filter is solved once
+for each picture.
 
-The networks `unrolled` and `informed` need the PSF, the glare, the clipped pixels and the noise of a picture. The
-recipe gives them to the step of the filter, whose result `train.picture` converts to colours. In the training the node
-of this step is `restore.wiener_problem` or `restore.filter_facts`, with the same inputs, so that the answer of the
-filter is the input of the network.
+The networks `unrolled` and `informed` need the PSF, the glare, the clipped pixels and the noise of
+a picture. The recipe gives them to the step of the filter, whose result `train.picture` converts to
+colours. In the training the node of this step is `restore.wiener_problem` or
+`restore.filter_facts`, with the same inputs, so that the answer of the filter is the input of the
+network.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.blocks.train_block import KEY, POSED, Training
 
 Posed = WienerProblem | FilterFacts
-Given = tuple[()] | tuple[Posed, Tensor]  #: nothing, or what the filter poses and knows, and the colour matrix
+#: nothing, or what the filter poses and knows, and the colour matrix
+Given = tuple[()] | tuple[Posed, Tensor]
 _FILTERS = ("restore.wiener", "restore.unrolled", "restore.informed")
 _KNOWN: dict[str, Any] = {"unrolled": restore.wiener_problem, "informed": restore.filter_facts}
 _PARAMETERS = ("balance", "doubt", "least_doubt", "read_noise")
@@ -30,7 +33,9 @@ _PARAMETERS = ("balance", "doubt", "least_doubt", "read_noise")
 
 @dataclass(frozen=True)
 class PosedPictures:
-    """The steps of a recipe that pose the problem of a picture, and that compute the colour matrix."""
+    """The steps of a recipe that pose the problem of a picture, and that compute the colour
+    matrix.
+    """
 
     filter: str
     matrix: str
@@ -50,8 +55,8 @@ class PosedPictures:
         if shown.node.path != "restore.colour" or recipe.steps[channels].node.path not in _FILTERS:
             given = recipe.config.settings.get(f"{KEY}.picture")
             text = (
-                f"{settings.picture} is {shown.node.path}, and the network {kind} starts from the Wiener filter: use "
-                f"restore: wiener and {KEY}.picture: restored"
+                f"{settings.picture} is {shown.node.path}, and the network {kind} starts from the"
+                f" Wiener filter: use restore: wiener and {KEY}.picture: restored"
             )
             raise ValueError(f"{given.source if given else recipe.name}   {KEY}.picture   {text}")
         return cls(channels, matrix, kind)
@@ -69,9 +74,11 @@ class PosedPictures:
         return replace(recipe, steps={**recipe.steps, self.filter: posed})
 
     def read(self, values: Mapping[str, Any], dtype: torch.dtype) -> tuple[Tensor, Given]:
-        """Return the picture of the filter (3, y, x), and what the network needs beside it in the given precision.
+        """Return the picture of the filter (3, y, x), and what the network needs beside it in the
+        given precision.
 
-        The filter solves small pictures in float64; the steps of a training take half the time in float32.
+        The filter solves small pictures in float64; the steps of a training take half the time in
+        float32.
         """
         posed, matrix = values[self.filter], values[self.matrix]
         told: Tensor = restore.colour(posed.answer * posed.scale + posed.mean, matrix)
@@ -91,11 +98,16 @@ def given_of(tensors: Mapping[str, Tensor]) -> Given:
     if "given.matrix" not in tensors:
         return ()
     kind = FilterFacts if "given.maps" in tensors else WienerProblem
-    return kind(**{name: tensors[f"given.{name}"] for name in kind._fields}), tensors["given.matrix"]
+    return (
+        kind(**{name: tensors[f"given.{name}"] for name in kind._fields}),
+        tensors["given.matrix"],
+    )
 
 
 def turned(given: Given, seed: tuple[int, ...]) -> Given:
-    """Turn the maps that a network sees beside a picture, as `scene.symmetry` turns the picture with the same seed."""
+    """Turn the maps that a network sees beside a picture, as `scene.symmetry` turns the picture
+    with the same seed.
+    """
     known = given[0] if given else None
     if not given or not isinstance(known, FilterFacts):
         return given

@@ -1,4 +1,6 @@
-"""Training pictures of several cameras in turn, so that one network learns to restore the pictures of all of them."""
+"""Training pictures of several cameras in turn, so that one network learns to restore the
+pictures of all of them.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +20,21 @@ from neusee.workflows.training.training_pictures import HELD_OUT, Sample, Traini
 class SeveralCameras:
     """The pictures of a training with the camera of its recipe and with each of ``train.cameras``.
 
-    The picture with the number n, or its number n in the pool, is of camera n modulo their count. A held-out photograph
-    is seen by every camera.
+    The picture with the number n, or its number n in the pool, is of camera n modulo their count. A
+    held-out photograph is seen by every camera.
     """
 
     shared = None  #: no mask is trained, so that no result depends on one
 
     def __init__(
-        self, recipe: Recipe, settings: Training, photographs: Photographs, store: Store, device: str,
+        self,
+        recipe: Recipe,
+        settings: Training,
+        photographs: Photographs,
+        store: Store,
+        device: str,
         held_out: Sequence[Path],
-    ) -> None:  # fmt: skip
+    ) -> None:
         recipes = (recipe, *recipe.cameras)
         self.repeats, self._pool = len(recipes), settings.pool
         seen = [path for path in held_out for _ in recipes]
@@ -46,11 +53,17 @@ class SeveralCameras:
         return Shared.of({})
 
     def counted(self, name: str, here: int) -> tuple[int, int]:
-        """Return the total number of spectral bands of a result, and how many processes compute each: one."""
+        """Return the total number of spectral bands of a result, and how many processes compute
+        each: one.
+        """
         return here, 1
 
-    def batch(self, shared: Shared, stage: int, first: int, count: int) -> Iterator[tuple[int, Sample]]:
-        """Yield index and picture of each of the ``count`` pictures of a batch, from the picture number ``first``."""
+    def batch(
+        self, shared: Shared, stage: int, first: int, count: int
+    ) -> Iterator[tuple[int, Sample]]:
+        """Yield index and picture of each of the ``count`` pictures of a batch, from the picture
+        number ``first``.
+        """
         for i in range(count):
             number = first + i
             within = number % self._pool if self._pool and stage != HELD_OUT else number
@@ -62,9 +75,15 @@ Samples = TrainingStream | SeveralCameras
 
 
 def samples_of(
-    recipe: Recipe, settings: Training, photographs: Photographs, store: Store, device: str, frozen: Recipe | None,
-    mesh: Mesh, held_out: Sequence[Path],
-) -> Samples:  # fmt: skip
+    recipe: Recipe,
+    settings: Training,
+    photographs: Photographs,
+    store: Store,
+    device: str,
+    frozen: Recipe | None,
+    mesh: Mesh,
+    held_out: Sequence[Path],
+) -> Samples:
     """Return the pictures of a training, of one camera or of several in turn."""
     if frozen is not None and frozen.cameras:
         return SeveralCameras(frozen, settings, photographs, store, device, held_out)
@@ -74,4 +93,7 @@ def samples_of(
 def require_alone(recipe: Recipe, mesh: Mesh) -> None:
     """Raise an error for a training with several cameras in several processes."""
     if recipe.cameras and mesh.size > 1:
-        raise MeshError(f"{KEY}.cameras: a training with several cameras runs in a single process, without torchrun")
+        raise MeshError(
+            f"{KEY}.cameras: a training with several cameras runs in a single process, without"
+            " torchrun"
+        )

@@ -1,7 +1,9 @@
-"""Simulated training pictures in the store, so that a later training with the same pictures begins at once.
+"""Simulated training pictures in the store, so that a later training with the same pictures begins
+at once.
 
-The key of a picture is made of the keys of its steps with the values that were drawn for it, of the scene itself and
-of the noise. So a picture of another optics, sensor, laser, distribution or code has another key.
+The key of a picture is made of the keys of its steps with the values that were drawn for it, of the
+scene itself and of the noise. So a picture of another optics, sensor, laser, distribution or code
+has another key.
 """
 
 from __future__ import annotations
@@ -29,18 +31,27 @@ _CODE = ("training.stored_pool", "training.training_pictures")
 class StoredPool:
     """The pictures of a pool behind a fixed mask, each in the store under a key of its own."""
 
-    def __init__(self, recipe: Recipe, settings: Training, outputs: Sequence[str], store: Store, device: str) -> None:
+    def __init__(
+        self, recipe: Recipe, settings: Training, outputs: Sequence[str], store: Store, device: str
+    ) -> None:
         self.recipe, self.settings, self.store, self.device = recipe, settings, store, device
         self._outputs = tuple(outputs)
         self._order = [name for name in needed(recipe, self._outputs) if name != settings.scene]
         self._code = Code(store.code_memo)
         self._resize = self._code.digest("neusee.nodes.bicubic_resize")
-        self.read, self.computed = 0, 0  #: pictures that came from the store, and pictures that were simulated
+        #: pictures that came from the store, and pictures that were simulated
+        self.read, self.computed = 0, 0
 
     def picture(
-        self, scene: Tensor, given: Mapping[str, Any], noise: int, compute: Callable[[], dict[str, Tensor]]
+        self,
+        scene: Tensor,
+        given: Mapping[str, Any],
+        noise: int,
+        compute: Callable[[], dict[str, Tensor]],
     ) -> dict[str, Tensor]:
-        """Return the tensors of a picture from the store, or compute and store them before the next picture."""
+        """Return the tensors of a picture from the store, or compute and store them before the
+        next picture.
+        """
         key = self._key(scene, given, noise)
         computed: list[bool] = []
 
@@ -49,7 +60,9 @@ class StoredPool:
             return compute()
 
         kept: dict[str, Tensor] = (
-            simulated() if is_private(key) else compute_once(self.store, key, dict, simulated, _ABOUT)
+            simulated()
+            if is_private(key)
+            else compute_once(self.store, key, dict, simulated, _ABOUT)
         )
         self.computed, self.read = self.computed + bool(computed), self.read + (not computed)
         return {name: x.to(self.device) for name, x in kept.items()}
@@ -70,5 +83,12 @@ class StoredPool:
         if private := next(filter(is_private, own), None):
             return private
         cut = [settings.size, settings.patch, settings.patches, settings.precision, self._resize]
-        within = [list(pixels.shape), noise, recipe.tolerance, recipe.exact, recipe.estimates, device_kind(self.device)]
+        within = [
+            list(pixels.shape),
+            noise,
+            recipe.tolerance,
+            recipe.exact,
+            recipe.estimates,
+            device_kind(self.device),
+        ]
         return digest("training picture", engine(*_CODE), own, cut, within)

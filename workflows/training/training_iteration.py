@@ -1,4 +1,6 @@
-"""The trainable parts of a training (mask, restoration network, critics), and one training iteration."""
+"""The trainable parts of a training (mask, restoration network, critics), and one training
+iteration.
+"""
 
 from __future__ import annotations
 
@@ -53,43 +55,68 @@ class Scales(NamedTuple):
 
 
 class Learner:
-    """The mask, the networks and the optimisers of a training, with equal values in all processes."""
+    """The mask, the networks and the optimisers of a training, with equal values in all
+    processes.
+    """
 
     def __init__(
-        self, recipe: Recipe, settings: Training, device: str, designed: bool = False, mesh: Mesh = ALONE,
+        self,
+        recipe: Recipe,
+        settings: Training,
+        device: str,
+        designed: bool = False,
+        mesh: Mesh = ALONE,
         start: WarmStart | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.settings, self.seed, self.device, self.mesh = settings, recipe.seed, device, mesh
         self.stop: Stop | None = None
         self._moment = 0, 0  # stage and iteration
-        self.mask = nn.Module() if designed or not settings.learn else self._start(recipe, settings.learn)
+        self.mask = (
+            nn.Module() if designed or not settings.learn else self._start(recipe, settings.learn)
+        )
         self.net: Restorer = self._network(settings.network)
         if start is not None:
             start.load_into(self.net)
-        self.critics = nn.ModuleList(critics(self._rng("critics"), settings.critics.width)).to(settings.dtype)
+        self.critics = nn.ModuleList(critics(self._rng("critics"), settings.critics.width)).to(
+            settings.dtype
+        )
         self.average = averaged(self.net, settings.average)
         self.begin(Stage(iterations=0), learns=True)
 
     def _network(self, network: Network) -> Restorer:
-        """Return the network with its initial weights; that of a user's class passes one call on this device first."""
+        """Return the network with its initial weights; that of a user's class passes one call on
+        this device first.
+        """
         if network.architecture is None:
-            return start_network(lambda: _network_of(network), self._rng("network")).to(self.settings.dtype)
+            return start_network(lambda: _network_of(network), self._rng("network")).to(
+                self.settings.dtype
+            )
         own = own_network(
-            network.architecture, network.parameters, network.multiple, stream_seed(self.seed, "train network")
+            network.architecture,
+            network.parameters,
+            network.multiple,
+            stream_seed(self.seed, "train network"),
         )
         try_network(own, self.settings.dtype, self.device)
         return own.train()
 
     def _start(self, recipe: Recipe, learn: str) -> nn.Module:
-        """Return the mask of the recipe step ``learn`` as a PyTorch module with trainable parameters."""
+        """Return the mask of the recipe step ``learn`` as a PyTorch module with trainable
+        parameters.
+        """
         step = recipe.steps[learn]
         path = step.node.path
         if path not in PARAMETRISATIONS:
-            text = f"{learn} is {path}, which has no trainable parameters; {nearest(path, PARAMETRISATIONS)}"
+            text = (
+                f"{learn} is {path}, which has no trainable parameters;"
+                f" {nearest(path, PARAMETRISATIONS)}"
+            )
             raise ValueError(f"train: {text}; or design a mask without images: --stage mask")
         stop = recipe.steps[str(step.wires["stop"])]
         self.stop = call(stop, [], stop.params, recipe.seed, "cpu")
-        return PARAMETRISATIONS[path](self.stop, step.params, self._rng("element")).to(self.settings.dtype)
+        return PARAMETRISATIONS[path](self.stop, step.params, self._rng("element")).to(
+            self.settings.dtype
+        )
 
     def height(self) -> Tensor:
         """Return the height map (v, u) of the mask in m; raise ValueError if no mask is trained."""
@@ -99,7 +126,9 @@ class Learner:
         return height
 
     def _rng(self, *names: object) -> torch.Generator:
-        return torch.Generator(self.device).manual_seed(stream_seed(self.seed, " ".join(map(str, ("train", *names)))))
+        return torch.Generator(self.device).manual_seed(
+            stream_seed(self.seed, " ".join(map(str, ("train", *names))))
+        )
 
     def begin(self, stage: Stage, learns: bool) -> None:
         """Begin a stage of the training with new optimisers and the initial learning rates.
@@ -112,30 +141,48 @@ class Learner:
             groups += [{"params": list(self.mask.parameters()), "lr": rates.mask}]
         self.generator_optimizer = torch.optim.Adam(groups, betas=self.settings.betas)
         self.critic_optimizer = torch.optim.Adam(
-            parameter_groups(self.critics, rates.weights, rates.biases), betas=self.settings.critics.betas
+            parameter_groups(self.critics, rates.weights, rates.biases),
+            betas=self.settings.critics.betas,
         )
-        self._first = [[g["lr"] for g in o.param_groups] for o in (self.generator_optimizer, self.critic_optimizer)]
+        self._first = [
+            [g["lr"] for g in o.param_groups]
+            for o in (self.generator_optimizer, self.critic_optimizer)
+        ]
 
     def set_rates(self, iteration: int) -> float:
-        """Set the learning rates of a training iteration, and return the factor on the initial learning rates."""
+        """Set the learning rates of a training iteration, and return the factor on the initial
+        learning rates.
+        """
         factor = self.settings.rates.share(iteration)
-        for optimiser, first in zip((self.generator_optimizer, self.critic_optimizer), self._first, strict=True):
+        for optimiser, first in zip(
+            (self.generator_optimizer, self.critic_optimizer), self._first, strict=True
+        ):
             for group, rate in zip(optimiser.param_groups, first, strict=True):
                 group["lr"] = max(rate * factor, min(rate, self.settings.rates.least))
         return factor
 
     def parts(self) -> dict[str, Any]:
         """Return by name the objects whose state a checkpoint must contain."""
-        parts = {"mask": self.mask, "net": self.net, "critics": self.critics, "makers": self.generator_optimizer}
-        return {**parts, "judges": self.critic_optimizer, **({"average": self.average} if self.average else {})}
+        parts = {
+            "mask": self.mask,
+            "net": self.net,
+            "critics": self.critics,
+            "makers": self.generator_optimizer,
+        }
+        return {
+            **parts,
+            "judges": self.critic_optimizer,
+            **({"average": self.average} if self.average else {}),
+        }
 
-    # --- one iteration ------------------------------------------------------------------------------------------------
+    # --- one iteration ----------------------------------------------------------------------------
 
     def iterate(self, samples: Samples, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
-        """Train on one batch of pictures; raise `NotFinite` if a loss or gradient is NaN or infinite.
+        """Train on one batch of pictures; raise `NotFinite` if a loss or gradient is NaN or
+        infinite.
 
-        Returns the losses of the batch, and the pictures of this process. Each of several processes has its own
-        pictures, and all processes apply the sum of the gradients.
+        Returns the losses of the batch, and the pictures of this process. Each of several processes
+        has its own pictures, and all processes apply the sum of the gradients.
         """
         self.generator_optimizer.zero_grad(set_to_none=True)
         self._moment = stage, iteration
@@ -165,28 +212,44 @@ class Learner:
 
     @property
     def _whole(self) -> bool:
-        """Return True where the pictures of a batch go through the network together: on a GPU, behind a fixed mask.
+        """Return True where the pictures of a batch go through the network together: on a GPU,
+        behind a fixed mask.
 
-        A class of the user has random numbers of its own for each picture, and sums over pixels are of one picture.
+        A class of the user has random numbers of its own for each picture, and sums over pixels are
+        of one picture.
         """
         gpu = device_kind(self.device) != "cpu" and not self.learns and not self.stage.bsr
         return gpu and self.settings.reduction == "mean" and not isinstance(self.net, OwnNetwork)
 
     @torch.no_grad()
     def shared(self, samples: Samples) -> Shared:
-        """Return the results that depend on the present mask but on no picture, without gradients."""
+        """Return the results that depend on the present mask but on no picture, without
+        gradients.
+        """
         return samples.begin(self.height()) if samples.shared else Shared.of({})
 
     def _names(self) -> list[str]:
-        """Return the names of the losses in the present training stage, in the same order in every process."""
-        weights = {"BSR": self.stage.bsr, "reconstruction": self.stage.reconstruction,
-                   "decibels": self.stage.decibels, "adversarial": self.stage.adversarial}  # fmt: skip
-        return [*(["LSR"] if self.learns else []), "L1", *(name for name, weight in weights.items() if weight)]
+        """Return the names of the losses in the present training stage, in the same order in
+        every process.
+        """
+        weights = {
+            "BSR": self.stage.bsr,
+            "reconstruction": self.stage.reconstruction,
+            "decibels": self.stage.decibels,
+            "adversarial": self.stage.adversarial,
+        }
+        return [
+            *(["LSR"] if self.learns else []),
+            "L1",
+            *(name for name, weight in weights.items() if weight),
+        ]
 
     def _mask_suppression(self, shared: Shared, samples: Samples) -> Losses:
-        """Backpropagate the laser suppression loss band by band to save memory, and return the mean suppression ratio.
+        """Backpropagate the laser suppression loss band by band to save memory, and return the mean
+        suppression ratio.
 
-        Processes have different bands, or the same bands with smaller weights, so that each band counts once.
+        Processes have different bands, or the same bands with smaller weights, so that each band
+        counts once.
         """
         psf: Psf = shared.values[samples.psf]
         count, times = samples.counted(samples.psf, len(psf.clear_peak))
@@ -194,7 +257,9 @@ class Learner:
             peaks: Tensor = metrics.lsr(psf)
         if self.stage.lsr:
             for one in range(len(psf.clear_peak)):
-                loss = checkpoint(self._suppression, psf.intensity, psf.clear_peak, one, use_reentrant=False)
+                loss = checkpoint(
+                    self._suppression, psf.intensity, psf.clear_peak, one, use_reentrant=False
+                )
                 (self.stage.lsr / times * loss).backward()
         return {"LSR": float(peaks.mean()) * (len(peaks) / count) / times}
 
@@ -203,9 +268,15 @@ class Learner:
         loss: Tensor = losses.suppression_loss(psf, log=self.settings.logarithm)
         return loss
 
-    def _restoration_terms(self, sample: Sample) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
-        """Restore a training picture; return its weighted loss terms, true picture and detached restored picture."""
-        low = torch.autocast(device_kind(self.device), torch.bfloat16, self.settings.precision == "bfloat16")
+    def _restoration_terms(
+        self, sample: Sample
+    ) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
+        """Restore a training picture; return its weighted loss terms, true picture and detached
+        restored picture.
+        """
+        low = torch.autocast(
+            device_kind(self.device), torch.bfloat16, self.settings.precision == "bfloat16"
+        )
         picture = sample.picture if self.learns else sample.picture.detach()
         with low, self._seeded(sample):
             coarse, fine = self.net.pyramid(picture, *sample.given)
@@ -217,7 +288,10 @@ class Learner:
         if self.stage.bsr:
             terms["BSR"] = (self.stage.bsr, (1.0 / sample.light.clamp_min(1e-30)).sum())
         if self.stage.reconstruction:
-            terms["reconstruction"] = (self.stage.reconstruction, sum(self._errors(estimate, truth), zero))
+            terms["reconstruction"] = (
+                self.stage.reconstruction,
+                sum(self._errors(estimate, truth), zero),
+            )
         if self.stage.decibels:
             terms["decibels"] = (self.stage.decibels, losses.log_error(estimate.fine, truth.fine))
         if self.stage.adversarial:
@@ -227,12 +301,16 @@ class Learner:
 
     @contextmanager
     def _seeded(self, sample: Sample) -> Iterator[None]:
-        """Seed the random numbers of a user's network, such as those of dropout, by picture and iteration."""
+        """Seed the random numbers of a user's network, such as those of dropout, by picture and
+        iteration.
+        """
         if not isinstance(self.net, OwnNetwork):
             yield
             return
         with torch.random.fork_rng([self.device] if self.device.startswith("cuda") else []):
-            torch.manual_seed(stream_seed(self.seed, f"train layers {self._moment} {sample.drawn['noise']}"))
+            torch.manual_seed(
+                stream_seed(self.seed, f"train layers {self._moment} {sample.drawn['noise']}")
+            )
             yield
 
     def _errors(self, estimate: Scales, truth: Scales) -> Iterator[Tensor]:
@@ -240,8 +318,12 @@ class Learner:
         for e, t in zip(estimate, truth, strict=True):
             yield losses.charbonnier(e, t, **how) + losses.fft_l1(e, t, **how)
 
-    def _train_critics(self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator) -> Losses:
-        """Train the critics to distinguish true from restored pictures, with equal random numbers in all processes."""
+    def _train_critics(
+        self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator
+    ) -> Losses:
+        """Train the critics to distinguish true from restored pictures, with equal random
+        numbers in all processes.
+        """
         self.critic_optimizer.zero_grad(set_to_none=True)
         found, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
         for i in range(batch):
@@ -259,11 +341,18 @@ class Learner:
         self._move(self.critic_optimizer, found, list(self.critics))
         return found
 
-    def _move(self, optimiser: torch.optim.Optimizer, found: Mapping[str, float], parts: Sequence[nn.Module]) -> float:
-        """Apply one optimiser step, and return the largest gradient norm of the modules ``parts`` before clipping.
+    def _move(
+        self,
+        optimiser: torch.optim.Optimizer,
+        found: Mapping[str, float],
+        parts: Sequence[nn.Module],
+    ) -> float:
+        """Apply one optimiser step, and return the largest gradient norm of the modules ``parts``
+        before clipping.
 
-        The gradient of each module is clipped to ``train.clip`` separately, because the laser suppression loss has a
-        thousand times as large a gradient for the mask as for a network. Raises `NotFinite` before the step.
+        The gradient of each module is clipped to ``train.clip`` separately, because the laser
+        suppression loss has a thousand times as large a gradient for the mask as for a network.
+        Raises `NotFinite` before the step.
         """
         self.mesh.add_gradients(parts)
         largest = math.inf if self.settings.clip is None else self.settings.clip
@@ -273,10 +362,17 @@ class Learner:
         return norm
 
 
-def _apart(numbers: Sequence[int], truth: Scales, estimate: Scales) -> dict[int, tuple[Scales, Scales]]:
-    """Return the true and the restored picture of each number, of pictures that went through the network together."""
+def _apart(
+    numbers: Sequence[int], truth: Scales, estimate: Scales
+) -> dict[int, tuple[Scales, Scales]]:
+    """Return the true and the restored picture of each number, of pictures that went through the
+    network together.
+    """
     each = [[x.chunk(len(numbers)) for x in scales] for scales in (truth, estimate)]
-    return {n: (Scales(*(x[i] for x in each[0])), Scales(*(x[i] for x in each[1]))) for i, n in enumerate(numbers)}
+    return {
+        n: (Scales(*(x[i] for x in each[0])), Scales(*(x[i] for x in each[1])))
+        for i, n in enumerate(numbers)
+    }
 
 
 def _backward(terms: Sequence[Tensor]) -> None:

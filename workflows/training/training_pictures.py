@@ -1,8 +1,9 @@
 """The numbered training pictures, each with its own scene, laser, sensor parameters and noise.
 
-Steps that depend neither on the mask nor on a drawn value are computed once, steps that depend only on the mask once
-in each iteration, and steps that depend on a scene, a drawn value or noise once for each picture. Gradients of steps
-that depend only on the mask are summed over all pictures, so that one picture is in memory at a time.
+Steps that depend neither on the mask nor on a drawn value are computed once, steps that depend only
+on the mask once in each iteration, and steps that depend on a scene, a drawn value or noise once
+for each picture. Gradients of steps that depend only on the mask are summed over all pictures, so
+that one picture is in memory at a time.
 """
 
 from __future__ import annotations
@@ -30,13 +31,21 @@ from neusee.workflows.training.parallel.band_shards import Shards
 from neusee.workflows.training.parallel.picture_rounds import Pictures
 from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
 from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.posed_pictures import Given, PosedPictures, given_of, tensors_of, turned
+from neusee.workflows.training.posed_pictures import (
+    Given,
+    PosedPictures,
+    given_of,
+    tensors_of,
+    turned,
+)
 from neusee.workflows.training.stored_pool import StoredPool
 from neusee.workflows.training.training_recipe import frame_of, in_precision, require_steps
 
-_LASER = ("optics.laser_irradiance", "strength")  #: the node of a laser, and the parameter that is 0 without a laser
+#: the node of a laser, and the parameter that is 0 without a laser
+_LASER = ("optics.laser_irradiance", "strength")
 _SEEDS = 2**31
-HELD_OUT = 3  #: in place of the number of a stage: the pictures of held-out photographs, the same in both stages
+#: in place of the number of a stage: the pictures of held-out photographs, the same in both stages
+HELD_OUT = 3
 
 
 @dataclass(frozen=True)
@@ -45,14 +54,23 @@ class Sample:
 
     picture: Tensor  #: (n, 3, y, x), the developed picture of the camera
     truth: Tensor  #: (n, 3, y, x), the true picture
-    light: Tensor  #: (band,), the fraction of the light of the scene that the mask keeps; empty where no loss reads it
+    #: (band,), the fraction of the light of the scene that the mask keeps; empty where no loss
+    #: reads it
+    light: Tensor
     drawn: Mapping[str, Any]  #: the values that were sampled for the picture
     given: Given = ()  #: what the network needs beside the picture
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """Return picture, true picture, light, and what the network needs beside the picture, by name."""
-        return {"picture": self.picture, "truth": self.truth, "light": self.light, **tensors_of(self.given)}
+        """Return picture, true picture, light, and what the network needs beside the picture, by
+        name.
+        """
+        return {
+            "picture": self.picture,
+            "truth": self.truth,
+            "light": self.light,
+            **tensors_of(self.given),
+        }
 
     @classmethod
     def of(cls, tensors: Mapping[str, Tensor], drawn: Mapping[str, Any]) -> Sample:
@@ -60,11 +78,14 @@ class Sample:
         return cls(tensors["picture"], tensors["truth"], tensors["light"], drawn, given_of(tensors))
 
 
-_NOTHING = Sample(torch.zeros(0), torch.zeros(0), torch.zeros(0), {})  #: of a process without a picture in a round
+#: of a process without a picture in a round
+_NOTHING = Sample(torch.zeros(0), torch.zeros(0), torch.zeros(0), {})
 
 
 class TrainingStream:
-    """The training pictures of a recipe, behind a mask that is trained or behind the fixed mask of ``frozen``."""
+    """The training pictures of a recipe, behind a mask that is trained or behind the fixed mask
+    of ``frozen``.
+    """
 
     repeats = 1  #: pictures of each held-out photograph
 
@@ -84,10 +105,13 @@ class TrainingStream:
         self.seed, self.mesh, self.held_out = recipe.seed, mesh, held_out
         self._pool = settings.pool if frozen else None
         self._kept: dict[tuple[int, int], Sample] = {}
-        self._rounds: dict[tuple[int, ...], Sample] = {}  #: by stage and numbers, of processes that divide the bands
+        #: by stage and numbers, of processes that divide the bands
+        self._rounds: dict[tuple[int, ...], Sample] = {}
         outputs: tuple[str, ...] = (settings.picture, settings.truth, settings.light, settings.psf)
         require_steps(recipe, "train", (*outputs, settings.scene, *([learn] if learn else [])))
-        self._inputs = Inputs.of(recipe, outputs) if recipe.uncertain and recipe.uncertain.names else None
+        self._inputs = (
+            Inputs.of(recipe, outputs) if recipe.uncertain and recipe.uncertain.names else None
+        )
         self._mismatch = CameraMismatch.of(recipe, settings)
         self.shape = frame_of(recipe, settings.scene)
         believed = in_precision(frozen or recipe, settings.dtype)
@@ -96,7 +120,9 @@ class TrainingStream:
         self._made = self._outputs(2 if frozen else 1)
         recipe, self.psf = self._mismatch.camera(believed, self._made, settings.psf)
         outputs = (*self._made, self.psf)
-        recipe = with_substitutions(replace(recipe, estimates=False), outputs, {learn} if learn else ())
+        recipe = with_substitutions(
+            replace(recipe, estimates=False), outputs, {learn} if learn else ()
+        )
         order = needed(recipe, outputs)
         keeps = self._pool and settings.keep_pool
         self._stored = StoredPool(recipe, settings, self._made, store, device) if keeps else None
@@ -107,47 +133,71 @@ class TrainingStream:
         self.shards = Shards.of(recipe, self.psf, outputs, drawn | learnt, store, mesh)
         drawn |= self.shards.behind
         read = _sources(recipe, drawn) | {self.psf}
-        self._divide(recipe, learn, [n for n in order if n in (learnt - drawn) & read], drawn, noise, store)
+        self._divide(
+            recipe, learn, [n for n in order if n in (learnt - drawn) & read], drawn, noise, store
+        )
 
     def _changing(self, recipe: Recipe, order: Sequence[str]) -> tuple[set[str], set[str]]:
-        """Return the steps that draw noise for each picture, and all steps that change with each picture."""
-        fixed = set(needed(recipe, [self.psf]))  # random effects in the PSF, such as dirt, are constant
+        """Return the steps that draw noise for each picture, and all steps that change with each
+        picture.
+        """
+        # random effects in the PSF, such as dirt, are constant
+        fixed = set(needed(recipe, [self.psf]))
         noise = {name for name in order if recipe.steps[name].node.random and name not in fixed}
         read = {self.settings.scene, *(name.rpartition(".")[0] for name in self._readers)}
         drawn = dependents(recipe, noise | read, order)
         if self.psf in drawn:
             raise ValueError(
-                f"train.psf: {self.settings.psf} changes with each picture: name a step with a constant PSF"
+                f"train.psf: {self.settings.psf} changes with each picture: name a step with a"
+                " constant PSF"
             )
         return noise, drawn
 
     def _outputs(self, number: int) -> tuple[str, ...]:
-        """Return the steps that make a picture of a stage: what a network sees, the truth, light if a loss reads it."""
+        """Return the steps that make a picture of a stage: what a network sees, the truth, light
+        if a loss reads it.
+        """
         stage = self.settings.stages.get(number)
         light = (self.settings.light,) if stage is not None and stage.bsr else ()
         seen = self._posed.steps if self._posed else (self.settings.picture,)
         return (*seen, self.settings.truth, *light)
 
     def _read(self, believed: Recipe, order: Sequence[str]) -> dict[str, Any]:
-        """Return the parameters that change with each picture, with the values that the recipe states.
+        """Return the parameters that change with each picture, with the values that the recipe
+        states.
 
-        What is drawn for the camera is told to the restorer too, but for the differences of ``train.mismatch``.
+        What is drawn for the camera is told to the restorer too, but for the differences of
+        ``train.mismatch``.
         """
         drawn = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
         told, steps = [TOLD + name for name in drawn], set(order)
-        each = [name for name in (*drawn, *told, *self._mismatch.moved) if name.rpartition(".")[0] in steps]
+        each = [
+            name
+            for name in (*drawn, *told, *self._mismatch.moved)
+            if name.rpartition(".")[0] in steps
+        ]
         return {name: _given(believed, name.removeprefix(TOLD)) for name in each}
 
     def _divide(
-        self, recipe: Recipe, learn: str | None, border: list[str], drawn: set[str], noise: set[str], store: Store
+        self,
+        recipe: Recipe,
+        learn: str | None,
+        border: list[str],
+        drawn: set[str],
+        noise: set[str],
+        store: Store,
     ) -> None:
-        """Divide the recipe into steps that depend on the mask alone, up to ``border``, and steps for each picture."""
+        """Divide the recipe into steps that depend on the mask alone, up to ``border``, and
+        steps for each picture.
+        """
         settings = self.settings
         ways: dict[str, Any] = {"store": store, "device": self.device}
         read = self.shards.steps & _sources(recipe, drawn - self.shards.steps)
         self._whole = [name for name in border if name in read]
         caller = self.shards.call
-        self.shared = as_function(recipe, learn, outputs=border, caller=caller, **ways) if learn else None
+        self.shared = (
+            as_function(recipe, learn, outputs=border, caller=caller, **ways) if learn else None
+        )
         free = [*border, settings.scene, *self._readers]
         self._each = Pictures(recipe, free, self._made, noise, self.shards, ways)
         if self._each.by_band:
@@ -155,25 +205,38 @@ class TrainingStream:
 
     @property
     def pool_counts(self) -> dict[str, int]:
-        """Return how many pictures of the pool this process read from the store, and how many it simulated."""
-        return {"from_store": self._stored.read, "simulated": self._stored.computed} if self._stored else {}
+        """Return how many pictures of the pool this process read from the store, and how many it
+        simulated.
+        """
+        return (
+            {"from_store": self._stored.read, "simulated": self._stored.computed}
+            if self._stored
+            else {}
+        )
 
     def begin(self, height: Tensor) -> Shared:
-        """Compute the steps that depend on the mask alone, once for all pictures of a training iteration."""
+        """Compute the steps that depend on the mask alone, once for all pictures of a training
+        iteration.
+        """
         results = self.shared({str(self.settings.learn): height}) if self.shared else {}
         return Shared.of(results, self.shards, self._whole)
 
     def counted(self, name: str, here: int) -> tuple[int, int]:
-        """Return the total number of spectral bands of a result, and the number of processes that compute each band."""
+        """Return the total number of spectral bands of a result, and the number of processes
+        that compute each band.
+        """
         by_band = name in self.shards.steps
         return (self.shards.count, self.mesh.data) if by_band else (here, self.mesh.size)
 
-    def batch(self, shared: Shared, stage: int, first: int, count: int) -> Iterator[tuple[int, Sample]]:
+    def batch(
+        self, shared: Shared, stage: int, first: int, count: int
+    ) -> Iterator[tuple[int, Sample]]:
         """Yield index and picture for each picture of a training batch that this process completes.
 
         The batch has ``count`` pictures and begins with the picture number ``first``.
 
-        The caller must exhaust the iterator, because gradients return to all processes that computed a part.
+        The caller must exhaust the iterator, because gradients return to all processes that
+        computed a part.
         """
         group = range(self.mesh.row, count, self.mesh.data)
         for begin in range(0, len(group), self.mesh.band):
@@ -181,14 +244,19 @@ class TrainingStream:
             mine = together[self.mesh.column] if self.mesh.column < len(together) else None
             if not self._each.by_band:
                 if mine is not None:
-                    yield mine, self.turned(self(shared.seen, stage, first + mine), stage, first + mine)
+                    yield (
+                        mine,
+                        self.turned(self(shared.seen, stage, first + mine), stage, first + mine),
+                    )
                 continue
             key = (stage, *(self._number(stage, first + i) for i in together))
             if key in self._rounds:  # in the memory of all processes, or of none
                 if mine is not None:
                     yield mine, self.turned(self._rounds[key], stage, first + mine)
                 continue
-            begun = {i: self._drawn(stage, number) for i, number in zip(together, key[1:], strict=True)}
+            begun = {
+                i: self._drawn(stage, number) for i, number in zip(together, key[1:], strict=True)
+            }
             parts = {i: (theta, noise) for i, (theta, noise, _) in begun.items()}
             with self._each.together(shared, parts, mine) as values:
                 sample = _NOTHING if mine is None else self._sample(values, begun[mine][2])
@@ -198,7 +266,9 @@ class TrainingStream:
                 self._rounds[key] = sample
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
-        """Return the training picture with the given number, which does not depend on order or process."""
+        """Return the training picture with the given number, which does not depend on order or
+        process.
+        """
         number = self._number(stage, number)
         if self._pool is None or stage == HELD_OUT:
             return self._alone(shared, stage, number)
@@ -211,7 +281,9 @@ class TrainingStream:
         return number % (self._pool or _SEEDS) if stage != HELD_OUT else number
 
     def turned(self, sample: Sample, stage: int, number: int) -> Sample:
-        """Turn a pooled picture and the true picture together, each time otherwise: as behind a mask that is turned."""
+        """Turn a pooled picture and the true picture together, each time otherwise: as behind a
+        mask that is turned.
+        """
         if self._pool is None or stage == HELD_OUT or self.settings.augment.pooled == "none":
             return sample
         seed = (self.seed, stage, number, 4)
@@ -221,11 +293,15 @@ class TrainingStream:
     def _scene(self, stage: int, number: int) -> Tensor:
         """Return the scene of a picture (3, y, x), with the changes of ``train.augment``."""
         if stage == HELD_OUT:
-            return Photographs((self.held_out[number],)).crop(self.shape, self.seed, (stage, number))
+            return Photographs((self.held_out[number],)).crop(
+                self.shape, self.seed, (stage, number)
+            )
         how = self.settings.augment
         much = how.exposure, how.colour, how.enlarge
         change = Change.drawn((self.seed, stage, number, 3), how.symmetries == "all", *much)
-        return change.of(self.photographs.crop(change.frame(self.shape), self.seed, (stage, number)), self.shape)
+        return change.of(
+            self.photographs.crop(change.frame(self.shape), self.seed, (stage, number)), self.shape
+        )
 
     def _alone(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
         theta, noise, drawn = self._drawn(stage, number)
@@ -236,11 +312,15 @@ class TrainingStream:
         if self._stored is None or stage == HELD_OUT:
             return simulated()
         given = {name: theta[name] for name in self._readers}
-        kept = self._stored.picture(theta[self.settings.scene], given, noise, lambda: simulated().tensors)
+        kept = self._stored.picture(
+            theta[self.settings.scene], given, noise, lambda: simulated().tensors
+        )
         return Sample.of(kept, drawn)
 
     def _drawn(self, stage: int, number: int) -> tuple[dict[str, Any], int, dict[str, Any]]:
-        """Sample the random inputs of a training picture; return the inputs, the noise seed, and all values by name."""
+        """Sample the random inputs of a training picture; return the inputs, the noise seed, and
+        all values by name.
+        """
         rng = np.random.default_rng((self.seed, stage, number, 1))
         theta, drawn = dict(self._readers), dict[str, Any]()
         if self._inputs is not None:
@@ -254,19 +334,24 @@ class TrainingStream:
         if rng.random() < self.settings.laser_free:
             theta |= dict.fromkeys(self._lasers, 0.0)
             drawn["laser"] = "none"
-        theta |= {self.settings.scene: self._scene(stage, number).to(self.device, self.settings.dtype)}
+        theta |= {
+            self.settings.scene: self._scene(stage, number).to(self.device, self.settings.dtype)
+        }
         noise = int(rng.integers(_SEEDS))
         return theta, noise, {**drawn, "noise": noise, "number": number}
 
     def _sample(self, values: Mapping[str, Any], drawn: Mapping[str, Any]) -> Sample:
-        """Resize a training picture and the true picture to ``train.size``, and cut both into patches.
+        """Resize a training picture and the true picture to ``train.size``, and cut both into
+        patches.
 
-        Antialiased `kornia.geometry.transform.resize` lets stripes alias: at 2/3 of the size the finest stripes keep a
-        contrast of 0.69 with kornia, and of 0.09 with `resize`.
+        Antialiased `kornia.geometry.transform.resize` lets stripes alias: at 2/3 of the size the
+        finest stripes keep a contrast of 0.69 with kornia, and of 0.09 with `resize`.
         """
         light = values.get(self.settings.light, torch.zeros(0))
         dtype = self.settings.dtype
-        picture, given = self._posed.read(values, dtype) if self._posed else (values[self.settings.picture], ())
+        picture, given = (
+            self._posed.read(values, dtype) if self._posed else (values[self.settings.picture], ())
+        )
         both = [x.to(dtype) for x in (picture, values[self.settings.truth])]
         if self.settings.size is not None:
             both = [resize(picture, *self.settings.size) for picture in both]
@@ -274,18 +359,26 @@ class TrainingStream:
         return Sample(picture, truth, light, drawn, given)
 
     def _patches(self, both: Tensor, seed: int) -> Tensor:
-        """Cut patches from a training picture and the true picture at the same positions, as a tensor (2, n, 3, y, x).
+        """Cut patches from a training picture and the true picture at the same positions, as a
+        tensor (2, n, 3, y, x).
 
-        A slice gives the same pixels as `kornia.geometry.transform.crop_by_indices` in a tenth of the time.
+        A slice gives the same pixels as `kornia.geometry.transform.crop_by_indices` in a tenth of
+        the time.
         """
         if self.settings.patch is None:
             return both[:, None]
         size, patch = (both.shape[-2], both.shape[-1]), self.settings.patch
         if any(have < want for have, want in zip(size, patch, strict=True)):
-            raise ValueError(f"train.patch: {list(patch)} is larger than the picture {list(size)}: set a smaller patch")
+            raise ValueError(
+                f"train.patch: {list(patch)} is larger than the picture {list(size)}: set a smaller"
+                " patch"
+            )
         rng = np.random.default_rng((seed, 2))
         count = self.settings.patches
-        places = [[int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)] for _ in range(count)]
+        places = [
+            [int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)]
+            for _ in range(count)
+        ]
         return torch.stack([both[..., y : y + patch[0], x : x + patch[1]] for y, x in places], 1)
 
 

@@ -1,4 +1,6 @@
-"""Files that must stay as they are while a training runs: its photographs, which are read again and again."""
+"""Files that must stay as they are while a training runs: its photographs, which are read again
+and again.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ class UnchangedFiles:
         return cls({path: file_digest(path) for path in paths})
 
     def require(self) -> None:
-        """Raise ValueError if a file is gone or has another content; a file that was only touched is the same."""
+        """Raise ValueError if a file is gone or has another content; a file that was only
+        touched is the same.
+        """
         for path, content in self.contents.items():
             try:
                 stamp = file_stamps(path)[0]
@@ -30,7 +34,9 @@ class UnchangedFiles:
                     continue
                 same = file_digest(path) == content
             except OSError as error:
-                raise ValueError(self._said(path, f"cannot be read any more ({error.strerror})")) from error
+                raise ValueError(
+                    self._said(path, f"cannot be read any more ({error.strerror})")
+                ) from error
             if not same:
                 raise ValueError(self._said(path, "has another content now"))
             self._stamps[path] = stamp
@@ -38,6 +44,7 @@ class UnchangedFiles:
     @staticmethod
     def _said(path: Path, what: str) -> str:
         return (
-            f"the photograph {path} {what}, after this training began with it; the checkpoint before is kept: put the "
-            "file back and give the command again to go on, or give the command as it is to begin anew"
+            f"the photograph {path} {what}, after this training began with it; the checkpoint"
+            " before is kept: put the file back and give the command again to go on, or give the"
+            " command as it is to begin anew"
         )

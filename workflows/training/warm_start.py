@@ -1,4 +1,6 @@
-"""The weights with which the network of a new training begins: those of an earlier training, in place of drawn ones."""
+"""The weights with which the network of a new training begins: those of an earlier training, in
+place of drawn ones.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from neusee.nodes.restore import Restorer
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.blocks.train_block import KEY, Training
 
-_FILES = ("best.safetensors", "network.safetensors")  #: of a folder of results, the first that is there
+#: of a folder of results, the first that is there
+_FILES = ("best.safetensors", "network.safetensors")
 
 
 @dataclass(frozen=True)
@@ -28,21 +31,32 @@ class WarmStart:
 
     @classmethod
     def of(cls, recipe: Recipe, settings: Training) -> WarmStart | None:
-        """Return the file of weights that ``train.start`` names, or None; raise ValueError if there is no such file."""
+        """Return the file of weights that ``train.start`` names, or None; raise ValueError if
+        there is no such file.
+        """
         if settings.start is None:
             return None
         given = recipe.config.settings.get(f"{KEY}.start")
         source = given.source if given else recipe.name
         file = settings.start
         if file.is_dir():
-            file = next((file / name for name in _FILES if (file / name).is_file()), file / _FILES[-1])
+            file = next(
+                (file / name for name in _FILES if (file / name).is_file()), file / _FILES[-1]
+            )
         if file.suffix != ".safetensors" or not file.is_file():
-            text = f"{file} is no file of weights: give a .safetensors file, or the folder of a training that ended"
+            text = (
+                f"{file} is no file of weights: give a .safetensors file, or the folder of a"
+                " training that ended"
+            )
             raise ValueError(f"{source}   {KEY}.start   {text}")
-        return cls(file, hashlib.sha256(bytes_of(file, parameter="train.start")).hexdigest(), source)
+        return cls(
+            file, hashlib.sha256(bytes_of(file, parameter="train.start")).hexdigest(), source
+        )
 
     def load_into(self, net: Restorer) -> None:
-        """Give the weights to a network; raise ValueError with the name of the first layer that does not fit."""
+        """Give the weights to a network; raise ValueError with the name of the first layer that
+        does not fit.
+        """
         from safetensors.torch import load_file
 
         safetensors_need(self.file, 2.0, "train.start")

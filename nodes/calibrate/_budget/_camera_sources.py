@@ -1,4 +1,6 @@
-"""The sources of the scatter of a real camera's levels: statistics of the frames, lamp, dark signal and variances."""
+"""The sources of the scatter of a real camera's levels: statistics of the frames, lamp, dark
+signal and variances.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,12 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.calibrate._emva_fit import without_histograms
-from neusee.nodes.calibrate._likelihood._camera_likelihood import CAMERA_PARAMETERS, _Camera, _signal, _used
+from neusee.nodes.calibrate._likelihood._camera_likelihood import (
+    CAMERA_PARAMETERS,
+    _Camera,
+    _signal,
+    _used,
+)
 from neusee.nodes.values import Levels
 
 STATISTICS = "statistics of the frames"
@@ -21,7 +28,8 @@ SOURCES = (STATISTICS, LAMP, DRIFT, SCATTER)
 
 
 def camera_sources(levels: Levels, params: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return the share of each source in the variance of each row of `Likelihood.scaled` of `camera`.
+    """Return the share of each source in the variance of each row of `Likelihood.scaled` of
+    `camera`.
 
     ``params`` are the parameters of `camera` at the mode.
 
@@ -32,20 +40,28 @@ def camera_sources(levels: Levels, params: Mapping[str, Any]) -> dict[str, Tenso
     """
     seen, top, _ = _used(levels, params["share"])
     used = without_histograms(levels, seen)
-    camera = _Camera(*(torch.as_tensor(params[name], dtype=torch.float64) for name in CAMERA_PARAMETERS))
+    camera = _Camera(
+        *(torch.as_tensor(params[name], dtype=torch.float64) for name in CAMERA_PARAMETERS)
+    )
     signal = _signal(used.mean - camera.signal, top, camera)
     light = camera.lamp * camera.efficiency * used.photons * signal.slope
     chance, drift = used.variance / used.pixels, camera.drift.square() * torch.ones_like(light)
     means = {STATISTICS: chance, LAMP: light.square(), DRIFT: drift}
-    variances = {STATISTICS: 2.0 / used.degrees_of_freedom, SCATTER: camera.scatter.square() * torch.ones_like(light)}
+    variances = {
+        STATISTICS: 2.0 / used.degrees_of_freedom,
+        SCATTER: camera.scatter.square() * torch.ones_like(light),
+    }
     parts = [_shares(each) for each in (variances, means)]
     none = torch.zeros_like(light)
     rows = {source: [part.get(source, none) for part in parts] for source in SOURCES}
     return {source: torch.cat([a, a, b, b]) for source, (a, b) in rows.items()}
 
 
-def source_freedom(levels: Levels, params: Mapping[str, Any], free: tuple[str, ...]) -> dict[str, float]:
-    """Return the degrees of freedom of each source: observations that scatter, less the ``free`` parameters they fit.
+def source_freedom(
+    levels: Levels, params: Mapping[str, Any], free: tuple[str, ...]
+) -> dict[str, float]:
+    """Return the degrees of freedom of each source: observations that scatter, less the ``free``
+    parameters they fit.
 
     Shapes: scalars by source.
     Units:  none.
@@ -64,14 +80,19 @@ def source_freedom(levels: Levels, params: Mapping[str, Any], free: tuple[str, .
     }
 
 
-def variance_shares(slopes: Tensor, sources: Mapping[str, Tensor], along: Tensor) -> dict[str, float]:
-    """Return the share of each source, and of the prior, in the variance of a function of the parameters.
+def variance_shares(
+    slopes: Tensor, sources: Mapping[str, Tensor], along: Tensor
+) -> dict[str, float]:
+    """Return the share of each source, and of the prior, in the variance of a function of the
+    parameters.
 
-    The estimate is linear in the scattering rows, so that its covariance is a sum over sources: C J^T F J C for the
-    shares F of a source in the rows, and C C for the prior, with C = (J^T J + 1)^-1.
+    The estimate is linear in the scattering rows, so that its covariance is a sum over sources: C
+    J^T F J C for the shares F of a source in the rows, and C C for the prior, with C = (J^T J +
+    1)^-1.
 
-    Shapes: slopes (row, free) derivatives per standard deviation of the prior; sources (row,) shares; along (free,)
-            derivative of the function per standard deviation of the prior -> shares that add up to 1.
+    Shapes: slopes (row, free) derivatives per standard deviation of the prior; sources (row,)
+            shares; along (free,) derivative of the function per standard deviation of the prior ->
+            shares that add up to 1.
     Units:  none.
     Source: JCGM 100:2008 (GUM), section 5.1, for a least-squares estimate with a prior.
     """

@@ -1,4 +1,6 @@
-"""The uncertainty budgets of the quantities of an EMVA 1288 sheet, by the law of propagation of uncertainty."""
+"""The uncertainty budgets of the quantities of an EMVA 1288 sheet, by the law of propagation of
+uncertainty.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ _STEP = 0.1  #: standard uncertainties of an input, half the step of a derivativ
 _SCALE = 1e-4  #: half the step of a derivative by the photons, relative
 _NOTHING = 1e-6  #: share of a value below which a change is rounding
 _HALF = 0.5 * SENSITIVITY  #: share of saturation up to which the second model fits its lines
-_BENT = 2.0  #: change of a slope from 70 % of saturation to no light, over that from 70 to 35 %, if it is proportional
+#: change of a slope from 70 % of saturation to no light, over that from 70 to 35 %, if it is
+#: proportional
+_BENT = 2.0
 #: by key of the sheet: the parameter of `camera` whose temperature coefficient counts, and its sign
 _COEFFICIENTS = {
     "K": ("gain", 1.0),
@@ -62,7 +66,9 @@ Values = dict[str, float]
 
 @dataclass(frozen=True)
 class _Propagation:
-    """How far all quantities of a sheet move with its levels, the light of each level, all photons and the model."""
+    """How far all quantities of a sheet move with its levels, the light of each level, all
+    photons and the model.
+    """
 
     levels: Levels
     sheet: EmvaSheet
@@ -80,17 +86,25 @@ class _Propagation:
         parts: dict[str, list[Contribution]] = {}
         for name, error, freedom in (
             ("mean", (levels.variance / levels.pixels).sqrt(), levels.pixels - 1),
-            ("variance", levels.variance * (2 / levels.degrees_of_freedom).sqrt(), levels.degrees_of_freedom),
+            (
+                "variance",
+                levels.variance * (2 / levels.degrees_of_freedom).sqrt(),
+                levels.degrees_of_freedom,
+            ),
         ):
             for i, (u, nu) in enumerate(zip(error.tolist(), freedom.tolist(), strict=True)):
                 if u > 0:
                     for key, slope in self._slopes(self._moved(name, i), _STEP * u).items():
-                        parts.setdefault(key, []).append(Contribution("", "A", "", u, "", slope, nu))
+                        parts.setdefault(key, []).append(
+                            Contribution("", "A", "", u, "", slope, nu)
+                        )
         return parts
 
     @cached_property
     def light(self) -> Values:
-        """Return the root of the sum of squares of dy/de over the lit levels, e the relative light of one level."""
+        """Return the root of the sum of squares of dy/de over the lit levels, e the relative
+        light of one level.
+        """
         sums: Values = {}
         for i in (self.levels.photons > 0).nonzero().squeeze(1).tolist():
             for key, slope in self._slopes(self._lit(i), _SCALE).items():
@@ -100,7 +114,9 @@ class _Propagation:
     @cached_property
     def photons(self) -> Values:
         """Return dy/ds for a relative change s of all numbers of photons."""
-        return self._slopes(lambda s: self.levels._replace(photons=self.levels.photons * (1 + s)), _SCALE)
+        return self._slopes(
+            lambda s: self.levels._replace(photons=self.levels.photons * (1 + s)), _SCALE
+        )
 
     @cached_property
     def other_model(self) -> Values:
@@ -117,20 +133,25 @@ class _Propagation:
 
     @cached_property
     def lamp(self) -> tuple[float, float]:
-        """Return the relative scatter of the light from level to level beyond chance, and its degrees of freedom."""
+        """Return the relative scatter of the light from level to level beyond chance, and its
+        degrees of freedom.
+        """
         transfer, found = self.sheet.transfer, self.sheet.linearity
         if found is None:
             return math.nan, math.nan
         used = transfer.linear
         order = _lit_order(self.levels)
-        chance = (self.levels.variance / self.levels.pixels).numpy()[order][used] / transfer.signal[used] ** 2
+        chance = (self.levels.variance / self.levels.pixels).numpy()[order][used] / transfer.signal[
+            used
+        ] ** 2
         freedom = len(found.deviation) - 2
         square = float(((found.deviation / 100) ** 2).sum()) / freedom - float(chance.mean())
         return math.sqrt(max(square, 0.0)), float(freedom)
 
     @cached_property
     def spacing(self) -> float:
-        """Return the standard uncertainty of the saturation, relative, that lies between its two neighbouring levels.
+        """Return the standard uncertainty of the saturation, relative, that lies between its two
+        neighbouring levels.
 
         The distribution is rectangular, from the level before to the level after.
         """
@@ -149,26 +170,36 @@ class _Propagation:
         return at
 
     def _lit(self, i: int) -> Callable[[float], Levels]:
-        """Return the levels as a function of the relative light of level ``i``, which moves mean and variance."""
+        """Return the levels as a function of the relative light of level ``i``, which moves mean
+        and variance.
+        """
         levels, dark = self.levels, self.levels.photons == 0
-        nearest = torch.where(dark, (levels.exposure - levels.exposure[i]).abs(), torch.inf).argmin()
+        nearest = torch.where(
+            dark, (levels.exposure - levels.exposure[i]).abs(), torch.inf
+        ).argmin()
         signal, excess = (float(x[i] - x[nearest]) for x in (levels.mean, levels.variance))
 
         def at(step: float) -> Levels:
-            mean, variance = _added(levels.mean, i, step * signal), _added(levels.variance, i, step * excess)
+            mean, variance = (
+                _added(levels.mean, i, step * signal),
+                _added(levels.variance, i, step * excess),
+            )
             return levels._replace(mean=mean, variance=variance)
 
         return at
 
 
-def sheet_budgets(levels: Levels, sheet: EmvaSheet, laboratory: Laboratory, photons_told: bool = True) -> list[Budget]:
+def sheet_budgets(
+    levels: Levels, sheet: EmvaSheet, laboratory: Laboratory, photons_told: bool = True
+) -> list[Budget]:
     """Return the uncertainty budget of each quantity of a sheet that has a value and no mere limit.
 
-    Derivatives are central differences of the whole sheet. The sources are the sampling of means and variances, the
-    scatter of the light from level to level, which the deviations from the line of linearity give, the spacing of the
-    levels, the model of the response, and what ``laboratory`` states. For the model the lines are fitted up to 35 % of
-    saturation too. A slope that changes in proportion to the range changes twice as much down to no light, and the
-    quantity may lie anywhere within that.
+    Derivatives are central differences of the whole sheet. The sources are the sampling of means
+    and variances, the scatter of the light from level to level, which the deviations from the line
+    of linearity give, the spacing of the levels, the model of the response, and what ``laboratory``
+    states. For the model the lines are fitted up to 35 % of saturation too. A slope that changes in
+    proportion to the range changes twice as much down to no light, and the quantity may lie
+    anywhere within that.
 
     Shapes: levels (level,).
     Units:  those of each quantity.
@@ -187,7 +218,11 @@ def sheet_budgets(levels: Levels, sheet: EmvaSheet, laboratory: Laboratory, phot
 
 
 def _budget(
-    q: Quantity, own: list[Contribution], moves: _Propagation, laboratory: Laboratory, gain: Quantity
+    q: Quantity,
+    own: list[Contribution],
+    moves: _Propagation,
+    laboratory: Laboratory,
+    gain: Quantity,
 ) -> Budget:
     assert q.value is not None
     name, sign = _COEFFICIENTS.get(q.key, (q.key, 1.0))
@@ -212,11 +247,15 @@ def _of_levels(q: Quantity, moves: _Propagation) -> Iterator[Contribution]:
         yield Contribution(SPACING, "B", "rectangular", moves.spacing, "relative", sensitivity)
     other = moves.other_model.get(q.key)
     if other is None:
-        yield Contribution(MODEL, "B", reason=f"{NOT_STATED}: too few levels up to 35 % of saturation")
+        yield Contribution(
+            MODEL, "B", reason=f"{NOT_STATED}: too few levels up to 35 % of saturation"
+        )
     elif abs(other - q.value) <= _NOTHING * abs(q.value):
         yield Contribution(MODEL, "B", reason=NOT_INVOLVED)
     else:
-        yield Contribution(MODEL, "B", "rectangular", _BENT * abs(other - q.value) / math.sqrt(3), q.unit)
+        yield Contribution(
+            MODEL, "B", "rectangular", _BENT * abs(other - q.value) / math.sqrt(3), q.unit
+        )
 
 
 def _of_lamp(sensitivity: float, value: float, moves: _Propagation) -> Contribution:
@@ -233,11 +272,21 @@ def _is_spatial(q: Quantity) -> bool:
 
 
 def _spatial(q: Quantity, sheet: EmvaSheet, moves: _Propagation) -> Iterator[Contribution]:
-    """Yield the contributions of a quantity of series of frames; one in electrons has those of the gain too."""
+    """Yield the contributions of a quantity of series of frames; one in electrons has those of
+    the gain too.
+    """
     assert q.value is not None
-    lit, dark, part = sheet.spatial.lit, sheet.spatial.dark, q.key.removesuffix("_DN").partition("_")[2]
+    lit, dark, part = (
+        sheet.spatial.lit,
+        sheet.spatial.dark,
+        q.key.removesuffix("_DN").partition("_")[2],
+    )
     at = ("", "row", "column", "pixel").index(part)
-    errors = [chance_of_variances(each)[at] for each in ((dark, lit) if q.key.startswith("PRNU") else (dark,)) if each]
+    errors = [
+        chance_of_variances(each)[at]
+        for each in ((dark, lit) if q.key.startswith("PRNU") else (dark,))
+        if each
+    ]
     scale = 1.0
     if q.key.startswith("PRNU") and lit is not None and dark is not None:
         scale = (100 / float(lit.average.mean() - dark.average.mean())) ** 2
@@ -259,8 +308,16 @@ def _spatial(q: Quantity, sheet: EmvaSheet, moves: _Propagation) -> Iterator[Con
 
 
 def _scaled(c: Contribution, by: float) -> Contribution:
-    return Contribution(c.source, c.kind, c.distribution, c.uncertainty, c.unit, c.sensitivity * by, c.freedom,
-                        c.reason)  # fmt: skip
+    return Contribution(
+        c.source,
+        c.kind,
+        c.distribution,
+        c.uncertainty,
+        c.unit,
+        c.sensitivity * by,
+        c.freedom,
+        c.reason,
+    )
 
 
 def _added(values: Tensor, i: int, step: float) -> Tensor:

@@ -1,4 +1,6 @@
-"""What a laboratory states of its light and of its temperature, so that its values can be traced to a standard."""
+"""What a laboratory states of its light and of its temperature, so that its values can be traced
+to a standard.
+"""
 
 from __future__ import annotations
 
@@ -38,8 +40,10 @@ class Statement(ParameterModel):
 class Photometry(Statement):
     """Calibration of the light: what is known of the numbers of photons, and who says so."""
 
-    known: Literal["absolute", "relative"] = "absolute"  #: relative: up to a factor, so that no efficiency is told
-    relative_uncertainty: Relative | None = None  #: standard uncertainty of the photons over their number
+    #: relative: up to a factor, so that no efficiency is told
+    known: Literal["absolute", "relative"] = "absolute"
+    #: standard uncertainty of the photons over their number
+    relative_uncertainty: Relative | None = None
     distribution: Literal["normal", "rectangular"] = "normal"
     degrees_of_freedom: Annotated[float, Field(ge=1, le=math.inf, allow_inf_nan=True)] = math.inf
     certificate: Text | None = None  #: its number
@@ -56,16 +60,23 @@ class Lamp(Statement):
     centroid_uncertainty: Linewidth | None = None  #: standard uncertainty
     fwhm: Linewidth | None = None
     efficiency_per_nm: Finite | None = None  #: relative change of the efficiency
-    drift: Relative | None = None  #: relative standard uncertainty, from the calibration of the light to the frames
+    #: relative standard uncertainty, from the calibration of the light to the frames
+    drift: Relative | None = None
 
 
 class SensorTemperature(Statement):
     """The temperature of the sensor, and the relative change of its parameters per kelvin."""
 
-    value: Annotated[float, Field(gt=0, le=1e4), BeforeValidator(_temperature, json_schema_input_type=str)] | None = (
-        None  #: K
-    )
-    uncertainty: Annotated[float, Field(gt=0, le=1e6), BeforeValidator(lambda x: read_quantity(x, "K"))] | None = None
+    value: (
+        Annotated[
+            float, Field(gt=0, le=1e4), BeforeValidator(_temperature, json_schema_input_type=str)
+        ]
+        | None
+    ) = None  #: K
+    uncertainty: (
+        Annotated[float, Field(gt=0, le=1e6), BeforeValidator(lambda x: read_quantity(x, "K"))]
+        | None
+    ) = None
     coefficients: Mapping[str, Finite] = Field(default_factory=dict)  #: 1/K, by parameter
 
     @property
@@ -75,7 +86,9 @@ class SensorTemperature(Statement):
 
 
 class Traceability(Statement):
-    """What a laboratory states of its photons, its lamp and its temperature: the recipe key ``traceability``."""
+    """What a laboratory states of its photons, its lamp and its temperature: the recipe key
+    ``traceability``.
+    """
 
     photons: Photometry = Photometry()
     lamp: Lamp = Lamp()

@@ -1,4 +1,6 @@
-"""The uncertainty budget of one quantity: each source, and the combined and the expanded uncertainty."""
+"""The uncertainty budget of one quantity: each source, and the combined and the expanded
+uncertainty.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ NOT_STATED, NOT_INVOLVED = "not stated", "does not enter"
 class Contribution:
     """One source of uncertainty of a quantity: a line of its budget.
 
-    Without an ``uncertainty``, ``reason`` says why: the source is not stated, or does not enter the quantity.
+    Without an ``uncertainty``, ``reason`` says why: the source is not stated, or does not enter the
+    quantity.
     """
 
     source: str
@@ -29,7 +32,9 @@ class Contribution:
 
     @property
     def share(self) -> float | None:
-        """Return u(y) = |c| u(x) in the unit of the quantity, or None for a source without an uncertainty."""
+        """Return u(y) = |c| u(x) in the unit of the quantity, or None for a source without an
+        uncertainty.
+        """
         return None if self.uncertainty is None else abs(self.sensitivity) * self.uncertainty
 
 
@@ -51,7 +56,9 @@ class Budget:
 
     @property
     def freedom(self) -> float:
-        """Return the effective degrees of freedom of the combined uncertainty (GUM, equation G.2b)."""
+        """Return the effective degrees of freedom of the combined uncertainty (GUM, equation
+        G.2b).
+        """
         return welch_satterthwaite(self.contributions)
 
     @property
@@ -67,11 +74,16 @@ class Budget:
     @property
     def missing(self) -> tuple[str, ...]:
         """Return the sources that are not stated, so that the combined uncertainty lacks them."""
-        return tuple(c.source for c in self.contributions if c.uncertainty is None and c.reason != NOT_INVOLVED)
+        return tuple(
+            c.source
+            for c in self.contributions
+            if c.uncertainty is None and c.reason != NOT_INVOLVED
+        )
 
 
 def welch_satterthwaite(contributions: Iterable[Contribution]) -> float:
-    """Return the effective degrees of freedom of the sum of independent contributions, infinite without a finite one.
+    """Return the effective degrees of freedom of the sum of independent contributions, infinite
+    without a finite one.
 
     Shapes: scalars.
     Units:  those of the quantity.

@@ -1,4 +1,6 @@
-"""The check of a file of raw frames before the run, which reads the pixels only if their type has other than counts."""
+"""The check of a file of raw frames before the run, which reads the pixels only if their type
+has other than counts.
+"""
 
 import math
 import warnings
@@ -20,13 +22,19 @@ _STRIP_STARTS, _STRIP_LENGTHS = 273, 279  #: TIFF tags
 
 @once_per_version
 def frame_problem(file: Path) -> str:
-    """Return a message for a file that is damaged or holds no raw frames, as far as headers show it, else nothing."""
+    """Return a message for a file that is damaged or holds no raw frames, as far as headers show
+    it, else nothing.
+    """
     check = _CHECKS.get(file.suffix.lower())
     try:
         refuse_other_than_file(file)
         return check(file) if check else ""
     except (OSError, SyntaxError, ValueError, EOFError) as error:
-        return str(error) if isinstance(error, ValueError) else f"{file} is damaged ({error}): copy the file again"
+        return (
+            str(error)
+            if isinstance(error, ValueError)
+            else f"{file} is damaged ({error}): copy the file again"
+        )
 
 
 def _picture(file: Path) -> str:
@@ -36,11 +44,16 @@ def _picture(file: Path) -> str:
         with Image.open(file) as image:
             refuse_page(file, image)
             pages_need(file, image, 2.0)
-            ends = zip(*(_numbers(image, tag) for tag in (_STRIP_STARTS, _STRIP_LENGTHS)), strict=False)
+            ends = zip(
+                *(_numbers(image, tag) for tag in (_STRIP_STARTS, _STRIP_LENGTHS)), strict=False
+            )
             if image.format == "PNG":
                 image.verify()
             elif (last := max(map(sum, ends), default=0)) > file.stat().st_size:
-                return f"{file} is damaged (its pixels end at byte {last}, after its end): copy the file again"
+                return (
+                    f"{file} is damaged (its pixels end at byte {last}, after its end): copy the"
+                    " file again"
+                )
             elif image.mode in ("I", "F"):
                 read(file)
     except UnidentifiedImageError:
@@ -64,12 +77,18 @@ def _numpy(file: Path) -> str:
 
 
 def _fits(file: Path) -> str:
-    """Return a message for a FITS file without an image, cut short, too large, or with other than whole numbers."""
+    """Return a message for a FITS file without an image, cut short, too large, or with other
+    than whole numbers.
+    """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # astropy warns of a file that is cut short, which is refused here
+        # astropy warns of a file that is cut short, which is refused here
+        warnings.simplefilter("ignore")
         shape, end, doubtful = fits_image(file)
     if end > (size := file.stat().st_size):
-        return f"{file} is damaged (its image ends at byte {end}, after its end at {size}): copy the file again"
+        return (
+            f"{file} is damaged (its image ends at byte {end}, after its end at {size}): copy the"
+            " file again"
+        )
     return _too_large(file, shape) or _wrong_numbers(file, shape, doubtful)
 
 
@@ -77,13 +96,18 @@ def _too_large(file: Path, shape: tuple[int, ...]) -> str:
     count = math.prod(map(int, shape))
     if count <= VALUES:
         return ""
-    return f"{file} has {count} values, more than the limit of {VALUES}: divide the frames among several files"
+    return (
+        f"{file} has {count} values, more than the limit of {VALUES}: divide the frames among"
+        " several files"
+    )
 
 
 def _wrong_numbers(file: Path, shape: tuple[int, ...], doubtful: bool) -> str:
-    """Return a message for an array that is no stack of frames, or holds no digital numbers, else an empty text.
+    """Return a message for an array that is no stack of frames, or holds no digital numbers, else
+    an empty text.
 
-    Numbers of a type that has counts of a converter alone, such as uint16, are not read before the run.
+    Numbers of a type that has counts of a converter alone, such as uint16, are not read before the
+    run.
     """
     if doubtful or len(shape) not in (2, 3) or not math.prod(shape):
         try:

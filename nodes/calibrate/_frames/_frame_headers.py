@@ -16,13 +16,17 @@ from neusee.nodes.input_files import once_per_version
 from neusee.nodes.picture_bytes import exr_needs, pages_need
 
 _EXIF, _EXPOSURE, _DESCRIPTION = 0x8769, 33434, 270  #: tags of TIFF and Exif
-_TIMES = ("exposuretime", "exptime", "exposure", "integrationtime")  #: keys of an exposure, in seconds without a unit
+#: keys of an exposure, in seconds without a unit
+_TIMES = ("exposuretime", "exptime", "exposure", "integrationtime")
 _LIGHTS = ("photons", "photonsperpixel")
 _SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
 _NUMBER = re.compile(r"\s*([-+]?[\d.]+(?:e[-+]?\d+)?)\s*(s|ms|us|µs|μs|ns)?\s*", re.IGNORECASE)
-_FRACTION = re.compile(r"\s*(\d+)\s*[/⁄]\s*([1-9]\d*(?:\.\d+)?)\s*(s|sec)?\s*", re.IGNORECASE)  #: 1/200 s
+#: 1/200 s
+_FRACTION = re.compile(r"\s*(\d+)\s*[/⁄]\s*([1-9]\d*(?:\.\d+)?)\s*(s|sec)?\s*", re.IGNORECASE)
 _PAIR = re.compile(
-    r"([A-Za-z _]+?)\s*[=:]\s*(\d+\s*[/⁄]\s*\d[\d.]*\s*s?|[-+.\deE]+\s*(?:ms|us|µs|μs|ns|s)?)(?![A-Za-z/⁄\d])"
+    r"([A-Za-z"
+    r" _]+?)\s*[=:]\s*"
+    r"(\d+\s*[/⁄]\s*\d[\d.]*\s*s?|[-+.\deE]+\s*(?:ms|us|µs|μs|ns|s)?)(?![A-Za-z/⁄\d])"
 )
 
 
@@ -38,13 +42,17 @@ class FrameHeader(NamedTuple):
 
 @once_per_version
 def frame_header(file: Path) -> FrameHeader:
-    """Return what the header of a file of raw frames says; raise ValueError for a file without raw frames.
+    """Return what the header of a file of raw frames says; raise ValueError for a file without raw
+    frames.
 
-    Exposure and light are read from Exif, TIFF descriptions, texts of a PNG, FITS keywords and attributes of OpenEXR.
+    Exposure and light are read from Exif, TIFF descriptions, texts of a PNG, FITS keywords and
+    attributes of OpenEXR.
 
     Shapes: scalars.
-    Units:  exposure s, as Exif, FITS and OpenEXR have it without a unit; photons per pixel and exposure.
-    Raises: ValueError for an unknown kind of file, a damaged file, colour, and numbers that are not counts.
+    Units:  exposure s, as Exif, FITS and OpenEXR have it without a unit; photons per pixel and
+            exposure.
+    Raises: ValueError for an unknown kind of file, a damaged file, colour, and numbers that are not
+            counts.
     """
     readable(file)
     if problem := frame_problem(file):
@@ -53,7 +61,13 @@ def frame_header(file: Path) -> FrameHeader:
     count, shape, bits, said = _HEADERS.get(suffix, _fits if suffix in FITS else _plain)(file)
     found = {re.sub(r"[^a-z]", "", str(key).lower()): value for key, value in said.items()}
     light = next((_number(found[key], False) for key in _LIGHTS if key in found), None)
-    return FrameHeader(count, shape, bits, next((_number(found[key]) for key in _TIMES if key in found), None), light)
+    return FrameHeader(
+        count,
+        shape,
+        bits,
+        next((_number(found[key]) for key in _TIMES if key in found), None),
+        light,
+    )
 
 
 def _number(value: Any, is_time: bool = True) -> float | None:
@@ -87,7 +101,13 @@ def _picture(file: Path) -> _Found:
         for tags in (exif, exif.get_ifd(_EXIF)):
             if _EXPOSURE in tags:
                 said["exposuretime"] = float(tags[_EXPOSURE])
-        bits = 8 if image.mode == "L" else 16 if image.mode.startswith("I;16") or image.format == "PNG" else 32
+        bits = (
+            8
+            if image.mode == "L"
+            else 16
+            if image.mode.startswith("I;16") or image.format == "PNG"
+            else 32
+        )
         return int(getattr(image, "n_frames", 1)), (image.height, image.width), bits, said
 
 
@@ -105,8 +125,12 @@ def _fits(file: Path) -> _Found:
 
     refuse_packed(file)
     with fits.open(file) as opened:
-        header = next(part.header for part in opened if getattr(part, "is_image", False) and part.shape)
-        said = {key: header[key] for key in header if key and isinstance(header[key], int | float | str)}
+        header = next(
+            part.header for part in opened if getattr(part, "is_image", False) and part.shape
+        )
+        said = {
+            key: header[key] for key in header if key and isinstance(header[key], int | float | str)
+        }
         bits = abs(int(header["BITPIX"]))
     shape = fits_image(file)[0]
     return *_stack(shape), bits, said
@@ -134,12 +158,19 @@ def _stack(shape: tuple[int, ...]) -> tuple[int, tuple[int, int]]:
 
 
 def frame_means(file: Path) -> list[tuple[float, float]]:
-    """Return the mean of each frame of a file and its standard error by the scatter of the pixels, DN."""
-    return [(float(x.mean(dtype=np.float64)), float(x.std(dtype=np.float64)) / x.size**0.5) for x in read(file)]
+    """Return the mean of each frame of a file and its standard error by the scatter of the
+    pixels, DN.
+    """
+    return [
+        (float(x.mean(dtype=np.float64)), float(x.std(dtype=np.float64)) / x.size**0.5)
+        for x in read(file)
+    ]
 
 
 def frame_divisor(file: Path) -> int:
-    """Return the greatest common divisor of the numbers of a file of frames; 0 for numbers that are all 0."""
+    """Return the greatest common divisor of the numbers of a file of frames; 0 for numbers that
+    are all 0.
+    """
     return int(np.gcd.reduce(np.unique(read(file))))
 
 

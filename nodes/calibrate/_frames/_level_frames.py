@@ -23,15 +23,15 @@ Divisor = Annotated[int, Field(ge=1, le=1 << 16)]
 def frames(*, files: DataFiles, divisor: Divisor = 1) -> Tensor:
     """Read the frames of one flat illumination: PNG, TIFF, EXR, NumPy or FITS files of raw numbers.
 
-    Numbers of a converter that are shifted to the left in the file, such as 12 bits by 4 in 16, are divided by
-    ``divisor``.
+    Numbers of a converter that are shifted to the left in the file, such as 12 bits by 4 in 16, are
+    divided by ``divisor``.
 
     Shapes: -> (frame, y, x) int32, the frames of all files in order.
     Units:  DN.
     Error:  exact.
-    Raises: ParameterError before the run for an unknown kind of file, for a damaged file, for colour, and for numbers
-            that are negative or not whole; ValueError for frames that differ in size, and for a number that is no
-            multiple of the divisor.
+    Raises: ParameterError before the run for an unknown kind of file, for a damaged file, for
+            colour, and for numbers that are negative or not whole; ValueError for frames that
+            differ in size, and for a number that is no multiple of the divisor.
     Source: EMVA Standard 1288, release 4.0 Linear, section 6.5 (raw frames, without corrections).
     """
     numbers = stack(files)
@@ -39,8 +39,10 @@ def frames(*, files: DataFiles, divisor: Divisor = 1) -> Tensor:
         return torch.from_numpy(numbers)
     left = numbers % divisor
     if left.any():
-        raise ValueError(f"{files[0]} and the files of its level hold {numbers[left > 0][0]}, no multiple of {divisor}:"
-                         " leave the divisor out")  # fmt: skip
+        raise ValueError(
+            f"{files[0]} and the files of its level hold {numbers[left > 0][0]}, no multiple of"
+            f" {divisor}: leave the divisor out"
+        )
     return torch.from_numpy(numbers // divisor)
 
 
@@ -52,11 +54,15 @@ def _(*, files: Sequence[Path], **params: Any) -> list[str]:
 @frames.check
 def _(result: Tensor, **params: Any) -> list[Check]:
     low, high = (int(x) for x in torch.aminmax(result))
-    return [Check(f"{len(result)} frames of {result.shape[1]} x {result.shape[2]}, {low} to {high} DN")]
+    return [
+        Check(f"{len(result)} frames of {result.shape[1]} x {result.shape[2]}, {low} to {high} DN")
+    ]
 
 
 def refuse_unreadable(parameter: str, files: Sequence[Path]) -> list[str]:
-    """Raise ParameterError for a file of frames that is damaged or of an unknown suffix; return no warnings."""
+    """Raise ParameterError for a file of frames that is damaged or of an unknown suffix; return
+    no warnings.
+    """
     try:
         for file in files:
             readable(file)
@@ -70,9 +76,14 @@ def refuse_unreadable(parameter: str, files: Sequence[Path]) -> list[str]:
 
 
 def stack(files: Sequence[Path]) -> np.ndarray[Any, np.dtype[np.int32]]:
-    """Read the frames of all files into one array; raise ValueError if the frames differ in size."""
+    """Read the frames of all files into one array; raise ValueError if the frames differ in
+    size.
+    """
     stacks = [read(file) for file in files]
     for file, each in zip(files, stacks, strict=True):
         if each.shape[1:] != stacks[0].shape[1:]:
-            raise ValueError(f"{file} is {each.shape[1:]}, but {files[0]} is {stacks[0].shape[1:]}: give equal sizes")
+            raise ValueError(
+                f"{file} is {each.shape[1:]}, but {files[0]} is {stacks[0].shape[1:]}: give equal"
+                " sizes"
+            )
     return np.concatenate(stacks)

@@ -43,10 +43,12 @@ def expose(
     """Simulate frames of a flat field by the same sensor steps that simulate a picture.
 
     Shapes: -> (frame, y, x).
-    Units:  result DN; photons per pixel and exposure; dark_current e- of one dark_exposure, in proportion to the
-            exposure; offset, read_noise, full_well e-; gain K, DN/e-.
-    Error:  the errors of the sensor steps. All pixels are alike: neither non-uniformity nor drift of the lamp.
-    Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 Linear (mathematical model).
+    Units:  result DN; photons per pixel and exposure; dark_current e- of one dark_exposure, in
+            proportion to the exposure; offset, read_noise, full_well e-; gain K, DN/e-.
+    Error:  the errors of the sensor steps. All pixels are alike: neither non-uniformity nor drift
+            of the lamp.
+    Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 Linear (mathematical
+            model).
     """
     flat = torch.full((frames, *shape), photons, device=rng.device)
     e = photon_noise(
@@ -85,4 +87,8 @@ def _(
 @expose.check
 def _(result: Tensor, **params: Any) -> list[Check]:
     mean = float(result.sum(-1).sum(dtype=torch.float64)) / result.numel()
-    return [Check(f"mean {mean:.5g} DN, pixels of {float(result.min()):g} to {float(result.max()):g} DN")]
+    return [
+        Check(
+            f"mean {mean:.5g} DN, pixels of {float(result.min()):g} to {float(result.max()):g} DN"
+        )
+    ]

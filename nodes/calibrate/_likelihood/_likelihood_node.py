@@ -35,21 +35,33 @@ def density(
     bits: Bits = 16,
     told: bool = True,
 ) -> Likelihood:
-    """Compute the likelihood of measured light levels from the probability distributions of the nodes in `sensor`.
+    """Compute the likelihood of measured light levels from the probability distributions of the
+    nodes in `sensor`.
 
-    Where numbers count as continuous, mean and variance are sufficient statistics of a level, so that the cost does not
-    depend on the number of pixels. Numbers near the well and coarse numbers have the exact probabilities of the
-    quantiser. Any of the seven numbers of the sensor may be a tensor (walker,), and all walkers are computed at
-    once. ``told`` adds deviances and the rows of the Fisher information, which a sampler does not need.
+    Where numbers count as continuous, mean and variance are sufficient statistics of a level, so
+    that the cost does not depend on the number of pixels. Numbers near the well and coarse numbers
+    have the exact probabilities of the quantiser. Any of the seven numbers of the sensor may be a
+    tensor (walker,), and all walkers are computed at once. ``told`` adds deviances and the rows of
+    the Fisher information, which a sampler does not need.
 
     Shapes: levels -> log (walker,), deviance (walker, level), scaled (walker, row).
     Units:  gain K, DN/e-; dark_current e- in ``dark_exposure``; log in nats, for numbers of 1 DN.
-    Error:  the signal is taken as Gaussian, except in coarse levels of up to 8 electrons: relative 1e-3 at 3 standard
-            deviations of 100 Poisson electrons. All pixels are assumed alike; crosstalk of neighbours, lag and drift
-            of the lamp, which real frames show, are neglected (see `camera`).
+    Error:  the signal is taken as Gaussian, except in coarse levels of up to 8 electrons: relative
+            1e-3 at 3 standard deviations of 100 Poisson electrons. All pixels are assumed alike;
+            crosstalk of neighbours, lag and drift of the lamp, which real frames show, are
+            neglected (see `camera`).
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 Linear, section 3.
     """
-    parameters = (gain, quantum_efficiency, offset, read_noise, dark_current, full_well, mean_shift, spread)
+    parameters = (
+        gain,
+        quantum_efficiency,
+        offset,
+        read_noise,
+        dark_current,
+        full_well,
+        mean_shift,
+        spread,
+    )
     columns = [torch.as_tensor(x, dtype=torch.float64)[..., None] for x in parameters]
     alike = torch.broadcast_tensors(*columns)  # type: ignore[no-untyped-call]
     k, efficiency, bias, read, dark, well, shift, c2 = alike

@@ -17,7 +17,9 @@ _COARSE = 0.8  #: DN, standard deviation below which mean and variance are not s
 
 
 class Sufficient(NamedTuple):
-    """The mean and variance of most pixels of each light level, and a histogram of the remaining pixels."""
+    """The mean and variance of most pixels of each light level, and a histogram of the remaining
+    pixels.
+    """
 
     photons: Tensor  #: (level,) float64, per pixel and exposure
     exposure: Tensor  #: (level,) float64, s
@@ -32,22 +34,27 @@ class Sufficient(NamedTuple):
 
 @node(rtol=1e-9)
 def sufficient(levels: Levels, *, share: Share | None = None) -> Sufficient:
-    """Replace the middle of each light level's histogram by mean and variance, and keep the counts near both ends.
+    """Replace the middle of each light level's histogram by mean and variance, and keep the counts
+    near both ends.
 
-    Between the ends numbers count as continuous, and mean and variance are sufficient; at a full well every single
-    number carries information. A level keeps its whole histogram if its numbers, or its numbers between the ends, have
-    a standard deviation below 0.8 DN. ``share`` leaves out the levels above this share of saturation, which is taken at
-    the lit level of the greatest variance. Give 0.7 for a sensor whose well ends the electrons before the read noise is
-    added: `density` ends the sum of both, as the paper prints, and cannot describe its saturated levels.
+    Between the ends numbers count as continuous, and mean and variance are sufficient; at a full
+    well every single number carries information. A level keeps its whole histogram if its numbers,
+    or its numbers between the ends, have a standard deviation below 0.8 DN. ``share`` leaves out
+    the levels above this share of saturation, which is taken at the lit level of the greatest
+    variance. Give 0.7 for a sensor whose well ends the electrons before the read noise is added:
+    `density` ends the sum of both, as the paper prints, and cannot describe its saturated levels.
 
-    Shapes: levels (level,), cells (cell,) -> the same, with at most ten cells for a level that is not coarse.
+    Shapes: levels (level,), cells (cell,) -> the same, with at most ten cells for a level that is
+            not coarse.
     Units:  those of `Levels`.
     Error:  1e-12 of the moments. The pixels of a histogram are assumed alike.
     Raises: ValueError for a ``share`` without a lit level.
     Source: Fisher, Phil. Trans. R. Soc. A 222, 309 (1922), sufficiency.
     """
     levels = levels if share is None else _below(levels, share)
-    moments = torch.stack([levels.pixels, levels.mean, levels.variance, levels.degrees_of_freedom], 1)
+    moments = torch.stack(
+        [levels.pixels, levels.mean, levels.variance, levels.degrees_of_freedom], 1
+    )
     kept = torch.ones(len(levels.cell_level), dtype=torch.bool)
     for level in sorted(set(levels.cell_level.tolist())):
         at = levels.cell_level == level
@@ -62,15 +69,27 @@ def sufficient(levels: Levels, *, share: Share | None = None) -> Sufficient:
 def _(result: Sufficient, *inputs: Levels, **params: Any) -> list[Check]:
     counted = len(set(result.cell_level.tolist()))
     return [
-        Check(f"{len(result.mean)} light levels, {counted} with a histogram, {len(result.cell_level)} histogram bins")
+        Check(
+            f"{len(result.mean)} light levels, {counted} with a histogram, {len(result.cell_level)}"
+            " histogram bins"
+        )
     ]
 
 
 @sufficient.reference
 def _(levels: Levels, *, share: float | None = None) -> Sufficient:
     levels = levels if share is None else _below(levels, share)
-    cells = list(zip(levels.cell_level.tolist(), levels.cell_value.tolist(), levels.cell_count.tolist(), strict=True))
-    rows = torch.stack([levels.pixels, levels.mean, levels.variance, levels.degrees_of_freedom], 1).tolist()
+    cells = list(
+        zip(
+            levels.cell_level.tolist(),
+            levels.cell_value.tolist(),
+            levels.cell_count.tolist(),
+            strict=True,
+        )
+    )
+    rows = torch.stack(
+        [levels.pixels, levels.mean, levels.variance, levels.degrees_of_freedom], 1
+    ).tolist()
     left = []
     for level in range(len(rows)):
         own = [(v, n) for at, v, n in cells if at == level]
@@ -83,18 +102,27 @@ def _(levels: Levels, *, share: float | None = None) -> Sufficient:
         square = math.fsum((v - middle) ** 2 * n for v, n in inside)
         if count < 2 or square < _COARSE**2 * (count - 1):
             inside, count, middle, square = [], 0.0, 0.0, 0.0
-        rows[level] = [count, middle, square / (count - 1) if count else 0.0, count - 1 if count else 0.0]
+        rows[level] = [
+            count,
+            middle,
+            square / (count - 1) if count else 0.0,
+            count - 1 if count else 0.0,
+        ]
         left += [(level, v, n) for v, n in own if (v, n) not in inside]
     cell = torch.tensor(left, dtype=torch.float64).reshape(-1, 3).unbind(1)
     numbers, mean, variance, freedom = torch.tensor(rows, dtype=torch.float64).unbind(1)
-    return Sufficient(levels.photons, levels.exposure, numbers, mean, variance, freedom, cell[0].long(), *cell[1:])
+    return Sufficient(
+        levels.photons, levels.exposure, numbers, mean, variance, freedom, cell[0].long(), *cell[1:]
+    )
 
 
 def _below(levels: Levels, share: float) -> Levels:
     """Return the dark levels, and the lit levels up to a share of saturation."""
     lit = levels.photons > 0
     if not bool(lit.any()):
-        raise ValueError("there are no lit levels, so saturation is unknown: leave out share, or give lit levels")
+        raise ValueError(
+            "there are no lit levels, so saturation is unknown: leave out share, or give lit levels"
+        )
     dark = float(levels.mean[~lit].min()) if bool((~lit).any()) else 0.0
     full = float(levels.mean[lit][levels.variance[lit].argmax()]) - dark
     kept = ~lit | (levels.mean - dark <= share * full)
@@ -105,11 +133,15 @@ def _below(levels: Levels, share: float) -> Levels:
 
 
 def _inner(value: Tensor, count: Tensor, sd: float) -> tuple[Tensor, Tensor]:
-    """Return a mask of the digital numbers away from both ends of the range, and the statistics of these numbers."""
+    """Return a mask of the digital numbers away from both ends of the range, and the statistics
+    of these numbers.
+    """
     inner = (value > value[0] + _EDGE) & (value < value[-1] - _EDGE)
     total = float(count[inner].sum())
     mean = (value[inner] * count[inner]).sum() / max(total, 1.0)
     variance = ((value[inner] - mean).square() * count[inner]).sum() / max(total - 1, 1.0)
     if min(sd, math.sqrt(float(variance))) < _COARSE:
         return torch.zeros_like(inner), torch.zeros(4, dtype=torch.float64)
-    return inner, torch.stack([torch.tensor(total, dtype=torch.float64), mean, variance, torch.tensor(total - 1.0)])
+    return inner, torch.stack(
+        [torch.tensor(total, dtype=torch.float64), mean, variance, torch.tensor(total - 1.0)]
+    )

@@ -11,7 +11,16 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.calibrate._prior._free_parameters import FAULTS, Factor, Free, Known, Positive, Prior, believed, freed
+from neusee.nodes.calibrate._prior._free_parameters import (
+    FAULTS,
+    Factor,
+    Free,
+    Known,
+    Positive,
+    Prior,
+    believed,
+    freed,
+)
 from neusee.nodes.sensor._saturation import Efficiency
 from neusee.nodes.units import Electrons, Gain, Real
 
@@ -34,12 +43,13 @@ def camera_prior(
     mixing: Known = "unknown",
     lag: Known = "unknown",
 ) -> Prior:
-    """Collect the priors of the free parameters of a camera; a parameter without a prior is held at a fixed value.
+    """Collect the priors of the free parameters of a camera; a parameter without a prior is held at
+    a fixed value.
 
-    A prior is a median and a factor: [0.37, 2] means half to twice the median with a probability of two thirds. The
-    priors of the dark signal and of the two terms of the response are a mean and a standard deviation. Mixing of
-    neighbouring pixels and lag between frames are `none` for a camera that is known to have neither; else intervals
-    include what of both may hide in the frames.
+    A prior is a median and a factor: [0.37, 2] means half to twice the median with a probability of
+    two thirds. The priors of the dark signal and of the two terms of the response are a mean and a
+    standard deviation. Mixing of neighbouring pixels and lag between frames are `none` for a camera
+    that is known to have neither; else intervals include what of both may hide in the frames.
 
     Shapes: -> (10,).
     Units:  those of `camera`.
@@ -64,7 +74,9 @@ def _(result: Prior, **params: object) -> list[Check]:
 
 @dataclass(frozen=True)
 class CameraCoordinates(Free):
-    """Coordinates of the free parameters of a camera: logarithms, or values of parameters that may be 0 or negative."""
+    """Coordinates of the free parameters of a camera: logarithms, or values of parameters that
+    may be 0 or negative.
+    """
 
     every: ClassVar[tuple[str, ...]] = CAMERA_NAMES
     linear: ClassVar[frozenset[str]] = _LINEAR
@@ -73,11 +85,15 @@ class CameraCoordinates(Free):
     @property
     def labels(self) -> tuple[str, ...]:
         """Return a readable name of each sampler coordinate."""
-        return tuple(("" if name in self.linear else "ln ") + name.replace("_", " ") for name in self.names)
+        return tuple(
+            ("" if name in self.linear else "ln ") + name.replace("_", " ") for name in self.names
+        )
 
     def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
         """Convert camera parameters to sampler coordinates (..., free parameter)."""
-        return self.scaled({name: torch.as_tensor(parameters[name], dtype=torch.float64) for name in self.names})
+        return self.scaled(
+            {name: torch.as_tensor(parameters[name], dtype=torch.float64) for name in self.names}
+        )
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
         """Convert sampler coordinates (..., free parameter) to camera parameters."""

@@ -17,8 +17,11 @@ _ABOVE = 1.3  #: factor on the brightest number, for a full well that no level r
 _LEAST = 1e-3  #: least dark current or read noise, relative to the believed value
 
 
-def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
-    """Return a least-squares estimate of each sensor parameter, or the ``believed`` value if there is no estimate.
+def guess(
+    levels: Sufficient, believed: Mapping[str, float], params: Mapping[str, Any]
+) -> dict[str, float]:
+    """Return a least-squares estimate of each sensor parameter, or the ``believed`` value if there
+    is no estimate.
 
     ``params`` are the fixed parameters of `density`.
 
@@ -46,8 +49,11 @@ def guess(levels: Sufficient, believed: Mapping[str, float], params: Mapping[str
     return values | {"full_well": _well(levels, values, params)}
 
 
-def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[str, Any]) -> dict[str, float]:
-    """Return a least-squares estimate of each camera parameter, or the ``believed`` value if there is no estimate.
+def guess_camera(
+    levels: Levels, believed: Mapping[str, float], params: Mapping[str, Any]
+) -> dict[str, float]:
+    """Return a least-squares estimate of each camera parameter, or the ``believed`` value if there
+    is no estimate.
 
     ``params`` are the fixed parameters of `camera`.
 
@@ -66,17 +72,29 @@ def guess_camera(levels: Levels, believed: Mapping[str, float], params: Mapping[
         "temporal_dark_noise": float(fit.temporal_dark_noise),
         "dark_current": float(fit.dark_current) * params["dark_exposure"],
     }
-    usable = {name: x for name, x in values.items() if math.isfinite(x) and (x > 0 or name == "dark_signal")}
+    usable = {
+        name: x
+        for name, x in values.items()
+        if math.isfinite(x) and (x > 0 or name == "dark_signal")
+    }
     return {**believed, **usable}
 
 
 def _well(levels: Sufficient, values: Mapping[str, float], params: Mapping[str, Any]) -> float:
-    """Return the full well at which numbers pile up, or, if none pile up, a full well above every number."""
-    top, shift, gain = 2 ** params["bits"] - 1, ROUNDED[params["rounding"]][0], float(values["gain"])
+    """Return the full well at which numbers pile up, or, if none pile up, a full well above
+    every number.
+    """
+    top, shift, gain = (
+        2 ** params["bits"] - 1,
+        ROUNDED[params["rounding"]][0],
+        float(values["gain"]),
+    )
     seen = levels.mean[levels.pixels > 0]
     brightest = max([*seen.tolist(), *levels.cell_value.tolist()], default=0.0)
     at = levels.cell_value >= brightest - 2
-    piled = bool(at.any()) and float(levels.cell_count[at].sum()) > 0.5 * float(levels.cell_count.max())
+    piled = bool(at.any()) and float(levels.cell_count[at].sum()) > 0.5 * float(
+        levels.cell_count.max()
+    )
     if piled and brightest < top:
         weight = levels.cell_count[at]
         return float((levels.cell_value[at] * weight).sum() / weight.sum() - shift) / gain

@@ -12,7 +12,16 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.calibrate._prior._free_parameters import FAULTS, Factor, Free, Known, Positive, Prior, believed, freed
+from neusee.nodes.calibrate._prior._free_parameters import (
+    FAULTS,
+    Factor,
+    Free,
+    Known,
+    Positive,
+    Prior,
+    believed,
+    freed,
+)
 from neusee.nodes.sensor._saturation import Efficiency, Well
 from neusee.nodes.units import Electrons, Gain
 
@@ -33,12 +42,13 @@ def prior(
     lag: Known = "unknown",
     pattern: Known = "unknown",
 ) -> Prior:
-    """Collect the priors of the free parameters of a sensor; a parameter without a prior is held at a fixed value.
+    """Collect the priors of the free parameters of a sensor; a parameter without a prior is held at
+    a fixed value.
 
-    A prior is a median and a factor: [0.37, 2] means half to twice the median with a probability of two thirds. The
-    prior of the offset is a mean and a standard deviation. Mixing of neighbouring pixels, lag between frames and
-    patterns of unequal pixels are `none` for a sensor that is known to have none of it, such as a simulated one; else
-    intervals include what may hide in the frames.
+    A prior is a median and a factor: [0.37, 2] means half to twice the median with a probability of
+    two thirds. The prior of the offset is a mean and a standard deviation. Mixing of neighbouring
+    pixels, lag between frames and patterns of unequal pixels are `none` for a sensor that is known
+    to have none of it, such as a simulated one; else intervals include what may hide in the frames.
 
     Shapes: -> (7,).
     Units:  those of `density`.
@@ -47,7 +57,13 @@ def prior(
     Source: log-normal and normal distributions.
     """
     pairs = (gain, offset, read_noise, dark_current, full_well, quantum_efficiency, spread)
-    return believed(dict(zip(NAMES, pairs, strict=True)), frozenset({_LINEAR}), mixing=mixing, lag=lag, pattern=pattern)
+    return believed(
+        dict(zip(NAMES, pairs, strict=True)),
+        frozenset({_LINEAR}),
+        mixing=mixing,
+        lag=lag,
+        pattern=pattern,
+    )
 
 
 #: the parameters of `density` that may be free
@@ -62,11 +78,13 @@ def _(result: Prior, **params: object) -> list[Check]:
 
 @dataclass(frozen=True)
 class Coordinates(Free):
-    """Coordinates of the free parameters of a sensor, in digital numbers, which frames constrain independently.
+    """Coordinates of the free parameters of a sensor, in digital numbers, which frames constrain
+    independently.
 
-    Frames constrain the slope of the photon-transfer curve, the offset in DN, the dark variance, the response and the
-    saturation level independently. Frames constrain gain, offset in electrons, read noise and well only jointly, with a
-    correlation of 1 - 1e-3. All coordinates except the offset in DN are logarithms.
+    Frames constrain the slope of the photon-transfer curve, the offset in DN, the dark variance,
+    the response and the saturation level independently. Frames constrain gain, offset in electrons,
+    read noise and well only jointly, with a correlation of 1 - 1e-3. All coordinates except the
+    offset in DN are logarithms.
     """
 
     every: ClassVar[tuple[str, ...]] = NAMES
@@ -76,12 +94,19 @@ class Coordinates(Free):
     @property
     def labels(self) -> tuple[str, ...]:
         """Return a readable name of each sampler coordinate."""
-        of = {"gain": "ln slope of the photon-transfer curve", "offset": "offset, DN", "spread": "ln spread"}
+        of = {
+            "gain": "ln slope of the photon-transfer curve",
+            "offset": "offset, DN",
+            "spread": "ln spread",
+        }
         return tuple(of.get(name, f"ln {name.replace('_', ' ')} in numbers") for name in self.names)
 
     def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
         """Convert sensor parameters to sampler coordinates (..., free parameter)."""
-        full = {name: torch.as_tensor(parameters.get(name, self.held.get(name)), dtype=torch.float64) for name in NAMES}
+        full = {
+            name: torch.as_tensor(parameters.get(name, self.held.get(name)), dtype=torch.float64)
+            for name in NAMES
+        }
         slope = full["gain"].log()
         return torch.stack([self._coordinate(name, full, slope) for name in self.names], -1)
 

@@ -1,4 +1,6 @@
-"""The general model of EMVA 1288, which needs no line: the local slope of the response refers noise to the light."""
+"""The general model of EMVA 1288, which needs no line: the local slope of the response refers
+noise to the light.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from neusee.nodes.calibrate._sheet._photon_transfer import FloatArray, PhotonTra
 from neusee.nodes.calibrate._sheet._quantity import Bound, Quantity
 from neusee.nodes.calibrate._sheet._sensitivity import COARSE
 
-_WINDOW, _SHARE = 5, 0.25  #: least number of levels of a local fit, and the share of all levels that a fit takes
+#: least number of levels of a local fit, and the share of all levels that a fit takes
+_WINDOW, _SHARE = 5, 0.25
 _KNOWN = 0.03  #: relative standard error of a slope above which nothing follows from it
 
 
@@ -20,17 +23,22 @@ class GeneralModel(NamedTuple):
 
     photons: FloatArray  #: (level,) per pixel and exposure
     slope: FloatArray  #: (1 + level,) DN per photon, local; the first is that of the dark
-    error: FloatArray  #: (1 + level,) relative standard error of the slope, from the scatter about the local fits
-    ratio: FloatArray  #: (level,) light over the standard deviation of the light that the noise in time stands for
+    #: (1 + level,) relative standard error of the slope, from the scatter about the local fits
+    error: FloatArray
+    #: (level,) light over the standard deviation of the light that the noise in time stands for
+    ratio: FloatArray
 
 
 def general_model(transfer: PhotonTransfer) -> GeneralModel | None:
-    """Return local slope and signal-to-noise ratio of the light at each level up to saturation; None below 3 levels.
+    """Return local slope and signal-to-noise ratio of the light at each level up to saturation;
+    None below 3 levels.
 
-    The slope is that of a parabola through five or more neighbouring levels, the dark among them. The light scatters
-    from level to level, by the same share at all levels; its scatter about the parabolas gives the errors.
+    The slope is that of a parabola through five or more neighbouring levels, the dark among them.
+    The light scatters from level to level, by the same share at all levels; its scatter about the
+    parabolas gives the errors.
 
-    Source: EMVA Standard 1288, release 4.0 General (characteristic curve, and noise referred to the input).
+    Source: EMVA Standard 1288, release 4.0 General (characteristic curve, and noise referred to the
+            input).
     """
     below = slice(0, transfer.saturation + 1)
     light = np.concatenate([[0.0], transfer.photons[below]])
@@ -45,18 +53,23 @@ def general_model(transfer: PhotonTransfer) -> GeneralModel | None:
 def general_quantities(transfer: PhotonTransfer, photons_told: bool = True) -> list[Quantity]:
     """Return threshold, greatest signal-to-noise ratio and dynamic range without a linear model.
 
-    The threshold is the light whose signal equals the noise; from dark to the first level the variance is taken as a
-    line over the light.
+    The threshold is the light whose signal equals the noise; from dark to the first level the
+    variance is taken as a line over the light.
 
     Units:  photons; a number; dB.
     Source: EMVA Standard 1288, release 4.0 General.
     """
-    least = Quantity("mu_p_min_general", "μ_p.min", "absolute sensitivity threshold, no linear model", "photons")
+    least = Quantity(
+        "mu_p_min_general", "μ_p.min", "absolute sensitivity threshold, no linear model", "photons"
+    )
     best = Quantity("SNR_max_general", "SNR.max", "maximum SNR of the light, no linear model", "dB")
     span = Quantity("DR_general", "DR", "dynamic range, no linear model", "dB")
     found = general_model(transfer)
     if found is None or not (found.slope > 0).all():
-        why = "three or more levels of different light up to saturation, all brighter than those below, are needed"
+        why = (
+            "three or more levels of different light up to saturation, all brighter than those"
+            " below, are needed"
+        )
         return [blank.untold(why) for blank in (least, best, span)]
     coarse = float(transfer.dark_variance[0]) < COARSE
     top: Bound = "" if transfer.saturated else ">"
@@ -72,13 +85,23 @@ def general_quantities(transfer: PhotonTransfer, photons_told: bool = True) -> l
         return [least.untold(why), first, span.untold(why)]
     threshold = _threshold(transfer, found)
     bottom: Bound = "<" if coarse else ""
-    last = span.told(20 * math.log10(float(found.photons[-1]) / threshold), ">" if coarse else top, rounded or cut)
-    low = least.told(threshold, bottom, rounded) if photons_told else least.untold("the photons are not told")
+    last = span.told(
+        20 * math.log10(float(found.photons[-1]) / threshold),
+        ">" if coarse else top,
+        rounded or cut,
+    )
+    low = (
+        least.told(threshold, bottom, rounded)
+        if photons_told
+        else least.untold("the photons are not told")
+    )
     return [low, first, last]
 
 
 def _slopes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the slope at each point of a parabola through the nearest points, and its relative standard error."""
+    """Return the slope at each point of a parabola through the nearest points, and its relative
+    standard error.
+    """
     count = min(len(x), max(_WINDOW, 2 * round(_SHARE * len(x) / 2) + 1))
     slopes, spreads, scatter = [], [], []
     for at in range(len(x)):
@@ -108,4 +131,6 @@ def _threshold(transfer: PhotonTransfer, found: GeneralModel) -> float:
     if last + 1 == len(found.ratio):
         return float(found.photons[last])
     ends = slice(last, last + 2)
-    return float(np.exp(np.interp(0.0, np.log(found.ratio[ends].clip(1e-300)), np.log(found.photons[ends]))))
+    return float(
+        np.exp(np.interp(0.0, np.log(found.ratio[ends].clip(1e-300)), np.log(found.photons[ends])))
+    )

@@ -31,17 +31,21 @@ class Profiles(NamedTuple):
 
 
 class DefectHistogram(NamedTuple):
-    """The distribution of pixels over their deviation from the mean, and the share of pixels beyond each deviation."""
+    """The distribution of pixels over their deviation from the mean, and the share of pixels
+    beyond each deviation.
+    """
 
     deviation: FloatArray  #: (class,) lower end of each class, in the unit of the frame
     pixels: NDArray[np.int64]  #: (class,)
-    normal: FloatArray  #: (class,) pixels of a normal distribution of the same mean and standard deviation
+    #: (class,) pixels of a normal distribution of the same mean and standard deviation
+    normal: FloatArray
     distance: FloatArray  #: (class,) rising amount of the deviation
     beyond: FloatArray  #: (class,) %, pixels whose deviation amounts to that much or more
 
 
 def spectrogram(image: FloatArray, vertical: bool = False) -> Spectrogram:
-    """Return the spectrogram of a frame (y, x) along its rows, or with ``vertical`` along its columns.
+    """Return the spectrogram of a frame (y, x) along its rows, or with ``vertical`` along its
+    columns.
 
     White noise of standard deviation s has the amplitude s at every frequency.
 
@@ -49,11 +53,14 @@ def spectrogram(image: FloatArray, vertical: bool = False) -> Spectrogram:
     """
     lines = (image - image.mean()).T if vertical else image - image.mean()
     power = np.abs(np.fft.rfft(lines, axis=1)) ** 2 / lines.shape[1]
-    return Spectrogram(np.asarray(np.fft.rfftfreq(lines.shape[1])), np.asarray(np.sqrt(power.mean(0))))
+    return Spectrogram(
+        np.asarray(np.fft.rfftfreq(lines.shape[1])), np.asarray(np.sqrt(power.mean(0)))
+    )
 
 
 def profiles(image: FloatArray, vertical: bool = False) -> Profiles:
-    """Return the middle row of a frame (y, x), and mean, least and greatest number of each column; or the transposed.
+    """Return the middle row of a frame (y, x), and mean, least and greatest number of each column;
+    or the transposed.
 
     Source: EMVA Standard 1288, release 4.0 Linear.
     """
@@ -62,7 +69,8 @@ def profiles(image: FloatArray, vertical: bool = False) -> Profiles:
 
 
 def without_trend(total: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return 25 times a frame less the mean of 5 x 5 pixels, without a rim of two pixels; whole numbers stay exact.
+    """Return 25 times a frame less the mean of 5 x 5 pixels, without a rim of two pixels; whole
+    numbers stay exact.
 
     Source: EMVA Standard 1288, release 4.0 Linear (highpass filtering of the lit frame).
     """
@@ -72,7 +80,8 @@ def without_trend(total: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def defects(total: NDArray[np.int64], unit: float) -> DefectHistogram:
-    """Return the histogram of the numbers (y, x) of a frame about their mean; ``unit`` is the value of the number 1.
+    """Return the histogram of the numbers (y, x) of a frame about their mean; ``unit`` is the value
+    of the number 1.
 
     Shapes: -> (class,), at most 256 classes of equal whole width.
     Source: EMVA Standard 1288, release 4.0 Linear (logarithmic and accumulated histograms).
@@ -86,9 +95,16 @@ def defects(total: NDArray[np.int64], unit: float) -> DefectHistogram:
     normal = np.zeros(len(count))
     if sigma > 0:
         centre = starts + (width - 1) / 2
-        normal = total.size * width / (math.sqrt(2 * math.pi) * sigma) * np.exp(-(((centre - mean) / sigma) ** 2) / 2)
+        normal = (
+            total.size
+            * width
+            / (math.sqrt(2 * math.pi) * sigma)
+            * np.exp(-(((centre - mean) / sigma) ** 2) / 2)
+        )
     apart = np.sort(np.abs(total.reshape(-1) - mean))
     distance = np.linspace(0.0, float(apart[-1]), min(_MOST, len(apart)))
-    beyond = np.asarray(100 * (len(apart) - np.searchsorted(apart, distance, side="left")) / len(apart))
+    beyond = np.asarray(
+        100 * (len(apart) - np.searchsorted(apart, distance, side="left")) / len(apart)
+    )
     deviation, distance = np.asarray((starts - mean) * unit), np.asarray(distance * unit)
     return DefectHistogram(deviation, count, normal, distance, beyond)

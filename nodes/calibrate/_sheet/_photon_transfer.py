@@ -1,4 +1,6 @@
-"""The photon transfer of EMVA 1288: lit levels with their darks, the saturation point, and the ranges of fits."""
+"""The photon transfer of EMVA 1288: lit levels with their darks, the saturation point, and the
+ranges of fits.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +15,15 @@ from neusee.nodes.values import Levels
 FloatArray = NDArray[np.float64]
 SENSITIVITY = 0.7  #: share of saturation up to which gain and responsivity are fitted
 LINEARITY = (0.05, 0.95)  #: shares of saturation between which the response is compared with a line
-_PLATEAU = 0.5  #: a maximum of the variance below this share of the greatest one is noise of saturated levels
+#: a maximum of the variance below this share of the greatest one is noise of saturated levels
+_PLATEAU = 0.5
 
 
 @dataclass(frozen=True)
 class PhotonTransfer:
-    """Lit levels (level,) in rising order of light, the dark of each, and all darks (dark,) in rising exposure."""
+    """Lit levels (level,) in rising order of light, the dark of each, and all darks (dark,) in
+    rising exposure.
+    """
 
     photons: FloatArray  #: mu_p, per pixel and exposure
     exposure: FloatArray  #: s
@@ -30,7 +35,8 @@ class PhotonTransfer:
     dark_mean: FloatArray  #: DN
     dark_variance: FloatArray  #: DN2
     saturation: int  #: index of the lit level at saturation
-    saturated: bool  #: False if the variance rises up to the brightest level, which then only bounds saturation
+    #: False if the variance rises up to the brightest level, which then only bounds saturation
+    saturated: bool
 
     @property
     def signal(self) -> FloatArray:
@@ -55,7 +61,8 @@ class PhotonTransfer:
 
 
 def photon_transfer(levels: Levels) -> PhotonTransfer:
-    """Return the photon-transfer measurement of light levels, each lit level with the dark of the nearest exposure.
+    """Return the photon-transfer measurement of light levels, each lit level with the dark of the
+    nearest exposure.
 
     Shapes: levels (level,).
     Units:  as in `PhotonTransfer`.
@@ -63,7 +70,8 @@ def photon_transfer(levels: Levels) -> PhotonTransfer:
     Source: EMVA Standard 1288, release 4.0 Linear.
     """
     photons, exposure, mean, variance = (
-        np.asarray(x, dtype=np.float64) for x in (levels.photons, levels.exposure, levels.mean, levels.variance)
+        np.asarray(x, dtype=np.float64)
+        for x in (levels.photons, levels.exposure, levels.mean, levels.variance)
     )
     dark = np.flatnonzero(photons == 0)
     dark = dark[np.argsort(exposure[dark], kind="stable")]
@@ -72,7 +80,9 @@ def photon_transfer(levels: Levels) -> PhotonTransfer:
     if not len(dark):
         raise ValueError("a sheet of EMVA 1288 needs dark frames: give a level without light")
     if len(lit) < 2:
-        raise ValueError(f"a sheet of EMVA 1288 needs lit levels, and there is {len(lit)}: give two or more")
+        raise ValueError(
+            f"a sheet of EMVA 1288 needs lit levels, and there is {len(lit)}: give two or more"
+        )
     below = dark[np.abs(exposure[lit, None] - exposure[dark]).argmin(1)]
     top = saturation_point(variance[lit])
     return PhotonTransfer(
@@ -91,9 +101,11 @@ def photon_transfer(levels: Levels) -> PhotonTransfer:
 
 
 def saturation_point(variance: FloatArray) -> int:
-    """Return the index of saturation: from the brightest level, the first variance that exceeds the next two below it.
+    """Return the index of saturation: from the brightest level, the first variance that exceeds the
+    next two below it.
 
-    A peak below half of the greatest variance is noise of levels that are saturated, and does not count.
+    A peak below half of the greatest variance is noise of levels that are saturated, and does not
+    count.
     """
     top = len(variance) - 1
     for i in range(len(variance) - 2, -1, -1):
@@ -105,7 +117,9 @@ def saturation_point(variance: FloatArray) -> int:
 
 
 def slope_through_origin(x: FloatArray, y: FloatArray) -> float:
-    """Return the slope of the line through the origin that fits (x, y) best, each point with equal weight."""
+    """Return the slope of the line through the origin that fits (x, y) best, each point with
+    equal weight.
+    """
     return float(x @ y / (x @ x))
 
 
@@ -117,8 +131,12 @@ def line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 
 
 def relative_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
-    """Return slope and value at 0 of the line with the least squares of relative deviations, which is linear in y."""
+    """Return slope and value at 0 of the line with the least squares of relative deviations,
+    which is linear in y.
+    """
     columns = np.stack([x / y, 1 / y], axis=1)
-    solved: Any = np.linalg.lstsq(columns / np.linalg.norm(columns, axis=0), np.ones_like(y), rcond=None)[0]
+    solved: Any = np.linalg.lstsq(
+        columns / np.linalg.norm(columns, axis=0), np.ones_like(y), rcond=None
+    )[0]
     slope, start = solved / np.linalg.norm(columns, axis=0)
     return float(slope), float(start)

@@ -17,7 +17,8 @@ from neusee.nodes.calibrate._sheet._photon_transfer import (
 from neusee.nodes.calibrate._sheet._quantity import Bound, Quantity
 
 QUANTIZATION = 1.0 / 12.0  #: sigma_q^2, DN2
-COARSE = 0.24  #: DN2, least temporal dark variance that rounding leaves measurable; its root is 0.49 DN
+#: DN2, least temporal dark variance that rounding leaves measurable; its root is 0.49 DN
+COARSE = 0.24
 _LINE = 2  #: exposures that a slope needs more than
 _SURE = 2.0  #: standard errors of a slope below which no slope is told
 _NO_GAIN = "K is not told, so that no value in electrons is"
@@ -26,7 +27,9 @@ _NO_LIGHT = "the photons of the levels are not told"
 
 @dataclass(frozen=True)
 class Linearity:
-    """The line of least relative deviation through the response, and the deviation from it in percent (level,)."""
+    """The line of least relative deviation through the response, and the deviation from it in
+    percent (level,).
+    """
 
     slope: float  #: DN per photon
     start: float  #: DN, at no light
@@ -38,9 +41,15 @@ def gain(transfer: PhotonTransfer) -> Quantity:
     blank = Quantity("K", "K", "overall system gain", "DN/e-")
     used = transfer.fitted
     if used.sum() < 2:
-        return blank.untold(f"{int(used.sum())} lit levels lie below 70 % of saturation, and a line needs two")
+        return blank.untold(
+            f"{int(used.sum())} lit levels lie below 70 % of saturation, and a line needs two"
+        )
     slope = slope_through_origin(transfer.signal[used], transfer.excess[used])
-    return blank.told(slope) if slope > 0 else blank.untold("the variance does not rise with the signal")
+    return (
+        blank.told(slope)
+        if slope > 0
+        else blank.untold("the variance does not rise with the signal")
+    )
 
 
 def sensitivity(transfer: PhotonTransfer, photons_told: bool = True) -> list[Quantity]:
@@ -67,7 +76,9 @@ def sensitivity(transfer: PhotonTransfer, photons_told: bool = True) -> list[Qua
 
 
 def dark_noise(transfer: PhotonTransfer) -> tuple[float, bool]:
-    """Return sigma_y.dark in DN at exposure 0, and True if rounding hides it, so that 0.49 DN is only a limit."""
+    """Return sigma_y.dark in DN at exposure 0, and True if rounding hides it, so that 0.49 DN is
+    only a limit.
+    """
     if len(np.unique(transfer.dark_exposure)) > _LINE:
         variance = line(transfer.dark_exposure, transfer.dark_variance)[1]
     else:
@@ -76,7 +87,9 @@ def dark_noise(transfer: PhotonTransfer) -> tuple[float, bool]:
 
 
 def linearity(transfer: PhotonTransfer) -> Linearity | None:
-    """Return the deviation of the response from a line, or None with fewer than three levels in the range."""
+    """Return the deviation of the response from a line, or None with fewer than three levels in
+    the range.
+    """
     used = transfer.linear
     if used.sum() < 3 or len(np.unique(transfer.photons[used])) < 3:
         return None
@@ -89,11 +102,17 @@ def linearity(transfer: PhotonTransfer) -> Linearity | None:
 def linearity_errors(transfer: PhotonTransfer) -> list[Quantity]:
     """Return LE_min and LE_max, the extreme relative deviations in percent."""
     ends = (("LE_min", "LE.min", "least"), ("LE_max", "LE.max", "greatest"))
-    blanks = [Quantity(key, symbol, f"linearity error, {name} deviation", "%") for key, symbol, name in ends]
+    blanks = [
+        Quantity(key, symbol, f"linearity error, {name} deviation", "%")
+        for key, symbol, name in ends
+    ]
     found = linearity(transfer)
     if found is None:
         count = int(transfer.linear.sum())
-        return [b.untold(f"{count} levels lie from 5 to 95 % of saturation, and three are needed") for b in blanks]
+        return [
+            b.untold(f"{count} levels lie from 5 to 95 % of saturation, and three are needed")
+            for b in blanks
+        ]
     values = (float(found.deviation.min()), float(found.deviation.max()))
     return [blank.told(value) for blank, value in zip(blanks, values, strict=True)]
 
@@ -119,14 +138,19 @@ def dark_current(transfer: PhotonTransfer) -> list[Quantity]:
 
 
 def _slope(blank: Quantity, times: FloatArray, values: FloatArray, scale: float) -> Quantity:
-    """Return the slope of values over exposures in units of ``scale``, if it is at least twice its standard error."""
+    """Return the slope of values over exposures in units of ``scale``, if it is at least twice
+    its standard error.
+    """
     slope, start = line(times, values)
     left = values - start - slope * times
-    error = math.sqrt(float(left @ left) / (len(times) - 2) / float(((times - times.mean()) ** 2).sum()))
+    error = math.sqrt(
+        float(left @ left) / (len(times) - 2) / float(((times - times.mean()) ** 2).sum())
+    )
     if slope > 0 and slope >= _SURE * error:
         return blank.told(slope / scale)
     return blank.untold(
-        f"no rise with the exposure: {slope / scale:.3g} {blank.unit}, with a standard error of {error / scale:.2g}"
+        f"no rise with the exposure: {slope / scale:.3g} {blank.unit}, with a standard error of"
+        f" {error / scale:.2g}"
     )
 
 
@@ -152,9 +176,14 @@ def _inverse(k: Quantity) -> Quantity:
 
 def _dark(transfer: PhotonTransfer, k: Quantity, noise: float, coarse: bool) -> list[Quantity]:
     """Return temporal dark noise and dark signal in DN and in electrons."""
-    why = f"the dark noise is below the {math.sqrt(COARSE):.2f} DN that the standard sets, because rounding hides it"
+    why = (
+        f"the dark noise is below the {math.sqrt(COARSE):.2f} DN that the standard sets, because"
+        " rounding hides it"
+    )
     bound: Bound = "<" if coarse else ""
-    in_numbers = Quantity("sigma_y_dark", "σ_y.dark", "temporal dark noise", "DN").told(noise, bound, why * coarse)
+    in_numbers = Quantity("sigma_y_dark", "σ_y.dark", "temporal dark noise", "DN").told(
+        noise, bound, why * coarse
+    )
     blank = Quantity("sigma_d", "σ_d", "temporal dark noise", "e-")
     signal = Quantity("mu_d", "μ_d", "dark signal, with the offset of the converter", "e-")
     mean = Quantity("mu_y_dark", "μ_y.dark", "dark signal", "DN").told(float(transfer.dark_mean[0]))
@@ -169,7 +198,9 @@ def _dark(transfer: PhotonTransfer, k: Quantity, noise: float, coarse: bool) -> 
     ]
 
 
-def _least(transfer: PhotonTransfer, k: Quantity, eta: Quantity, noise: float, coarse: bool) -> list[Quantity]:
+def _least(
+    transfer: PhotonTransfer, k: Quantity, eta: Quantity, noise: float, coarse: bool
+) -> list[Quantity]:
     """Return the absolute sensitivity threshold in photons and in electrons."""
     photons = Quantity("mu_p_min", "μ_p.min", "absolute sensitivity threshold", "photons")
     electrons = Quantity("mu_e_min", "μ_e.min", "absolute sensitivity threshold", "e-")
@@ -184,11 +215,17 @@ def _least(transfer: PhotonTransfer, k: Quantity, eta: Quantity, noise: float, c
     return [photons.told(100 * value / eta.value, limit, why), found]
 
 
-def _greatest(transfer: PhotonTransfer, k: Quantity, eta: Quantity, least: list[Quantity]) -> list[Quantity]:
+def _greatest(
+    transfer: PhotonTransfer, k: Quantity, eta: Quantity, least: list[Quantity]
+) -> list[Quantity]:
     """Return saturation in photons and in electrons, the greatest SNR, and the dynamic range."""
     at = transfer.saturation
     bound: Bound = "" if transfer.saturated else ">"
-    why = "" if transfer.saturated else "the variance rises up to the brightest level: saturation was not reached"
+    why = (
+        ""
+        if transfer.saturated
+        else "the variance rises up to the brightest level: saturation was not reached"
+    )
     in_photons = Quantity("mu_p_sat", "μ_p.sat", "saturation capacity", "photons")
     in_electrons = Quantity("mu_e_sat", "μ_e.sat", "saturation capacity", "e-")
     photons = in_photons.untold(eta.reason)
@@ -208,16 +245,33 @@ def _ratios(electrons: Quantity, least: list[Quantity]) -> list[Quantity]:
     found = []
     threshold = least[1]
     best = None if electrons.value is None else math.sqrt(electrons.value)
-    span = None if electrons.value is None or threshold.value is None else electrons.value / threshold.value
+    span = (
+        None
+        if electrons.value is None or threshold.value is None
+        else electrons.value / threshold.value
+    )
     limited: Bound = ">" if electrons.bound or threshold.bound else ""
     why = "; ".join(dict.fromkeys(q.reason for q in (electrons, threshold) if q.reason))
     for key, symbol, name, value, bound, reason in (
-        ("SNR_max", "SNR.max", "maximum signal-to-noise ratio", best, electrons.bound, electrons.reason),
+        (
+            "SNR_max",
+            "SNR.max",
+            "maximum signal-to-noise ratio",
+            best,
+            electrons.bound,
+            electrons.reason,
+        ),
         ("DR", "DR", "dynamic range", span, limited, why),
     ):
-        for suffix, unit, scaled in (("", "", lambda x: x), ("_dB", "dB", _decibel), ("_bit", "bit", math.log2)):
+        for suffix, unit, scaled in (
+            ("", "", lambda x: x),
+            ("_dB", "dB", _decibel),
+            ("_bit", "bit", math.log2),
+        ):
             blank = Quantity(key + suffix, symbol, name, unit)
-            found.append(blank.untold(reason) if value is None else blank.told(scaled(value), bound, reason))
+            found.append(
+                blank.untold(reason) if value is None else blank.told(scaled(value), bound, reason)
+            )
     return found
 
 

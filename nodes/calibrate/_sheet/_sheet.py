@@ -32,11 +32,14 @@ class EmvaSheet:
         return next(quantity for quantity in self.quantities if quantity.key == key)
 
 
-def emva_sheet(levels: Levels, spatial: Nonuniformity | None = None, *, photons_told: bool = True) -> EmvaSheet:
+def emva_sheet(
+    levels: Levels, spatial: Nonuniformity | None = None, *, photons_told: bool = True
+) -> EmvaSheet:
     """Compute every quantity of the sheet of EMVA 1288 from light levels and from series of frames.
 
-    ``levels`` are the pairs of the photon-transfer measurement, whose variance is the one in time; ``spatial`` has the
-    averaged frames. With ``photons_told`` False the light is known up to a factor, and no quantity in photons follows.
+    ``levels`` are the pairs of the photon-transfer measurement, whose variance is the one in time;
+    ``spatial`` has the averaged frames. With ``photons_told`` False the light is known up to a
+    factor, and no quantity in photons follows.
 
     Shapes: levels (level,); frames (y, x).
     Units:  with each quantity.

@@ -1,4 +1,6 @@
-"""Frames of the light levels of a calibration as pairs, and the verdict of a test of these frames."""
+"""Frames of the light levels of a calibration as pairs, and the verdict of a test of these
+frames.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ from neusee.nodes.calibrate._validity._hidden_faults import Hidden, open_errors
 
 Verdict = Literal["passed", "modelled", "widened", "refused"]
 ALARM = 1e-3  #: probability with which chance alone fails one test of a whole measurement
-REFUSED = 0.02  #: relative error of gain or dark noise above which frames are refused, and below which intervals widen
+#: relative error of gain or dark noise above which frames are refused, and below which intervals
+#: widen
+REFUSED = 0.02
 _WINDOW = 1024  #: pixels of the central window on a side, in which patterns and noise are tested
 _TESTED = 1 << 21  #: pixels of a level in all tested frames together
 _BLOCK = 8  #: pixels by which the window is aligned, as blocks of a compressed picture are
@@ -49,15 +53,20 @@ class Stack(NamedTuple):
 
 
 class Level(NamedTuple):
-    """One light level: pairs of frames in the central window, and the histogram of the whole frames."""
+    """One light level: pairs of frames in the central window, and the histogram of the whole
+    frames.
+    """
 
     name: str
     photons: float
     exposure: float  #: s
     scatter: Scatter
-    first: Tensor  #: (pair, y, x) float32, DN, with the mean of each frame removed; 0 in pixels that are left out
+    #: (pair, y, x) float32, DN, with the mean of each frame removed; 0 in pixels that are left out
+    first: Tensor
     second: Tensor  #: (pair, y, x), as `first`
-    apart: Tensor  #: (pair, y, x) DN, second less first, without what the lamp changed from the first to the second
+    #: (pair, y, x) DN, second less first, without what the lamp changed from the first to the
+    #: second
+    apart: Tensor
     drift: Tensor  #: (pair,) DN, mean of the second frame less mean of the first
     variance: float  #: DN2, temporal, without the drift of the mean
     mean: float  #: DN
@@ -78,9 +87,13 @@ class Level(NamedTuple):
 
     @property
     def low(self) -> bool:
-        """Return True if numbers pile up at the lowest number, or if 0 is a number of more than a few pixels."""
+        """Return True if numbers pile up at the lowest number, or if 0 is a number of more than
+        a few pixels.
+        """
         at_zero = float(self.pixels[self.value == 0].sum())
-        return at_zero > _AT_ZERO * float(self.pixels.sum()) or _piled(self, self.value, self.pixels)
+        return at_zero > _AT_ZERO * float(self.pixels.sum()) or _piled(
+            self, self.value, self.pixels
+        )
 
     @property
     def high(self) -> bool:
@@ -97,13 +110,17 @@ class FrameTest:
     limit: float  #: above the limit chance alone does not explain the number
     verdict: Verdict
     sentence: str
-    shifts: Mapping[str, float] = field(default_factory=dict)  #: relative errors of "gain" and "noise" that may follow
+    #: relative errors of "gain" and "noise" that may follow
+    shifts: Mapping[str, float] = field(default_factory=dict)
     explains_all: bool = False  #: True if other tests would only find consequences of this fault
-    hidden: tuple[Hidden, ...] = ()  #: faults of which the frames tell a size, whether the test finds them or not
+    #: faults of which the frames tell a size, whether the test finds them or not
+    hidden: tuple[Hidden, ...] = ()
 
 
 class Evidence(NamedTuple):
-    """The strongest of several standard normal deviations, and the value that chance alone exceeds rarely."""
+    """The strongest of several standard normal deviations, and the value that chance alone
+    exceeds rarely.
+    """
 
     strength: float  #: standard deviations
     limit: float
@@ -115,7 +132,9 @@ class Evidence(NamedTuple):
 
 
 def prepared(stack: Stack) -> Level:
-    """Return the pairs and the histogram of a light level; frame 0 forms a pair with 1, 2 with 3, and so on."""
+    """Return the pairs and the histogram of a light level; frame 0 forms a pair with 1, 2 with
+    3, and so on.
+    """
     kept = stack.frames if stack.mask is None else stack.frames[:, ~stack.mask]
     value, count = histogram(kept)
     frames = _window(stack.frames)
@@ -140,23 +159,29 @@ def prepared(stack: Stack) -> Level:
 
 
 def fitted_levels(levels: Sequence[Level], share: float | None) -> list[Level]:
-    """Return the levels with what the fit uses: dark levels, and lit levels up to ``share`` of saturation.
+    """Return the levels with what the fit uses: dark levels, and lit levels up to ``share`` of
+    saturation.
 
-    Saturation is at the lit level of the greatest variance, as for the likelihood. Without a ``share`` each level is
-    used. What the lamp changed from frame to frame, which is proportional to the light of each pixel, is taken off the
-    differences of the pairs.
+    Saturation is at the lit level of the greatest variance, as for the likelihood. Without a
+    ``share`` each level is used. What the lamp changed from frame to frame, which is proportional
+    to the light of each pixel, is taken off the differences of the pairs.
     """
     dark = min((level.mean for level in levels if level.dark), default=0.0)
     lit = [level for level in levels if not level.dark and level.paired]
     full = max(lit, key=lambda level: level.variance).mean - dark if lit else math.inf
     limit = math.inf if share is None else share * full
-    return [_steadied(level, dark)._replace(fitted=level.dark or level.mean - dark <= limit) for level in levels]
+    return [
+        _steadied(level, dark)._replace(fitted=level.dark or level.mean - dark <= limit)
+        for level in levels
+    ]
 
 
 def saturated(levels: Sequence[Level]) -> list[Level]:
-    """Return the levels whose numbers pile up at the highest number, or whose variance has fallen above its maximum.
+    """Return the levels whose numbers pile up at the highest number, or whose variance has fallen
+    above its maximum.
 
-    A well that differs from pixel to pixel, or that fills before the read noise is added, makes no pile.
+    A well that differs from pixel to pixel, or that fills before the read noise is added, makes no
+    pile.
     """
     lit = [level for level in levels if not level.dark and level.paired]
     peak = max(lit, key=lambda level: level.variance, default=None)
@@ -164,18 +189,31 @@ def saturated(levels: Sequence[Level]) -> list[Level]:
 
 
 def tested(levels: Sequence[Level]) -> list[Level]:
-    """Return the paired levels whose noise is tested: those that the fit uses, without a pile at an end."""
-    return [level for level in levels if level.paired and level.fitted and not level.high and not level.low]
+    """Return the paired levels whose noise is tested: those that the fit uses, without a pile at
+    an end.
+    """
+    return [
+        level
+        for level in levels
+        if level.paired and level.fitted and not level.high and not level.low
+    ]
 
 
 def _is_flat(level: Level, peak: Level) -> bool:
-    return level.paired and not level.dark and level.mean > peak.mean and level.variance < _FLAT * peak.variance
+    return (
+        level.paired
+        and not level.dark
+        and level.mean > peak.mean
+        and level.variance < _FLAT * peak.variance
+    )
 
 
 def _steadied(level: Level, dark: float) -> Level:
-    """Return a lit level without what a change of the lamp between the frames of a pair adds to their difference.
+    """Return a lit level without what a change of the lamp between the frames of a pair adds to
+    their difference.
 
-    The light of the second frame is that of the first, times the ratio of their means above the dark.
+    The light of the second frame is that of the first, times the ratio of their means above the
+    dark.
     """
     signal = level.mean - dark
     if level.dark or not level.paired or signal <= 0:
@@ -188,12 +226,20 @@ def _steadied(level: Level, dark: float) -> Level:
 
 
 def _variance(apart: Tensor) -> float:
-    """Return the temporal variance of differences (pair, y, x), without the drift of the mean; NaN without a pair."""
-    return float(apart.square().sum()) / 2 / max(1, apart.numel() - len(apart)) if len(apart) else math.nan
+    """Return the temporal variance of differences (pair, y, x), without the drift of the mean;
+    NaN without a pair.
+    """
+    return (
+        float(apart.square().sum()) / 2 / max(1, apart.numel() - len(apart))
+        if len(apart)
+        else math.nan
+    )
 
 
 def _centred(frames: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return the means (frame,) of frames, and the frames (frame, y, x) less their means, 0 in masked pixels."""
+    """Return the means (frame,) of frames, and the frames (frame, y, x) less their means, 0 in
+    masked pixels.
+    """
     numbers = frames.double()
     if mask is None:
         means = numbers.mean((1, 2))
@@ -219,7 +265,8 @@ def _window(frames: Tensor) -> Tensor:
 def _piled(level: Level, value: Tensor, count: Tensor) -> bool:
     """Return True if the lowest number occurs more often than the next number.
 
-    The counts of numbers without a limit fall towards the ends. A full well fills two neighbouring numbers.
+    The counts of numbers without a limit fall towards the ends. A full well fills two neighbouring
+    numbers.
     """
     last, at_zero = int(value[0]), int(value[0]) == 0
     counts = [float(count[value == last + i].sum()) for i in range(4)]
@@ -232,11 +279,12 @@ def _piled(level: Level, value: Tensor, count: Tensor) -> bool:
 
 
 def strongest(z: Sequence[Sequence[float]], more: Sequence[float] = (), sides: int = 1) -> Evidence:
-    """Return the strongest evidence of independent standard normal numbers (statistic, level), and its limit.
+    """Return the strongest evidence of independent standard normal numbers (statistic, level), and
+    its limit.
 
-    Each number counts alone, and all numbers of a statistic count together by their sum over the square root of their
-    count; ``more`` are further standard normal numbers. The limit is Bonferroni's for all of these, and for both signs
-    with two ``sides``.
+    Each number counts alone, and all numbers of a statistic count together by their sum over the
+    square root of their count; ``more`` are further standard normal numbers. The limit is
+    Bonferroni's for all of these, and for both signs with two ``sides``.
     """
     together = [sum(row) / math.sqrt(len(row)) for row in z if len(row) > 1]
     every = [*(x for row in z for x in row), *together, *more]
@@ -245,7 +293,9 @@ def strongest(z: Sequence[Sequence[float]], more: Sequence[float] = (), sides: i
 
 
 def normal_limit(probability: float) -> float:
-    """Return the number of standard deviations that a standard normal number exceeds with a probability."""
+    """Return the number of standard deviations that a standard normal number exceeds with a
+    probability.
+    """
     return -float(torch.special.ndtri(torch.tensor(probability, dtype=torch.float64)))
 
 
@@ -255,16 +305,29 @@ def studentised(product: Tensor) -> float:
 
 
 def outcome(
-    name: str, evidence: Evidence, sentence: str, shifts: Mapping[str, float], passed: str, modelled: str = ""
+    name: str,
+    evidence: Evidence,
+    sentence: str,
+    shifts: Mapping[str, float],
+    passed: str,
+    modelled: str = "",
 ) -> FrameTest:
-    """Return the result of a test: passed, modelled, widened, or refused where an error exceeds 2 %."""
+    """Return the result of a test: passed, modelled, widened, or refused where an error exceeds
+    2 %.
+    """
     if not evidence.found:
         return FrameTest(name, evidence.strength, evidence.limit, "passed", passed)
     if modelled:
-        return FrameTest(name, evidence.strength, evidence.limit, "modelled", f"{sentence}: {modelled}", shifts)
+        return FrameTest(
+            name, evidence.strength, evidence.limit, "modelled", f"{sentence}: {modelled}", shifts
+        )
     worst = max(shifts.values(), default=math.inf)
     verdict: Verdict = "refused" if worst > REFUSED else "widened"
-    means = f"an error of {100 * worst:.2g} % may follow" if math.isfinite(worst) else "no model describes such frames"
+    means = (
+        f"an error of {100 * worst:.2g} % may follow"
+        if math.isfinite(worst)
+        else "no model describes such frames"
+    )
     text = f"{sentence}: {means}{_remedy(name, verdict)}"
     return FrameTest(name, evidence.strength, evidence.limit, verdict, text, shifts)
 
@@ -274,18 +337,28 @@ def _remedy(name: str, verdict: Verdict) -> str:
 
 
 def bounded(
-    name: str, evidence: Evidence, hidden: Sequence[Hidden], sentence: str, passed: str, modelled: str = ""
+    name: str,
+    evidence: Evidence,
+    hidden: Sequence[Hidden],
+    sentence: str,
+    passed: str,
+    modelled: str = "",
 ) -> FrameTest:
     """Return the result of a test of a fault of which the frames tell a size, found or not.
 
-    Nothing is corrected. A fault that is found is refused where gain or noise may be wrong by more than 2 %, and else
-    widens by its whole size.
+    Nothing is corrected. A fault that is found is refused where gain or noise may be wrong by more
+    than 2 %, and else widens by its whole size.
     """
     worst = max(open_errors(hidden).values())
     if not evidence.found:
         text = f"{passed}; the frames may hide {100 * worst:.2g} %" if hidden else passed
-        return FrameTest(name, evidence.strength, evidence.limit, "passed", text, hidden=tuple(hidden))
+        return FrameTest(
+            name, evidence.strength, evidence.limit, "passed", text, hidden=tuple(hidden)
+        )
     verdict: Verdict = "refused" if worst > REFUSED else "modelled" if modelled else "widened"
-    text = f"{sentence}: an error of {100 * worst:.2g} % may follow, and nothing is corrected{_remedy(name, verdict)}"
+    text = (
+        f"{sentence}: an error of {100 * worst:.2g} % may follow, and nothing is"
+        f" corrected{_remedy(name, verdict)}"
+    )
     text = f"{sentence}: {modelled}" if verdict == "modelled" else text
     return FrameTest(name, evidence.strength, evidence.limit, verdict, text, hidden=tuple(hidden))

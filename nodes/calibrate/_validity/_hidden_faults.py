@@ -1,4 +1,6 @@
-"""Faults that change the variance of noise in proportion: the error that frames leave open, found by a test or not."""
+"""Faults that change the variance of noise in proportion: the error that frames leave open,
+found by a test or not.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +21,12 @@ CLEAN_PAIRS = 4e6
 class Hidden:
     """A fault that changes the measured variance, and what the frames say of its size.
 
-    The logarithm of the true over the measured variance has a normal likelihood about `estimate`. Before the frames
-    are seen it is 0 with the probability `sound`, and else has a Cauchy distribution about 0, which leaves large values
-    to the frames. Nothing is corrected by it: its root mean square is an error that gain and noise may have, so that a
-    fault that is found widens by its whole size. Frames of many pixels that show nothing leave almost nothing open;
-    with few pixels `sound` is small, and the whole standard error counts.
+    The logarithm of the true over the measured variance has a normal likelihood about `estimate`.
+    Before the frames are seen it is 0 with the probability `sound`, and else has a Cauchy
+    distribution about 0, which leaves large values to the frames. Nothing is corrected by it: its
+    root mean square is an error that gain and noise may have, so that a fault that is found widens
+    by its whole size. Frames of many pixels that show nothing leave almost nothing open; with few
+    pixels `sound` is small, and the whole standard error counts.
     """
 
     fault: str  #: "mixing", "lag" or "pattern"
@@ -54,25 +57,32 @@ class Hidden:
         return math.sqrt(float(weight @ points.square()))
 
     def _likelihood(self, points: Tensor) -> Tensor:
-        """Return the likelihood of points relative to that of the likeliest value that is possible."""
+        """Return the likelihood of points relative to that of the likeliest value that is
+        possible.
+        """
         best = max(0.0, self.estimate) if self.positive else self.estimate
         offset = ((best - self.estimate) / self.error) ** 2
         return (-0.5 * (((points - self.estimate) / self.error).square() - offset)).exp()
 
 
 def probably_sound(pairs: float) -> float:
-    """Return the probability of no fault before frames are seen, for a number of pairs of pixels in lit levels.
+    """Return the probability of no fault before frames are seen, for a number of pairs of pixels in
+    lit levels.
 
-    Frames of few pixels cannot show a fault that would matter: then nobody should believe that there is none. The odds
-    rise with the square of the pairs, up to 9 at `CLEAN_PAIRS`.
+    Frames of few pixels cannot show a fault that would matter: then nobody should believe that
+    there is none. The odds rise with the square of the pairs, up to 9 at `CLEAN_PAIRS`.
     """
     odds = _SOUND * min(1.0, pairs / CLEAN_PAIRS) ** 2
     return odds / (1 + odds)
 
 
 def open_errors(hidden: Sequence[Hidden]) -> dict[str, float]:
-    """Return the relative errors that independent faults leave open, by the names "gain" and "noise" (in DN)."""
+    """Return the relative errors that independent faults leave open, by the names "gain" and
+    "noise" (in DN).
+    """
     sizes = [fault.size() for fault in hidden]
     gain = math.hypot(*(fault.gain * size for fault, size in zip(hidden, sizes, strict=True)), 0.0)
-    noise = math.hypot(*(fault.noise * size for fault, size in zip(hidden, sizes, strict=True)), 0.0)
+    noise = math.hypot(
+        *(fault.noise * size for fault, size in zip(hidden, sizes, strict=True)), 0.0
+    )
     return {"gain": gain, "noise": noise}

@@ -11,18 +11,21 @@ from neusee.nodes.calibrate._validity._number_tests import codes, number_tests
 from neusee.nodes.calibrate._validity._pattern_tests import pattern_tests
 
 
-def inspect_frames(stacks: Iterable[Stack], exact: bool, share: float | None = None) -> list[FrameTest]:
+def inspect_frames(
+    stacks: Iterable[Stack], exact: bool, share: float | None = None
+) -> list[FrameTest]:
     """Test the frames of all light levels for what no likelihood of this package describes.
 
-    ``exact`` is True for `density`, which uses the probability of each digital number, and False for `camera`. Levels
-    above ``share`` of saturation, which the likelihood leaves out, are not tested, but for saturation itself. Noise and
-    patterns are tested in the central 1024 x 1024 pixels, digital numbers in the whole frames. Of a colour mosaic, and
-    of shifted numbers, that alone is said.
+    ``exact`` is True for `density`, which uses the probability of each digital number, and False
+    for `camera`. Levels above ``share`` of saturation, which the likelihood leaves out, are not
+    tested, but for saturation itself. Noise and patterns are tested in the central 1024 x 1024
+    pixels, digital numbers in the whole frames. Of a colour mosaic, and of shifted numbers, that
+    alone is said.
 
     Shapes: frames (frame, y, x) of each level -> a list of tests.
     Units:  frames DN.
-    Error:  each test fails by chance with a probability of 1e-3. A fault too small to be found is in `hidden` of a test
-            that passed.
+    Error:  each test fails by chance with a probability of 1e-3. A fault too small to be found is
+            in `hidden` of a test that passed.
     Raises: ValueError for frames that hold other than digital numbers.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 2 and 6 (assumptions of the model).
     """

@@ -1,4 +1,6 @@
-"""A test of frames for lag: noise of a frame that persists in the next frame, apart from the patterns that stay."""
+"""A test of frames for lag: noise of a frame that persists in the next frame, apart from the
+patterns that stay.
+"""
 
 from __future__ import annotations
 
@@ -27,21 +29,26 @@ _KEPT = 0.02  #: scale of the prior of the share of the variance that lag takes
 def lag(levels: Sequence[Level]) -> list[FrameTest]:
     """Test if the noise of a frame persists in the next frame of the same light.
 
-    The pattern of each pixel is fitted over the levels, separately for first and for second frames: an offset, a part
-    in proportion to the signal and to its square, and one in proportion to the exposure. What is left of the first
-    frames and of the second frames is independent noise, unless the first frame persists in the second. With a share L
-    that stays, the variance of a pair falls by the factor (1 - L)**2 / (1 + L).
+    The pattern of each pixel is fitted over the levels, separately for first and for second frames:
+    an offset, a part in proportion to the signal and to its square, and one in proportion to the
+    exposure. What is left of the first frames and of the second frames is independent noise, unless
+    the first frame persists in the second. With a share L that stays, the variance of a pair falls
+    by the factor (1 - L)**2 / (1 + L).
 
     Shapes: a list of levels -> a list of one test, or of none.
     Units:  number and limit in standard deviations of chance.
-    Error:  the test fails by chance with a probability of 1e-3. It needs three levels more than the parts of a pattern.
-    Source: Janesick, Photon Transfer, SPIE Press 2007, chapter 8 (image lag); weighted least squares.
+    Error:  the test fails by chance with a probability of 1e-3. It needs three levels more than the
+            parts of a pattern.
+    Source: Janesick, Photon Transfer, SPIE Press 2007, chapter 8 (image lag); weighted least
+            squares.
     """
     group = _comparable(levels)
     patterns = _patterns(group)
     if len(group) < patterns.shape[1] + _LEAST - 1:
         return []
-    weight = torch.tensor([max(level.variance, 1e-12) for level in group], dtype=torch.float64).rsqrt()
+    weight = torch.tensor(
+        [max(level.variance, 1e-12) for level in group], dtype=torch.float64
+    ).rsqrt()
     basis = torch.linalg.qr(weight[:, None] * patterns).Q
     lit = torch.tensor([not level.dark for level in group])
     lit = lit if bool(lit.any()) else ~lit
@@ -69,16 +76,22 @@ def lag(levels: Sequence[Level]) -> list[FrameTest]:
 
 
 def _comparable(levels: Sequence[Level]) -> list[Level]:
-    """Return the levels of frames of the most frequent shape, up to the level of the greatest variance."""
+    """Return the levels of frames of the most frequent shape, up to the level of the greatest
+    variance.
+    """
     shapes = [level.apart.shape[1:] for level in levels]
     common = max(shapes, key=shapes.count)
     top = max(levels, key=lambda level: level.variance).mean
     chosen = zip(levels, shapes, strict=True)
-    return [level for level, shape in chosen if shape == common and (level.dark or level.mean <= top)]
+    return [
+        level for level, shape in chosen if shape == common and (level.dark or level.mean <= top)
+    ]
 
 
 def _patterns(levels: Sequence[Level]) -> Tensor:
-    """Return the size (level, part) of each part of a pattern in each level, with as many parts as levels allow."""
+    """Return the size (level, part) of each part of a pattern in each level, with as many parts
+    as levels allow.
+    """
     offset = min((level.mean for level in levels), default=0.0)
     signal = torch.tensor([level.mean - offset for level in levels], dtype=torch.float64)
     exposure = torch.tensor([level.exposure for level in levels], dtype=torch.float64)
@@ -95,7 +108,9 @@ def _patterns(levels: Sequence[Level]) -> Tensor:
 
 
 def _left(frames: Tensor, weight: Tensor, basis: Tensor) -> Tensor:
-    """Return frames (level, y, x) over their standard deviations, without patterns and without means of lines."""
+    """Return frames (level, y, x) over their standard deviations, without patterns and without
+    means of lines.
+    """
     flat = weight[:, None] * without_lines(frames).flatten(1)
     return (flat - basis @ (basis.T @ flat)).view_as(frames)
 

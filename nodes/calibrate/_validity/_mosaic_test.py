@@ -9,16 +9,23 @@ from torch import Tensor
 
 from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Level, tested
 
-_PERIODS = {2: "2 x 2 pixels, as of Bayer", 4: "4 x 4 pixels, as of a quad mosaic", 6: "6 x 6 pixels, as of X-Trans"}
-_UNLIKE = 0.05  #: largest relative difference of the positions of a monochrome sensor with several readouts
+_PERIODS = {
+    2: "2 x 2 pixels, as of Bayer",
+    4: "4 x 4 pixels, as of a quad mosaic",
+    6: "6 x 6 pixels, as of X-Trans",
+}
+#: largest relative difference of the positions of a monochrome sensor with several readouts
+_UNLIKE = 0.05
 _CHANCE = 8.0  #: standard errors by which the brightest and the darkest position differ by chance
 
 
 def mosaic(levels: Sequence[Level]) -> Iterator[FrameTest]:
-    """Test if the light of pixels depends on their position in a small cell that repeats over the frame.
+    """Test if the light of pixels depends on their position in a small cell that repeats over the
+    frame.
 
     Shapes: a list of levels -> a test, or none without light.
-    Units:  number and limit: relative difference of the brightest and the darkest position of the cell.
+    Units:  number and limit: relative difference of the brightest and the darkest position of the
+            cell.
     Error:  positions of a monochrome sensor that differ by more than 5 % count as a mosaic.
     Source: Bayer, US patent 3971065 (1976), for the cell of 2 x 2 pixels.
     """
@@ -32,14 +39,19 @@ def mosaic(levels: Sequence[Level]) -> Iterator[FrameTest]:
         number = _difference(picture, period) / signal
         if number > _UNLIKE:
             colours = f"the light of pixels differs by {number:.0%} over a cell of {cell}"
-            text = f"{colours}: the frames are a mosaic of colours, whose calibration is not offered; give frames of"
+            text = (
+                f"{colours}: the frames are a mosaic of colours, whose calibration is not offered;"
+                " give frames of"
+            )
             text += " one colour alone, such as every second pixel of every second row"
             yield FrameTest("one colour", number, _UNLIKE, "refused", text, explains_all=True)
             return
 
 
 def _difference(picture: Tensor, period: int) -> float:
-    """Return the difference of the brightest and the darkest position of a cell, DN; 0 if chance explains it."""
+    """Return the difference of the brightest and the darkest position of a cell, DN; 0 if chance
+    explains it.
+    """
     if min(picture.shape) < 2 * period:
         return 0.0
     means, error = _positions(picture, period)

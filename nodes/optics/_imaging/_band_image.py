@@ -14,20 +14,22 @@ from neusee.nodes.values import Psf
 
 Border = Literal["zero", "reflect"]
 Corner = tuple[int, int]
-_DEEP = 100.0  #: ratio of a scene's root mean square to its typical value, from which float32 is too short
+#: ratio of a scene's root mean square to its typical value, from which float32 is too short
+_DEEP = 100.0
 
 
 @node(rtol=1e-5, bands={"radiance": -3, "psf": 0, "return": -3})
 def image(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
-    """Convolve each band with its PSF linearly, so that light that leaves one edge does not return at the other edge.
+    """Convolve each band with its PSF linearly, so that light that leaves one edge does not return
+    at the other edge.
 
     Shapes: radiance (..., band, y, x), psf.intensity (band, any, any) -> (..., band, y, x).
     Units:  those of the radiance, times the share of the pupil's light that reaches each pixel.
-    Error:  float32 FFT: rms 2e-7 of the scene's root mean square or less. A band whose root mean square exceeds 100
-            times its typical value (lamps at night) is transformed in float64, in twice the time, so that round-off
-            of the lamps does not hide the dark parts. Lasers are added as spots and are not convolved.
-            A PSF wider than twice the scene is cropped to the part that reaches the scene. `reflect` needs up to four
-            times the memory of `zero`.
+    Error:  float32 FFT: rms 2e-7 of the scene's root mean square or less. A band whose root mean
+            square exceeds 100 times its typical value (lamps at night) is transformed in float64,
+            in twice the time, so that round-off of the lamps does not hide the dark parts. Lasers
+            are added as spots and are not convolved. A PSF wider than twice the scene is cropped to
+            the part that reaches the scene. `reflect` needs up to four times the memory of `zero`.
     Raises: ValueError where scene and PSF have different bands.
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (incoherent imaging).
     """
@@ -35,12 +37,18 @@ def image(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
     size = (radiance.shape[-2], radiance.shape[-1])
     flat = scene.reshape(-1, *scene.shape[-3:])
     done = [_by_contrast(one, kernel, at, size) for one in flat]
-    return done[0].reshape(radiance.shape) if len(done) == 1 else torch.stack(done).reshape(radiance.shape)
+    return (
+        done[0].reshape(radiance.shape)
+        if len(done) == 1
+        else torch.stack(done).reshape(radiance.shape)
+    )
 
 
 @image.reference
 def _(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
-    scene, kernel, _ = _fitted(radiance.double(), psf.intensity.double(), "reflect" if border == "reflect" else "zero")
+    scene, kernel, _ = _fitted(
+        radiance.double(), psf.intensity.double(), "reflect" if border == "reflect" else "zero"
+    )
     m, n = kernel.shape[-2:]
     if border == "zero":
         scene = pad(scene, (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2))
@@ -63,11 +71,13 @@ def _(result: Tensor, radiance: Tensor, psf: Psf, **params: Any) -> list[Check]:
 
 
 def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor, Tensor, Corner]:
-    """Return the padded scene, the PSF that reaches the scene, and the first image pixel within their convolution."""
+    """Return the padded scene, the PSF that reaches the scene, and the first image pixel within
+    their convolution.
+    """
     if radiance.ndim < 3 or radiance.shape[-3] != intensity.shape[0]:
         raise ValueError(
-            f"radiance {tuple(radiance.shape)} and PSF {tuple(intensity.shape)} must have the same bands: "
-            "compute both from the same `bands` step"
+            f"radiance {tuple(radiance.shape)} and PSF {tuple(intensity.shape)} must have the same"
+            " bands: compute both from the same `bands` step"
         )
     dtype = torch.promote_types(torch.promote_types(radiance.dtype, intensity.dtype), torch.float32)
     kernel = reach(reach(intensity, -2, radiance.shape[-2]), -1, radiance.shape[-1]).to(dtype)
@@ -80,26 +90,35 @@ def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor
 
 
 def reach(kernel: Tensor, dim: int, size: int) -> Tensor:
-    """Crop a PSF along one axis to the samples that are at most one scene width from the centre of the PSF."""
+    """Crop a PSF along one axis to the samples that are at most one scene width from the centre
+    of the PSF.
+    """
     centre = kernel.shape[dim] // 2
     low, high = max(0, centre - size + 1), min(kernel.shape[dim], centre + size)
     return kernel.narrow(dim, low, high - low)
 
 
 def _by_contrast(scene: Tensor, kernel: Tensor, at: Corner, size: Corner) -> Tensor:
-    """Convolve each band of the scene with its PSF, in float64 if the contrast of the band is too high for float32."""
+    """Convolve each band of the scene with its PSF, in float64 if the contrast of the band is
+    too high for float32.
+    """
     deep = _deep(scene) if scene.dtype == torch.float32 else []
     if not any(deep):
         return _convolve(scene, kernel, at, size)
     if all(deep):
         return _convolve(scene.double(), kernel.double(), at, size).to(scene.dtype)
     wide = (torch.float64 if d else scene.dtype for d in deep)
-    each = [_convolve(s[None].to(d), k[None].to(d), at, size) for s, k, d in zip(scene, kernel, wide, strict=True)]
+    each = [
+        _convolve(s[None].to(d), k[None].to(d), at, size)
+        for s, k, d in zip(scene, kernel, wide, strict=True)
+    ]
     return torch.cat([band.to(scene.dtype) for band in each])
 
 
 def _deep(scene: Tensor) -> list[bool]:
-    """Return, for each band of the scene, True if its bright pixels make float32 round-off hide its other pixels."""
+    """Return, for each band of the scene, True if its bright pixels make float32 round-off hide
+    its other pixels.
+    """
     flat = scene.detach().flatten(1)
     few = flat[:, :: max(1, flat.shape[1] >> 16)]
     mostly = few.abs().sqrt().mean(1).square()
@@ -109,7 +128,9 @@ def _deep(scene: Tensor) -> list[bool]:
 
 
 def _convolve(scene: Tensor, kernel: Tensor, at: Corner, size: Corner) -> Tensor:
-    """Return a window of the convolution of scene and PSF, by the shortest FFT without wrap-around in the window."""
+    """Return a window of the convolution of scene and PSF, by the shortest FFT without
+    wrap-around in the window.
+    """
     length = [
         smooth(max(s, a + w, s + k - 1 - a))
         for s, k, a, w in zip(scene.shape[1:], kernel.shape[1:], at, size, strict=True)
@@ -119,10 +140,11 @@ def _convolve(scene: Tensor, kernel: Tensor, at: Corner, size: Corner) -> Tensor
 
 
 class _Product(torch.autograd.Function):
-    """The convolution or correlation of two pictures, band by band, as a product of their FFTs, cropped to a window.
+    """The convolution or correlation of two pictures, band by band, as a product of their FFTs,
+    cropped to a window.
 
-    ``a`` and ``b`` are padded with zeros around their corners. Both gradients are products of the same
-    kind, so only the inputs are stored and derivatives of every order exist.
+    ``a`` and ``b`` are padded with zeros around their corners. Both gradients are products of the
+    same kind, so only the inputs are stored and derivatives of every order exist.
     """
 
     @staticmethod
@@ -145,10 +167,14 @@ class _Product(torch.autograd.Function):
         (a, b), (at_a, at_b, at, _, conjugate, length), grad = ctx.saved_tensors, ctx.how, grads[0]
         of_a = of_b = None
         if ctx.needs_input_grad[0]:
-            of_a = _Product.apply(grad, b, at, at_b, at_a, tuple(a.shape[1:]), not conjugate, length)  # type: ignore[no-untyped-call]
+            of_a = _Product.apply(
+                grad, b, at, at_b, at_a, tuple(a.shape[1:]), not conjugate, length
+            )  # type: ignore[no-untyped-call]
         if ctx.needs_input_grad[1]:
             first, second, here, there = (a, grad, at_a, at) if conjugate else (grad, a, at, at_a)
-            of_b = _Product.apply(first, second, here, there, at_b, tuple(b.shape[1:]), True, length)  # type: ignore[no-untyped-call]
+            of_b = _Product.apply(
+                first, second, here, there, at_b, tuple(b.shape[1:]), True, length
+            )  # type: ignore[no-untyped-call]
         return of_a, of_b, *(None for _ in ctx.how)
 
     @staticmethod
@@ -161,13 +187,16 @@ class _Product(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
-        return one_by_one(_Product.apply, info.batch_size, (*in_dims[:2], *(None for _ in given[2:])), given)
+        return one_by_one(
+            _Product.apply, info.batch_size, (*in_dims[:2], *(None for _ in given[2:])), given
+        )
 
 
 class _Plane:
     """Memory for the FFT of one zero-padded band of a picture, reused for the next band.
 
-    The transform of the columns does not use ``out=``, which makes a copy: 21 ms instead of 12 ms at 3072 x 1537.
+    The transform of the columns does not use ``out=``, which makes a copy: 21 ms instead of 12 ms
+    at 3072 x 1537.
     """
 
     def __init__(self, length: Corner, like: Tensor) -> None:
@@ -182,9 +211,16 @@ class _Plane:
         return both
 
     def _spectrum(self, x: Tensor, at: Corner) -> Tensor:
-        """Return the FFT of a zero-padded picture: first along the rows that hold samples, then along all columns."""
+        """Return the FFT of a zero-padded picture: first along the rows that hold samples, then
+        along all columns.
+        """
         (y, left), (h, w) = at, x.shape
-        for edge in (self.rows[:y], self.rows[y + h :], self.real[:h, :left], self.real[:h, left + w :]):
+        for edge in (
+            self.rows[:y],
+            self.rows[y + h :],
+            self.real[:h, :left],
+            self.real[:h, left + w :],
+        ):
             edge.zero_()
         self.real[:h, left : left + w] = x
         torch.fft.rfft(self.real[:h], out=self.rows[y : y + h])

@@ -1,4 +1,6 @@
-"""The convolution of a scene with PSFs by a chosen plan, with borders, kernels and an estimate of the round-off."""
+"""The convolution of a scene with PSFs by a chosen plan, with borders, kernels and an estimate
+of the round-off.
+"""
 
 import math
 
@@ -15,30 +17,39 @@ _SOME = 16  #: rows of the PSF summed at a time; these rows of 31 bands fit in t
 
 
 def convolved(planes: Tensor, intensity: Tensor, given: Given, plan: Plan) -> Tensor:
-    """Return weighted sums (row, y, x) over the bands of the image, from the basis images and kernels of ``plan``."""
+    """Return weighted sums (row, y, x) over the bands of the image, from the basis images and
+    kernels of ``plan``.
+    """
     scene = bordered(planes[: plan.planes], given, plan.window)
     return summed(scene, _kernels(intensity, given, plan), plan.mix, _where(given, plan.window))
 
 
 def _where(given: Given, window: tuple[int, int]) -> Where:
-    """Return the zero padding of scene and kernel, and the window of their convolution that is the image."""
+    """Return the zero padding of scene and kernel, and the window of their convolution that is
+    the image.
+    """
     (m, n), zero = window, (0, 0)
     at = (m - 1, n - 1) if given.reflect else (m // 2, n // 2)
     return Where(zero, zero, at, given.size, transform(given, window))
 
 
 def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
-    """Return an upper bound (y, x) of the image error from an error ``off`` (y, x) in every band of the scene."""
+    """Return an upper bound (y, x) of the image error from an error ``off`` (y, x) in every band
+    of the scene.
+    """
     window, kernel = (intensity.shape[1], intensity.shape[2]), _heaviest(intensity, given)
-    reached = summed(bordered(off[None], given, window), kernel, Mix(None, None, None), _where(given, window))
+    reached = summed(
+        bordered(off[None], given, window), kernel, Mix(None, None, None), _where(given, window)
+    )
     return reached[0].clamp_min_(0)
 
 
 def majorant_by_cell(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
-    """Return an upper bound of `majorant` over cells of 8 x 8 pixels: (cell, cell) float64, far faster.
+    """Return an upper bound of `majorant` over cells of 8 x 8 pixels: (cell, cell) float64, far
+    faster.
 
-    A part of the kernel in one cell takes light to the pixels of a cell from four neighbouring cells of the scene, and
-    from none of their pixels more than from the one with the largest error.
+    A part of the kernel in one cell takes light to the pixels of a cell from four neighbouring
+    cells of the scene, and from none of their pixels more than from the one with the largest error.
     """
     window, kernel = (intensity.shape[1], intensity.shape[2]), _heaviest(intensity, given)[0]
     at = _where(given, window).at
@@ -46,9 +57,13 @@ def majorant_by_cell(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
     around = [-(k + b) % _CELL for k, b in zip(window, before, strict=True)]
     wide = pad(kernel.double(), (before[1], around[1], before[0], around[0]))
     light = avg_pool2d(wide[None], _CELL)[0] * _CELL**2
-    worst = max_pool2d(pad(cells(bordered(off[None], given, window))[None], (1, 1, 1, 1)), 2, 1)[0, 0].to(light)
+    worst = max_pool2d(pad(cells(bordered(off[None], given, window))[None], (1, 1, 1, 1)), 2, 1)[
+        0, 0
+    ].to(light)
     length = [a + b for a, b in zip(light.shape, worst.shape, strict=True)]
-    whole = torch.fft.irfft2(torch.fft.rfft2(light, length) * torch.fft.rfft2(worst, length), length)
+    whole = torch.fft.irfft2(
+        torch.fft.rfft2(light, length) * torch.fft.rfft2(worst, length), length
+    )
     first = [(k + b) // _CELL for k, b in zip(at, before, strict=True)]
     y, x = (slice(f, f + -(-n // _CELL)) for f, n in zip(first, given.size, strict=True))
     inside: Tensor = whole[y, x]
@@ -56,7 +71,9 @@ def majorant_by_cell(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
 
 
 def cells(planes: Tensor) -> Tensor:
-    """Return the largest number in each cell of planes (k, y, x): (k, cell, cell); the last cells may be smaller."""
+    """Return the largest number in each cell of planes (k, y, x): (k, cell, cell); the last
+    cells may be smaller.
+    """
     largest: Tensor = max_pool2d(planes[None], _CELL, ceil_mode=True)
     return largest[0]
 
@@ -69,7 +86,9 @@ def _heaviest(intensity: Tensor, given: Given) -> Tensor:
 
 
 def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:
-    """Return the basis images of the scene, with a mirrored border if the convolution with the PSF needs a border."""
+    """Return the basis images of the scene, with a mirrored border if the convolution with the
+    PSF needs a border.
+    """
     if not given.reflect:
         return planes
     m, n = window
@@ -89,7 +108,8 @@ def _kernels(intensity: Tensor, given: Given, plan: Plan) -> Tensor:
 
 
 def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Tensor:
-    """Return weighted sums (kernel, y, x) over the bands of a PSF, or over the absolute values of a PSF.
+    """Return weighted sums (kernel, y, x) over the bands of a PSF, or over the absolute values of a
+    PSF.
 
     A stack that must be copied is copied in slabs of a few rows.
     """
@@ -106,8 +126,8 @@ def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Ten
 def guessed(planes: Tensor, given: Given) -> Tensor:
     """Return an estimate of the brightest pixel of each weighted sum over the image bands.
 
-    The estimate is the smaller of two numbers: a quarter of the brightest pixel without blur, and half of an upper
-    bound of the brightest pixel with blur.
+    The estimate is the smaller of two numbers: a quarter of the brightest pixel without blur, and
+    half of an upper bound of the brightest pixel with blur.
     """
     through = given.passed.total
     room, sharp = planes.new_empty(planes[0].numel()), torch.zeros_like(given.rows[:, 0])
@@ -122,9 +142,10 @@ def guessed(planes: Tensor, given: Given) -> Tensor:
 def rounding(given: Given, plan: Plan, found: Tensor, eps: float) -> Tensor:
     """Return an estimate of the largest FFT round-off in each weighted sum over the image bands.
 
-    The round-off is close to white: a share eps sqrt(log2 N) / 2 of the power, spread over all N samples. The estimate
-    takes eight standard deviations of that noise. It adds ten roundings of the brightest pixel for errors that are not
-    spread: sums over the bands, planes and rows of a PSF, of which five roundings were measured.
+    The round-off is close to white: a share eps sqrt(log2 N) / 2 of the power, spread over all N
+    samples. The estimate takes eight standard deviations of that noise. It adds ten roundings of
+    the brightest pixel for errors that are not spread: sums over the bands, planes and rows of a
+    PSF, of which five roundings were measured.
     """
     count = math.prod(transform(given, plan.window))
     u, x, y, _ = plan.mix

@@ -1,4 +1,6 @@
-"""The choice of few bands whose PSFs represent the PSFs of all bands, by an estimate of the error in the picture."""
+"""The choice of few bands whose PSFs represent the PSFs of all bands, by an estimate of the
+error in the picture.
+"""
 
 import math
 from itertools import pairwise
@@ -47,28 +49,36 @@ def few_bands(
     within: Share = 0.0,
     largest: bool = False,
 ) -> FewBands:
-    """Choose the fewest bands whose PSFs, interpolated linearly between the bands, give the image of the scene within
-    an error.
+    """Choose the fewest bands whose PSFs, interpolated linearly between the bands, give the image
+    of the scene within an error.
 
-    The error is estimated: PSFs of a thinned pupil, of every second band where at least three times as many as few
-    bands are enough to compare with, else of all, are convolved with three parts of the scene: the brightest, the one
-    of the most contrast, and the middle. Their window holds 90 % of the light, in cells of 1, 2 or
-    4 pixels along each side. The estimate is twice the error of the worst part. With `largest`, the error of the
-    brightest pixel is held too. All bands are kept where no such window is much smaller than that of the PSF.
+    The error is estimated: PSFs of a thinned pupil, of every second band where at least three times
+    as many as few bands are enough to compare with, else of all, are convolved with three parts of
+    the scene: the brightest, the one of the most contrast, and the middle. Their window holds 90 %
+    of the light, in cells of 1, 2 or 4 pixels along each side. The estimate is twice the error of
+    the worst part. With `largest`, the error of the brightest pixel is held too. All bands are kept
+    where no such window is much smaller than that of the PSF.
 
-    Shapes: pupil (v, u), radiance k planes (y, x), rows (row, band) -> used (j,), share (band, j) float64.
+    Shapes: pupil (v, u), radiance k planes (y, x), rows (row, band) -> used (j,), share (band, j)
+            float64.
     Units:  errors relative to the brightest pixel of each row.
-    Error:  an estimate, not a bound: `optics.few_bands_checked` compares it with a finer choice. The choice is constant
-            for gradients.
+    Error:  an estimate, not a bound: `optics.few_bands_checked` compares it with a finer choice.
+            The choice is constant for gradients.
     Raises: ValueError where pupil, scene and rows have different bands.
-    Source: composite trapezoidal rule over wavelengths: Dahlquist and Bjorck, Numerical Methods, section 7.2 (1974).
+    Source: composite trapezoidal rule over wavelengths: Dahlquist and Bjorck, Numerical Methods,
+            section 7.2 (1974).
     """
     count = _same_count(pupil, radiance, rows)
     rungs = [few for few in _RUNGS if few <= _MOST * count]
     if not rungs or within <= 0:
         return _all_bands(count)
     pupil, radiance, rows = without_gradients(pupil, radiance, rows)
-    lens = {"focal_length": focal_length, "pixel_pitch": pixel_pitch, "pixel": pixel, "sensor": sensor}
+    lens = {
+        "focal_length": focal_length,
+        "pixel_pitch": pixel_pitch,
+        "pixel": pixel,
+        "sensor": sensor,
+    }
     small = thumbnail(pupil, shape, lens)
     if small is None:
         return _all_bands(count)
@@ -76,10 +86,14 @@ def few_bands(
     light_of_half = small.light(half)
     light = _interpolated(light_of_half, half, count)
     rungs_of_half = [few for few in rungs if _FINER * few <= len(half)]
-    choice = _fewest(rungs_of_half, parts_of(radiance, rows, light, small.pixels), light, within, largest)
+    choice = _fewest(
+        rungs_of_half, parts_of(radiance, rows, light, small.pixels), light, within, largest
+    )
     if choice is None:
         light = _completed(light_of_half, half, count, small)
-        choice = _fewest(rungs, parts_of(radiance, rows, light, small.pixels), light, within, largest)
+        choice = _fewest(
+            rungs, parts_of(radiance, rows, light, small.pixels), light, within, largest
+        )
     return choice or _all_bands(count)
 
 
@@ -88,12 +102,16 @@ def _same_count(pupil: Pupil, radiance: LowRankCube, rows: Tensor) -> int:
     counts = len(pupil.wavelengths), len(radiance.basis), rows.shape[-1]
     if len(set(counts)) > 1:
         text = f"{counts[0]}, {counts[1]} and {counts[2]}"
-        raise ValueError(f"pupil, radiance and rows have {text} bands: compute all from the same `bands` step")
+        raise ValueError(
+            f"pupil, radiance and rows have {text} bands: compute all from the same `bands` step"
+        )
     return counts[0]
 
 
 def _interpolated(light: Tensor, some: Tensor, count: int) -> Tensor:
-    """Return the PSFs (band, y, x) of all bands from those of some bands, linearly between the bands."""
+    """Return the PSFs (band, y, x) of all bands from those of some bands, linearly between the
+    bands.
+    """
     planes = share_of_bands(some, count).to(light) @ light.flatten(1)
     return planes.view(count, *light.shape[1:])
 
@@ -105,7 +123,9 @@ def _completed(light: Tensor, some: Tensor, count: int, small: Thumbnail) -> Ten
     return together[torch.cat([some, others]).argsort()]
 
 
-def _fewest(rungs: list[int], parts: Parts, light: Tensor, within: float, largest: bool) -> FewBands | None:
+def _fewest(
+    rungs: list[int], parts: Parts, light: Tensor, within: float, largest: bool
+) -> FewBands | None:
     """Return the first number of bands whose estimated error is within the limit, or None."""
     count = len(light)
     for few in rungs:
@@ -126,13 +146,21 @@ def _evenly(few: int, count: int) -> Tensor:
 def _(result: FewBands, *inputs: object, **params: object) -> list[Check]:
     bands, few = result.share.shape
     if few == bands:
-        return [Check(f"all {bands} bands: fewer would not be within the tolerance, or save nothing")]
-    return [Check(f"{few} of {bands} bands: estimated error {float(result.error):.2g} of the brightest pixel")]
+        return [
+            Check(f"all {bands} bands: fewer would not be within the tolerance, or save nothing")
+        ]
+    return [
+        Check(
+            f"{few} of {bands} bands: estimated error {float(result.error):.2g} of the brightest"
+            " pixel"
+        )
+    ]
 
 
 @node(rtol=1e-12)
 def pupil_of_bands(pupil: Pupil, few: FewBands) -> Pupil:
-    """Return the pupil of some bands: the factors of all bands, and index and wavelengths of the bands in use.
+    """Return the pupil of some bands: the factors of all bands, and index and wavelengths of the
+    bands in use.
 
     Shapes: pupil (v, u) -> (v, u), with one index and one wavelength for each band in use.
     Units:  as the pupil.
@@ -156,33 +184,45 @@ def few_bands_checked(
     pixel: Literal["point", "zoh"] = "point",
     sensor: SensorSampling = "point",
 ) -> FewBands:
-    """Compare PSFs of few bands with about twice as many bands, on parts of the scene, and raise the error estimate
-    where it was too low.
+    """Compare PSFs of few bands with about twice as many bands, on parts of the scene, and raise
+    the error estimate where it was too low.
 
-    The PSFs are those of the run, and those of the bands halfway between them, from the pupil in full. The new
-    estimate is the larger of the old one and twice the difference.
+    The PSFs are those of the run, and those of the bands halfway between them, from the pupil in
+    full. The new estimate is the larger of the old one and twice the difference.
 
-    Shapes: psf.intensity (j, y, x), pupil (v, u), radiance k planes (y, x), rows (row, band) -> as `few`.
+    Shapes: psf.intensity (j, y, x), pupil (v, u), radiance k planes (y, x), rows (row, band) -> as
+            `few`.
     Units:  errors relative to the brightest pixel of each row.
-    Error:  an estimate, not a bound: for a smooth change with the wavelength the difference is 3/4 of the error.
-    Source: comparison of two composite rules: Dahlquist and Bjorck, Numerical Methods, section 7.2 (1974).
+    Error:  an estimate, not a bound: for a smooth change with the wavelength the difference is 3/4
+            of the error.
+    Source: comparison of two composite rules: Dahlquist and Bjorck, Numerical Methods, section 7.2
+            (1974).
     """
     count, used = len(few.share), few.used.tolist()
     between = [(a + b) // 2 for a, b in pairwise(used) if b - a > 1]
     if not between:
         return few
     pupil, radiance, rows = without_gradients(pupil, radiance, rows)
-    lens = {"focal_length": focal_length, "pixel_pitch": pixel_pitch, "pixel": pixel, "sensor": sensor}
+    lens = {
+        "focal_length": focal_length,
+        "pixel_pitch": pixel_pitch,
+        "pixel": pixel,
+        "sensor": sensor,
+    }
     more, pixels = few._replace(used=torch.tensor(between)), bins_of(psf.intensity)
     window = (pixels * SIDE, pixels * SIDE)
     own = binned(centred(psf.intensity.detach(), window), pixels)
     added = binned(focused(pupil_of_bands(pupil, more), window, lens), pixels)
     order = sorted(range(len(used) + len(between)), key=[*used, *between].__getitem__)
     light = torch.cat([own, added])[order]
-    finer = share_of_bands(torch.tensor(sorted([*used, *between])), count).to(light) @ light.flatten(1)
+    finer = share_of_bands(torch.tensor(sorted([*used, *between])), count).to(
+        light
+    ) @ light.flatten(1)
     parts = parts_of(radiance, rows, finer.view(count, *light.shape[1:]), pixels)
     error, top = estimated(parts, few.share.cpu(), own)
-    raised = (max(float(old), _SAFETY * new) for old, new in ((few.error, error), (few.largest, top)))
+    raised = (
+        max(float(old), _SAFETY * new) for old, new in ((few.error, error), (few.largest, top))
+    )
     return few._replace(**dict(zip(("error", "largest"), map(_number, raised), strict=True)))
 
 
@@ -199,12 +239,17 @@ def _(result: FewBands, few: FewBands, *inputs: object, **params: object) -> lis
     bands, count = result.share.shape
     if count == bands:
         return [Check(f"all {bands} bands are in use")]
-    text = f"{count} of {bands} bands, compared with the next finer choice: estimated error {float(result.error):.2g}"
+    text = (
+        f"{count} of {bands} bands, compared with the next finer choice: estimated error"
+        f" {float(result.error):.2g}"
+    )
     return [Check(text, math.isfinite(float(result.error)))]
 
 
 def _all_bands(count: int) -> FewBands:
-    return FewBands(torch.eye(count, dtype=torch.float64), torch.arange(count), _number(0.0), _number(0.0))
+    return FewBands(
+        torch.eye(count, dtype=torch.float64), torch.arange(count), _number(0.0), _number(0.0)
+    )
 
 
 def _number(value: float) -> Tensor:

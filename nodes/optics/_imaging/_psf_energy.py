@@ -7,11 +7,14 @@ import torch
 from torch import Tensor
 
 _LADDER = (1.0, 0.75, 0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625, 0.03125, 0.015625)
-_ROUNDED = 4e-6  #: relative round-off of a float32 sum: a few nested sums of a few dozen additions each
+#: relative round-off of a float32 sum: a few nested sums of a few dozen additions each
+_ROUNDED = 4e-6
 
 
 class Passed(NamedTuple):
-    """Sums and maxima of the PSF of each band, inside and outside of windows, as float64 tensors on the CPU."""
+    """Sums and maxima of the PSF of each band, inside and outside of windows, as float64 tensors
+    on the CPU.
+    """
 
     windows: list[tuple[int, int]]  #: the largest first
     total: Tensor  #: (band,) sum of |PSF|
@@ -23,7 +26,8 @@ class Passed(NamedTuple):
 
 def passed(intensity: Tensor) -> Passed:
     """Return the sums and maxima of PSFs (band, y, x), with the whole PSF as the only window."""
-    ends = [torch.aminmax(band) for band in intensity]  # a maximum over several dimensions takes three times as long
+    # a maximum over several dimensions takes three times as long
+    ends = [torch.aminmax(band) for band in intensity]
     low, high = (torch.stack(found).double().cpu() for found in zip(*ends, strict=True))
     signed = not bool((low >= 0).all())  # True for NaN too
     rows = (intensity.abs() if signed else intensity).sum(2)
@@ -51,7 +55,9 @@ def by_window(intensity: Tensor, signed: bool) -> Passed:
 
 
 def spread(of: Passed, share: Tensor | None) -> Passed:
-    """Return bounds for bands whose PSFs are weighted means, with weights ``share`` (band, j), of the measured PSFs."""
+    """Return bounds for bands whose PSFs are weighted means, with weights ``share`` (band, j),
+    of the measured PSFs.
+    """
     if share is None:
         return of
     beyond, above = of.beyond @ share.T, of.above @ share.T
@@ -60,7 +66,9 @@ def spread(of: Passed, share: Tensor | None) -> Passed:
 
 def centred(stack: Tensor, window: tuple[int, int]) -> Tensor:
     """Return the samples of each PSF in a window about the central sample n // 2."""
-    (top, bottom), (left, right) = (_inside(n, w) for n, w in zip(stack.shape[1:], window, strict=True))
+    (top, bottom), (left, right) = (
+        _inside(n, w) for n, w in zip(stack.shape[1:], window, strict=True)
+    )
     return stack[:, top:bottom, left:right]
 
 
@@ -79,9 +87,11 @@ def _covered(span: tuple[int, int], cuts: list[int]) -> Tensor:
 
 
 def _pieces(size: Tensor, rows: list[int], columns: list[int]) -> tuple[Tensor, Tensor]:
-    """Return the sum, rounded up, and the maximum of each rectangular piece of a PSF, both (band, rows, columns).
+    """Return the sum, rounded up, and the maximum of each rectangular piece of a PSF, both (band,
+    rows, columns).
 
-    A few large calls are faster than many small calls, each of which waits for other work on the machine.
+    A few large calls are faster than many small calls, each of which waits for other work on the
+    machine.
     """
     along = [(size[:, a:b].sum(1), size[:, a:b].amax(1)) for a, b in pairwise(rows)]
     sums, tops = (torch.stack(found, 1).double().cpu() for found in zip(*along, strict=True))

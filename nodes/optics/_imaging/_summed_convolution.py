@@ -1,9 +1,11 @@
-"""Weighted sums of convolutions of a few pictures with a few kernels, computed in blocks of spectrum columns.
+"""Weighted sums of convolutions of a few pictures with a few kernels, computed in blocks of
+spectrum columns.
 
-Result i is ``sum_s U[i, s] (X a)_s * (Y b)_s`` with planes a and kernels b. First all planes and kernels are
-transformed along their rows. Then a few columns of all of them at a time are transformed, multiplied and transformed
-back, in memory that fits in the cache. At 3072 x 3072 this takes 11 ms for the columns of a plane, on two cores;
-a transform of all columns in place takes 35 ms.
+Result i is ``sum_s U[i, s] (X a)_s * (Y b)_s`` with planes a and kernels b. First all planes and
+kernels are transformed along their rows. Then a few columns of all of them at a time are
+transformed, multiplied and transformed back, in memory that fits in the cache. At 3072 x 3072 this
+takes 11 ms for the columns of a plane, on two cores; a transform of all columns in place takes 35
+ms.
 """
 
 from typing import Any, NamedTuple
@@ -16,16 +18,21 @@ from neusee.nodes.torch_func import one_by_one
 Corner = tuple[int, int]
 
 _COLUMNS = 16  #: columns of each spectrum at a time; on a GPU all columns
-_SOME = 64  #: rows of a picture at a time: whole pictures would take new memory, which costs more than their FFTs
+#: rows of a picture at a time: whole pictures would take new memory, which costs more than their
+#: FFTs
+_SOME = 64
 
 
 class Mix(NamedTuple):
-    """The matrices that combine pictures and kernels into products, and products into results; None is the identity."""
+    """The matrices that combine pictures and kernels into products, and products into results;
+    None is the identity.
+    """
 
     u: Tensor | None  #: (result, s)
     x: Tensor | None  #: (s, plane)
     y: Tensor | None  #: (s, kernel)
-    results: int = 0  #: number of results, where each has its own kernel for each plane, in this order
+    #: number of results, where each has its own kernel for each plane, in this order
+    results: int = 0
 
     def to(self, like: Tensor) -> "Mix":
         """Return the matrices, converted to the precision and the device of the tensor ``like``."""
@@ -34,7 +41,9 @@ class Mix(NamedTuple):
 
 
 class Where(NamedTuple):
-    """The positions of pictures and kernels in zero-padded arrays, and the window of the convolution to return."""
+    """The positions of pictures and kernels in zero-padded arrays, and the window of the
+    convolution to return.
+    """
 
     at_a: Corner
     at_b: Corner
@@ -45,7 +54,9 @@ class Where(NamedTuple):
 
 
 class Summed(torch.autograd.Function):
-    """A sum of convolutions. Its gradients are sums of convolutions too, so that derivatives of all orders exist."""
+    """A sum of convolutions. Its gradients are sums of convolutions too, so that derivatives of
+    all orders exist.
+    """
 
     @staticmethod
     def forward(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
@@ -65,14 +76,18 @@ class Summed(torch.autograd.Function):
         flip = not where.conjugate
         of_a = of_b = None
         if ctx.needs_input_grad[0]:
-            back = where._replace(at_a=where.at, at=where.at_a, size=tuple(a.shape[1:]), conjugate=flip)
+            back = where._replace(
+                at_a=where.at, at=where.at_a, size=tuple(a.shape[1:]), conjugate=flip
+            )
             of_a = summed(grad, b, Mix(x, u, mix.y), back)
         if ctx.needs_input_grad[1]:
             back = where._replace(at=where.at_b, size=tuple(b.shape[1:]), conjugate=True)
             if where.conjugate:
                 of_b = summed(a, grad, Mix(y, mix.x, u), back._replace(at_b=where.at))
             else:
-                of_b = summed(grad, a, Mix(y, u, mix.x), back._replace(at_a=where.at, at_b=where.at_a))
+                of_b = summed(
+                    grad, a, Mix(y, u, mix.x), back._replace(at_a=where.at, at_b=where.at_a)
+                )
         return of_a, of_b, None, None
 
     @staticmethod
@@ -89,7 +104,9 @@ class Summed(torch.autograd.Function):
 
 
 def summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
-    """Return weighted sums (r, y, x) of convolutions of pictures (k, y, x) with kernels (q, y, x)."""
+    """Return weighted sums (r, y, x) of convolutions of pictures (k, y, x) with kernels (q, y,
+    x).
+    """
     result: Tensor = Summed.apply(a, b, mix, where)  # type: ignore[no-untyped-call]
     return result
 
@@ -114,7 +131,9 @@ def _results(mix: Mix, a: Tensor) -> int:
 
 
 def _mixed(mix: Mix, x: Tensor, y: Tensor) -> Tensor:
-    """Return the spectra of the sums of convolutions, from the spectra ``x`` of pictures and ``y`` of kernels."""
+    """Return the spectra of the sums of convolutions, from the spectra ``x`` of pictures and
+    ``y`` of kernels.
+    """
     if not mix.results:
         return _times(mix.u, _times(mix.x, x) * y)
     each = y.view(mix.results, len(x), *y.shape[1:])
@@ -125,9 +144,11 @@ def _mixed(mix: Mix, x: Tensor, y: Tensor) -> Tensor:
 
 
 def _rows(x: Tensor, left: int, wide: int, step: int) -> Tensor:
-    """Return the FFT of each picture row, shifted by ``left`` zeros, as (plane, block, row, ``step`` columns).
+    """Return the FFT of each picture row, shifted by ``left`` zeros, as (plane, block, row,
+    ``step`` columns).
 
-    A block of columns is contiguous: in rows 12 kB apart, each element would lie in another memory page.
+    A block of columns is contiguous: in rows 12 kB apart, each element would lie in another memory
+    page.
     """
     count, tall, broad = x.shape
     whole, more = divmod(wide // 2 + 1, step)
@@ -142,7 +163,9 @@ def _rows(x: Tensor, left: int, wide: int, step: int) -> Tensor:
             inside = room[: rows.stop - y]
             inside[:, left : left + broad] = plane[rows]
             spectrum: Tensor = torch.fft.rfft(inside)
-            block[:whole, rows] = spectrum[:, : whole * step].view(len(inside), whole, step).transpose(0, 1)
+            block[:whole, rows] = (
+                spectrum[:, : whole * step].view(len(inside), whole, step).transpose(0, 1)
+            )
             block[whole:, rows, :more] = spectrum[:, whole * step :]
     return blocks
 
@@ -164,7 +187,9 @@ def _few_rows(x: Tensor, count: int) -> int:
 
 
 class _Columns:
-    """Blocks of spectrum columns, transformed in reused memory, because allocation takes longer than the FFTs."""
+    """Blocks of spectrum columns, transformed in reused memory, because allocation takes longer
+    than the FFTs.
+    """
 
     def __init__(self, blocks: Tensor, top: int, high: int) -> None:
         self.blocks = blocks
@@ -184,4 +209,6 @@ def _times(matrix: Tensor | None, spectra: Tensor) -> Tensor:
     if matrix is None:
         return spectra
     pairs = torch.view_as_real(spectra)
-    return torch.view_as_complex((matrix @ pairs.reshape(len(spectra), -1)).reshape(-1, *pairs.shape[1:]))
+    return torch.view_as_complex(
+        (matrix @ pairs.reshape(len(spectra), -1)).reshape(-1, *pairs.shape[1:])
+    )

@@ -1,4 +1,6 @@
-"""Banded matrices stored as batches of small dense matrices, so that interpolation is a matrix product."""
+"""Banded matrices stored as batches of small dense matrices, so that interpolation is a matrix
+product.
+"""
 
 import copy
 import math
@@ -12,7 +14,9 @@ _SLACK = 8  #: columns of zeros that let blocks of unequal spacing share one str
 
 
 class _Run(NamedTuple):
-    """A range of matrix blocks whose first columns are equally spaced: start, start + stride and so on."""
+    """A range of matrix blocks whose first columns are equally spaced: start, start + stride and
+    so on.
+    """
 
     first: int
     blocks: int
@@ -25,13 +29,17 @@ class _Run(NamedTuple):
 
 
 class Banded:
-    """A banded matrix, whose row ``i`` is nonzero only in the columns within ``reach`` of ``origin + step i``.
+    """A banded matrix, whose row ``i`` is nonzero only in the columns within ``reach`` of ``origin
+    + step i``.
 
-    ``n_rows`` is rounded up to whole blocks; the extra rows are finite and meaningless. The other factor of a product
-    needs ``margin`` zeros before and behind its ``n_columns`` samples, so that all blocks have the same size.
+    ``n_rows`` is rounded up to whole blocks; the extra rows are finite and meaningless. The other
+    factor of a product needs ``margin`` zeros before and behind its ``n_columns`` samples, so that
+    all blocks have the same size.
     """
 
-    def __init__(self, n_rows: int, n_columns: int, origin: float, step: float, reach: float, block: int) -> None:
+    def __init__(
+        self, n_rows: int, n_columns: int, origin: float, step: float, reach: float, block: int
+    ) -> None:
         self.n_columns, self.reach = n_columns, reach
         self.count = -(-n_rows // block)
         self.block = -(-n_rows // self.count)
@@ -49,9 +57,13 @@ class Banded:
         return self.origin + self.step * row
 
     def fill(self, weigh: Callable[[Tensor, Tensor], Tensor]) -> "Banded":
-        """Set the matrix to ``weigh(row, column)`` within the band and to zero outside; the indices are float64."""
+        """Set the matrix to ``weigh(row, column)`` within the band and to zero outside; the
+        indices are float64.
+        """
         starts = [start for run in self.runs for start in run.starts]
-        columns = torch.tensor(starts, dtype=torch.float64)[:, None, None] + torch.arange(self.width)
+        columns = torch.tensor(starts, dtype=torch.float64)[:, None, None] + torch.arange(
+            self.width
+        )
         rows = torch.arange(self.n_rows, dtype=torch.float64).view(self.count, self.block, 1)
         near = (columns - (self.origin + self.step * rows)).abs_() <= self.reach
         self.weights = torch.where(near, weigh(rows, columns), 0.0)
@@ -63,18 +75,24 @@ class Banded:
         return self
 
     def part(self, first: int, last: int) -> "Banded":
-        """Return the part of the banded matrix from block ``first`` up to, but without, block ``last``."""
+        """Return the part of the banded matrix from block ``first`` up to, but without, block
+        ``last``.
+        """
         part = copy.copy(self)
         part.count, part.n_rows = last - first, (last - first) * self.block
         part.weights, part.runs = self.weights[first:last], []
         for run in self.runs:
             a, z = max(run.first, first), min(run.first + run.blocks, last)
             if a < z:
-                part.runs.append(_Run(a - first, z - a, run.start + (a - run.first) * run.stride, run.stride))
+                part.runs.append(
+                    _Run(a - first, z - a, run.start + (a - run.first) * run.stride, run.stride)
+                )
         return part
 
     def left(self, x: Tensor, out: Tensor) -> None:
-        """Write ``matrix @ x[margin + n_columns + margin, c]`` to ``out[n_rows, c]``; ``x`` may have a row stride."""
+        """Write ``matrix @ x[margin + n_columns + margin, c]`` to ``out[n_rows, c]``; ``x`` may
+        have a row stride.
+        """
         wide, pitch = x.shape[1], x.stride(0)
         blocks = out.view(self.count, self.block, wide)
         for first, count, start, stride in self.runs:
@@ -83,16 +101,24 @@ class Banded:
             _multiply(self.weights[first : first + count], view, blocks[first : first + count])
 
     def right(self, x: Tensor, out: Tensor) -> None:
-        """Write ``x[r, margin + n_columns + margin] @ matrix^T`` to ``out[block, r, i]``, in blocks of matrix rows."""
+        """Write ``x[r, margin + n_columns + margin] @ matrix^T`` to ``out[block, r, i]``, in
+        blocks of matrix rows.
+        """
         tall, wide = x.shape
         for first, count, start, stride in self.runs:
             at = start + self.margin + x.storage_offset()
             view = x.as_strided((count, tall, self.width), (stride, wide, 1), at)
-            _multiply(view, self.weights[first : first + count].transpose(1, 2), out[first : first + count])
+            _multiply(
+                view,
+                self.weights[first : first + count].transpose(1, 2),
+                out[first : first + count],
+            )
 
 
 def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
-    """Multiply two batches of matrices; fewer than 8 products run one after another, each on all threads."""
+    """Multiply two batches of matrices; fewer than 8 products run one after another, each on all
+    threads.
+    """
     if len(a) >= 8:
         torch.bmm(a, b, out=out)
         return
@@ -101,7 +127,9 @@ def _multiply(a: Tensor, b: Tensor, out: Tensor) -> None:
 
 
 def _runs(low: list[int], high: list[int], pace: float) -> list[_Run]:
-    """Return a few runs of matrix blocks with equally spaced first columns, each column from ``low`` to ``high``."""
+    """Return a few runs of matrix blocks with equally spaced first columns, each column from
+    ``low`` to ``high``.
+    """
     runs: list[_Run] = []
     first = 0
     while first < len(low):
@@ -117,7 +145,10 @@ def _runs(low: list[int], high: list[int], pace: float) -> list[_Run]:
 def _longest(low: list[int], high: list[int], first: int, stride: int) -> _Run:
     a, z, count = low[first], high[first], 0
     while first + count < len(low):
-        lower, upper = max(a, low[first + count] - stride * count), min(z, high[first + count] - stride * count)
+        lower, upper = (
+            max(a, low[first + count] - stride * count),
+            min(z, high[first + count] - stride * count),
+        )
         if lower > upper:
             break
         a, z, count = lower, upper, count + 1

@@ -1,4 +1,6 @@
-"""The scaled Fourier transform as matrix products: complex, or real for the even and odd parts of the field."""
+"""The scaled Fourier transform as matrix products: complex, or real for the even and odd parts
+of the field.
+"""
 
 import torch
 from torch import Tensor
@@ -17,7 +19,9 @@ from neusee.nodes.optics._transform._workspace import Workspace
 
 
 def direct(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
-    """Transform the field by complex matrix products with the full kernel, without use of symmetry."""
+    """Transform the field by complex matrix products with the full kernel, without use of
+    symmetry.
+    """
     last = last_type(columns.n_in, rows.n_out, work.dtype)
     along_x, along_y = _kernel(columns, work.dtype, work.device), _kernel(rows, last, work.device)
     half = torch.empty(rows.n_in, columns.n_out, dtype=along_x.dtype, device=work.device)
@@ -32,11 +36,14 @@ def direct(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspac
 
 
 def folded(rows: Axis, columns: Axis, source: Source, sink: Sink, work: Workspace) -> None:
-    """Transform the even and odd parts of the field by real matrix products, in a quarter of the operations of
-    `direct`.
+    """Transform the even and odd parts of the field by real matrix products, in a quarter of the
+    operations of `direct`.
     """
     last = last_type(columns.n_in, rows.n_out, work.dtype)
-    turn_x, turn_y = _half_kernels(columns, work.dtype, work.device), _half_kernels(rows, last, work.device)
+    turn_x, turn_y = (
+        _half_kernels(columns, work.dtype, work.device),
+        _half_kernels(rows, last, work.device),
+    )
     half = work.take("half", 2, rows.n_in, columns.n_out)
     for start, stop in row_chunks(rows.n_in, columns.n_in):
         planes = work.take("planes", 2, stop - start, columns.n_in)
@@ -60,7 +67,10 @@ def _half_kernels(axis: Axis, dtype: torch.dtype, device: torch.device) -> tuple
 
     The cosine is halved at a sample on the axis, which both halves of the field contain.
     """
-    j, k = centred(axis.n_in, device)[axis.n_in // 2 :], centred(axis.n_out, device)[axis.n_out // 2 :]
+    j, k = (
+        centred(axis.n_in, device)[axis.n_in // 2 :],
+        centred(axis.n_out, device)[axis.n_out // 2 :],
+    )
     angle = radians(torch.outer(k, j).mul_(axis.alpha))
     cosine, sine = angle.cos().to(dtype), angle.sin().mul_(axis.sign).to(dtype)
     if axis.n_in % 2:
@@ -74,7 +84,9 @@ def _fold(field: Tensor, n: int) -> tuple[Tensor, Tensor]:
 
 
 def _unfold(even: Tensor, odd: Tensor, axis: Axis, out: Tensor) -> None:
-    """Write even(k) + i odd(k) and its mirror image to the halves of ``out``; all tensors are (re, im) planes."""
+    """Write even(k) + i odd(k) and its mirror image to the halves of ``out``; all tensors are
+    (re, im) planes.
+    """
     n = axis.n_out
     low = (n + 1) // 2
     mirrored = torch.stack((even[0] + odd[1], even[1] - odd[0]))

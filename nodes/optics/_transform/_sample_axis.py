@@ -11,18 +11,23 @@ Source = Callable[
     [int, int, Tensor], None
 ]  #: fills ``planes`` (2, stop - start, n_in) with rows start..stop of the field
 Sink = Callable[[slice, slice, Tensor], None]
-#: takes a patch (2, ..., columns) of the result, re and im; the dimensions between are the rows, unflattened
+#: takes a patch (2, ..., columns) of the result, re and im; the dimensions between are the rows,
+#: unflattened
 
-LITTLE = 1 / 10  #: share of the work of the first axis, up to which the last axis is transformed in float64
+#: share of the work of the first axis, up to which the last axis is transformed in float64
+LITTLE = 1 / 10
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """An axis of ``U[k] = sum_j P[j] exp(sign 2 pi i alpha (j - j0) (k - k0))``; j0 and k0 are the centres."""
+    """An axis of ``U[k] = sum_j P[j] exp(sign 2 pi i alpha (j - j0) (k - k0))``; j0 and k0 are
+    the centres.
+    """
 
     n_in: int
     n_out: int
-    alpha: float  #: turns per input sample and output sample: pitch times pitch over wavelength and focal length
+    #: turns per input sample and output sample: pitch times pitch over wavelength and focal length
+    alpha: float
     sign: int = -1
 
     def adjoint(self) -> "Axis":
@@ -31,7 +36,9 @@ class Axis:
 
     @property
     def bandwidth(self) -> float:
-        """Return the time-bandwidth product, the number of independent samples that the transform carries."""
+        """Return the time-bandwidth product, the number of independent samples that the
+        transform carries.
+        """
         return self.alpha * self.n_in * self.n_out
 
 
@@ -41,7 +48,9 @@ def centred(n: int, device: torch.device) -> Tensor:
 
 
 def radians(turns: Tensor) -> Tensor:
-    """Return the phase ``turns`` modulo one turn, in radians, so that a cast to float32 is exact to 2e-7 rad."""
+    """Return the phase ``turns`` modulo one turn, in radians, so that a cast to float32 is exact
+    to 2e-7 rad.
+    """
     return (turns - turns.round()).mul_(2 * math.pi)
 
 
@@ -52,11 +61,12 @@ def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def last_type(first: float, last: float, dtype: torch.dtype, little: float = LITTLE) -> torch.dtype:
-    """Return the number type of the transform along the last axis, given the work along the first and the last axis.
+    """Return the number type of the transform along the last axis, given the work along the first
+    and the last axis.
 
-    The type is float64 where this costs little. The round-off of the first axis averages out along the last axis; that
-    of the last axis does not. In float32 the last axis errs by about 2^-24 of the brightest field, which is 1.2e-3 of
-    an intensity that is 1e-8 of the brightest pixel.
+    The type is float64 where this costs little. The round-off of the first axis averages out along
+    the last axis; that of the last axis does not. In float32 the last axis errs by about 2^-24 of
+    the brightest field, which is 1.2e-3 of an intensity that is 1e-8 of the brightest pixel.
     """
     return torch.float64 if last <= little * first else dtype
 

@@ -1,4 +1,6 @@
-"""Reusable buffers: the page faults of a new 100 MB buffer take longer than the transform that fills the buffer."""
+"""Reusable buffers: the page faults of a new 100 MB buffer take longer than the transform that
+fills the buffer.
+"""
 
 import contextlib
 import threading
@@ -15,14 +17,18 @@ _lock = threading.Lock()
 
 
 class Workspace:
-    """Named buffers for one thread at a time; each name returns the same memory, enlarged for larger requests."""
+    """Named buffers for one thread at a time; each name returns the same memory, enlarged for
+    larger requests.
+    """
 
     def __init__(self, dtype: torch.dtype, device: torch.device) -> None:
         self.dtype, self.device = dtype, device
         self._flat: dict[tuple[str, torch.dtype], Tensor] = {}
 
     def take(self, name: str, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
-        """Return an uninitialised buffer; an earlier buffer of the same name and type is overwritten."""
+        """Return an uninitialised buffer; an earlier buffer of the same name and type is
+        overwritten.
+        """
         key = (name, dtype or self.dtype)
         flat, size = self._flat.get(key), prod(shape)
         if flat is None or flat.numel() < size:

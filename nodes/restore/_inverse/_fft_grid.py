@@ -1,4 +1,6 @@
-"""Size of the periodic grid on which a picture is deblurred: unknown pixels around the picture, and fast FFTs."""
+"""Size of the periodic grid on which a picture is deblurred: unknown pixels around the picture,
+and fast FFTs.
+"""
 
 import math
 
@@ -15,12 +17,16 @@ def torus(picture: Size, edge: Size) -> Size:
 
 
 def _smooth(n: int) -> int:
-    """Return the least whole number of at least ``n`` without prime factors above 7, for which FFTs are fast."""
+    """Return the least whole number of at least ``n`` without prime factors above 7, for which
+    FFTs are fast.
+    """
     while 210**32 % n:
         n += 1
     return n
 
 
 def halvings(picture: Size) -> int:
-    """Return how often the grid of a picture is halved until the picture is small enough to be solved exactly."""
+    """Return how often the grid of a picture is halved until the picture is small enough to be
+    solved exactly.
+    """
     return max(0, math.ceil(math.log2(max(picture) / DENSE)))

@@ -1,4 +1,6 @@
-"""What the Wiener filter finds in a picture and knows of it, as maps for a network that goes on from its answer."""
+"""What the Wiener filter finds in a picture and knows of it, as maps for a network that goes on
+from its answer.
+"""
 
 from typing import Annotated, Any
 
@@ -38,21 +40,24 @@ def filter_facts(
     least_doubt: LeastDoubt = 0.0,
     read_noise: Electrons,
 ) -> FilterFacts:
-    """Deconvolve a picture by `restore.wiener`, and map what the filter knows of each pixel and of each frequency.
+    """Deconvolve a picture by `restore.wiener`, and map what the filter knows of each pixel and of
+    each frequency.
 
-    Nine maps of each channel, all without a unit: the answer; the brightness, the answer above black to the power
-    1 / 2.2; the frame y without the glare; the residual y - B x over its noise; the certainty of the pixel of the
-    frame, its inverse noise variance W; 1 where it is not clipped; the pattern of the glare; the variance of what is
-    not known of this pattern; and the deviation, the predicted error of the answer. Wide ranges are compressed by asinh
-    or log. Then, for each of five octaves of frequency from the finest down, one map with the share of the prior's
-    variance that the frame tells: the mean over the octave of S / (S + 1), where S = |OTF|^2 W P with the mean W of the
-    picture and the prior's spectrum P. The square of the deviation has the mean 1 - S / (S + 1) weighted by P, and is
-    larger where the frame tells less.
+    Nine maps of each channel, all without a unit: the answer; the brightness, the answer above
+    black to the power 1 / 2.2; the frame y without the glare; the residual y - B x over its noise;
+    the certainty of the pixel of the frame, its inverse noise variance W; 1 where it is not
+    clipped; the pattern of the glare; the variance of what is not known of this pattern; and the
+    deviation, the predicted error of the answer. Wide ranges are compressed by asinh or log. Then,
+    for each of five octaves of frequency from the finest down, one map with the share of the
+    prior's variance that the frame tells: the mean over the octave of S / (S + 1), where S =
+    |OTF|^2 W P with the mean W of the picture and the prior's spectrum P. The square of the
+    deviation has the mean 1 - S / (S + 1) weighted by P, and is larger where the frame tells less.
 
     Shapes: as `restore.wiener`; maps (9 channels + 5, y, x).
     Units:  as `restore.wiener`; the maps none.
-    Error:  as `restore.wiener`; the deviation leaves out light from beyond the frame and errors of PSF and glare, so
-            that behind masks the true error was 10 to 30 times as large: it orders pixels, no more.
+    Error:  as `restore.wiener`; the deviation leaves out light from beyond the frame and errors of
+            PSF and glare, so that behind masks the true error was 10 to 30 times as large: it
+            orders pixels, no more.
     Raises: ValueError as `restore.wiener`.
     Source: as `restore.wiener`; the maps are ours.
     """
@@ -76,10 +81,15 @@ def facts(scaled: Scaled) -> FilterFacts:
     return FilterFacts(answer, *found, scale, scaled.mean)
 
 
-def maps(seen: Blurred, answer: Tensor, brightness: Tensor, blurred: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the predicted deviation and all maps of an answer, its value above black, and its blur by the camera."""
+def maps(
+    seen: Blurred, answer: Tensor, brightness: Tensor, blurred: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the predicted deviation and all maps of an answer, its value above black, and its
+    blur by the camera.
+    """
     known = (seen.weight > 0).to(answer)
-    root = torch.where(seen.weight > 0, seen.weight, 1.0).sqrt() * known  # the slope of sqrt is infinite at 0
+    # the slope of sqrt is infinite at 0
+    root = torch.where(seen.weight > 0, seen.weight, 1.0).sqrt() * known
     free = len(seen.glare) - seen.bounded
     glare = sum(seen.glare[:free], torch.zeros_like(answer))
     doubt = sum((mode.square() for mode in seen.glare[free:]), torch.zeros_like(answer))
@@ -99,13 +109,17 @@ def maps(seen: Blurred, answer: Tensor, brightness: Tensor, blurred: Tensor) -> 
 
 
 def _predicted(seen: Blurred, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the deviation of the answer from the scene that the filter expects, and a map for each octave.
+    """Return the deviation of the answer from the scene that the filter expects, and a map for each
+    octave.
 
-    The mean square over the frame follows from the share of each frequency that the frame tells. It is divided over
-    the pixels by the inverse of 1 + I, where I is the diagonal of B' W B: a pixel behind a clipped one is less certain.
+    The mean square over the frame follows from the share of each frequency that the frame tells. It
+    is divided over the pixels by the inverse of 1 + I, where I is the diagonal of B' W B: a pixel
+    behind a clipped one is less certain.
     """
     gain = seen.transfer.abs().square() * weight.mean((-2, -1), keepdim=True) * seen.power
-    untold = _whole_mean(seen.power / (1.0 + gain), seen.torus) / _whole_mean(seen.power, seen.torus)
+    untold = _whole_mean(seen.power / (1.0 + gain), seen.torus) / _whole_mean(
+        seen.power, seen.torus
+    )
     information = _information(seen, weight)
     uneven = (1.0 + information.mean((-2, -1), keepdim=True)) / (1.0 + information)
     return (untold * uneven).clamp(1e-6, 1.0).sqrt(), _octaves(gain / (1.0 + gain), seen)
@@ -117,9 +131,13 @@ def _whole_mean(half: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _information(seen: Blurred, weight: Tensor) -> Tensor:
-    """Return the diagonal of B' W B for the blur B: the information of the frame on each pixel of the scene."""
+    """Return the diagonal of B' W B for the blur B: the information of the frame on each pixel
+    of the scene.
+    """
     squared = torch.fft.rfft2(torch.fft.irfft2(seen.transfer, s=seen.torus).square())
-    whole: Tensor = torch.fft.irfft2(squared.conj() * torch.fft.rfft2(weight, s=seen.torus), s=seen.torus)
+    whole: Tensor = torch.fft.irfft2(
+        squared.conj() * torch.fft.rfft2(weight, s=seen.torus), s=seen.torus
+    )
     return whole[..., : seen.picture.shape[-2], : seen.picture.shape[-1]].clamp_min(0.0)
 
 
@@ -128,6 +146,12 @@ def _octaves(shares: Tensor, seen: Blurred) -> Tensor:
     told = shares.mean(0)
     rows = torch.fft.fftfreq(seen.torus[0], dtype=told.dtype, device=told.device)
     columns = torch.fft.rfftfreq(seen.torus[1], dtype=told.dtype, device=told.device)
-    octave = (-torch.hypot(rows[:, None], columns).clamp(1e-9, 0.5).log2() - 1.0).floor().clamp_max(_OCTAVES - 1)
-    means = torch.stack([told[octave == k].mean() if (octave == k).any() else told.mean() for k in range(_OCTAVES)])
+    octave = (
+        (-torch.hypot(rows[:, None], columns).clamp(1e-9, 0.5).log2() - 1.0)
+        .floor()
+        .clamp_max(_OCTAVES - 1)
+    )
+    means = torch.stack(
+        [told[octave == k].mean() if (octave == k).any() else told.mean() for k in range(_OCTAVES)]
+    )
     return means[:, None, None].expand(_OCTAVES, *seen.picture.shape[-2:])

@@ -1,4 +1,6 @@
-"""The blur of a camera as a linear operator, from a scene wider than the frame to the frame, and its adjoint."""
+"""The blur of a camera as a linear operator, from a scene wider than the frame to the frame, and
+its adjoint.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +17,17 @@ from neusee.nodes.values import Bands, Psf
 
 
 class FrameBlur(NamedTuple):
-    """The blur from a scene (..., channel, *scene) to a frame (..., channel, *frame), and the adjoint of this blur.
+    """The blur from a scene (..., channel, *scene) to a frame (..., channel, *frame), and the
+    adjoint of this blur.
 
-    The frame is the middle of the scene. The border of the scene beyond the frame is as wide as the radius that holds
-    99.9 % of the PSF, as in `restore.wiener`. Each pixel of the frame is thus a sum over scene pixels that are unknowns
-    themselves. Light from beyond the border is taken from the opposite side of the scene.
+    The frame is the middle of the scene. The border of the scene beyond the frame is as wide as the
+    radius that holds 99.9 % of the PSF, as in `restore.wiener`. Each pixel of the frame is thus a
+    sum over scene pixels that are unknowns themselves. Light from beyond the border is taken from
+    the opposite side of the scene.
     """
 
-    transfer: Tensor  #: (channel, fy, fx), half the spectrum of the PSF of each channel on the grid of the scene
+    #: (channel, fy, fx), half the spectrum of the PSF of each channel on the grid of the scene
+    transfer: Tensor
     scene: Size
     frame: Size
 
@@ -52,20 +57,27 @@ class FrameBlur(NamedTuple):
         return float(self.transfer.abs().max())
 
     def _transfer(self, like: Tensor) -> Tensor:
-        """Return the transfer function in the precision of a picture, which the result then has too."""
+        """Return the transfer function in the precision of a picture, which the result then has
+        too.
+        """
         return self.transfer.to(like.dtype.to_complex())
 
 
 def frame_blur(
-    psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, frame: Size, dtype: torch.dtype = torch.float32
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    frame: Size,
+    dtype: torch.dtype = torch.float32,
 ) -> FrameBlur:
     """Return the blur of a camera for a grey scene, whose frames have the size ``frame``.
 
     Shapes: psf.intensity (band, any, any), illuminant (band,), responses (channel, band).
-    Units:  scene and frame in one unit: the electrons of a pixel behind a perfect lens without losses, and behind the
-            lens of the PSF.
-    Error:  a grey scene is assumed, as in `restore.wiener`. 0.1 % of the light, and what falls beyond the window of the
-            PSF, comes from the wrong place or from none.
+    Units:  scene and frame in one unit: the electrons of a pixel behind a perfect lens without
+            losses, and behind the lens of the PSF.
+    Error:  a grey scene is assumed, as in `restore.wiener`. 0.1 % of the light, and what falls
+            beyond the window of the PSF, comes from the wrong place or from none.
     Raises: ValueError where the number of bands differs.
     """
     kernels = effective_psf(psf, illuminant, responses, bands, torch.float64)

@@ -1,4 +1,6 @@
-"""The glare of lasers in a picture: strength, variance of the pattern, and other patterns that are as likely."""
+"""The glare of lasers in a picture: strength, variance of the pattern, and other patterns that
+are as likely.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +10,23 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_REACH = (1, 4, 16, 64)  #: pixels; radii of the squares around a pixel, an octave's light of counting alike
+#: pixels; radii of the squares around a pixel, an octave's light of counting alike
+_REACH = (1, 4, 16, 64)
 _ROWS = 64  #: rows of a picture at a time, so that their float64 copies fit in the cache
 
 
 class Glare(NamedTuple):
-    """Patterns of glare whose strengths are unknown, and for some of them other patterns that are as likely."""
+    """Patterns of glare whose strengths are unknown, and for some of them other patterns that
+    are as likely.
+    """
 
     patterns: list[Tensor]  #: (channel, y, x), of maximum 1
     nearby: list[Tensor | None]  #: (pattern, channel, y, x), in the same unit
-    around: list[Tensor] | None = None  #: (channel, y, x), of each pattern; by `with_light_around`, for a doubt
+    #: (channel, y, x), of each pattern; by `with_light_around`, for a doubt
+    around: list[Tensor] | None = None
     peaks: Sequence[float] = ()  #: by which patterns were divided
-    smooth: list[list[Tensor]] | None = None  #: (channel, y, x), of each pattern spread over each radius that is tried
+    #: (channel, y, x), of each pattern spread over each radius that is tried
+    smooth: list[list[Tensor]] | None = None
 
 
 class Light(NamedTuple):
@@ -27,14 +34,19 @@ class Light(NamedTuple):
 
     sum: Tensor  #: (channel, y, x) e-
     variance: Tensor  #: (channel, y, x) e-^2, of each pixel by itself
-    modes: list[Tensor]  #: (channel, y, x) e-; the sum of their outer products is the rest of the covariance
+    #: (channel, y, x) e-; the sum of their outer products is the rest of the covariance
+    modes: list[Tensor]
 
 
 def visible(patterns: Sequence[Tensor], nearby: Sequence[Tensor | None], known: Tensor) -> Glare:
-    """Return the glare patterns that are nonzero at some known pixel, each scaled to a maximum of 1."""
+    """Return the glare patterns that are nonzero at some known pixel, each scaled to a maximum
+    of 1.
+    """
     peaks = [float((pattern.detach().abs() * known).max()) for pattern in patterns]
     seen = [
-        (p / peak, n if n is None else n / peak) for p, n, peak in zip(patterns, nearby, peaks, strict=True) if peak
+        (p / peak, n if n is None else n / peak)
+        for p, n, peak in zip(patterns, nearby, peaks, strict=True)
+        if peak
     ]
     return Glare([p for p, _ in seen], [n for _, n in seen], peaks=[peak for peak in peaks if peak])
 
@@ -47,9 +59,9 @@ def with_light_around(glare: Glare) -> Glare:
 def light_around(pattern: Tensor) -> Tensor:
     """Return the light around each pixel of a pattern (channel, y, x), in its unit.
 
-    The mean over squares of 3, 9, 33 and 129 pixels a side, each over its radius and summed: a point of light spreads
-    as 1 / distance^3, like the rings of a lens and the light that edges, dirt and defocus move. Beyond the picture is
-    no light.
+    The mean over squares of 3, 9, 33 and 129 pixels a side, each over its radius and summed: a
+    point of light spreads as 1 / distance^3, like the rings of a lens and the light that edges,
+    dirt and defocus move. Beyond the picture is no light.
     """
     exact = pattern.double()
     total = sum((square_mean(exact, radius) / radius for radius in _REACH), torch.zeros_like(exact))
@@ -70,11 +82,12 @@ def square_mean(picture: Tensor, radius: int) -> Tensor:
 def doubted(
     electrons: Tensor, known: Tensor, glare: Glare, doubt: float, noise: Callable[[Tensor], Tensor]
 ) -> tuple[Tensor, Light, Tensor]:
-    """Return the weights of pixels, an estimate of the glare, and the mean variance of its pattern by these weights.
+    """Return the weights of pixels, an estimate of the glare, and the mean variance of its pattern
+    by these weights.
 
-    A ``doubt`` above 0 needs the light around the patterns. If they are uncertain, the estimate is made twice: a pixel
-    then weighs noise / (noise + variance of the glare). ``noise`` returns the variance of the noise for the mean of the
-    picture without glare.
+    A ``doubt`` above 0 needs the light around the patterns. If they are uncertain, the estimate is
+    made twice: a pixel then weighs noise / (noise + variance of the glare). ``noise`` returns the
+    variance of the noise for the mean of the picture without glare.
     """
     light = _estimated(electrons, known, glare, doubt)
     if not (doubt or light.modes) or not glare.patterns:
@@ -88,7 +101,9 @@ def doubted(
 
 
 def _estimated(electrons: Tensor, weights: Tensor, glare: Glare, doubt: float) -> Light:
-    """Return the glare whose strengths fit a picture best, and its uncertainty at these strengths."""
+    """Return the glare whose strengths fit a picture best, and its uncertainty at these
+    strengths.
+    """
     dark = torch.zeros_like(electrons)
     fit = strengths(electrons, weights, glare.patterns)
     parts = [strength * pattern for strength, pattern in zip(fit, glare.patterns, strict=True)]
@@ -115,7 +130,9 @@ def average(picture: Tensor, weights: Tensor) -> Tensor:
 
 
 def strengths(electrons: Tensor, weights: Tensor, glare: Sequence[Tensor]) -> Tensor:
-    """Return the strength of each glare pattern by a weighted least-squares fit of all patterns and a constant."""
+    """Return the strength of each glare pattern by a weighted least-squares fit of all patterns
+    and a constant.
+    """
     if not glare:
         return electrons.new_zeros(0)
     means = [average(pattern, weights) for pattern in glare]

@@ -1,4 +1,6 @@
-"""What the channels of a sensor see of a grey scene: the PSF of each, shares of the bands, and the white."""
+"""What the channels of a sensor see of a grey scene: the PSF of each, shares of the bands, and
+the white.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +12,28 @@ from neusee.nodes.values import Bands, Psf
 
 
 def effective_psf(
-    psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, dtype: torch.dtype = torch.float32
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Return the PSF of each channel of the sensor for a grey scene, (channel, y, x), in the more precise of the types
-    of the PSF and ``dtype``.
+    """Return the PSF of each channel of the sensor for a grey scene, (channel, y, x), in the more
+    precise of the types of the PSF and ``dtype``.
     """
     lengths = {len(psf.intensity), len(illuminant), responses.shape[-1], len(bands.centres)}
     if len(lengths) > 1:
-        raise ValueError(f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: use one `bands` step")
+        raise ValueError(
+            f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: use one `bands`"
+            " step"
+        )
     intensity = single(psf.intensity)
     shares = grey_shares(illuminant, responses, bands).to(intensity.device)
     if torch.promote_types(intensity.dtype, dtype) == intensity.dtype:
         whole: Tensor = torch.tensordot(shares.to(intensity), intensity, 1)
         return whole
-    planes = zip(shares.to(dtype).T, intensity, strict=True)  # band by band, without a copy of all bands
+    # band by band, without a copy of all bands
+    planes = zip(shares.to(dtype).T, intensity, strict=True)
     seen = torch.zeros(len(shares), *intensity.shape[-2:], dtype=dtype, device=intensity.device)
     for share, plane in planes:
         seen = seen + share[:, None, None] * plane.to(dtype)
@@ -31,7 +41,9 @@ def effective_psf(
 
 
 def grey_shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """Return the share of each band in the signal of each channel from a grey scene: (channel, band), float64."""
+    """Return the share of each band in the signal of each channel from a grey scene: (channel,
+    band), float64.
+    """
     share = responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()
     blind = share.sum(-1, keepdim=True) <= 0  # a channel without response gets equal shares
     share = share.where(~blind, 1.0)
@@ -39,6 +51,8 @@ def grey_shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
 
 
 def grey_white(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """Return what each channel sees of a grey scene, (channel, 1, 1) float64, over what the best channel sees."""
+    """Return what each channel sees of a grey scene, (channel, 1, 1) float64, over what the best
+    channel sees.
+    """
     light = (responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()).sum(-1)
     return (light / light.max().clamp_min(1e-30)).clamp_min(1e-3)[:, None, None]

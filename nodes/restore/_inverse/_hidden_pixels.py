@@ -1,10 +1,11 @@
 """The most likely picture before a blur, given only some pixels of the blurred picture.
 
-Linear least squares with a Gaussian prior (Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005,
-ch. 3), in which pixels beyond the edge are as unknown as pixels within. Light from beyond the edge mixes with the seen
-light, so conjugate gradients converge too slowly from a bad start. The problem is therefore solved exactly on a coarse
-grid, each finer grid starts from the solution of the coarser grid, and on the coarser grids each step also solves the
-lowest frequencies exactly.
+Linear least squares with a Gaussian prior (Kaipio and Somersalo, Statistical and Computational
+Inverse Problems, 2005, ch. 3), in which pixels beyond the edge are as unknown as pixels within.
+Light from beyond the edge mixes with the seen light, so conjugate gradients converge too slowly
+from a bad start. The problem is therefore solved exactly on a coarse grid, each finer grid starts
+from the solution of the coarser grid, and on the coarser grids each step also solves the lowest
+frequencies exactly.
 """
 
 from __future__ import annotations
@@ -17,24 +18,43 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from neusee.nodes.restore._inverse._conjugate_gradients import LOWEST, Preconditioner, descend, inner, pieces
+from neusee.nodes.restore._inverse._conjugate_gradients import (
+    LOWEST,
+    Preconditioner,
+    descend,
+    inner,
+    pieces,
+)
 from neusee.nodes.restore._inverse._fft_grid import halvings
-from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, mixed, narrowed, variance, widened
+from neusee.nodes.restore._inverse._masked_blur import (
+    Blurred,
+    Size,
+    mixed,
+    narrowed,
+    variance,
+    widened,
+)
 from neusee.nodes.torch_func import transformed
 
-STEPS = 20  #: the most steps on the finest grid; each coarser grid may take four times as many, up to MOST
+#: the most steps on the finest grid; each coarser grid may take four times as many, up to MOST
+STEPS = 20
 MOST = 100
-ENOUGH = 1e-6  #: squared distance for each seen pixel, in units of the posterior, at which the iteration ends. The
-#: residual underestimates this distance by a factor of 10 to 30, because it underestimates the slowest modes
-_NOISELESS = 1e10  #: norm of the covariance of the scene over that of the noise, whose rounding is 1e-6 of the noise
+#: squared distance for each seen pixel, in units of the posterior, at which the iteration ends. The
+ENOUGH = 1e-6
+#: residual underestimates this distance by a factor of 10 to 30, because it underestimates the
+#: slowest modes
+#: norm of the covariance of the scene over that of the noise, whose rounding is 1e-6 of the noise
+_NOISELESS = 1e10
 _ONCE = "the deconvolution has no second derivative: differentiate without create_graph=True"
 CAREFUL = 8.0  #: factor by which the tolerance falls with each coarser grid, whose steps are cheap
 
 
 class Inverses:
-    """What solves the grids of a deconvolution and depends on no pixel of the picture: for several pictures of it.
+    """What solves the grids of a deconvolution and depends on no pixel of the picture: for several
+    pictures of it.
 
-    The preconditioners of grids beyond `LOWEST` pixels a side are large and cheap to make, and are not kept.
+    The preconditioners of grids beyond `LOWEST` pixels a side are large and cheap to make, and are
+    not kept.
     """
 
     def __init__(self) -> None:
@@ -57,12 +77,18 @@ class Inverses:
 
 
 def most_likely(
-    seen: Blurred, steps: int = STEPS, enough: float = ENOUGH, coarser: bool = True, inverses: Inverses | None = None
+    seen: Blurred,
+    steps: int = STEPS,
+    enough: float = ENOUGH,
+    coarser: bool = True,
+    inverses: Inverses | None = None,
 ) -> Tensor:
-    """Return half the spectrum of the most likely picture before the blur, given the seen pixels and the prior.
+    """Return half the spectrum of the most likely picture before the blur, given the seen pixels
+    and the prior.
 
-    Without ``coarser`` grids the steps start from a picture without contrast, which suits a narrow PSF alone.
-    ``inverses`` are those of a problem that differs in the picture alone; missing ones are made and added.
+    Without ``coarser`` grids the steps start from a picture without contrast, which suits a narrow
+    PSF alone. ``inverses`` are those of a problem that differs in the picture alone; missing ones
+    are made and added.
     """
     inverses = inverses or Inverses()
     tensors = (seen.picture, seen.weight, seen.transfer, *seen.glare)
@@ -87,9 +113,13 @@ def most_likely(
 
 def fixed(seen: Blurred) -> Blurred:
     """Return the problem without gradients and tangents."""
-    parts = {name: getattr(seen, name).detach() for name in ("picture", "weight", "transfer", "power")}
+    parts = {
+        name: getattr(seen, name).detach() for name in ("picture", "weight", "transfer", "power")
+    }
     held = None if seen.held is None else seen.held.detach()
-    return replace(seen, **parts, glare=tuple(pattern.detach() for pattern in seen.glare), held=held)
+    return replace(
+        seen, **parts, glare=tuple(pattern.detach() for pattern in seen.glare), held=held
+    )
 
 
 class _Frame(NamedTuple):
@@ -102,7 +132,9 @@ class _Frame(NamedTuple):
 
 
 class _Followed(torch.autograd.Function):
-    """The deconvolved picture as a function of the residual of the linear problem, which carries all derivatives."""
+    """The deconvolved picture as a function of the residual of the linear problem, which carries
+    all derivatives.
+    """
 
     @staticmethod
     def forward(answer: Tensor, rest: Tensor, frame: _Frame, *fixed: Tensor) -> Tensor:
@@ -125,15 +157,29 @@ class _Followed(torch.autograd.Function):
 
 
 class _Solved(torch.autograd.Function):
-    """The solution of the linear problem for a given right side, with which forward and reverse mode differentiate."""
+    """The solution of the linear problem for a given right side, with which forward and reverse
+    mode differentiate.
+    """
 
     @staticmethod
     def forward(right: Tensor, frame: _Frame, *fixed: Tensor) -> Tensor:
         lower, weight, transfer, power, *glare = fixed
         pull, nothing = torch.fft.rfft2(right), torch.zeros_like(weight)
-        seen = Blurred(nothing, weight, transfer, power, frame.torus, frame.grey, tuple(glare), pull, frame.bounded)
+        seen = Blurred(
+            nothing,
+            weight,
+            transfer,
+            power,
+            frame.torus,
+            frame.grey,
+            tuple(glare),
+            pull,
+            frame.bounded,
+        )
         enough = 1e-10 * float(inner(pull, _spread(seen, pull), seen.torus))
-        solution: Tensor = torch.fft.irfft2(_solved(seen, lower, frame.steps, enough, Inverses()), s=seen.torus)
+        solution: Tensor = torch.fft.irfft2(
+            _solved(seen, lower, frame.steps, enough, Inverses()), s=seen.torus
+        )
         return solution
 
     @staticmethod
@@ -150,7 +196,9 @@ class _Solved(torch.autograd.Function):
 
 
 def _solved(seen: Blurred, lower: Tensor, steps: int, enough: float, inverses: Inverses) -> Tensor:
-    """Solve a small problem exactly with the Cholesky factor `lower` of its matrix, and a larger problem by steps."""
+    """Solve a small problem exactly with the Cholesky factor `lower` of its matrix, and a larger
+    problem by steps.
+    """
     return _by_factor(seen, lower) if lower.numel() else _nested(seen, steps, enough, inverses)
 
 
@@ -158,7 +206,9 @@ def _nested(seen: Blurred, steps: int, enough: float, inverses: Inverses) -> Ten
     if not halvings(_size(seen)):
         return _by_factor(seen, inverses.factor(seen))
     coarse = halved(seen)
-    start = widened(_nested(coarse, min(4 * steps, MOST), enough / CAREFUL, inverses), coarse.torus, seen.torus)
+    start = widened(
+        _nested(coarse, min(4 * steps, MOST), enough / CAREFUL, inverses), coarse.torus, seen.torus
+    )
     return descend(seen, start, steps, enough, inverses.preconditioner(seen))
 
 
@@ -168,14 +218,22 @@ def _size(seen: Blurred) -> Size:
 
 
 def halved(seen: Blurred) -> Blurred:
-    """Return the deconvolution problem on pixels twice as wide, where lost variance of the picture counts as noise."""
+    """Return the deconvolution problem on pixels twice as wide, where lost variance of the
+    picture counts as noise.
+    """
     weight = _pooled(seen.weight)
-    picture, *glare = (_pooled(seen.weight * p) / weight.clamp_min(1e-30) for p in (seen.picture, *seen.glare))
+    picture, *glare = (
+        _pooled(seen.weight * p) / weight.clamp_min(1e-30) for p in (seen.picture, *seen.glare)
+    )
     size = (seen.torus[0] // 2, seen.torus[1] // 2)
     y_mean, x_mean = (_pooling(n, seen.transfer) for n in seen.torus)
     lost = seen.power.new_zeros(len(seen.transfer))
     for rows in pieces(seen.transfer):
-        passed = seen.power[rows] * y_mean[rows, None].abs().square() * x_mean[: seen.transfer.shape[-1]].abs().square()
+        passed = (
+            seen.power[rows]
+            * y_mean[rows, None].abs().square()
+            * x_mean[: seen.transfer.shape[-1]].abs().square()
+        )
         through = seen.transfer[:, rows]
         lost = lost + variance((through.real.square() + through.imag.square()) * passed, seen.torus)
     up, right = (size[0] + 1) // 2, size[1] // 2 + 1
@@ -185,9 +243,15 @@ def halved(seen: Blurred) -> Blurred:
     lost = (lost - variance(transfer.abs().square() * power, size)).clamp_min(0.0)[:, None, None]
     pull = None if seen.pull is None else narrowed(seen.pull, size)
     return replace(
-        seen, picture=picture, weight=weight / (1.0 + weight * lost), transfer=transfer, power=power, torus=size,
-        glare=tuple(glare), pull=pull,
-    )  # fmt: skip
+        seen,
+        picture=picture,
+        weight=weight / (1.0 + weight * lost),
+        transfer=transfer,
+        power=power,
+        torus=size,
+        glare=tuple(glare),
+        pull=pull,
+    )
 
 
 def _pooled(pixels: Tensor) -> Tensor:
@@ -197,21 +261,30 @@ def _pooled(pixels: Tensor) -> Tensor:
 
 
 def _pooling(size: int, like: Tensor) -> Tensor:
-    """Return the transfer function of the mean of two neighbouring pixels along an axis of `size` pixels."""
+    """Return the transfer function of the mean of two neighbouring pixels along an axis of
+    `size` pixels.
+    """
     turns = torch.arange(size, dtype=torch.float64, device=like.device) / size
     turns = torch.where(turns > 0.5, turns - 1.0, turns)
     return ((1.0 + torch.exp(2j * math.pi * turns)) / 2.0).to(like)
 
 
 def _factor(seen: Blurred) -> Tensor:
-    """Return the Cholesky factor, in float64, of the whitened covariance of the seen pixels of a small picture.
+    """Return the Cholesky factor, in float64, of the whitened covariance of the seen pixels of a
+    small picture.
 
-    The noise has the covariance 1. Rounding of the covariance of the scene acts as further noise of 1e-16 of its norm,
-    so that a picture with less noise than that has the factor of a square root of the covariance: ten times slower.
+    The noise has the covariance 1. Rounding of the covariance of the scene acts as further noise of
+    1e-16 of its norm, so that a picture with less noise than that has the factor of a square root
+    of the covariance: ten times slower.
     """
     fine, root, colours = _fine(seen), _root(seen), _colours(seen)
-    rows = [torch.cat([colours[i, j] * _covariance(fine, a * b.conj()) for j, b in enumerate(fine.transfer)], 1)
-            for i, a in enumerate(fine.transfer)]  # fmt: skip
+    rows = [
+        torch.cat(
+            [colours[i, j] * _covariance(fine, a * b.conj()) for j, b in enumerate(fine.transfer)],
+            1,
+        )
+        for i, a in enumerate(fine.transfer)
+    ]
     matrix = root[:, None] * torch.cat(rows) * root
     patterns = _spread_patterns(seen)
     if float(matrix.detach().abs().sum(-1).max()) > _NOISELESS:
@@ -224,16 +297,20 @@ def _factor(seen: Blurred) -> Tensor:
 
 
 def _factor_of_root(fine: Blurred, patterns: list[Tensor]) -> Tensor:
-    """Return the Cholesky factor of A A^T + 1 by QR decompositions of [A 1]^T, without the product A A^T.
+    """Return the Cholesky factor of A A^T + 1 by QR decompositions of [A 1]^T, without the product
+    A A^T.
 
-    A (seen pixel, unknown) is the response of the whitened pixels to independent unknowns: those of the scene, channel
-    by channel, and the strengths of the glare ``patterns``. The factor has the rounding of A, not that of its square.
+    A (seen pixel, unknown) is the response of the whitened pixels to independent unknowns: those of
+    the scene, channel by channel, and the strengths of the glare ``patterns``. The factor has the
+    rounding of A, not that of its square.
     """
     root, mixing = _root(fine), torch.linalg.cholesky(_colours(fine))
     responses = [_response(fine, transfer) for transfer in fine.transfer]
     upper = torch.eye(len(root), dtype=root.dtype, device=root.device)
     for shares in mixing.T:
-        columns = torch.cat([share * response for share, response in zip(shares, responses, strict=True)])
+        columns = torch.cat(
+            [share * response for share, response in zip(shares, responses, strict=True)]
+        )
         upper = torch.linalg.qr(torch.cat([upper, (root[:, None] * columns).T]), mode="r").R
     if patterns:
         upper = torch.linalg.qr(torch.cat([upper, torch.stack(patterns)]), mode="r").R
@@ -242,7 +319,9 @@ def _factor_of_root(fine: Blurred, patterns: list[Tensor]) -> Tensor:
 
 
 def _response(seen: Blurred, transfer: Tensor) -> Tensor:
-    """Return the blurred pixels of a channel for a unit of each independent unknown of the prior, (pixel, unknown)."""
+    """Return the blurred pixels of a channel for a unit of each independent unknown of the
+    prior, (pixel, unknown).
+    """
     impulse = torch.fft.irfft2(transfer * seen.power.sqrt(), s=seen.torus)
     y, x = (torch.arange(count, device=impulse.device) for count in _size(seen))
     v, u = (torch.arange(count, device=impulse.device) for count in seen.torus)
@@ -255,12 +334,16 @@ def _response(seen: Blurred, transfer: Tensor) -> Tensor:
 def _colours(seen: Blurred) -> Tensor:
     """Return the correlations of the channels of the scene."""
     channels = len(seen.picture)
-    colours = torch.full((channels, channels), seen.grey, dtype=torch.float64, device=seen.weight.device)
+    colours = torch.full(
+        (channels, channels), seen.grey, dtype=torch.float64, device=seen.weight.device
+    )
     return colours.fill_diagonal_(1.0)
 
 
 def _spread_patterns(seen: Blurred) -> list[Tensor]:
-    """Return the whitened glare patterns (pixel,), times the standard deviation of their strengths."""
+    """Return the whitened glare patterns (pixel,), times the standard deviation of their
+    strengths.
+    """
     root, patterns = _root(seen), []
     for number, pattern in enumerate(seen.glare):
         shape = root * pattern.double().flatten()
@@ -270,12 +353,20 @@ def _spread_patterns(seen: Blurred) -> list[Tensor]:
 
 
 def _by_factor(seen: Blurred, lower: Tensor) -> Tensor:
-    """Return the exact deconvolution of a small picture, given the factor of its matrix that `_factor` returns."""
+    """Return the exact deconvolution of a small picture, given the factor of its matrix that
+    `_factor` returns.
+    """
     fine, root = _fine(seen), _root(seen)
-    before = torch.zeros_like(fine.transfer) if seen.pull is None else _spread(fine, seen.pull.to(torch.complex128))
+    before = (
+        torch.zeros_like(fine.transfer)
+        if seen.pull is None
+        else _spread(fine, seen.pull.to(torch.complex128))
+    )
     residual = (root * (seen.picture.double() - fine.blur(before)).flatten())[:, None]
     answer = root * torch.cholesky_solve(residual, lower)[:, 0]
-    return (before + _spread(fine, fine.gathered(answer.reshape(seen.picture.shape)))).to(seen.transfer)
+    return (before + _spread(fine, fine.gathered(answer.reshape(seen.picture.shape)))).to(
+        seen.transfer
+    )
 
 
 def _fine(seen: Blurred) -> Blurred:
@@ -284,11 +375,14 @@ def _fine(seen: Blurred) -> Blurred:
 
 def _root(seen: Blurred) -> Tensor:
     weight = seen.weight.double().flatten()
-    return weight.where(weight > 0, 1.0).sqrt().where(weight > 0, 0.0)  # the gradient of sqrt is infinite at 0
+    # the gradient of sqrt is infinite at 0
+    return weight.where(weight > 0, 1.0).sqrt().where(weight > 0, 0.0)
 
 
 def _covariance(seen: Blurred, passed: Tensor) -> Tensor:
-    """Return the prior covariance of all pairs of picture pixels, given the product of two transfer functions."""
+    """Return the prior covariance of all pairs of picture pixels, given the product of two
+    transfer functions.
+    """
     lags = torch.fft.irfft2(passed * seen.power, s=seen.torus)
     y, x = (torch.arange(n, device=lags.device) for n in seen.picture.shape[-2:])
     down, right = (y[:, None] - y) % seen.torus[0], (x[:, None] - x) % seen.torus[1]

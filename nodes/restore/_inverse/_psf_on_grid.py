@@ -12,7 +12,9 @@ _LIGHT = 0.999  #: share of the light that the unknown border around the picture
 
 
 def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
-    """Return the radii (y, x) that hold 99.9 % of the PSF, at most the larger of 256 pixels and half the picture."""
+    """Return the radii (y, x) that hold 99.9 % of the PSF, at most the larger of 256 pixels and
+    half the picture.
+    """
     reach = []
     for dim, size in ((-1, picture[0]), (-2, picture[1])):
         profile = kernels.detach().sum((0, dim)).double()
@@ -23,12 +25,16 @@ def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
 
 
 def bordered(reach: tuple[int, int], border: float) -> tuple[int, int]:
-    """Return the width (y, x) of the unknown border around a picture, ``border`` times the reach of the PSF."""
+    """Return the width (y, x) of the unknown border around a picture, ``border`` times the reach
+    of the PSF.
+    """
     return math.ceil(border * reach[0]), math.ceil(border * reach[1])
 
 
 def wrapped(kernels: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return PSFs centred on the first sample of a periodic grid; a PSF wider than the grid wraps around."""
+    """Return PSFs centred on the first sample of a periodic grid; a PSF wider than the grid
+    wraps around.
+    """
     (m, n), (y, x) = kernels.shape[-2:], size
     rows, columns = -(-m // y), -(-n // x)
     around = pad(kernels, (0, columns * x - n, 0, rows * y - m))

@@ -1,4 +1,6 @@
-"""Richardson-Lucy deconvolution with a known PSF, for scenes with lamps much brighter than the rest."""
+"""Richardson-Lucy deconvolution with a known PSF, for scenes with lamps much brighter than the
+rest.
+"""
 
 import math
 from typing import Annotated, Any
@@ -17,9 +19,13 @@ from neusee.nodes.sensor._digitization import crop
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf
 
-_UNSEEN = 1e-3  #: share of the light of a scene pixel that reaches known pixels, below which the share counts as this
+#: share of the light of a scene pixel that reaches known pixels, below which the share counts as
+#: this
+_UNSEEN = 1e-3
 _DARK = 1e-6  #: e-, least expected count, because the expectation is a divisor
-_GONE = 1e-30  #: e-, light below which a scene pixel stays dark; its gradient would grow with each step and overflow
+#: e-, light below which a scene pixel stays dark; its gradient would grow with each step and
+#: overflow
+_GONE = 1e-30
 
 
 @node(rtol=3e-4, additive_inputs=[("glare",), ("ghosts",)])
@@ -36,24 +42,28 @@ def richardson_lucy(
     iterations: Annotated[int, Field(ge=1, le=1000)] = 40,
     read_noise: Electrons,
 ) -> Tensor:
-    """Deconvolve a picture with a known PSF: approach the most likely scene without negative light, step by step.
+    """Deconvolve a picture with a known PSF: approach the most likely scene without negative light,
+    step by step.
 
-    Each step multiplies the scene by the blurred ratio of the picture to the picture that the scene would give, which
-    raises the likelihood of Poisson counts. The scene stays nonnegative, so that no dark ring can balance the glare of
-    a lamp, as it does in `restore.wiener`. Few steps keep the result smooth. The variance of the read noise is added to
-    the counts. Clipped pixels, and the border beyond the edge, are unknown, and so is the strength of each pattern of
-    ``glare`` and ``ghosts``, as in `restore.wiener`.
+    Each step multiplies the scene by the blurred ratio of the picture to the picture that the scene
+    would give, which raises the likelihood of Poisson counts. The scene stays nonnegative, so that
+    no dark ring can balance the glare of a lamp, as it does in `restore.wiener`. Few steps keep the
+    result smooth. The variance of the read noise is added to the counts. Clipped pixels, and the
+    border beyond the edge, are unknown, and so is the strength of each pattern of ``glare`` and
+    ``ghosts``, as in `restore.wiener`.
 
-    Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses (channel, band),
-            each glare and ghost (channel, at least y, at least x), cropped to the centre -> (channel, y, x).
+    Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses
+            (channel, band), each glare and ghost (channel, at least y, at least x), cropped to the
+            centre -> (channel, y, x).
     Units:  e-; glare any; the result as behind a perfect lens without losses.
-    Error:  a grey scene is assumed. The number of steps decides between blur and noise, and is no convergence: more
-            steps restore finer detail and more noise. Without such lamps `restore.wiener` leaves less error.
-            float32: 1e-5 of the brightest pixel after 40 steps, and 3e-4 at pixels of which 1e-3 of the light is seen,
-            where the rounding of a Fourier transform, 1e-7, counts a thousandfold.
+    Error:  a grey scene is assumed. The number of steps decides between blur and noise, and is no
+            convergence: more steps restore finer detail and more noise. Without such lamps
+            `restore.wiener` leaves less error. float32: 1e-5 of the brightest pixel after 40 steps,
+            and 3e-4 at pixels of which 1e-3 of the light is seen, where the rounding of a Fourier
+            transform, 1e-7, counts a thousandfold.
     Raises: ValueError where shapes or bands differ, and for pictures and PSFs that are not finite.
-    Source: Richardson, J. Opt. Soc. Am. 62, 55 (1972); Lucy, Astron. J. 79, 745 (1974); read noise as in Snyder,
-            Hammoud and White, J. Opt. Soc. Am. A 10, 1014 (1993).
+    Source: Richardson, J. Opt. Soc. Am. 62, 55 (1972); Lucy, Astron. J. 79, 745 (1974); read noise
+            as in Snyder, Hammoud and White, J. Opt. Soc. Am. A 10, 1014 (1993).
     """
     electrons = single(electrons)
     glare = [*(glare or ()), *(ghosts or ())]
@@ -66,7 +76,8 @@ def richardson_lucy(
     wide = torus(size, edge(kernels, size))
     total = kernels.sum((-2, -1), keepdim=True)
     total = torch.where(total > 0, total, 1.0)
-    transfer = torch.fft.rfft2(wrapped(kernels / total, wide))  # of sum 1, so that no scale of the PSF overflows
+    # of sum 1, so that no scale of the PSF overflows
+    transfer = torch.fft.rfft2(wrapped(kernels / total, wide))
     return _climb(electrons, known, transfer, wide, patterns, iterations, read_noise**2) / total
 
 
@@ -74,11 +85,18 @@ def richardson_lucy(
 def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: Any) -> list[Check]:
     share = float(inputs[4].any(-3).double().mean())
     ratio = float(result.mean() / electrons.mean())
-    return [Check(f"{share:.2%} of pixels clipped, restored mean {ratio:.2f} of raw mean", math.isfinite(ratio))]
+    return [
+        Check(
+            f"{share:.2%} of pixels clipped, restored mean {ratio:.2f} of raw mean",
+            math.isfinite(ratio),
+        )
+    ]
 
 
 def _known(clipped: Tensor, like: Tensor) -> Tensor:
-    """Return 1 for each pixel that is not clipped and 0 for the others; a channel without known pixels has only 1."""
+    """Return 1 for each pixel that is not clipped and 0 for the others; a channel without known
+    pixels has only 1.
+    """
     known = (~clipped).to(like)
     return torch.where(known.amax((-2, -1), keepdim=True) > 0, known, 1.0)
 
@@ -96,7 +114,9 @@ def _climb(
     y, x = electrons.shape[-2:]
 
     def seen_from(pixels: Tensor) -> Tensor:
-        gathered: Tensor = torch.fft.irfft2(transfer.conj() * torch.fft.rfft2(pixels, s=wide), s=wide)
+        gathered: Tensor = torch.fft.irfft2(
+            transfer.conj() * torch.fft.rfft2(pixels, s=wide), s=wide
+        )
         return gathered
 
     counts = (electrons + variance).clamp_min(0) * known
@@ -105,10 +125,16 @@ def _climb(
     share = seen_from(known).clamp_min(_UNSEEN)
     strengths = [mean.mean().clamp_min(0) for _ in patterns]
     for _ in range(iterations):
-        expected = torch.fft.irfft2(transfer * torch.fft.rfft2(scene), s=wide)[..., :y, :x].clamp_min(0) + variance
+        expected = (
+            torch.fft.irfft2(transfer * torch.fft.rfft2(scene), s=wide)[..., :y, :x].clamp_min(0)
+            + variance
+        )
         for strength, pattern in zip(strengths, patterns, strict=True):
             expected = expected + strength * pattern
         ratio = counts / expected.clamp_min(_DARK)
         scene = torch.where(scene <= _GONE, 0.0, scene * (seen_from(ratio) / share).clamp_min(0))
-        strengths = [s * (p * ratio).sum() / (p * known).sum() for s, p in zip(strengths, patterns, strict=True)]
+        strengths = [
+            s * (p * ratio).sum() / (p * known).sum()
+            for s, p in zip(strengths, patterns, strict=True)
+        ]
     return scene[..., :y, :x]

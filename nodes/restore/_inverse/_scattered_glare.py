@@ -1,9 +1,11 @@
-"""The glare of a laser behind a lens that is not quite its recipe's: part of its light is scattered around it.
+"""The glare of a laser behind a lens that is not quite its recipe's: part of its light is scattered
+around it.
 
-Dirt, edges and defocus take light out of a pattern and spread it over some pixels (defocus, edges) or many (grains of
-dirt, each like a hole of its size). Laser light is coherent: where scattered light of mean d meets light c of the
-pattern, the intensity has the mean c + d and the variance d^2 + 2 c d, speckle. Smooth light may be scene, speckle is
-not, and it has the colour of the laser: speckle tells how much is scattered.
+Dirt, edges and defocus take light out of a pattern and spread it over some pixels (defocus, edges)
+or many (grains of dirt, each like a hole of its size). Laser light is coherent: where scattered
+light of mean d meets light c of the pattern, the intensity has the mean c + d and the variance d^2
++ 2 c d, speckle. Smooth light may be scene, speckle is not, and it has the colour of the laser:
+speckle tells how much is scattered.
 Source: Goodman, Speckle Phenomena in Optics, 2007, ch. 3 (speckle with a known phasor).
 """
 
@@ -21,13 +23,19 @@ from neusee.nodes.restore._inverse._glare import Glare, Light, average, square_m
 
 RADII = (4, 16, 64)  #: pixels, over which light is scattered
 _TIMES = 3  #: running means one after another, which are nearly a Gaussian
-_SHARES = (0.1, 0.01, 0.02)  #: of the light of a pattern, scattered over each radius, in the median of lenses
+#: of the light of a pattern, scattered over each radius, in the median of lenses
+_SHARES = (0.1, 0.01, 0.02)
 _FACTORS = (3.0, 3.0, 2.0)  #: of one standard deviation of these shares
 _STRENGTH = 0.5  #: standard deviation of the logarithm of a strength that was found
-_SHARP = 0.5  #: part of the variance of speckle two pixels wide that differs from the mean of the 3 x 3 pixels around
-_ALIKE = 4.0  #: pixels that share a grain of speckle, so that a likelihood of pixels counts too much
-_GRAINY = 2.0  #: variance of a pixel over that of its speckle, because grains of speckle are wider than pixels
-_SMOOTH, _SIZE = 1.0, 0.3  #: standard deviations of scattered light and of a pattern, over their light
+#: part of the variance of speckle two pixels wide that differs from the mean of the 3 x 3 pixels
+#: around
+_SHARP = 0.5
+#: pixels that share a grain of speckle, so that a likelihood of pixels counts too much
+_ALIKE = 4.0
+#: variance of a pixel over that of its speckle, because grains of speckle are wider than pixels
+_GRAINY = 2.0
+#: standard deviations of scattered light and of a pattern, over their light
+_SMOOTH, _SIZE = 1.0, 0.3
 _COLOUR = 0.1  #: variance of speckle that differs between channels, over that of all
 _BRIGHT = 0.01  #: probability that something else than the patterns fills a pixel
 _SAMPLE = 1 << 15  #: pixels of a frame that tell of speckle
@@ -38,13 +46,16 @@ _EVALUATIONS = 160  #: of the likelihood
 def scattered(
     electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
 ) -> tuple[Tensor, Light, Tensor]:
-    """Return what `doubted` returns, for glare in electrons of which a part that the picture tells is scattered."""
+    """Return what `doubted` returns, for glare in electrons of which a part that the picture
+    tells is scattered.
+    """
     if glare.smooth is None:
         glare = with_smooth(glare)
     strength, *shares = _likeliest(electrons, known, glare, noise)
     light = _light(glare, strength, shares)
     total = sum((mode.square() for mode in light.modes), light.variance)
-    known = torch.where(known.amax((-2, -1), keepdim=True) > 0, known, 1.0)  # a channel without known pixels has a mean
+    # a channel without known pixels has a mean
+    known = torch.where(known.amax((-2, -1), keepdim=True) > 0, known, 1.0)
     trusted = known
     for _ in range(2):
         own = noise(average(electrons - light.sum, trusted))
@@ -52,7 +63,9 @@ def scattered(
     return trusted, light, average(total, trusted)
 
 
-def speckle(electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]) -> Tensor:
+def speckle(
+    electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
+) -> Tensor:
     """Return the variance of each pixel by the likeliest speckle of glare: (channel, y, x) e-^2."""
     if not glare.patterns:
         return torch.zeros_like(electrons)
@@ -63,7 +76,9 @@ def speckle(electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Ten
 
 def with_smooth(glare: Glare) -> Glare:
     """Return the glare with each of its patterns spread over each of the `RADII`."""
-    return glare._replace(smooth=[[_spread(pattern, radius) for radius in RADII] for pattern in glare.patterns])
+    return glare._replace(
+        smooth=[[_spread(pattern, radius) for radius in RADII] for pattern in glare.patterns]
+    )
 
 
 def _spread(pattern: Tensor, radius: int) -> Tensor:
@@ -75,7 +90,9 @@ def _spread(pattern: Tensor, radius: int) -> Tensor:
 
 
 def _light(glare: Glare, strength: float, shares: Sequence[float]) -> Light:
-    """Return the light of all patterns, with its uncertainty, if ``shares`` of each are scattered."""
+    """Return the light of all patterns, with its uncertainty, if ``shares`` of each are
+    scattered.
+    """
     total = variance = torch.zeros_like(glare.patterns[0])
     modes: list[Tensor] = []
     found = zip(glare.patterns, glare.peaks, glare.nearby, glare.smooth or (), strict=True)
@@ -83,18 +100,22 @@ def _light(glare: Glare, strength: float, shares: Sequence[float]) -> Light:
         straight = strength * peak * pattern
         each = [share * peak * wide for share, wide in zip(shares, smooth, strict=True)]
         wide = sum(each, torch.zeros_like(pattern))
-        total, variance = total + straight + wide, variance + _GRAINY * (wide.square() + 2.0 * straight * wide)
+        total, variance = (
+            total + straight + wide,
+            variance + _GRAINY * (wide.square() + 2.0 * straight * wide),
+        )
         modes += [_SMOOTH * x for x in each] + [_SIZE * straight]
         if others is not None:
             modes += [strength * peak * (other - pattern) / len(others) ** 0.5 for other in others]
     return Light(total, variance, modes)
 
 
-# --- what a picture tells of the shares -------------------------------------------------------------------------------
+# --- what a picture tells of the shares -----------------------------------------------------------
 
 
 class _Pixels(NamedTuple):
-    """Pixels that are known with all around them, one a column: of all channels (channel, pixel) or of any (1, pixel).
+    """Pixels that are known with all around them, one a column: of all channels (channel, pixel) or
+    of any (1, pixel).
 
     Sharp pictures lack the mean of the 3 x 3 pixels around.
     """
@@ -115,8 +136,12 @@ class _Hidden(NamedTuple):
     channel: Tensor  #: (pixel,), the row of `_Pixels`
 
 
-def _likeliest(electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]) -> tuple[float, ...]:
-    """Return the strength of the patterns over that told, and the share scattered over each radius: the likeliest."""
+def _likeliest(
+    electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
+) -> tuple[float, ...]:
+    """Return the strength of the patterns over that told, and the share scattered over each
+    radius: the likeliest.
+    """
     from scipy.optimize import minimize
 
     start = [0.0, *(math.log(share) for share in _SHARES)]
@@ -124,9 +149,14 @@ def _likeliest(electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[
         likelihood = _likelihood(electrons, known, glare, noise)
     if likelihood is None:
         return tuple(math.exp(x) for x in start)
-    simplex = [start, *([x + 1.2 * (i == j) for j, x in enumerate(start)] for i in range(len(start)))]
+    simplex = [
+        start,
+        *([x + 1.2 * (i == j) for j, x in enumerate(start)] for i in range(len(start))),
+    ]
     options = {"maxfev": _EVALUATIONS, "xatol": 0.05, "fatol": 0.1, "initial_simplex": simplex}
-    found = minimize(lambda x: -likelihood(x) / _ALIKE - _prior(x), start, method="Nelder-Mead", options=options)
+    found = minimize(
+        lambda x: -likelihood(x) / _ALIKE - _prior(x), start, method="Nelder-Mead", options=options
+    )
     return tuple(math.exp(x) for x in found.x)
 
 
@@ -142,7 +172,9 @@ def _prior(logs: Sequence[float]) -> float:
 def _likelihood(
     electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
 ) -> Callable[[Sequence[float]], float] | None:
-    """Return the log likelihood of logarithms of the strength and of what is scattered; None where nothing tells."""
+    """Return the log likelihood of logarithms of the strength and of what is scattered; None
+    where nothing tells.
+    """
     pixels = _pixels(electrons, known, glare, noise)
     if pixels is None:
         return None
@@ -160,7 +192,11 @@ def _likelihood(
             mean / mean.norm(),
         )
         top = float(given[0].square().mean())
-        tried = [scenes[-1] * f for f in (0.5, 0.7, 1.0, 1.4, 2.0)] if scenes else [top * 0.5**n for n in range(20)]
+        tried = (
+            [scenes[-1] * f for f in (0.5, 0.7, 1.0, 1.4, 2.0)]
+            if scenes
+            else [top * 0.5**n for n in range(20)]
+        )
         best = max((_log_density(*given, scene), scene) for scene in tried)
         scenes[:] = best[1:]
         return best[0] + _log_full(pixels.hidden, amounts[:, :, 0], mean[:, 0])
@@ -168,11 +204,19 @@ def _likelihood(
     return likelihood
 
 
-def _pixels(electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]) -> _Pixels | None:
+def _pixels(
+    electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
+) -> _Pixels | None:
     """Return the pixels of a frame that tell of speckle; None for too few."""
-    kinds = [glare.patterns, *([each[number] for each in glare.smooth or ()] for number in range(len(RADII)))]
+    kinds = [
+        glare.patterns,
+        *([each[number] for each in glare.smooth or ()] for number in range(len(RADII))),
+    ]
     peaks, nothing = glare.peaks, torch.zeros_like(electrons)
-    lights = [sum((peak * x for x, peak in zip(kind, peaks, strict=True)), nothing).detach() for kind in kinds]
+    lights = [
+        sum((peak * x for x, peak in zip(kind, peaks, strict=True)), nothing).detach()
+        for kind in kinds
+    ]
     use = _mean_around(known) > 1 - 1e-6  # all of the 3 x 3 pixels are known
     dark = noise(torch.zeros_like(average(electrons, torch.ones_like(electrons))))
     together = use.all(0)
@@ -184,7 +228,9 @@ def _pixels(electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Ten
     def picked(picture: Tensor) -> Tensor:
         return picture[:, together][:, some] if joint else picture[use][None, some]
 
-    parts, light = (torch.stack([picked(x) for x in each]) for each in ([_sharp(x) for x in lights], lights))
+    parts, light = (
+        torch.stack([picked(x) for x in each]) for each in ([_sharp(x) for x in lights], lights)
+    )
     hidden = (known == 0).nonzero(as_tuple=True)
     hidden = tuple(at[:: max(1, len(at) // _SAMPLE)] for at in hidden)
     rows = hidden[0] if joint else torch.zeros_like(hidden[0])
@@ -195,8 +241,9 @@ def _pixels(electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Ten
 def _log_density(rest: Tensor, noise: Tensor, speckle: Tensor, grey: Tensor, scene: float) -> float:
     """Return the log density of sharp pictures (channel, pixel).
 
-    Speckle is that of one colour, the root of its variance. A scene has the variance ``scene`` in each channel, and
-    details of any strength that have the colour ``grey`` in all channels, which therefore count for nothing.
+    Speckle is that of one colour, the root of its variance. A scene has the variance ``scene`` in
+    each channel, and details of any strength that have the colour ``grey`` in all channels, which
+    therefore count for nothing.
     """
     if len(rest) == 1:
         variance = noise + scene + speckle
@@ -220,7 +267,9 @@ def _log_full(hidden: _Hidden, amounts: Tensor, mean: Tensor) -> float:
     straight, wide = amounts[0] * hidden.light[0], (amounts[1:] * hidden.light[1:]).sum(0)
     scene = mean[hidden.channel]
     over = straight + wide + scene - hidden.full
-    short = torch.special.ndtr(-over / (wide.square() + 2.0 * straight * wide + scene.square()).sqrt())
+    short = torch.special.ndtr(
+        -over / (wide.square() + 2.0 * straight * wide + scene.square()).sqrt()
+    )
     return float(torch.log1p(-(1.0 - _BRIGHT) * short).sum())
 
 

@@ -11,7 +11,14 @@ from torch import Tensor
 from neusee.nodes import Check, node
 from neusee.nodes._half_precision import refuse_not_finite, single
 from neusee.nodes.restore._inverse._fft_grid import torus
-from neusee.nodes.restore._inverse._glare import Glare, Light, average, doubted, visible, with_light_around
+from neusee.nodes.restore._inverse._glare import (
+    Glare,
+    Light,
+    average,
+    doubted,
+    visible,
+    with_light_around,
+)
 from neusee.nodes.restore._inverse._glare_doubt import likeliest_doubt
 from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_white
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
@@ -32,13 +39,17 @@ from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf
 
 GREY = 0.95  #: correlation between the channels of pictures
-PRECISE = 256  #: pixels a side, up to which all is computed in float64: the dense float64 algebra takes most time there
+#: pixels a side, up to which all is computed in float64: the dense float64 algebra takes most time
+#: there
+PRECISE = 256
 
 
-#: standard deviation of a glare pattern in each pixel over its light around there; None: the likeliest for the picture
+#: standard deviation of a glare pattern in each pixel over its light around there; None: the
+#: likeliest for the picture
 Doubt = Annotated[float, Field(ge=0, le=10)] | None
 LeastDoubt = Annotated[float, Field(ge=0, le=10)]  #: of a doubt that is found
-Border = Annotated[float, Field(ge=1, le=4)]  #: of unknown pixels around a picture, over the reach of its PSF
+#: of unknown pixels around a picture, over the reach of its PSF
+Border = Annotated[float, Field(ge=1, le=4)]
 
 
 class Settings(NamedTuple):
@@ -72,52 +83,62 @@ def wiener(
     coarser_grids: bool = True,
     read_noise: Electrons,
 ) -> Tensor:
-    """Deconvolve a picture with a known PSF: compute the most likely scene, given the pixels that are not clipped.
+    """Deconvolve a picture with a known PSF: compute the most likely scene, given the pixels that
+    are not clipped.
 
-    Least squares with a Gaussian prior, which for a picture without edges is the Wiener filter. Each channel has the
-    PSF that it sees of a grey scene: the mean over bands, weighted by illuminant x response x wavelength. The power
-    spectrum of the prior falls as 1 / frequency^3, like that of edges, with the variance of this picture; channels have
-    a correlation of 0.95. Clipped pixels and pixels beyond the edge are unknown. The picture with its border repeats
-    itself, so that opposite ends agree. `border` above 1 widens the border beyond the reach of the PSF, so that they
-    may differ behind a wide PSF; the prior then hardly rises below half a cycle in the picture, and its variance counts
-    about the mean of the picture. The patterns of `glare` and `ghosts`, wide as the scene, are removed, each with its
-    own unknown strength. By default their shapes count as known exactly.
-    `doubt` is the standard deviation of a pattern in each pixel over the light of the pattern around this pixel, which
-    falls as 1 / distance^3 from each point of it: the variance of the noise grows by (doubt x this light)^2. Without a
-    number (null) it is the likeliest of 0, 0.01, 0.03, 0.1, 0.3, 1 and 3 for this picture that is not below
-    `least_doubt`. `nearby` has other possible patterns of each glare, as `restore.nearby_glare` computes them: their
-    differences from the glare, averaged over the patterns, are its covariance. The glare in a variance is a
-    least-squares estimate, in which uncertain pixels count less. With `scatter`, patterns are in e- and nearly of the
-    strength told, and `doubt` does not count: dirt and defocus scatter part of their light over 4, 16 and 64 pixels,
-    as much as speckle and clipped pixels of this picture tell, and channels that glare covers take mean and contrast of
-    others, as of a grey scene. The iteration starts from the answer on
-    `coarser_grids`; without these it starts from a picture without contrast: faster, and right for a plain lens alone.
+    Least squares with a Gaussian prior, which for a picture without edges is the Wiener filter.
+    Each channel has the PSF that it sees of a grey scene: the mean over bands, weighted by
+    illuminant x response x wavelength. The power spectrum of the prior falls as 1 / frequency^3,
+    like that of edges, with the variance of this picture; channels have a correlation of 0.95.
+    Clipped pixels and pixels beyond the edge are unknown. The picture with its border repeats
+    itself, so that opposite ends agree. `border` above 1 widens the border beyond the reach of the
+    PSF, so that they may differ behind a wide PSF; the prior then hardly rises below half a cycle
+    in the picture, and its variance counts about the mean of the picture. The patterns of `glare`
+    and `ghosts`, wide as the scene, are removed, each with its own unknown strength. By default
+    their shapes count as known exactly. `doubt` is the standard deviation of a pattern in each
+    pixel over the light of the pattern around this pixel, which falls as 1 / distance^3 from each
+    point of it: the variance of the noise grows by (doubt x this light)^2. Without a number (null)
+    it is the likeliest of 0, 0.01, 0.03, 0.1, 0.3, 1 and 3 for this picture that is not below
+    `least_doubt`. `nearby` has other possible patterns of each glare, as `restore.nearby_glare`
+    computes them: their differences from the glare, averaged over the patterns, are its covariance.
+    The glare in a variance is a least-squares estimate, in which uncertain pixels count less. With
+    `scatter`, patterns are in e- and nearly of the strength told, and `doubt` does not count: dirt
+    and defocus scatter part of their light over 4, 16 and 64 pixels, as much as speckle and clipped
+    pixels of this picture tell, and channels that glare covers take mean and contrast of others, as
+    of a grey scene. The iteration starts from the answer on `coarser_grids`; without these it
+    starts from a picture without contrast: faster, and right for a plain lens alone.
 
-    Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses (channel, band),
-            each glare and ghost (channel, at least y, at least x), cropped to the centre, each nearby
-            (pattern, channel, y, x) -> (channel, y, x).
-    Units:  e-; glare any, nearby as its glare; the result as behind a perfect lens without losses. `balance` multiplies
-            the noise variance, without that of the glare; doubt none.
-    Error:  a grey scene is assumed, and noise in the dark no smaller than that of the mean picture. Without `glare` a
-            laser that does not clip is taken for scene. The result may be negative: beside lamps hundreds of times as
-            bright as the scene it rings. The iteration ends by its residual, or after 20 steps on the finest grid: rms
-            from the converged answer over the contrast, for 96 pixels a side, 4e-4 to 5e-3 (medians behind four masks)
-            and at most 0.025; for 384, 0.010 behind five half-rings and 0.023 behind a half-ring, where it costs 0.05
-            dB; 4e-3 without coarser grids behind a plain lens. Gradients: of the exact answer, first order only; a
-            doubt that is found counts as constant. Up to 256 pixels a side all is float64, and rounding adds 1e-6 to
-            both (`rtol` holds there); in wider pictures float32 adds 3e-4 to the result and up to 2e-3 to the
-            gradients; in pictures of 1e7 e-, 2e-2 and 8e-2. With less noise rounding adds more to the gradients,
-            1e-16 of the largest ratio of the variances of scene and noise at one frequency: 1 in pictures of 1e15 e-,
-            whose result up to 20 pixels a side is right to 1e-7.
-            With `scatter`, the light that is scattered over 4 and 64 pixels is found to a factor of 2 to 3.
+    Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses
+            (channel, band), each glare and ghost (channel, at least y, at least x), cropped to the
+            centre, each nearby (pattern, channel, y, x) -> (channel, y, x).
+    Units:  e-; glare any, nearby as its glare; the result as behind a perfect lens without losses.
+            `balance` multiplies the noise variance, without that of the glare; doubt none.
+    Error:  a grey scene is assumed, and noise in the dark no smaller than that of the mean picture.
+            Without `glare` a laser that does not clip is taken for scene. The result may be
+            negative: beside lamps hundreds of times as bright as the scene it rings. The iteration
+            ends by its residual, or after 20 steps on the finest grid: rms from the converged
+            answer over the contrast, for 96 pixels a side, 4e-4 to 5e-3 (medians behind four masks)
+            and at most 0.025; for 384, 0.010 behind five half-rings and 0.023 behind a half-ring,
+            where it costs 0.05 dB; 4e-3 without coarser grids behind a plain lens. Gradients: of
+            the exact answer, first order only; a doubt that is found counts as constant. Up to 256
+            pixels a side all is float64, and rounding adds 1e-6 to both (`rtol` holds there); in
+            wider pictures float32 adds 3e-4 to the result and up to 2e-3 to the gradients; in
+            pictures of 1e7 e-, 2e-2 and 8e-2. With less noise rounding adds more to the gradients,
+            1e-16 of the largest ratio of the variances of scene and noise at one frequency: 1 in
+            pictures of 1e15 e-, whose result up to 20 pixels a side is right to 1e-7. With
+            `scatter`, the light that is scattered over 4 and 64 pixels is found to a factor of 2 to
+            3.
     Raises: ValueError where shapes or bands differ, and for pictures and PSFs that are not finite.
-    Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; as least squares with a
-            prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.
+    Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; as
+            least squares with a prior, Kaipio and Somersalo, Statistical and Computational Inverse
+            Problems, 2005, ch. 3.
     """
     electrons, light = single(electrons), (glare, nearby, ghosts)
     settings = Settings(balance, read_noise, doubt, least_doubt, scatter, border)
     scaled = pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings)
-    return (scaled.pixels(most_likely(scaled.problem, coarser=coarser_grids)) + scaled.mean).to(electrons)
+    return (scaled.pixels(most_likely(scaled.problem, coarser=coarser_grids)) + scaled.mean).to(
+        electrons
+    )
 
 
 def known_and_light(
@@ -129,20 +150,29 @@ def known_and_light(
     nearby: list[Tensor] | None,
     ghosts: list[Tensor] | None,
 ) -> tuple[Tensor, Tensor, Glare]:
-    """Return a picture in the type of the computation, 1 for each pixel that is not clipped, and the visible glare.
+    """Return a picture in the type of the computation, 1 for each pixel that is not clipped, and
+    the visible glare.
 
     Raises ValueError for inputs that differ in shape or are not finite.
     """
-    refuse_other_pictures(electrons, psf, responses, clipped, [*(glare or ()), *(nearby or ()), *(ghosts or ())])
+    refuse_other_pictures(
+        electrons, psf, responses, clipped, [*(glare or ()), *(nearby or ()), *(ghosts or ())]
+    )
     _refuse_other_glare(glare or [], nearby)
     size = (electrons.shape[-2], electrons.shape[-1])
     fine = electrons.double() if max(size) <= PRECISE else electrons
-    patterns, others, ghostly = ([crop(x.to(fine), shape=size) for x in g or ()] for g in (glare, nearby, ghosts))
+    patterns, others, ghostly = (
+        [crop(x.to(fine), shape=size) for x in g or ()] for g in (glare, nearby, ghosts)
+    )
     known = (~clipped).to(fine)
     return (
         fine,
         known,
-        visible([*patterns, *ghostly], [*others, *[None] * (len(patterns) + len(ghostly) - len(others))], known),
+        visible(
+            [*patterns, *ghostly],
+            [*others, *[None] * (len(patterns) + len(ghostly) - len(others))],
+            known,
+        ),
     )
 
 
@@ -152,7 +182,8 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[
     finite = math.isfinite(float(result.sum()))
     return [
         Check(
-            f"{share:.2%} of pixels clipped, restored mean {float(result.mean() / electrons.mean()):.2f} of raw mean",
+            f"{share:.2%} of pixels clipped, restored mean"
+            f" {float(result.mean() / electrons.mean()):.2f} of raw mean",
             finite,
         )
     ]
@@ -162,26 +193,37 @@ def _refuse_other_glare(glare: list[Tensor], nearby: list[Tensor] | None) -> Non
     if nearby and [x.shape[-3:] for x in nearby] != [x.shape for x in glare]:
         found, wanted = [tuple(x.shape) for x in nearby], [tuple(x.shape) for x in glare]
         raise ValueError(
-            f"nearby {found} does not fit glare {wanted}: give one nearby, (pattern, channel, y, x), for each glare"
+            f"nearby {found} does not fit glare {wanted}: give one nearby, (pattern, channel, y,"
+            " x), for each glare"
         )
 
 
 def refuse_other_pictures(
     electrons: Tensor, psf: Psf, responses: Tensor, clipped: Tensor, glare: list[Tensor] | None
 ) -> None:
-    """Raise ValueError for inputs that differ in channels or pixels, and for inputs that are not finite."""
+    """Raise ValueError for inputs that differ in channels or pixels, and for inputs that are not
+    finite.
+    """
     if electrons.shape != clipped.shape or len(responses) != electrons.shape[-3]:
         raise ValueError(
             f"electrons {tuple(electrons.shape)}, clipped {tuple(clipped.shape)} and responses "
             f"{tuple(responses.shape)} must have the same channels and pixels"
         )
-    for name, values in {"electrons": [electrons], "psf": [psf.intensity], "glare": glare or ()}.items():
+    for name, values in {
+        "electrons": [electrons],
+        "psf": [psf.intensity],
+        "glare": glare or (),
+    }.items():
         for x in values:
-            refuse_not_finite("the picture cannot be restored", **{name: x.sum(-1).sum(dtype=torch.float64)})
+            refuse_not_finite(
+                "the picture cannot be restored", **{name: x.sum(-1).sum(dtype=torch.float64)}
+            )
 
 
 class Scaled(NamedTuple):
-    """A deconvolution whose scene has mean 0 and variance 1, and what gives the result its scale and mean back."""
+    """A deconvolution whose scene has mean 0 and variance 1, and what gives the result its scale
+    and mean back.
+    """
 
     problem: Blurred
     scale: Tensor  #: (channel, 1, 1)
@@ -207,10 +249,14 @@ def pose(
     ghosts: list[Tensor] | None,
     settings: Settings,
 ) -> Scaled:
-    """Return the inputs of `wiener` as a linear problem, unsolved; ``settings`` as `Settings` says."""
+    """Return the inputs of `wiener` as a linear problem, unsolved; ``settings`` as `Settings`
+    says.
+    """
     fine, known, light = known_and_light(psf, responses, electrons, clipped, glare, nearby, ghosts)
     kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
-    return posed(fine, known, kernels, light, settings, grey_white(illuminant, responses, bands).to(fine))
+    return posed(
+        fine, known, kernels, light, settings, grey_white(illuminant, responses, bands).to(fine)
+    )
 
 
 def posed(
@@ -223,15 +269,16 @@ def posed(
 ) -> Scaled:
     """Return the deconvolution of a picture as a linear problem; ``settings`` as `Settings` says.
 
-    With `Settings.scatter` and ``white``, what the channels (channel, 1, 1) see of a grey scene, channels that glare
-    covers take mean and contrast of others.
+    With `Settings.scatter` and ``white``, what the channels (channel, 1, 1) see of a grey scene,
+    channels that glare covers take mean and contrast of others.
     """
     frame = (electrons.shape[-2], electrons.shape[-1])
     read, scatter = settings.read_noise, settings.scatter
     seen, some = known, known.amax((-2, -1), keepdim=True)
     known = torch.where(some > 0, known, 1.0)
     share = power_of_two(kernels.sum((-2, -1), keepdim=True).detach())
-    kernels = kernels / share  # the same bits, and the floors below concern the shape of the PSF, not a grey filter
+    # the same bits, and the floors below concern the shape of the PSF, not a grey filter
+    kernels = kernels / share
 
     free, trusted, light, wrong = _found_light(electrons, (known, seen), glare, settings)
     picture = electrons - light.sum
@@ -246,17 +293,30 @@ def posed(
     noise = settings.balance * picture_noise(electrons, mean, read) + light.variance
     weight = known * (scale / noise.sqrt()).square()
     scaled = tuple(pattern / scale for pattern in (*free, *light.modes))
-    problem = Blurred((picture - mean) / scale, weight, transfer, power, size, GREY, scaled, bounded=len(light.modes))
+    problem = Blurred(
+        (picture - mean) / scale,
+        weight,
+        transfer,
+        power,
+        size,
+        GREY,
+        scaled,
+        bounded=len(light.modes),
+    )
     bright = mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None] / share
     if not scatter:
         return Scaled(problem, scale, bright, share, kernels)
     full = float(electrons.detach().max())
     both = told_of_scene(*told, wrong / passed, light, trusted, (some == 0) * full)
-    return Scaled(problem, scale, bright, share, kernels, scene_doubt((mean, scale), both, white, full, light))
+    return Scaled(
+        problem, scale, bright, share, kernels, scene_doubt((mean, scale), both, white, full, light)
+    )
 
 
 def _on_torus(kernels: Tensor, frame: Size, border: float) -> tuple[Size, Tensor, Tensor, Tensor]:
-    """Return the torus of a picture, the transfer of the PSF, the prior, and the variance that a picture then has."""
+    """Return the torus of a picture, the transfer of the PSF, the prior, and the variance that a
+    picture then has.
+    """
     size = torus(frame, bordered(edge(kernels, frame), border))
     transfer, wide = torch.fft.rfft2(wrapped(kernels, size)), border > 1
     power = fall(size, (2 * frame[0], 2 * frame[1]) if wide else None).to(kernels)
@@ -267,9 +327,11 @@ def _on_torus(kernels: Tensor, frame: Size, border: float) -> tuple[Size, Tensor
 def _found_light(
     electrons: Tensor, known: tuple[Tensor, Tensor], glare: Glare, settings: Settings
 ) -> tuple[list[Tensor], Tensor, Light, Tensor]:
-    """Return the patterns of unknown strength, and what `doubted` returns; ``known`` with and without blind channels.
+    """Return the patterns of unknown strength, and what `doubted` returns; ``known`` with and
+    without blind channels.
 
-    With `Settings.scatter` the strengths are found too, so that no pattern of unknown strength is left.
+    With `Settings.scatter` the strengths are found too, so that no pattern of unknown strength is
+    left.
     """
 
     def own_noise(mean: Tensor) -> Tensor:
@@ -277,7 +339,9 @@ def _found_light(
 
     if settings.scatter and glare.patterns:
         return [], *scattered(electrons, known[1], glare, own_noise)
-    return glare.patterns, *_doubted(electrons, known[0], glare, (settings.doubt, settings.least_doubt), own_noise)
+    return glare.patterns, *_doubted(
+        electrons, known[0], glare, (settings.doubt, settings.least_doubt), own_noise
+    )
 
 
 def _doubted(

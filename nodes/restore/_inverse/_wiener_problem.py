@@ -1,4 +1,6 @@
-"""The problem that the Wiener filter solves, as a value: for the training of restorers that begin with its answer."""
+"""The problem that the Wiener filter solves, as a value: for the training of restorers that
+begin with its answer.
+"""
 
 from typing import Annotated, Any
 
@@ -35,9 +37,11 @@ def wiener_problem(
     least_doubt: LeastDoubt = 0.0,
     read_noise: Electrons,
 ) -> WienerProblem:
-    """Pose the deconvolution of `restore.wiener` as a linear problem, and solve it: the answer is that of the filter.
+    """Pose the deconvolution of `restore.wiener` as a linear problem, and solve it: the answer is
+    that of the filter.
 
-    A training of `restore.unrolled` poses the problem of each picture once, and uses it at each of its iterations.
+    A training of `restore.unrolled` poses the problem of each picture once, and uses it at each of
+    its iterations.
 
     Shapes: as `restore.wiener`; those of the result as `WienerProblem` says.
     Units:  e-; the fields of the result as `WienerProblem` says.
@@ -53,7 +57,9 @@ def wiener_problem(
 @wiener_problem.check
 def _(result: WienerProblem, *inputs: Any, **params: Any) -> list[Check]:
     largest = float(result.answer.abs().max())
-    return [Check(f"contrast of the answer up to {largest:.3g} of its scale", largest < float("inf"))]
+    return [
+        Check(f"contrast of the answer up to {largest:.3g} of its scale", largest < float("inf"))
+    ]
 
 
 def packed(scaled: Scaled) -> WienerProblem:
@@ -61,11 +67,15 @@ def packed(scaled: Scaled) -> WienerProblem:
     problem = scaled.problem
     free = len(problem.glare) - problem.bounded
     none = problem.picture.new_zeros(0, *problem.picture.shape)
-    parts = [torch.stack(some) if some else none for some in (problem.glare[:free], problem.glare[free:])]
+    parts = [
+        torch.stack(some) if some else none for some in (problem.glare[:free], problem.glare[free:])
+    ]
     spectrum = most_likely(problem)
     scale = scaled.scale / scaled.share
     answer = (problem.first(spectrum), problem.blur(spectrum))
-    return WienerProblem._make((problem.picture, problem.weight, scaled.kernels, *parts, *answer, scale, scaled.mean))
+    return WienerProblem._make(
+        (problem.picture, problem.weight, scaled.kernels, *parts, *answer, scale, scaled.mean)
+    )
 
 
 def unpacked(value: WienerProblem) -> Blurred:
@@ -74,4 +84,6 @@ def unpacked(value: WienerProblem) -> Blurred:
     size = torus(frame, edge(value.psf, frame))
     transfer, power = torch.fft.rfft2(wrapped(value.psf, size)), fall(size).to(value.psf)
     glare = (*value.glare, *value.doubts)
-    return Blurred(value.picture, value.weight, transfer, power, size, GREY, glare, bounded=len(value.doubts))
+    return Blurred(
+        value.picture, value.weight, transfer, power, size, GREY, glare, bounded=len(value.doubts)
+    )

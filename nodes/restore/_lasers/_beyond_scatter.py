@@ -1,4 +1,6 @@
-"""Lasers that are more than light which dirt, edges and defocus scatter out of the pattern of a stronger laser."""
+"""Lasers that are more than light which dirt, edges and defocus scatter out of the pattern of a
+stronger laser.
+"""
 
 from __future__ import annotations
 
@@ -17,16 +19,20 @@ _FEW, _STEPS = 5, 12  #: steps of a fit without one laser, and of the last fit
 
 
 def without_scattered(found: Found, known: Known, least: float) -> Found:
-    """Return what was found without lasers that gain less than ``least`` where scattered light counts as noise.
+    """Return what was found without lasers that gain less than ``least`` where scattered light
+    counts as noise.
 
-    A lens that is not as its recipe says leaves grains of speckle around a strong laser, and each looks like a weak
-    laser of the same colour. The frame tells how strong this speckle is likely to be; its variance is added to that of
-    the noise, beginning with the weakest laser, whose stronger ones may have scattered it.
+    A lens that is not as its recipe says leaves grains of speckle around a strong laser, and each
+    looks like a weak laser of the same colour. The frame tells how strong this speckle is likely to
+    be; its variance is added to that of the noise, beginning with the weakest laser, whose stronger
+    ones may have scattered it.
     """
     lasers = [n for n, part in enumerate(found.fit.parts) if isinstance(part, Laser)]
     kept = set(range(len(found.fit.parts)))
     for n in sorted(lasers, key=lambda n: found.choices[n].gain)[:-1]:
-        stronger = [found.fit.parts[m] for m in lasers if found.choices[m].gain > found.choices[n].gain]
+        stronger = [
+            found.fit.parts[m] for m in lasers if found.choices[m].gain > found.choices[n].gain
+        ]
         data = _with_speckle(found.data, known, found.fit.parts, tuple(stronger))
         parts = tuple(found.fit.parts[m] for m in sorted(kept))
         others = tuple(found.fit.parts[m] for m in sorted(kept - {n}))
@@ -39,7 +45,9 @@ def without_scattered(found: Found, known: Known, least: float) -> Found:
 
 
 def _with_speckle(data: Data, known: Known, parts: Parts, lasers: Parts) -> Data:
-    """Return the frame with weights for which the likeliest speckle of some lasers is noise, without clipped pixels."""
+    """Return the frame with weights for which the likeliest speckle of some lasers is noise,
+    without clipped pixels.
+    """
     dark = torch.zeros_like(known.electrons)
     every, own = (sum((part.electrons() for part in some), dark) for some in (parts, lasers))
     left = known.electrons - every
@@ -48,6 +56,8 @@ def _with_speckle(data: Data, known: Known, parts: Parts, lasers: Parts) -> Data
         return picture_noise(left + own, mean, known.read_noise)
 
     glare = visible([part.electrons() for part in lasers], [None] * len(lasers), known.seen)
-    variance = noise_of(known.electrons, known.seen, known.read_noise) + speckle(left + own, known.seen, glare, noise)
+    variance = noise_of(known.electrons, known.seen, known.read_noise) + speckle(
+        left + own, known.seen, glare, noise
+    )
     weights = weights_of(data.use(left), data.use, variance, left)
     return data._replace(weights=weights, clipped=None)

@@ -1,4 +1,6 @@
-"""Where a pattern may lie: its likelihood at every place of the frame at once, by fast correlations."""
+"""Where a pattern may lie: its likelihood at every place of the frame at once, by fast
+correlations.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ class Candidate(NamedTuple):
 
 
 class Templates(NamedTuple):
-    """Patterns on the axis, in windows of odd sides about the spot, with the response of each channel to them."""
+    """Patterns on the axis, in windows of odd sides about the spot, with the response of each
+    channel to them.
+    """
 
     wavelengths: Tensor  #: (line,) float64, m; 0 for light of many wavelengths
     patterns: Tensor  #: (line, 1 or channel, y, x)
@@ -53,8 +57,12 @@ def line_templates(pupil: Pupil, responses: Tensor, bands: Bands, lens: Lens) ->
     return Templates(at, intensity[:, None], heard)
 
 
-def candidates(residual: Tensor, use: Filter, weights: Weights, templates: Templates, count: int) -> list[Candidate]:
-    """Return the most likely places and wavelengths of one more pattern in a filtered residual, the best first."""
+def candidates(
+    residual: Tensor, use: Filter, weights: Weights, templates: Templates, count: int
+) -> list[Candidate]:
+    """Return the most likely places and wavelengths of one more pattern in a filtered residual,
+    the best first.
+    """
     residual = residual.float()  # a start needs no more
     weights = Weights(*(x.float() for x in weights))
     white, frame = weights(residual), residual.shape[-2:]
@@ -69,18 +77,26 @@ def candidates(residual: Tensor, use: Filter, weights: Weights, templates: Templ
             top, low = heard.to(residual)[:, None, None] * weights(white), by.square()
         product = _correlated(top, own, size).sum(0)
         norm = _correlated(low, own.square(), size).sum(0).clamp_min(0.0)
-        found += _peaks(_gain(product, norm), product / norm.clamp_min(1e-30), float(line), pattern, frame, count)
+        found += _peaks(
+            _gain(product, norm),
+            product / norm.clamp_min(1e-30),
+            float(line),
+            pattern,
+            frame,
+            count,
+        )
     return _apart(sorted(found, reverse=True), count)
 
 
 def clipped_candidates(
     picture: Tensor, full: float, use: Filter, weights: Weights, templates: Templates, count: int
 ) -> list[Candidate]:
-    """Return candidates for a pattern that the sensor clips, in a frame with clipped pixels at ``full``.
+    """Return candidates for a pattern that the sensor clips, in a frame with clipped pixels at
+    ``full``.
 
-    Each pattern is so strong that as many of its pixels are clipped as in the frame, or `_MORE` times as many, of which
-    some lie beyond the frame. Each channel is clipped by itself: those that hardly see a wavelength show more of its
-    pattern.
+    Each pattern is so strong that as many of its pixels are clipped as in the frame, or `_MORE`
+    times as many, of which some lie beyond the frame. Each channel is clipped by itself: those that
+    hardly see a wavelength show more of its pattern.
     """
     clipped = int((picture >= 0.98 * full).any(0).sum())
     picture, frame = picture.float(), picture.shape[-2:]
@@ -88,7 +104,9 @@ def clipped_candidates(
     size = _size(frame, templates.patterns[0])
     pairs = list(itertools.combinations_with_replacement(range(len(picture)), 2))
     both = torch.fft.rfft2(weights.twice(use.sharp(picture)), s=size)
-    inverse = torch.fft.rfft2(torch.stack([weights.pair(*pair) * (1 + (pair[0] != pair[1])) for pair in pairs]), s=size)
+    inverse = torch.fft.rfft2(
+        torch.stack([weights.pair(*pair) * (1 + (pair[0] != pair[1])) for pair in pairs]), s=size
+    )
     found: list[Candidate] = []
     for (line, pattern, heard), more in itertools.product(zip(*templates, strict=True), _MORE):
         share, level = (heard / heard.max()).to(picture), _level(pattern, round(more * clipped))
@@ -99,7 +117,9 @@ def clipped_candidates(
             for data, model in ((both, own), (inverse, squares))
         )
         strength = torch.full_like(norm, full / (level * float(heard.max())))
-        found += _peaks(_gain(product, norm.clamp_min(0.0)), strength, float(line), pattern, frame, count)
+        found += _peaks(
+            _gain(product, norm.clamp_min(0.0)), strength, float(line), pattern, frame, count
+        )
     return _apart(sorted(found, reverse=True), count)
 
 
@@ -117,7 +137,9 @@ def _level(pattern: Tensor, count: int) -> float:
 
 
 def _correlated(picture: Tensor, pattern: Tensor, size: list[int]) -> Tensor:
-    """Return the sum of picture x shifted pattern for every shift of the spot that lies in the frame or near it."""
+    """Return the sum of picture x shifted pattern for every shift of the spot that lies in the
+    frame or near it.
+    """
     product = torch.fft.rfft2(picture, s=size) * torch.fft.rfft2(pattern, s=size).conj()
     result: Tensor = torch.fft.irfft2(product, s=size)
     return result
@@ -136,12 +158,16 @@ def _peaks(
     found = []
     for value, at in zip(best.values.tolist(), best.indices.tolist(), strict=True):
         y, x = divmod(at, frame[1])
-        found.append(Candidate(value, (y - frame[0] // 2, x - frame[1] // 2), line, float(sizes[y, x])))
+        found.append(
+            Candidate(value, (y - frame[0] // 2, x - frame[1] // 2), line, float(sizes[y, x]))
+        )
     return _apart(found, count)
 
 
 def _apart(found: list[Candidate], count: int) -> list[Candidate]:
-    """Return the first candidates of a list that differ from all earlier ones in place or wavelength."""
+    """Return the first candidates of a list that differ from all earlier ones in place or
+    wavelength.
+    """
     kept: list[Candidate] = []
     for one in found:
         if len(kept) < count and all(_differ(one, other) for other in kept):

@@ -1,4 +1,6 @@
-"""What adds light to a frame beside the scene: a laser, of one spectral line, and a lamp, of light in many bands."""
+"""What adds light to a frame beside the scene: a laser, of one spectral line, and a lamp, of
+light in many bands.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +12,22 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.restore._lasers._lamp_light import LampLight, phases
-from neusee.nodes.restore._lasers._line_pattern import Lens, deviation, line_moves, line_pattern, response_at
+from neusee.nodes.restore._lasers._line_pattern import (
+    Lens,
+    deviation,
+    line_moves,
+    line_pattern,
+    response_at,
+)
 from neusee.nodes.values import Bands, Pupil
 
 NANOMETRE = 1e-9
-_WIDTH = 0.5  #: nm^2, standard deviation of the variance of a line, or that variance itself where it is more
+#: nm^2, standard deviation of the variance of a line, or that variance itself where it is more
+_WIDTH = 0.5
 _WIDEST = 50.0  #: nm^2, most that is added to the variance of a line
 _KNOWN = 0.03  #: relative standard deviation of the response of a channel to one line
-_BLIND = 0.003  #: the same as a share of the largest response, for a channel that hardly sees the line
+#: the same as a share of the largest response, for a channel that hardly sees the line
+_BLIND = 0.003
 
 
 class Camera(NamedTuple):
@@ -32,11 +42,13 @@ class Camera(NamedTuple):
 
 @dataclass(frozen=True)
 class Laser:
-    """A laser: place (y, x) of the spot in pixels from the middle, wavelength in nm, strength, width, errors."""
+    """A laser: place (y, x) of the spot in pixels from the middle, wavelength in nm, strength,
+    width, errors.
+    """
 
     camera: Camera
-    #: (5 + channel,): y, x, nm, electrons at response 1, nm^2 of the variance of the line beyond that of the camera's
-    #: ``fwhm``, and the errors of the responses over their spread
+    #: (5 + channel,): y, x, nm, electrons at response 1, nm^2 of the variance of the line beyond
+    #: that of the camera's ``fwhm``, and the errors of the responses over their spread
     values: Tensor
 
     @property
@@ -64,16 +76,24 @@ class Laser:
         return self.values[3] * (heard + spread * self.values[5:])
 
     def columns(self, of: Callable[[Tensor], Tensor]) -> Tensor:
-        """Return ``of`` of the change of the light for a unit change of each value: (value, channel, ...).
+        """Return ``of`` of the change of the light for a unit change of each value: (value,
+        channel, ...).
 
-        ``of`` is linear, treats each channel by itself, and takes pictures (picture, 1 or channel, y, x).
+        ``of`` is linear, treats each channel by itself, and takes pictures (picture, 1 or channel,
+        y, x).
         """
-        seen = of(self._slopes()[:, None])  # one picture for all channels before, one for each after
+        # one picture for all channels before, one for each after
+        seen = of(self._slopes()[:, None])
         ones = (1,) * (seen.ndim - 2)
         channels = self.channels().view(-1, *ones)
         heard, spread = self._response(self.values[2])
         wave = channels * seen[3] + self._response_slope().view(-1, *ones) * seen[0]
-        columns = [channels * seen[1], channels * seen[2], wave, (channels / self.values[3].clamp_min(1e-9)) * seen[0]]
+        columns = [
+            channels * seen[1],
+            channels * seen[2],
+            wave,
+            (channels / self.values[3].clamp_min(1e-9)) * seen[0],
+        ]
         columns.append(channels * seen[4])
         for i in range(len(heard)):
             one = torch.zeros_like(heard)
@@ -82,14 +102,18 @@ class Laser:
         return torch.stack(columns)
 
     def _slopes(self) -> Tensor:
-        """Return the pattern and its change with y, x (pixels), wavelength (nm) and variance (nm^2): (5, y, x)."""
+        """Return the pattern and its change with y, x (pixels), wavelength (nm) and variance
+        (nm^2): (5, y, x).
+        """
         camera, at = self.camera, self.values[:3].double()
         moves = line_moves(camera.pupil, at[:2], at[2] * NANOMETRE, camera.lens, self.fwhm)
         moves = moves._replace(wave=moves.wave * NANOMETRE, blur=moves.blur * NANOMETRE**2)
         return torch.stack(list(moves)).to(self.values)
 
     def moved(self, step: Tensor) -> Laser:
-        """Return the laser after a step, which stays in the range of the bands and near the frame."""
+        """Return the laser after a step, which stays in the range of the bands and near the
+        frame.
+        """
         centres, shape = self.camera.bands.centres / NANOMETRE, self.camera.lens.shape
         most = torch.tensor([1.0, 1.0, 5.0]).to(step)
         step = torch.cat([torch.maximum(torch.minimum(step[:3], most), -most), step[3:]])
@@ -102,7 +126,9 @@ class Laser:
         return replace(self, values=values)
 
     def channel_slopes(self) -> Tensor:
-        """Return the change of the electrons of each channel for a unit change of each value: (channel, value)."""
+        """Return the change of the electrons of each channel for a unit change of each value:
+        (channel, value).
+        """
         heard, spread = self._response(self.values[2])
         slopes = torch.zeros(len(heard), len(self.values)).to(self.values)
         slopes[:, 2] = self._response_slope()
@@ -128,7 +154,9 @@ class Laser:
 
 @dataclass(frozen=True)
 class Lamp:
-    """A lamp: place (y, x) of its spot in pixels from the middle, and electrons in each channel by kind of spectrum."""
+    """A lamp: place (y, x) of its spot in pixels from the middle, and electrons in each channel
+    by kind of spectrum.
+    """
 
     light: LampLight
     shape: tuple[int, int]
@@ -144,9 +172,11 @@ class Lamp:
         return self._pictures(self._spectra())
 
     def columns(self, of: Callable[[Tensor], Tensor]) -> Tensor:
-        """Return ``of`` of the change of the light for a unit change of each value: (value, channel, ...).
+        """Return ``of`` of the change of the light for a unit change of each value: (value,
+        channel, ...).
 
-        ``of`` is linear, treats each channel by itself, and takes pictures (picture, channel, y, x).
+        ``of`` is linear, treats each channel by itself, and takes pictures (picture, channel, y,
+        x).
         """
         kinds, channels = self.light.spectra.shape[:2]
         seen = of(torch.stack([self._pictures(each) for each in self._slopes()]))
@@ -157,9 +187,14 @@ class Lamp:
         return torch.cat([seen[:2], amounts])
 
     def _slopes(self) -> Iterator[Tensor]:
-        """Yield the spectra of the changes with y, x (pixels) and each kind, one after another to save memory."""
+        """Yield the spectra of the changes with y, x (pixels) and each kind, one after another
+        to save memory.
+        """
         (y, x), whole = self.light.torus, self._spectra()
-        fy, fx = torch.fft.fftfreq(y).to(self.values)[:, None], torch.fft.rfftfreq(x).to(self.values)
+        fy, fx = (
+            torch.fft.fftfreq(y).to(self.values)[:, None],
+            torch.fft.rfftfreq(x).to(self.values),
+        )
         for frequency in (fy, fx):
             yield -2j * torch.pi * self.light.finer * frequency * whole
         for kind in self.light.spectra:

@@ -8,7 +8,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes.restore._lasers._candidates import Candidate, Templates, candidates, clipped_candidates
+from neusee.nodes.restore._lasers._candidates import (
+    Candidate,
+    Templates,
+    candidates,
+    clipped_candidates,
+)
 from neusee.nodes.restore._lasers._censored import censored
 from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Lamp, Laser
 from neusee.nodes.restore._lasers._joint_fit import Data, Fit, Parts, fitted, misfit_of
@@ -20,8 +25,10 @@ _AHEAD = 10.0  #: log likelihood by which a laser is ahead of a lamp at least
 _SAME = (2.0, 25.0)  #: pixels and nm, within which two lasers are one
 _FEW = 4  #: clipped pixels, fewer of which need no explanation
 _TRIED = 2  #: candidates that are fitted before one of them is chosen
-_LEFT = 0.25  #: share of the clipped pixels that no part explains, from which on one more is sought farther away
-_ODD = 6.25  #: sum of squares of the errors of three responses, which one laser in ten exceeds by chance
+#: share of the clipped pixels that no part explains, from which on one more is sought farther away
+_LEFT = 0.25
+#: sum of squares of the errors of three responses, which one laser in ten exceeds by chance
+_ODD = 6.25
 _CLIPPED = 4  #: candidates for clipped pixels, whose surroundings are searched before any is fitted
 _BEHIND = 0.25  #: share of a gain, candidates below which are not fitted
 _WIDER = 1.5  #: times the first width, up to which a fitted width is not compared with others
@@ -41,7 +48,9 @@ class Known(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """A part that explains some of a frame, the log likelihood that it gains, and how far it is ahead of others."""
+    """A part that explains some of a frame, the log likelihood that it gains, and how far it is
+    ahead of others.
+    """
 
     part: Laser | Lamp
     gain: float
@@ -58,7 +67,9 @@ class Found(NamedTuple):
 
 
 def search(known: Known, most: int, lamps: int, least: float, margin: float) -> Found:
-    """Return the lasers and lamps of a frame: each gains at least ``least``, a laser ``margin`` of it beyond a lamp."""
+    """Return the lasers and lamps of a frame: each gains at least ``least``, a laser ``margin``
+    of it beyond a lamp.
+    """
     parts: Parts = ()
     chosen: list[Choice] = []
     while True:
@@ -73,14 +84,18 @@ def search(known: Known, most: int, lamps: int, least: float, margin: float) -> 
 
 
 def _pruned(found: Found, least: float) -> Found:
-    """Return what was found without parts that later parts made needless, each with its gain beside the rest."""
+    """Return what was found without parts that later parts made needless, each with its gain
+    beside the rest.
+    """
     parts, chosen = found.fit.parts, found.choices
     data = found.data._replace(clipped=None)
     while len(parts) > 1:
         now = misfit_of(data, parts, 1)[1]
         others = [parts[:n] + parts[n + 1 :] for n in range(len(parts))]
         costs = [misfit_of(data, rest, _FIRST)[1] - now for rest in others]
-        chosen = tuple(choice._replace(gain=cost) for choice, cost in zip(chosen, costs, strict=True))
+        chosen = tuple(
+            choice._replace(gain=cost) for choice, cost in zip(chosen, costs, strict=True)
+        )
         least_needed = min(range(len(parts)), key=lambda n: costs[n])
         if costs[least_needed] >= least:
             break
@@ -100,12 +115,19 @@ def _light(known: Known, parts: Parts) -> Tensor:
 
 
 def _data(known: Known, parts: Parts) -> Data:
-    """Return the frame with the filter and the weights that the frame without the parts asks for."""
+    """Return the frame with the filter and the weights that the frame without the parts asks
+    for.
+    """
     noise = noise_of(known.electrons, known.seen, known.read_noise)
     scene = known.electrons - _light(known, parts)
     use = filter_of(scene, noise, known.seen)
     weights = weights_of(use(scene), use, noise, scene)
-    return Data(known.electrons, use, weights, censored(known.electrons, known.seen, scene, known.read_noise))
+    return Data(
+        known.electrons,
+        use,
+        weights,
+        censored(known.electrons, known.seen, scene, known.read_noise),
+    )
 
 
 def _empty(data: Data) -> Fit:
@@ -115,7 +137,9 @@ def _empty(data: Data) -> Fit:
 
 
 class _Left(NamedTuple):
-    """What the parts found so far leave, in float32, which is enough to choose between candidates."""
+    """What the parts found so far leave, in float32, which is enough to choose between
+    candidates.
+    """
 
     known: Known
     data: Data
@@ -128,7 +152,9 @@ def _rough(known: Known, fit: Fit, data: Data) -> _Left:
     camera = known.camera._replace(responses=known.camera.responses.float())
     light, seen = known.lamp, known.seen.float()
     lamp = light._replace(
-        spectra=light.spectra.to(torch.complex64), colour=light.colour.float(), patterns=light.patterns.float()
+        spectra=light.spectra.to(torch.complex64),
+        colour=light.colour.float(),
+        patterns=light.patterns.float(),
     )
     less = known._replace(electrons=known.electrons.float(), seen=seen, camera=camera, lamp=lamp)
     rough = Data(left, Filter(seen, data.use.kernel.float()), weights)
@@ -140,7 +166,9 @@ def _best(known: Known, fit: Fit, data: Data, least: float, margin: float) -> Ch
     left = _rough(known, fit, data)
     residual = left.data.use(left.data.electrons)
     choose = (residual, left.data.use, left.data.weights)
-    lamp = Templates(torch.zeros(1).double(), left.known.lamp.patterns[None], left.known.lamp.colour[None])
+    lamp = Templates(
+        torch.zeros(1).double(), left.known.lamp.patterns[None], left.known.lamp.colour[None]
+    )
     starts = [*candidates(*choose, known.lines, _TRIED), *candidates(*choose, lamp, 1)]
     all_clipped = _clipped_starts(known, fit.parts, data.use)
     clipped = [one for one in all_clipped if one.gain >= _BEHIND * all_clipped[0].gain]
@@ -149,7 +177,9 @@ def _best(known: Known, fit: Fit, data: Data, least: float, margin: float) -> Ch
     starts += sorted(near, reverse=True)[:_TRIED]
     grown = _all_grown(left, sorted(starts, reverse=True))
     if clipped and _leaves_dark(known, fit.parts, grown):
-        grown = _with_more(left, grown, [nearest_of_many(*rough, residual, one) for one in clipped[:_TRIED]])
+        grown = _with_more(
+            left, grown, [nearest_of_many(*rough, residual, one) for one in clipped[:_TRIED]]
+        )
     for _ in range(_TRIED):
         odd = [each.part for each in grown if isinstance(each.part, Laser)][:1]
         if not odd or float(odd[0].values[5:].square().sum()) < _ODD:
@@ -161,8 +191,12 @@ def _best(known: Known, fit: Fit, data: Data, least: float, margin: float) -> Ch
     return best and best._replace(part=_precise(best.part, known))
 
 
-def _ahead(left: _Left, found: list[Choice], lasers: list[Choice], least: float, margin: float) -> Choice | None:
-    """Return the best laser, or the best lamp where the laser is not ahead of it enough; None for too little gain."""
+def _ahead(
+    left: _Left, found: list[Choice], lasers: list[Choice], least: float, margin: float
+) -> Choice | None:
+    """Return the best laser, or the best lamp where the laser is not ahead of it enough; None
+    for too little gain.
+    """
     if found[0].gain < least:
         return None
     best = _widened(left, lasers[0])
@@ -186,7 +220,9 @@ def _precise(part: Laser | Lamp, known: Known) -> Laser | Lamp:
 
 
 def _all_grown(left: _Left, starts: list[Candidate]) -> list[Choice]:
-    """Return what grows from candidates that are not far behind what others have grown to, the largest gain first."""
+    """Return what grows from candidates that are not far behind what others have grown to, the
+    largest gain first.
+    """
     found: list[Choice] = []
     for start in starts:
         if start.gain >= _BEHIND * max((each.gain for each in found), default=0.0):
@@ -196,7 +232,9 @@ def _all_grown(left: _Left, starts: list[Candidate]) -> list[Choice]:
 
 def _with_more(left: _Left, grown: list[Choice], starts: list[Candidate]) -> list[Choice]:
     """Return what was grown with what grows from more candidates, the largest gain first."""
-    return sorted([*grown, *_all_grown(left, sorted(starts, reverse=True))], key=lambda each: -each.gain)
+    return sorted(
+        [*grown, *_all_grown(left, sorted(starts, reverse=True))], key=lambda each: -each.gain
+    )
 
 
 def _start(part: Laser) -> Candidate:
@@ -206,7 +244,9 @@ def _start(part: Laser) -> Candidate:
 
 
 def _widened(left: _Left, one: Choice) -> Choice:
-    """Return a laser with the width of its line that explains most; one of a narrow line stays as it is."""
+    """Return a laser with the width of its line that explains most; one of a narrow line stays
+    as it is.
+    """
     best, widths = one, left.known.widths
     assert isinstance(one.part, Laser)
     if float(one.part.fwhm) < _WIDER * widths[0]:
@@ -231,7 +271,9 @@ def _known_already(part: Laser | Lamp, parts: Parts) -> bool:
 
 
 def _full_well(known: Known) -> Tensor:
-    """Return the value of the clipped pixels of each channel, 0 in a channel without any: (channel, 1, 1)."""
+    """Return the value of the clipped pixels of each channel, 0 in a channel without any:
+    (channel, 1, 1).
+    """
     return known.electrons.where(known.seen == 0, 0.0).amax((-2, -1), keepdim=True)
 
 
@@ -241,13 +283,19 @@ def _dark(known: Known, light: Tensor) -> int:
 
 
 def _leaves_dark(known: Known, parts: Parts, grown: list[Choice]) -> bool:
-    """Return True if many of the clipped pixels are too bright for the parts and for the one that gains most."""
+    """Return True if many of the clipped pixels are too bright for the parts and for the one
+    that gains most.
+    """
     more = [_precise(each.part, known).electrons() for each in grown[:1]]
-    return _dark(known, sum(more, _light(known, parts))) > _LEFT * int((known.seen == 0).any(0).sum())
+    return _dark(known, sum(more, _light(known, parts))) > _LEFT * int(
+        (known.seen == 0).any(0).sum()
+    )
 
 
 def _clipped_starts(known: Known, parts: Parts, use: Filter) -> list[Candidate]:
-    """Return candidates whose clipped pixels are those that no part explains; none where all are explained."""
+    """Return candidates whose clipped pixels are those that no part explains; none where all are
+    explained.
+    """
     full, light = _full_well(known), _light(known, parts)
     if _dark(known, light) < _FEW:
         return []

@@ -1,4 +1,6 @@
-"""The most likely values of all lasers and lamps of a frame at once, by steps of Gauss and Newton."""
+"""The most likely values of all lasers and lamps of a frame at once, by steps of Gauss and
+Newton.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from neusee.nodes.restore._lasers._components import Lamp, Laser
 from neusee.nodes.restore._lasers._whitening import Filter, Weights
 
 Parts = tuple[Laser | Lamp, ...]
-_DAMPED = (0.0, 1e-3, 1e-1, 10.0)  #: factors of the diagonal, tried in this order until a step lowers the misfit
+#: factors of the diagonal, tried in this order until a step lowers the misfit
+_DAMPED = (0.0, 1e-3, 1e-1, 10.0)
 _PIECE = 1 << 16  #: numbers at a time whose float64 copies fit in the cache
 _ENOUGH = 0.02  #: log likelihood, a smaller gain of which ends the steps
 
@@ -33,12 +36,15 @@ class Fit(NamedTuple):
     parts: Parts
     misfit: float  #: half the sum of squares of the white residual and of the errors of responses
     normal: Tensor  #: (value, value), matrix of second derivatives of the misfit
-    columns: Tensor  #: (value, number), slopes of the white residual, and of the misfits of clipped pixels after it
+    #: (value, number), slopes of the white residual, and of the misfits of clipped pixels after it
+    columns: Tensor
     rest: Tensor  #: (number,), the white residual, and the misfits of clipped pixels after it
 
 
 def fitted(data: Data, parts: Sequence[Laser | Lamp], steps: int) -> Fit:
-    """Return the parts after at most ``steps`` steps, each of which lowers the misfit, with the slopes at the end."""
+    """Return the parts after at most ``steps`` steps, each of which lowers the misfit, with the
+    slopes at the end.
+    """
     now, left, rest, misfit = _walked(data, tuple(parts), steps)
     columns = _columns(data, now, left)
     return Fit(now, misfit, _normal(now, columns), columns, rest)
@@ -67,7 +73,9 @@ def _walked(data: Data, now: Parts, steps: int) -> tuple[Parts, Tensor, Tensor, 
 def _step(
     data: Data, now: Parts, left: Tensor, rest: Tensor, misfit: float
 ) -> tuple[Parts, Tensor, Tensor, float] | None:
-    """Return the parts after one step, and what `_misfit` says of them; None if no step lowers the misfit."""
+    """Return the parts after one step, and what `_misfit` says of them; None if no step lowers
+    the misfit.
+    """
     columns = _columns(data, now, left)
     normal = _normal(now, columns)
     pulled = torch.cat([part.values * part.precision for part in now])
@@ -75,7 +83,9 @@ def _step(
     sizes = [len(part.values) for part in now]
     for damping in _DAMPED:
         step = solved(normal + damping * normal.diagonal().diag(), slope).to(slope)
-        moved = tuple(part.moved(own) for part, own in zip(now, torch.split(step, sizes), strict=True))
+        moved = tuple(
+            part.moved(own) for part, own in zip(now, torch.split(step, sizes), strict=True)
+        )
         after, white, new = _misfit(data, moved)
         if new < misfit:
             return moved, after, white, new
@@ -96,9 +106,11 @@ def _normal(parts: Parts, columns: Tensor) -> Tensor:
 
 
 def products(columns: Tensor) -> Tensor:
-    """Return the products (value, value) of columns (value, number), summed in float64, a piece at a time.
+    """Return the products (value, value) of columns (value, number), summed in float64, a piece at
+    a time.
 
-    Of a million numbers float32 loses 1e-4 of a product, and what tells strength from responses is smaller than that.
+    Of a million numbers float32 loses 1e-4 of a product, and what tells strength from responses is
+    smaller than that.
     """
     total = torch.zeros(len(columns), len(columns), dtype=torch.float64, device=columns.device)
     for first in range(0, columns.shape[1], _PIECE):
@@ -118,7 +130,9 @@ def solved(normal: Tensor, right: Tensor) -> Tensor:
 
 
 def _misfit(data: Data, parts: Parts) -> tuple[Tensor, Tensor, float]:
-    """Return the frame less the light of the parts, the numbers that are squared, and the misfit."""
+    """Return the frame less the light of the parts, the numbers that are squared, and the
+    misfit.
+    """
     left = data.electrons
     for part in parts:
         left = left - part.electrons()

@@ -17,13 +17,16 @@ from neusee.nodes.values import Bands, Pupil
 
 Sensor = SensorSampling
 
-_COUNTS, _MOST = ((2.5e-9, 3), (6e-9, 5)), 7  #: widths of a line in m, each with the number of its parts; then the most
+#: widths of a line in m, each with the number of its parts; then the most
+_COUNTS, _MOST = ((2.5e-9, 3), (6e-9, 5)), 7
 _NARROW = 0.1e-9  #: m, width of a line, below which slopes are those of a line so wide
 _FILTER_ERROR = 1e-8  #: of the average over a pixel, relative to the brightest pixel
 
 
 class Lens(NamedTuple):
-    """What forms the pattern: focal length and pixel pitch in m, window in pixels, and how a pixel sees it."""
+    """What forms the pattern: focal length and pixel pitch in m, window in pixels, and how a
+    pixel sees it.
+    """
 
     focal_length: float
     pixel_pitch: float
@@ -31,28 +34,41 @@ class Lens(NamedTuple):
     sensor: Sensor = "point"
 
 
-def line_pattern(pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens, fwhm: Tensor) -> Tensor:
+def line_pattern(
+    pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens, fwhm: Tensor
+) -> Tensor:
     """Return the share of the clear pupil's light in each pixel (y, x), mean over a Gaussian line.
 
-    The result has derivatives with respect to every tensor. Beyond half the alias-free field from the spot it is 0,
-    because a sampled pupil repeats its pattern there.
+    The result has derivatives with respect to every tensor. Beyond half the alias-free field from
+    the spot it is 0, because a sampled pupil repeats its pattern there.
     """
     offsets, shares = _parts(fwhm)
-    patterns = [_pattern(pupil, direction, wavelength + at * deviation(fwhm), lens) for at in offsets]
-    return sum((share * each for share, each in zip(shares, patterns, strict=True)), torch.zeros_like(patterns[0]))
+    patterns = [
+        _pattern(pupil, direction, wavelength + at * deviation(fwhm), lens) for at in offsets
+    ]
+    return sum(
+        (share * each for share, each in zip(shares, patterns, strict=True)),
+        torch.zeros_like(patterns[0]),
+    )
 
 
 def deviation(fwhm: Tensor) -> Tensor:
-    """Return the standard deviation of a Gaussian line in m, from its full width at half maximum."""
+    """Return the standard deviation of a Gaussian line in m, from its full width at half
+    maximum.
+    """
     return fwhm / (2.0 * math.sqrt(2.0 * math.log(2.0)))
 
 
 def _parts(fwhm: Tensor) -> tuple[list[float], list[float]]:
-    """Return the wavelengths that stand for a Gaussian line, in standard deviations, and their shares of its light.
+    """Return the wavelengths that stand for a Gaussian line, in standard deviations, and their
+    shares of its light.
 
-    The sums over them are exact for every polynomial of the wavelength up to degree 5, 9 or 13 (Gauss and Hermite).
+    The sums over them are exact for every polynomial of the wavelength up to degree 5, 9 or 13
+    (Gauss and Hermite).
     """
-    at, weights = hermegauss(next((count for most, count in _COUNTS if float(fwhm.detach()) < most), _MOST))
+    at, weights = hermegauss(
+        next((count for most, count in _COUNTS if float(fwhm.detach()) < most), _MOST)
+    )
     return at.tolist(), (weights / weights.sum()).tolist()
 
 
@@ -68,7 +84,9 @@ def _pattern(pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens) ->
 
 
 class _Window(NamedTuple):
-    """The places along both axes at which the light of a window is computed, and what its pixels see of it."""
+    """The places along both axes at which the light of a window is computed, and what its pixels
+    see of it.
+    """
 
     places: tuple[Tensor, Tensor]  #: pixels from the middle pixel
     pixels: tuple[Tensor, Tensor]  #: the middles of the pixels
@@ -76,11 +94,14 @@ class _Window(NamedTuple):
 
     @classmethod
     def of(cls, lens: Lens, field: Tensor, reach: Tensor) -> _Window:
-        y, x = (torch.arange(n, dtype=torch.float64, device=field.device) - n // 2 for n in lens.shape)
+        y, x = (
+            torch.arange(n, dtype=torch.float64, device=field.device) - n // 2 for n in lens.shape
+        )
         if lens.sensor != "integrated":
             return cls((y, x), (y, x), None)
         rows, columns = (
-            fine_axis(n, k * float(reach.detach()), _FILTER_ERROR) for n, k in zip(lens.shape, field.shape, strict=True)
+            fine_axis(n, k * float(reach.detach()), _FILTER_ERROR)
+            for n, k in zip(lens.shape, field.shape, strict=True)
         )
         down, across = (
             centred(grid.samples, field.device) / grid.per_pixel + pixels.mean()
@@ -92,7 +113,10 @@ class _Window(NamedTuple):
         """Return the light (y, x) of each pixel; 0 where the pattern of a spot would repeat."""
         if self.grids is not None:
             light = averaged(light, *self.grids)
-        y, x = (_within(pixels, at, reach).to(light) for pixels, at in zip(self.pixels, spot, strict=True))
+        y, x = (
+            _within(pixels, at, reach).to(light)
+            for pixels, at in zip(self.pixels, spot, strict=True)
+        )
         return light * y[:, None] * x
 
 
@@ -102,7 +126,9 @@ def _reach(pupil: Pupil, wavelength: Tensor, lens: Lens) -> Tensor:
 
 
 def _share(pupil: Pupil, wavelength: Tensor, reach: Tensor) -> Tensor:
-    """Return the factor from the squared sum over the pupil to the share of its light in one pixel."""
+    """Return the factor from the squared sum over the pupil to the share of its light in one
+    pixel.
+    """
     area = pupil.aperture.double().square().sum()
     passed = passed_by_notches(pupil._replace(wavelengths=wavelength[None]))[0]
     return reach.square() * passed / area
@@ -127,7 +153,8 @@ class Moves(NamedTuple):
 def line_moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens, fwhm: Tensor) -> Moves:
     """Return the pattern of `line_pattern` and its slopes, for a spot in pixels; no derivative.
 
-    The slopes with wavelength and variance are means over the line too, by parts of the integral over a Gaussian line.
+    The slopes with wavelength and variance are means over the line too, by parts of the integral
+    over a Gaussian line.
     """
     wide = fwhm.clamp_min(_NARROW)
     sigma, sums = deviation(wide), [torch.zeros(1)] * 5
@@ -139,7 +166,9 @@ def line_moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens, fwhm:
     return Moves(*sums)
 
 
-def _moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens) -> tuple[Tensor, Tensor, Tensor]:
+def _moves(
+    pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return the pattern of one wavelength, and its slopes along y and x by pixel."""
     field, reach = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
     turn_y, turn_x = (_turns(n, reach, field) for n in field.shape)
@@ -149,13 +178,19 @@ def _moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens) -> tuple[
     far, right = (rows @ both).chunk(2, dim=1)
     down = (turn_y * rows) @ both[:, : len(columns)]
     light = window.seen(far.real.square() + far.imag.square(), at, reach)
-    by_pixel = [window.seen(far.real * way.real + far.imag * way.imag, at, reach) for way in (down, right)]
+    by_pixel = [
+        window.seen(far.real * way.real + far.imag * way.imag, at, reach) for way in (down, right)
+    ]
     share = _share(pupil, wavelength, reach).to(light)
     return share * light, 2 * share * by_pixel[0], 2 * share * by_pixel[1]
 
 
-def grid_patterns(pupil: Pupil, down: Tensor, right: Tensor, wavelength: Tensor, lens: Lens) -> Tensor:
-    """Return the patterns (row, column, y, x) of one wavelength with spots at each of ``down`` x ``right`` pixels."""
+def grid_patterns(
+    pupil: Pupil, down: Tensor, right: Tensor, wavelength: Tensor, lens: Lens
+) -> Tensor:
+    """Return the patterns (row, column, y, x) of one wavelength with spots at each of ``down`` x
+    ``right`` pixels.
+    """
     field, reach = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
     window = _Window.of(lens, field, reach)
     rows = torch.cat([_axis(window.places[0], reach, at, field, 0) for at in down])
@@ -165,7 +200,10 @@ def grid_patterns(pupil: Pupil, down: Tensor, right: Tensor, wavelength: Tensor,
     tall, wide = (len(places) for places in window.places)
     patterns = [
         torch.stack(
-            [window.seen(part, (y, x), reach) for x, part in zip(right, torch.split(row, wide, 1), strict=True)]
+            [
+                window.seen(part, (y, x), reach)
+                for x, part in zip(right, torch.split(row, wide, 1), strict=True)
+            ]
         )
         for y, row in zip(down, torch.split(light, tall), strict=True)
     ]
@@ -199,11 +237,15 @@ def _radians(turns: Tensor) -> Tensor:
 
 
 def index_at(wavelength: Tensor, pupil: Pupil) -> Tensor:
-    """Return the index of the mask at a wavelength, by the cubic through the four nearest bands or fewer."""
+    """Return the index of the mask at a wavelength, by the cubic through the four nearest bands
+    or fewer.
+    """
     known, values = pupil.wavelengths.to(wavelength), pupil.index.to(wavelength)
     count = min(4, len(known))
     first = int(
-        torch.searchsorted(known.detach(), wavelength.detach()).clamp(count // 2, len(known) - count + count // 2)
+        torch.searchsorted(known.detach(), wavelength.detach()).clamp(
+            count // 2, len(known) - count + count // 2
+        )
     )
     at, value = (x[first - count // 2 : first - count // 2 + count] for x in (known, values))
     total = torch.zeros_like(wavelength)
@@ -215,7 +257,9 @@ def index_at(wavelength: Tensor, pupil: Pupil) -> Tensor:
 
 
 def interpolated(at: Tensor, known: Tensor, values: Tensor) -> Tensor:
-    """Return values (row,) at one place, linear between known places in rising order and beyond their ends."""
+    """Return values (row,) at one place, linear between known places in rising order and beyond
+    their ends.
+    """
     if len(known) == 1:
         return values[:, 0] + 0.0 * at
     right = int(torch.searchsorted(known.detach(), at.detach()).clamp(1, len(known) - 1))
@@ -224,5 +268,9 @@ def interpolated(at: Tensor, known: Tensor, values: Tensor) -> Tensor:
 
 
 def response_at(wavelength: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """Return the response of each channel at a wavelength: (channel,), linear between the centres of the bands."""
-    return interpolated(wavelength, bands.centres.to(wavelength), responses.to(wavelength)).clamp_min(0.0)
+    """Return the response of each channel at a wavelength: (channel,), linear between the
+    centres of the bands.
+    """
+    return interpolated(
+        wavelength, bands.centres.to(wavelength), responses.to(wavelength)
+    ).clamp_min(0.0)

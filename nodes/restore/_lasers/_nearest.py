@@ -1,4 +1,6 @@
-"""Where around a rough candidate a pattern gains most, with the clipped pixels left out as in the fit."""
+"""Where around a rough candidate a pattern gains most, with the clipped pixels left out as in
+the fit.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +13,21 @@ from neusee.nodes.restore._lasers._joint_fit import Data
 from neusee.nodes.restore._lasers._line_pattern import grid_patterns, response_at
 from neusee.nodes.restore._lasers._whitening import Filter, Weights
 
-_HALVES, _NEAR = (-0.6, -0.3, 0.0, 0.3, 0.6), (-3.0, -1.5, 0.0, 1.5, 3.0)  #: pixels and nm around a candidate
-FAR = tuple(1.5 * n for n in range(-10, 11))  #: nm around a laser whose colours do not fit its wavelength
-_COARSE, _TILES = (-0.5, 0.0, 0.5), (-3.0, -1.5, 0.0, 1.5, 3.0)  #: pixels around a tile, and of the tiles
+#: pixels and nm around a candidate
+_HALVES, _NEAR = (-0.6, -0.3, 0.0, 0.3, 0.6), (-3.0, -1.5, 0.0, 1.5, 3.0)
+#: nm around a laser whose colours do not fit its wavelength
+FAR = tuple(1.5 * n for n in range(-10, 11))
+#: pixels around a tile, and of the tiles
+_COARSE, _TILES = (-0.5, 0.0, 0.5), (-3.0, -1.5, 0.0, 1.5, 3.0)
 _AROUND = 256  #: pixels a side of the window in which these are compared
 
 
 def nearest_of_many(camera: Camera, data: Data, residual: Tensor, start: Candidate) -> Candidate:
-    """Return the best candidate within 3.5 pixels and 3 nm of a rough one; ``residual`` is filtered.
+    """Return the best candidate within 3.5 pixels and 3 nm of a rough one; ``residual`` is
+    filtered.
 
-    Clipped pixels tell the place of a wide pattern to a few pixels, and a pattern of fine rings gains nothing where it
-    is half a pixel off.
+    Clipped pixels tell the place of a wide pattern to a few pixels, and a pattern of fine rings
+    gains nothing where it is half a pixel off.
     """
     y, x = start.spot
     tiles = [start._replace(spot=(y + down, x + right)) for down in _TILES for right in _TILES]
@@ -38,10 +44,12 @@ def nearest(
     halves: tuple[float, ...] = _HALVES,
     near: tuple[float, ...] = _NEAR,
 ) -> Candidate:
-    """Return the best of the candidates around one, because the rings far from a clipped spot are narrow.
+    """Return the best of the candidates around one, because the rings far from a clipped spot are
+    narrow.
 
-    Candidates are ``halves`` (pixels) away along y and along x, and ``near`` (nm); ``residual`` is filtered. All
-    channels count with the responses of the camera, so that a wrong wavelength gains less than in a fit.
+    Candidates are ``halves`` (pixels) away along y and along x, and ``near`` (nm); ``residual`` is
+    filtered. All channels count with the responses of the camera, so that a wrong wavelength gains
+    less than in a fit.
     """
     window, middle = _window(residual, start.spot)
     seen = Filter(data.use.seen[..., *window], data.use.kernel)
@@ -53,11 +61,16 @@ def nearest(
         for at, m in zip(start.spot, middle, strict=True)
     )
     for nm in near:
-        wavelength = torch.tensor(start.wavelength + nm * NANOMETRE, dtype=torch.float64, device=white.device)
+        wavelength = torch.tensor(
+            start.wavelength + nm * NANOMETRE, dtype=torch.float64, device=white.device
+        )
         heard = start.strength * response_at(wavelength, camera.responses, camera.bands).to(white)
         patterns = grid_patterns(camera.pupil, down, right, wavelength, lens).to(white)
         light = within(heard[:, None, None] * seen(patterns.flatten(0, 1)[:, None]))
-        product, norm = (light * white).sum((1, 2, 3)), light.square().sum((1, 2, 3)).clamp_min(1e-30)
+        product, norm = (
+            (light * white).sum((1, 2, 3)),
+            light.square().sum((1, 2, 3)).clamp_min(1e-30),
+        )
         gain = 0.5 * product.clamp_min(0.0).square() / norm
         n = int(gain.argmax())
         if float(gain[n]) > best.gain:
@@ -68,8 +81,12 @@ def nearest(
     return best
 
 
-def _window(frame: Tensor, spot: tuple[float, float]) -> tuple[tuple[slice, slice], tuple[int, int]]:
-    """Return the window of a frame around a spot that tells the candidates apart, and where its middle lies."""
+def _window(
+    frame: Tensor, spot: tuple[float, float]
+) -> tuple[tuple[slice, slice], tuple[int, int]]:
+    """Return the window of a frame around a spot that tells the candidates apart, and where its
+    middle lies.
+    """
     window, middle = [], []
     for n, at in zip(frame.shape[-2:], spot, strict=True):
         side = min(n, _AROUND)

@@ -1,4 +1,6 @@
-"""Blocks of the FFT-Mamba network, which combine selective scans of a picture and of the spectrum of the picture."""
+"""Blocks of the FFT-Mamba network, which combine selective scans of a picture and of the
+spectrum of the picture.
+"""
 
 import functools
 from typing import Any, Literal
@@ -12,15 +14,23 @@ from neusee.nodes.restore._networks._restorer import ChannelNorm, Scale, gated
 from neusee.nodes.restore._networks._scan_layer import BothWays, Kind
 
 Directions = Literal[2, 4]  #: 2: a block scans rows or columns; 4: both
-Form = Literal["complex", "amp_phase"]  #: the numbers that represent a spectrum in a scan and in its gate
+#: the numbers that represent a spectrum in a scan and in its gate
+Form = Literal["complex", "amp_phase"]
 SMALL = 1e-4  #: added to the square of an amplitude, so that gradients stay finite
 
 
 class Spatial(nn.Module):
-    """A layer that applies selective scans along the rows or columns of a picture, or both, and gates the result."""
+    """A layer that applies selective scans along the rows or columns of a picture, or both, and
+    gates the result.
+    """
 
     def __init__(
-        self, width: int, states: int, by_columns: bool, kind: Kind = "s6", directions: Directions = 2
+        self,
+        width: int,
+        states: int,
+        by_columns: bool,
+        kind: Kind = "s6",
+        directions: Directions = 2,
     ) -> None:
         super().__init__()
         inner, self.by_columns = 2 * width, by_columns
@@ -43,9 +53,13 @@ class Spatial(nn.Module):
 
 
 def _along(scan: nn.Module, value: Tensor, by_columns: bool) -> Tensor:
-    """Apply a selective scan along the rows of a picture (n, channel, y, x), or the columns if ``by_columns``."""
+    """Apply a selective scan along the rows of a picture (n, channel, y, x), or the columns if
+    ``by_columns``.
+    """
     value = value.mT if by_columns else value
-    scanned: Tensor = scan(value.flatten(2).transpose(1, 2)).transpose(1, 2).unflatten(2, value.shape[-2:])
+    scanned: Tensor = (
+        scan(value.flatten(2).transpose(1, 2)).transpose(1, 2).unflatten(2, value.shape[-2:])
+    )
     return scanned.mT if by_columns else scanned
 
 
@@ -66,7 +80,8 @@ class _Phase(torch.autograd.Function):
 
 @functools.lru_cache(maxsize=32)
 def radial_order(size: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return the positions in the half spectrum of a (y, x) picture by rising radius, and the rank of each position.
+    """Return the positions in the half spectrum of a (y, x) picture by rising radius, and the rank
+    of each position.
 
     Radii are in cycles per pixel. Equal radii are ordered by angle, from -90 to 90 degrees.
     """
@@ -74,7 +89,8 @@ def radial_order(size: tuple[int, int], device: torch.device) -> tuple[Tensor, T
     with torch.inference_mode(False):  # the cache may serve a caller that trains
         rows = torch.fft.fftfreq(y, 1 / y, dtype=torch.float64).round().long()[:, None] * x
         columns = torch.arange(x // 2 + 1)[None] * y
-        radius = (rows * rows + columns * columns).flatten()  # whole numbers, so that equal radii compare equal
+        # whole numbers, so that equal radii compare equal
+        radius = (rows * rows + columns * columns).flatten()
         angle = torch.atan2(rows.double(), columns.double()).flatten()
         order = angle.argsort(stable=True)
         order = order[radius[order].argsort(stable=True)]
@@ -82,10 +98,12 @@ def radial_order(size: tuple[int, int], device: torch.device) -> tuple[Tensor, T
 
 
 class Frequency(nn.Module):
-    """A layer that multiplies the spectrum of a picture by a gate, computed by selective scans over frequency.
+    """A layer that multiplies the spectrum of a picture by a gate, computed by selective scans over
+    frequency.
 
-    The gate uses real and imaginary parts, because phase has no gradient at 0. Amplitude and phase, ``amp_phase``, are
-    for comparison. At the start of training the gate is close to 1 and the picture passes almost unchanged.
+    The gate uses real and imaginary parts, because phase has no gradient at 0. Amplitude and phase,
+    ``amp_phase``, are for comparison. At the start of training the gate is close to 1 and the
+    picture passes almost unchanged.
     """
 
     def __init__(self, width: int, states: int, kind: Kind = "s6", form: Form = "complex") -> None:
@@ -124,7 +142,9 @@ class Frequency(nn.Module):
         return (real.square() + imaginary.square() + SMALL).sqrt(), phase
 
     def _factor(self, first: Tensor, second: Tensor) -> Tensor:
-        """Return the factor near 1 that multiplies the spectrum, in complex form or from amplitude and phase."""
+        """Return the factor near 1 that multiplies the spectrum, in complex form or from
+        amplitude and phase.
+        """
         if self.form == "complex":
             return 1 + self.strength * torch.complex(first, second)
         amplitude, turn = 1 + self.strength * first, self.strength * second
@@ -132,7 +152,9 @@ class Frequency(nn.Module):
 
 
 class Block(nn.Module):
-    """A block that mixes selective scans of a picture and of its spectrum, with a gated feed-forward layer."""
+    """A block that mixes selective scans of a picture and of its spectrum, with a gated
+    feed-forward layer.
+    """
 
     def __init__(
         self,
@@ -158,5 +180,7 @@ class Block(nn.Module):
         near, far = self.spatial(seen), self.frequency(seen)
         share = torch.sigmoid(self.weigh(torch.cat([near.to(far), far], 1)))
         x = x + self.scale(share * near + (1 - share) * far)
-        result: Tensor = x + self.second_scale(self.narrow(gated(self.mix(self.widen(self.second_norm(x))))))
+        result: Tensor = x + self.second_scale(
+            self.narrow(gated(self.mix(self.widen(self.second_norm(x)))))
+        )
         return result

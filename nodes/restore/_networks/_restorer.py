@@ -1,4 +1,6 @@
-"""The common base of all restoring networks, with their initial weights and their application to a picture."""
+"""The common base of all restoring networks, with their initial weights and their application to
+a picture.
+"""
 
 import math
 from abc import ABC, abstractmethod
@@ -29,7 +31,8 @@ LAYERS = (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)
 
 
 class Restorer(nn.Module, ABC):
-    """A network that restores pictures (n, 3, y, x) of any size at two scales, a coarse and a fine scale.
+    """A network that restores pictures (n, 3, y, x) of any size at two scales, a coarse and a fine
+    scale.
 
     ``given`` is what a network needs of a picture beside its pixels; most networks need nothing.
     """
@@ -60,7 +63,9 @@ class PictureRestorer(Restorer):
 
     @abstractmethod
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the restored picture at half and full size, for a picture whose sides are multiples of `multiple`."""
+        """Return the restored picture at half and full size, for a picture whose sides are
+        multiples of `multiple`.
+        """
 
     def pyramid(self, picture: Tensor, *given: Any) -> tuple[Tensor, Tensor]:
         y, x = picture.shape[-2:]
@@ -72,11 +77,15 @@ class PictureRestorer(Restorer):
 
 
 class Flat(PictureRestorer):
-    """A restoring network that works at full size only; its coarse estimate is the reduced fine estimate."""
+    """A restoring network that works at full size only; its coarse estimate is the reduced fine
+    estimate.
+    """
 
     @abstractmethod
     def change(self, picture: Tensor) -> Tensor:
-        """Return the restored picture minus ``picture``, whose sides are multiples of `multiple`."""
+        """Return the restored picture minus ``picture``, whose sides are multiples of
+        `multiple`.
+        """
 
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
         fine = picture + self.change(picture)
@@ -84,14 +93,18 @@ class Flat(PictureRestorer):
 
 
 class ChannelNorm(nn.LayerNorm):
-    """A layer norm over the channels of a picture (n, channel, y, x), computed in float32 or better."""
+    """A layer norm over the channels of a picture (n, channel, y, x), computed in float32 or
+    better.
+    """
 
     def forward(self, input: Tensor) -> Tensor:
         return super().forward(single(input).movedim(1, -1)).movedim(-1, 1)
 
 
 class Scale(nn.Module):
-    """A trainable factor for each channel, small at the start, which scales the output of a network block."""
+    """A trainable factor for each channel, small at the start, which scales the output of a
+    network block.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -105,11 +118,12 @@ class Scale(nn.Module):
 
 
 def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
-    """Return a network with initial values: random orthogonal weights and zero biases of linear and convolution layers.
+    """Return a network with initial values: random orthogonal weights and zero biases of linear and
+    convolution layers.
 
-    Norms, decays and factors have rules of their own. The weights of a network with leaky layers are multiplied by its
-    `gain`, which keeps the power from layer to layer. `Restorer.begin` makes the change to a picture small, so that
-    the network at first returns almost the same picture.
+    Norms, decays and factors have rules of their own. The weights of a network with leaky layers
+    are multiplied by its `gain`, which keeps the power from layer to layer. `Restorer.begin` makes
+    the change to a picture small, so that the network at first returns almost the same picture.
     """
     net = empty(make).to_empty(device=rng.device)
     gain = getattr(net, "gain", 1.0)
@@ -128,8 +142,12 @@ def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
     return net
 
 
-def parameter_groups(net: nn.Module, weights: float = 2e-4, biases: float = 4e-4) -> list[dict[str, Any]]:
-    """Return the network's parameters in two groups for an optimiser; the second group has the biases of layers."""
+def parameter_groups(
+    net: nn.Module, weights: float = 2e-4, biases: float = 4e-4
+) -> list[dict[str, Any]]:
+    """Return the network's parameters in two groups for an optimiser; the second group has the
+    biases of layers.
+    """
     of_layers = [m.bias for m in net.modules() if isinstance(m, LAYERS) and m.bias is not None]
     known = set(map(id, of_layers))
     others = [p for p in net.parameters() if id(p) not in known]
@@ -144,23 +162,34 @@ def restored(
     reduce: int = 1,
     detail: bool = False,
 ) -> Tensor:
-    """Restore a picture in float32 by a network with weights read from a file; only the picture receives gradients.
+    """Restore a picture in float32 by a network with weights read from a file; only the picture
+    receives gradients.
 
-    ``tile``: the side of the pieces in which a larger picture is restored. ``reduce``: the factor by which the picture
-    is first reduced and afterwards enlarged, antialiased; ``detail`` adds the detail that the reduction loses.
+    ``tile``: the side of the pieces in which a larger picture is restored. ``reduce``: the factor
+    by which the picture is first reduced and afterwards enlarged, antialiased; ``detail`` adds the
+    detail that the reduction loses.
     """
     return restored_by(lambda: loaded(make, _needed(weights)), picture, tile, reduce, detail)
 
 
 def restored_by(
-    ready: Callable[[], nn.Module], picture: Tensor, tile: int | None = None, reduce: int = 1, detail: bool = False
+    ready: Callable[[], nn.Module],
+    picture: Tensor,
+    tile: int | None = None,
+    reduce: int = 1,
+    detail: bool = False,
 ) -> Tensor:
     """Restore a picture as `restored` does, by the network with weights that ``ready`` returns."""
     if picture.ndim != 3 or len(picture) != 3:
-        raise ValueError(f"a picture {tuple(picture.shape)} is not a colour picture: give (3, y, x)")
+        raise ValueError(
+            f"a picture {tuple(picture.shape)} is not a colour picture: give (3, y, x)"
+        )
     refuse_not_finite("the network would spread them to every pixel", picture=picture)
     net = ready().requires_grad_(False).eval().to(picture.device)
-    with exact_convolutions(picture, deterministic=True), torch.autocast(picture.device.type, enabled=False):
+    with (
+        exact_convolutions(picture, deterministic=True),
+        torch.autocast(picture.device.type, enabled=False),
+    ):
         y, x = picture.shape[-2:]
         whole = picture.float()[None]
         seen = whole if reduce == 1 else resize(whole, -(-y // reduce), -(-x // reduce))
@@ -180,24 +209,34 @@ def fitting(
     width: int,
     **sizes: Any,
 ) -> list[str]:
-    """Raise ParameterError if the file of weights is absent or belongs to another network; return no warnings."""
+    """Raise ParameterError if the file of weights is absent or belongs to another network;
+    return no warnings.
+    """
     same_layout(partial(network, width, **sizes), _needed(weights), width)
     return []
 
 
 def _needed(weights: Path | None) -> Path:
     if weights is None:
-        text = "a network needs trained weights: give the .safetensors file of its weights, or choose restore: wiener"
+        text = (
+            "a network needs trained weights: give the .safetensors file of its weights, or choose"
+            " restore: wiener"
+        )
         raise ParameterError("weights", text)
     return weights
 
 
 def restorer_checks(result: Tensor, picture: Tensor, **params: Any) -> list[Check]:
-    """Return a check of the root mean square change by a network, which fails if this change is not finite."""
+    """Return a check of the root mean square change by a network, which fails if this change is
+    not finite.
+    """
     change = float((result - picture).square().mean(dtype=torch.float64).sqrt())
     before = float(picture.square().mean(dtype=torch.float64).sqrt())
     return [
-        Check(f"network changed the picture by {change:.3g} rms, of {before:.3g} rms before", math.isfinite(change))
+        Check(
+            f"network changed the picture by {change:.3g} rms, of {before:.3g} rms before",
+            math.isfinite(change),
+        )
     ]
 
 

@@ -1,4 +1,6 @@
-"""Trainable layers for selective scans, with the initial values of their time steps and decay rates."""
+"""Trainable layers for selective scans, with the initial values of their time steps and decay
+rates.
+"""
 
 import math
 from typing import Literal
@@ -13,11 +15,14 @@ from neusee.nodes.restore._scan._selective_scan import selective_scan
 
 Kind = Literal["s6", "ssd"]  #: s6: a decay for each channel and state; ssd: a decay for each head
 HEAD = 16  #: channels that share a decay
-STEPS = (1e-3, 0.1)  #: range of the first steps of a scan, log-uniform: a memory of ten to a thousand positions
+#: range of the first steps of a scan, log-uniform: a memory of ten to a thousand positions
+STEPS = (1e-3, 0.1)
 
 
 class Scan(nn.Module):
-    """A selective scan along a sequence (n, length, channel), with step, input and output weights from the sequence."""
+    """A selective scan along a sequence (n, length, channel), with step, input and output
+    weights from the sequence.
+    """
 
     def __init__(self, channels: int, states: int, rank: int) -> None:
         super().__init__()
@@ -34,7 +39,11 @@ class Scan(nn.Module):
         Zero biases would give a memory of one position.
         """
         self.dt_bias.copy_(_first_steps(len(self.D), rng))
-        self.A_log.copy_(torch.arange(1.0, 1.0 + self.A_log.shape[1], device=rng.device).log().expand_as(self.A_log))
+        self.A_log.copy_(
+            torch.arange(1.0, 1.0 + self.A_log.shape[1], device=rng.device)
+            .log()
+            .expand_as(self.A_log)
+        )
         self.D.fill_(1.0)
 
     def forward(self, u: Tensor) -> Tensor:
@@ -46,7 +55,9 @@ class Scan(nn.Module):
 
 
 class DualScan(nn.Module):
-    """A selective scan with one step and one decay rate for each head of channels, computed by matrix products."""
+    """A selective scan with one step and one decay rate for each head of channels, computed by
+    matrix products.
+    """
 
     def __init__(self, channels: int, states: int, rank: int) -> None:
         super().__init__()
@@ -56,7 +67,9 @@ class DualScan(nn.Module):
         self.dt_bias, self.A_log, self.D = (nn.Parameter(torch.empty(heads)) for _ in range(3))
 
     def start(self, rng: torch.Generator) -> None:
-        """Set random time steps for the start of training, and random decay rates from 1 to 16, the range of `Scan`."""
+        """Set random time steps for the start of training, and random decay rates from 1 to 16,
+        the range of `Scan`.
+        """
         self.dt_bias.copy_(_first_steps(len(self.D), rng))
         self.A_log.uniform_(1.0, 16.0, generator=rng).log_()
         self.D.fill_(1.0)
@@ -64,7 +77,9 @@ class DualScan(nn.Module):
     def forward(self, u: Tensor) -> Tensor:
         rate, into, out = (single(part) for part in self.read(u).split(self.sizes, -1))
         with torch.autocast(u.device.type, enabled=False):
-            return dual_scan(single(u), _step(rate, self.dt_bias), _decay(self.A_log), into, out, self.D)
+            return dual_scan(
+                single(u), _step(rate, self.dt_bias), _decay(self.A_log), into, out, self.D
+            )
 
 
 class BothWays(nn.Module):
@@ -81,7 +96,9 @@ class BothWays(nn.Module):
 
 
 def _first_steps(count: int, rng: torch.Generator) -> Tensor:
-    """Return random biases that softplus turns into time steps, log-uniform within the range `STEPS`."""
+    """Return random biases that softplus turns into time steps, log-uniform within the range
+    `STEPS`.
+    """
     low, high = map(math.log, STEPS)
     steps = torch.rand(count, generator=rng, device=rng.device).mul_(high - low).add_(low).exp_()
     return steps + torch.log(-torch.expm1(-steps))

@@ -7,12 +7,22 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes import node
-from neusee.nodes.restore._networks._restorer import LEAK, LEAKY, Flat, Tile, fitting, restored, restorer_checks
+from neusee.nodes.restore._networks._restorer import (
+    LEAK,
+    LEAKY,
+    Flat,
+    Tile,
+    fitting,
+    restored,
+    restorer_checks,
+)
 from neusee.nodes.units import Count, DataFile, Layers
 
 
 class UNet(Flat):
-    """A network whose encoder halves size and doubles channels three times, with skips to a mirrored decoder."""
+    """A network whose encoder halves size and doubles channels three times, with skips to a
+    mirrored decoder.
+    """
 
     multiple, gain = 8, LEAKY
 
@@ -37,7 +47,10 @@ class UNet(Flat):
 
 
 def _pair(inputs: int, outputs: int) -> nn.Sequential:
-    first, second = nn.Conv2d(inputs, outputs, 3, padding=1), nn.Conv2d(outputs, outputs, 3, padding=1)
+    first, second = (
+        nn.Conv2d(inputs, outputs, 3, padding=1),
+        nn.Conv2d(outputs, outputs, 3, padding=1),
+    )
     return nn.Sequential(first, nn.LeakyReLU(LEAK), second, nn.LeakyReLU(LEAK))
 
 
@@ -58,9 +71,10 @@ def unet(
     Shapes: picture (3, y, x) of any size -> (3, y, x).
     Units:  linear sRGB, as in the training of the weights.
     Error:  float32, 1e-5; of the restoration, the error that the training reached.
-    Raises: ParameterError before the run without weights, or where the weights do not fit; ValueError for a picture
-            that is not a colour picture or not finite.
-    Source: Ronneberger et al., U-Net, MICCAI 2015; four levels, padded convolutions and the added picture are ours.
+    Raises: ParameterError before the run without weights, or where the weights do not fit;
+            ValueError for a picture that is not a colour picture or not finite.
+    Source: Ronneberger et al., U-Net, MICCAI 2015; four levels, padded convolutions and the added
+            picture are ours.
     """
     return restored(picture, partial(UNet, width), weights, tile, reduce, detail)
 

@@ -1,7 +1,8 @@
 """The PSF of highest likelihood for frames of point sources, and draws of its error.
 
-Places, signals, backgrounds and PSFs are fitted together by Gauss-Newton steps (Bjoerck, Numerical Methods for Least
-Squares Problems, 1996, ch. 9), so that the error of the centring is part of the error of the PSF.
+Places, signals, backgrounds and PSFs are fitted together by Gauss-Newton steps (Bjoerck, Numerical
+Methods for Least Squares Problems, 1996, ch. 9), so that the error of the centring is part of the
+error of the PSF.
 """
 
 from __future__ import annotations
@@ -41,9 +42,17 @@ class Fit(NamedTuple):
     inflation: Tensor  #: (node,)
 
 
-def fitted(seen: Seen, shape: tuple[int, int], zones: tuple[int, int], window: tuple[int, int], count: int,
-           rng: Generator) -> Fit:  # fmt: skip
-    """Return the PSFs at the nodes and draws of them; raise ValueError where no pixel tells of a part of a PSF."""
+def fitted(
+    seen: Seen,
+    shape: tuple[int, int],
+    zones: tuple[int, int],
+    window: tuple[int, int],
+    count: int,
+    rng: Generator,
+) -> Fit:
+    """Return the PSFs at the nodes and draws of them; raise ValueError where no pixel tells of a
+    part of a PSF.
+    """
     share = node_weights(seen.middle, shape, zones)
     state, weight = _start(seen, share, window)
     hold = _hold(linear(seen, state, share), state.kernels, weight)
@@ -53,7 +62,9 @@ def fitted(seen: Seen, shape: tuple[int, int], zones: tuple[int, int], window: t
         residual = seen.light - near.model(state.background)
         step = _solved(near, hold, weight, _slope(near, state, weight, residual))
         before = state.offset
-        state = _ahead(seen, state, share, weight, step._replace(offset=step.offset.clamp(-_MOST, _MOST)))
+        state = _ahead(
+            seen, state, share, weight, step._replace(offset=step.offset.clamp(-_MOST, _MOST))
+        )
         weight = _weight(seen, linear(seen, state, share).model(state.background))
         if float((state.offset - before).abs().max()) < _ENOUGH:
             break
@@ -66,16 +77,21 @@ def fitted(seen: Seen, shape: tuple[int, int], zones: tuple[int, int], window: t
     for _ in range(count):
         noise = _normal(weight, rng) * weight.sqrt()
         slope = near.slope(noise)
-        slope = slope._replace(background=slope.background + _normal(seen.doubt, rng) / seen.doubt.sqrt())
+        slope = slope._replace(
+            background=slope.background + _normal(seen.doubt, rng) / seen.doubt.sqrt()
+        )
         other = gauged(state.plus(_solved(near, hold, weight, slope)).kernels)
         draws.append((kernels + local * (other - kernels)).float())
-    return Fit(kernels, torch.stack(draws), state, _chi(weight, residual, near), *_support(near, weight))
+    return Fit(
+        kernels, torch.stack(draws), state, _chi(weight, residual, near), *_support(near, weight)
+    )
 
 
 def gauged(kernels: Tensor) -> Tensor:
     """Return kernels of sum 1 whose centres are in the middle of the window.
 
-    The centre is the mean place, weighted by the square of the sum of the channels; noise in the wings hardly moves it.
+    The centre is the mean place, weighted by the square of the sum of the channels; noise in the
+    wings hardly moves it.
     """
     offset = kernels.new_zeros(len(kernels), 2)
     found = kernels
@@ -90,24 +106,33 @@ def centre(kernels: Tensor) -> Tensor:
     power = kernels.mean(1).square()
     y, x = (torch.arange(n, dtype=power.dtype) - n // 2 for n in power.shape[-2:])
     whole = power.sum((-2, -1))
-    return torch.stack([(power.sum(-1) * y).sum(-1) / whole, (power.sum(-2) * x).sum(-1) / whole], -1)
+    return torch.stack(
+        [(power.sum(-1) * y).sum(-1) / whole, (power.sum(-2) * x).sum(-1) / whole], -1
+    )
 
 
-# --- start ------------------------------------------------------------------------------------------------------------
+# --- start ----------------------------------------------------------------------------------------
 
 
 def _start(seen: Seen, share: Tensor, window: tuple[int, int]) -> tuple[State, Tensor]:
     """Return a first guess: one PSF for all nodes, from the points that are not saturated."""
     points, channels, nodes = len(seen.owner), len(seen.light), share.shape[1]
     kernels = seen.light.new_zeros(nodes, channels, *window)
-    state = State(kernels, seen.light.new_zeros(points, channels), seen.light.new_zeros(points, 2), seen.background)
+    state = State(
+        kernels,
+        seen.light.new_zeros(points, channels),
+        seen.light.new_zeros(points, 2),
+        seen.background,
+    )
     near = linear(seen, state, share)
     stamps = near.stamps_of(seen.light - seen.background.T[:, seen.frame])
     weight = _weight(seen, seen.light)
     weights = near.stamps_of(weight)
     good = (near.stamps_of(seen.clipped.double()) == 0).all(1).flatten(1).all(1)
     valid = (weights[good] > 0).double()
-    guess = (stamps[good] * valid).sum(0) / (valid * stamps[good].sum((-2, -1), keepdim=True)).sum(0).clamp_min(1e-9)
+    guess = (stamps[good] * valid).sum(0) / (valid * stamps[good].sum((-2, -1), keepdim=True)).sum(
+        0
+    ).clamp_min(1e-9)
     guess = guess.clamp_min(0.0)
     guess = guess / guess.sum((-2, -1), keepdim=True).clamp_min(1e-9)
     for _ in range(2):
@@ -116,18 +141,22 @@ def _start(seen: Seen, share: Tensor, window: tuple[int, int]) -> tuple[State, T
 
 
 def _registered(stamps: Tensor, weights: Tensor, guess: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the whole-pixel offset of each point at which the guess explains most, and the signal of each channel."""
+    """Return the whole-pixel offset of each point at which the guess explains most, and the
+    signal of each channel.
+    """
     channels, wide = len(guess), (_SEARCH,) * 4
     found = conv2d(pad(weights * stamps, wide), guess[:, None], groups=channels)
     there = conv2d(pad(weights, wide), guess.square()[:, None], groups=channels).clamp_min(1e-30)
     best = (found.clamp_min(0.0).square() / there).sum(1).flatten(1).argmax(1)
-    signal = (found / there).flatten(2).gather(2, best[:, None, None].expand(-1, channels, 1))[..., 0]
+    signal = (
+        (found / there).flatten(2).gather(2, best[:, None, None].expand(-1, channels, 1))[..., 0]
+    )
     side = 2 * _SEARCH + 1
     offset = torch.stack([best // side, best % side], 1).double() - _SEARCH
     return offset, signal.clamp_min(1e-3)
 
 
-# --- steps ------------------------------------------------------------------------------------------------------------
+# --- steps ----------------------------------------------------------------------------------------
 
 
 def _weight(seen: Seen, expected: Tensor) -> Tensor:
@@ -145,7 +174,9 @@ def _slope(near: Linear, state: State, weight: Tensor, residual: Tensor) -> Stat
 
 
 def _ahead(seen: Seen, state: State, share: Tensor, weight: Tensor, step: State) -> State:
-    """Return the state after a step, halved until the frames fit better; the state itself if none does."""
+    """Return the state after a step, halved until the frames fit better; the state itself if
+    none does.
+    """
     worst = _square(seen, state, linear(seen, state, share), weight)
     for _ in range(_HALVED):
         ahead = state.plus(step)
@@ -162,20 +193,28 @@ def _square(seen: Seen, state: State, near: Linear, weight: Tensor) -> Tensor:
 
 
 def _curvature(near: Linear, weight: Tensor) -> State:
-    """Return the diagonal of the matrix of the step, roughly: that of the PSFs as if no point were shifted."""
+    """Return the diagonal of the matrix of the step, roughly: that of the PSFs as if no point
+    were shifted.
+    """
     stamps = near.stamps_of(weight)
-    kernels = torch.tensordot(near.share.square(), near.signal.square()[..., None, None] * stamps, ([0], [0]))
+    kernels = torch.tensordot(
+        near.share.square(), near.signal.square()[..., None, None] * stamps, ([0], [0])
+    )
     signal = (stamps * near.patterns[0].square()).sum((-2, -1))
     offset = (stamps * near.patterns[1:].square()).sum((-3, -2, -1)).T
-    count = weight.new_zeros(len(near.seen.background), len(weight)).index_add(0, near.seen.frame, weight.T)
+    count = weight.new_zeros(len(near.seen.background), len(weight)).index_add(
+        0, near.seen.frame, weight.T
+    )
     found = State(kernels, signal, offset, count + 1.0 / near.seen.doubt)
     return State(*(x + 1e-3 * x.amax() * (x <= 0) + _CALM * x.amax() for x in found))
 
 
 def _solved(near: Linear, hold: Hold, weight: Tensor, right: State) -> State:
-    """Return the step for a slope, by conjugate gradients that the curvature of each entry speeds up.
+    """Return the step for a slope, by conjugate gradients that the curvature of each entry speeds
+    up.
 
-    A shift of all points is a shift of the PSFs, and a factor of a PSF is one of the signals: ``hold`` decides.
+    A shift of all points is a shift of the PSFs, and a factor of a PSF is one of the signals:
+    ``hold`` decides.
     """
     diagonal = _curvature(near, weight)
     inverse = State(*(1.0 / x for x in diagonal))
@@ -203,14 +242,16 @@ class Hold(NamedTuple):
     """What stays where it is, because a shift of all points is a shift of the PSFs."""
 
     points: Tensor  #: (point, point), projects on the moves of the points that are left to the PSFs
-    ways: Tensor | None  #: (way, node, channel, y, x), changes of the PSFs that are left to the points
+    #: (way, node, channel, y, x), changes of the PSFs that are left to the points
+    ways: Tensor | None
 
 
 def _hold(near: Linear, kernels: Tensor, weight: Tensor) -> Hold:
     """Return what stays where it is at the nodes.
 
-    Where each point tells one PSF, the points stay, so that a PSF need not be known between pixels. Where points tell
-    several, the PSFs stay in the middle: those that lie beside one another would add to a wider one.
+    Where each point tells one PSF, the points stay, so that a PSF need not be known between pixels.
+    Where points tell several, the PSFs stay in the middle: those that lie beside one another would
+    add to a wider one.
     """
     if float(_support(near, weight)[1].max()) > _SHARED:
         return Hold(torch.zeros_like(near.share @ near.share.T), _ways(kernels))
@@ -226,7 +267,9 @@ def _free(change: State, hold: Hold) -> State:
 
 
 def _ways(kernels: Tensor) -> Tensor:
-    """Return two changes (2, node, channel, y, x) of each PSF, of unit length, that move it down and to the right."""
+    """Return two changes (2, node, channel, y, x) of each PSF, of unit length, that move it down
+    and to the right.
+    """
     found = list[Tensor]()
     for way in torch.gradient(kernels, dim=(-2, -1)):
         way = way - way.mean((-2, -1), keepdim=True)
@@ -241,18 +284,24 @@ def _refuse_unseen(near: Linear, weight: Tensor) -> None:
     seen = torch.tensordot(near.share.square(), (near.stamps_of(weight) > 0).double(), ([0], [0]))
     if missing := int((seen <= 0).any(1).sum()):
         raise ValueError(
-            f"{missing} pixels of the PSF are saturated, or beyond the edge, in every frame: add frames of a shorter "
-            "exposure, move points from the edge, or choose a smaller window or fewer zones"
+            f"{missing} pixels of the PSF are saturated, or beyond the edge, in every frame: add"
+            " frames of a shorter exposure, move points from the edge, or choose a smaller window"
+            " or fewer zones"
         )
 
 
-# --- error ------------------------------------------------------------------------------------------------------------
+# --- error ----------------------------------------------------------------------------------------
 
 
 def _misfit(near: Linear, weight: Tensor, residual: Tensor) -> Tensor:
     """Return the root of chi-square around each pixel of the window (y, x), at least 1."""
-    square, known = (near.stamps_of(x).sum((0, 1)) for x in (weight * residual.square(), (weight > 0).double()))
-    mean = [avg_pool2d(x[None, None], _LOCAL, 1, _LOCAL // 2, count_include_pad=False)[0, 0] for x in (square, known)]
+    square, known = (
+        near.stamps_of(x).sum((0, 1)) for x in (weight * residual.square(), (weight > 0).double())
+    )
+    mean = [
+        avg_pool2d(x[None, None], _LOCAL, 1, _LOCAL // 2, count_include_pad=False)[0, 0]
+        for x in (square, known)
+    ]
     free = 1.0 - _unknowns(near) / float((weight > 0).sum())
     return (mean[0] / (free * mean[1]).clamp_min(1e-9)).clamp_min(1.0).sqrt()
 
@@ -263,11 +312,13 @@ def _chi(weight: Tensor, residual: Tensor, near: Linear) -> Tensor:
 
 
 def _support(near: Linear, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return how many points at each node would tell its PSF as well, and the inflation of its variance.
+    """Return how many points at each node would tell its PSF as well, and the inflation of its
+    variance.
 
-    The worst of the pixels in the middle. With A the bilinear weights of the points that show a pixel, the number is
-    1 over the diagonal of the inverse of A^T A, and the inflation the product of this diagonal and that of A^T A
-    (Kutner et al., Applied Linear Statistical Models, 5th ed., 2005, sec. 10.5): 1 for points in the middles of zones.
+    The worst of the pixels in the middle. With A the bilinear weights of the points that show a
+    pixel, the number is 1 over the diagonal of the inverse of A^T A, and the inflation the product
+    of this diagonal and that of A^T A (Kutner et al., Applied Linear Statistical Models, 5th ed.,
+    2005, sec. 10.5): 1 for points in the middles of zones.
     """
     shown = near.stamps_of(weight) > 0
     y, x = (n // 2 for n in shown.shape[-2:])

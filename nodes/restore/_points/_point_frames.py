@@ -1,4 +1,6 @@
-"""Frames of point sources, read from files: where the points are, and the pixels in the windows around them."""
+"""Frames of point sources, read from files: where the points are, and the pixels in the windows
+around them.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,8 @@ class Seen(NamedTuple):
     light: Tensor  #: (channel, pixel) float64, e-
     clipped: Tensor  #: (channel, pixel) bool
     frame: Tensor  #: (pixel,) int64, the frame of each pixel
-    pixels: Tensor  #: (point, y * x) int64, pixel of each place in a window; their number where there is none
+    #: (point, y * x) int64, pixel of each place in a window; their number where there is none
+    pixels: Tensor
     owner: Tensor  #: (point,) int64, the frame of each point
     middle: Tensor  #: (point, 2) int64, the pixel in the middle of each window
     background: Tensor  #: (frame, channel) float64, e-, mean beyond all windows
@@ -49,14 +52,25 @@ def lit_and_dark(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
 
 
 def refuse_bad_frames(
-    files: Sequence[Path], channels: int | None, shape: tuple[int, int], window: tuple[int, int],
-    zones: tuple[int, int], camera: Camera, curve: Curve | None = None,
-) -> None:  # fmt: skip
-    """Raise ParameterError with the names of all frames that cannot be used, and of all zones without a point."""
+    files: Sequence[Path],
+    channels: int | None,
+    shape: tuple[int, int],
+    window: tuple[int, int],
+    zones: tuple[int, int],
+    camera: Camera,
+    curve: Curve | None = None,
+) -> None:
+    """Raise ParameterError with the names of all frames that cannot be used, and of all zones
+    without a point.
+    """
     lit, dark = lit_and_dark(files)
     if not lit:
-        raise ParameterError("files", "there is no frame with points: only names that begin with dark")
-    problems = [p for file in [*lit, *dark] if (p := frame_problem(file, channels, shape, camera[3], curve))]
+        raise ParameterError(
+            "files", "there is no frame with points: only names that begin with dark"
+        )
+    problems = [
+        p for file in [*lit, *dark] if (p := frame_problem(file, channels, shape, camera[3], curve))
+    ]
     found = {}
     if not problems:
         found = {file: _found(file, window, camera) for file in lit}
@@ -76,10 +90,16 @@ def points_in(files: Sequence[Path], window: tuple[int, int], camera: Camera) ->
 
 
 def read_points(files: Sequence[Path], window: tuple[int, int], camera: Camera) -> Seen:
-    """Read all frames and keep the pixels in the windows of their points; subtract the mean of the dark frames."""
+    """Read all frames and keep the pixels in the windows of their points; subtract the mean of
+    the dark frames.
+    """
     gain, offset, full_well, bits, read_noise = camera
     lit, dark = lit_and_dark(files)
-    base = sum((read_frame(file).values / gain for file in dark), np.zeros(1)) / len(dark) if dark else offset
+    base = (
+        sum((read_frame(file).values / gain for file in dark), np.zeros(1)) / len(dark)
+        if dark
+        else offset
+    )
     parts, first = [], 0
     for number, file in enumerate(lit):
         raw = torch.from_numpy(np.ascontiguousarray(read_frame(file).values, dtype=np.float64))
@@ -88,21 +108,38 @@ def read_points(files: Sequence[Path], window: tuple[int, int], camera: Camera) 
         places = [place for place, _ in _found(file, window, camera)]
         parts.append(_kept(light, ends, places, window, number, first))
         first += parts[-1][0].shape[-1]
-    lights, cut, frames, indices, middle, owner, background, doubt, spread = zip(*parts, strict=True)
+    lights, cut, frames, indices, middle, owner, background, doubt, spread = zip(
+        *parts, strict=True
+    )
     index, ground = torch.cat(indices), torch.stack(background)
     level = min(full_well, (2.0**bits - 1) / gain) - float(np.mean(base))
     least = read_noise**2 * (1 + (1 / len(dark) if dark else 0)) + 1 / (12 * gain**2)
     floor = torch.maximum(torch.stack(spread), least + ground.clamp_min(0.0))
     return Seen(
-        torch.cat(lights, 1), torch.cat(cut, 1), torch.cat(frames), torch.where(index < 0, first, index),
-        torch.cat(owner), torch.cat(middle), ground, torch.stack(doubt), floor, level,
-    )  # fmt: skip
+        torch.cat(lights, 1),
+        torch.cat(cut, 1),
+        torch.cat(frames),
+        torch.where(index < 0, first, index),
+        torch.cat(owner),
+        torch.cat(middle),
+        ground,
+        torch.stack(doubt),
+        floor,
+        level,
+    )
 
 
 def _kept(
-    light: Tensor, ends: Tensor, places: list[tuple[int, int]], window: tuple[int, int], number: int, first: int
+    light: Tensor,
+    ends: Tensor,
+    places: list[tuple[int, int]],
+    window: tuple[int, int],
+    number: int,
+    first: int,
 ) -> tuple[Tensor, ...]:
-    """Return the pixels of one frame in the windows of its points, and the background of the frame beyond them."""
+    """Return the pixels of one frame in the windows of its points, and the background of the
+    frame beyond them.
+    """
     y, x = light.shape[-2:]
     middle = torch.tensor(places, dtype=torch.int64).reshape(-1, 2)
     rows = middle[:, :1] + torch.arange(window[0]) - window[0] // 2
@@ -115,14 +152,25 @@ def _kept(
     order = used.cumsum(0) - 1 + first
     index = torch.where(inside, order[flat], -1).flatten(1)
     pairs = zip(light.flatten(1), ends.flatten(1), strict=True)
-    level, doubt, spread = map(torch.stack, zip(*(_average(c[~lit & ~e]) for c, e in pairs), strict=True))
+    level, doubt, spread = map(
+        torch.stack, zip(*(_average(c[~lit & ~e]) for c, e in pairs), strict=True)
+    )
     return (
-        light.flatten(1)[:, used], ends.flatten(1)[:, used], torch.full((int(used.sum()),), number), index, middle,
-        torch.full((len(places),), number), level, doubt, spread,
-    )  # fmt: skip
+        light.flatten(1)[:, used],
+        ends.flatten(1)[:, used],
+        torch.full((int(used.sum()),), number),
+        index,
+        middle,
+        torch.full((len(places),), number),
+        level,
+        doubt,
+        spread,
+    )
 
 
-def _covered(shape: tuple[int, int], places: list[tuple[int, int]], window: tuple[int, int]) -> Tensor:
+def _covered(
+    shape: tuple[int, int], places: list[tuple[int, int]], window: tuple[int, int]
+) -> Tensor:
     """Return True for the pixels (y, x) in windows around places."""
     used, (down, right) = torch.zeros(shape, dtype=torch.bool), (n // 2 for n in window)
     for y, x in places:
@@ -138,12 +186,16 @@ def _average(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return values.mean(), values.var() / len(values), values.var()
 
 
-# --- points -----------------------------------------------------------------------------------------------------------
+# --- points ---------------------------------------------------------------------------------------
 
 
 @once_per_version
-def _found(file: Path, window: tuple[int, int], camera: Camera) -> list[tuple[tuple[int, int], bool]]:
-    """Return the middle pixel of each point of a frame, the brightest first, and True for one that is not clipped."""
+def _found(
+    file: Path, window: tuple[int, int], camera: Camera
+) -> list[tuple[tuple[int, int], bool]]:
+    """Return the middle pixel of each point of a frame, the brightest first, and True for one
+    that is not clipped.
+    """
     gain, _, full_well, bits, read_noise = camera
     raw = torch.from_numpy(np.ascontiguousarray(read_frame(file).values, dtype=np.float64))
     ends = clipped(raw, full_well=full_well, gain=gain, bits=bits).any(0)
@@ -162,9 +214,14 @@ def _found(file: Path, window: tuple[int, int], camera: Camera) -> list[tuple[tu
         near = ends[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
         points.append(((y, x), not bool(near.any())))
         above[
-            max(y - window[0] // 2, 0) : y + window[0] // 2 + 1, max(x - window[1] // 2, 0) : x + window[1] // 2 + 1
+            max(y - window[0] // 2, 0) : y + window[0] // 2 + 1,
+            max(x - window[1] // 2, 0) : x + window[1] // 2 + 1,
         ] = 0
-    inner = [p for p in points if all(_RIM <= c < n - _RIM for c, n in zip(p[0], above.shape, strict=True))]
+    inner = [
+        p
+        for p in points
+        if all(_RIM <= c < n - _RIM for c, n in zip(p[0], above.shape, strict=True))
+    ]
     return inner
 
 
@@ -175,23 +232,29 @@ def _median(picture: Tensor) -> Tensor:
 
 
 def _unusable(
-    file: Path, points: list[tuple[tuple[int, int], bool]], shape: tuple[int, int], window: tuple[int, int]
+    file: Path,
+    points: list[tuple[tuple[int, int], bool]],
+    shape: tuple[int, int],
+    window: tuple[int, int],
 ) -> str:
     """Return why a frame does not show points, or an empty text."""
     if not points:
         return (
-            f"{file.name} shows no point source: nothing stands out of the noise by {_SIGNIFICANT:g} deviations "
-            "(a frame without light needs a name that begins with dark)"
+            f"{file.name} shows no point source: nothing stands out of the noise by"
+            f" {_SIGNIFICANT:g} deviations (a frame without light needs a name that begins with"
+            " dark)"
         )
     if (free := int((~_covered(shape, [place for place, _ in points], window)).sum())) < _AROUND:
         return (
-            f"{file.name} has {free} pixels beyond the windows of its {len(points)} points, but its background needs "
-            f"{_AROUND}: choose a smaller window, or fewer points a frame"
+            f"{file.name} has {free} pixels beyond the windows of its {len(points)} points, but its"
+            f" background needs {_AROUND}: choose a smaller window, or fewer points a frame"
         )
     return ""
 
 
-def _zone(place: tuple[int, int], shape: tuple[int, int], zones: tuple[int, int]) -> tuple[int, int]:
+def _zone(
+    place: tuple[int, int], shape: tuple[int, int], zones: tuple[int, int]
+) -> tuple[int, int]:
     row, column = (c * z // n for c, z, n in zip(place, zones, shape, strict=True))
     return row, column
 
@@ -199,6 +262,7 @@ def _zone(place: tuple[int, int], shape: tuple[int, int], zones: tuple[int, int]
 def _without_point(empty: list[tuple[int, int]], zones: tuple[int, int]) -> str:
     names = ", ".join(f"({i}, {j})" for i, j in empty)
     return (
-        f"{len(empty)} of {zones[0]} x {zones[1]} zones have no point with an unsaturated core, (row, column) {names}: "
-        "take frames with points there, a shorter exposure, or choose fewer zones"
+        f"{len(empty)} of {zones[0]} x {zones[1]} zones have no point with an unsaturated core,"
+        f" (row, column) {names}: take frames with points there, a shorter exposure, or choose"
+        " fewer zones"
     )

@@ -17,30 +17,51 @@ from neusee.nodes.shape_rules import blank, double
 from neusee.nodes.values import MeasuredPsf, Psf
 
 _FITS = 6  #: steps of Gauss and Newton that a fit usually takes, each of as much work as a draw
-_HELD = 80.0  #: bytes for each pixel of each window: the points, their slopes and the arrays of a step
+#: bytes for each pixel of each window: the points, their slopes and the arrays of a step
+_HELD = 80.0
 _SEEN = 40.0  #: bytes for each pixel of a frame while it is searched for points
 
 
 @measured_psf.shape
 def _(
-    responses: Tensor, *, files: Sequence[Path], window: Sequence[int], zones: Sequence[int], draws: int = 24,
-    gain: float, offset: float, full_well: float, read_noise: float, bits: int = 16, **params: Any,
-) -> MeasuredPsf:  # fmt: skip
+    responses: Tensor,
+    *,
+    files: Sequence[Path],
+    window: Sequence[int],
+    zones: Sequence[int],
+    draws: int = 24,
+    gain: float,
+    offset: float,
+    full_well: float,
+    read_noise: float,
+    bits: int = 16,
+    **params: Any,
+) -> MeasuredPsf:
     channels, (y, x), (rows, columns) = len(responses), window, zones
     kernels = rows, columns, channels, y, x
     points = points_in(files, (y, x), (gain, offset, full_well, bits, read_noise))
     each = [double(rows, columns) for _ in range(2)]
     return MeasuredPsf(
-        double(*kernels), double(*kernels), blank(draws, *kernels), double(points, 4), double(channels),
-        double(channels), *each,
-    )  # fmt: skip
+        double(*kernels),
+        double(*kernels),
+        blank(draws, *kernels),
+        double(points, 4),
+        double(channels),
+        double(channels),
+        *each,
+    )
 
 
 @measured_psf.work
 def _(
-    result: MeasuredPsf, *inputs: Any, files: Sequence[Path] = (), shape: Sequence[int], **params: Any
+    result: MeasuredPsf,
+    *inputs: Any,
+    files: Sequence[Path] = (),
+    shape: Sequence[int],
+    **params: Any,
 ) -> tuple[float, float]:
-    """Return the bytes of the windows and a frame, and the products of the shifts of all draws and fits.
+    """Return the bytes of the windows and a frame, and the products of the shifts of all draws and
+    fits.
 
     Each node slows the iteration down, because points tell several PSFs at once.
     """
@@ -53,14 +74,22 @@ def _(
 
 @wiener_by_field.work
 def _(
-    result: Tensor, electrons: Tensor, measured: MeasuredPsf, clipped: Any = None, glare: Any = None,
-    nearby: Sequence[Tensor] | None = None, **params: Any,
-) -> tuple[float, float]:  # fmt: skip
+    result: Tensor,
+    electrons: Tensor,
+    measured: MeasuredPsf,
+    clipped: Any = None,
+    glare: Any = None,
+    nearby: Sequence[Tensor] | None = None,
+    **params: Any,
+) -> tuple[float, float]:
     """Return the work of the filter on the largest part, and on all parts."""
     rows, columns = (
         _sides(n, count, size)
         for n, count, size in zip(
-            electrons.shape[-2:], measured.kernels.shape[:2], measured.kernels.shape[-2:], strict=True
+            electrons.shape[-2:],
+            measured.kernels.shape[:2],
+            measured.kernels.shape[-2:],
+            strict=True,
         )
     )
     psf, memory, operations = Psf(measured.kernels[0, 0], measured.fit), 0.0, 0.0
@@ -75,9 +104,15 @@ def _(
 
 @spread_by_field.work
 def _(
-    result: Tensor, electrons: Tensor, measured: MeasuredPsf, clipped: Any, matrix: Any, *others: Any,
-    draws: int = 8, **params: Any,
-) -> tuple[float, float]:  # fmt: skip
+    result: Tensor,
+    electrons: Tensor,
+    measured: MeasuredPsf,
+    clipped: Any,
+    matrix: Any,
+    *others: Any,
+    draws: int = 8,
+    **params: Any,
+) -> tuple[float, float]:
     memory, operations = wiener_by_field.hooks.work(  # type: ignore[misc]
         result, electrons, measured, clipped, *others[:2]
     )
@@ -85,7 +120,9 @@ def _(
 
 
 def _sides(size: int, count: int, window: int) -> list[int]:
-    """Return the pixels that the parts around each of ``count`` nodes have along one axis, at most."""
+    """Return the pixels that the parts around each of ``count`` nodes have along one axis, at
+    most.
+    """
     if count == 1:
         return [size]
     ends = math.ceil(1.5 * size / count) + window // 2

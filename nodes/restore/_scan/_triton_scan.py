@@ -1,9 +1,11 @@
-"""The selective scan as one CUDA kernel for each direction, in Triton, which is part of torch's CUDA builds.
+"""The selective scan as one CUDA kernel for each direction, in Triton, which is part of torch's
+CUDA builds.
 
-A program walks the line of one picture for some of its channels, with the states in registers. It stores the states
-between chunks; the backward pass computes the states within a chunk again, in its own memory. Torch sums partial sums
-over channels and pictures, without atomics, so every run gives the same numbers. As in C++, decays enter as
-exp(x) - 1, and the round-off of a state is added at its next step.
+A program walks the line of one picture for some of its channels, with the states in registers. It
+stores the states between chunks; the backward pass computes the states within a chunk again, in its
+own memory. Torch sums partial sums over channels and pictures, without atomics, so every run gives
+the same numbers. As in C++, decays enter as exp(x) - 1, and the round-off of a state is added at
+its next step.
 """
 
 # Triton reads the annotations of a kernel as its own, so kernels have none.
@@ -22,7 +24,8 @@ from neusee.nodes.restore._scan._torch_scan import refuse_twice
 
 __depends__ = ("unaffected:triton",)
 
-#: Channels of a program, steps of a chunk, and warps: chosen, not measured. 1 / CHUNK of all states are stored.
+#: Channels of a program, steps of a chunk, and warps: chosen, not measured. 1 / CHUNK of all states
+#: are stored.
 CHANNELS, CHUNK, WARPS = 16, 64, 2
 
 
@@ -42,7 +45,9 @@ def _lost(x):
 
 @triton.jit
 def _add(total, missed, more):
-    """Return the sum of ``total`` and ``more``, and the round-off, which is added at the next step."""
+    """Return the sum of ``total`` and ``more``, and the round-off, which is added at the next
+    step.
+    """
     more = more + missed
     now = total + more
     return now, more - (now - total)
@@ -50,9 +55,20 @@ def _add(total, missed, more):
 
 @triton.jit
 def _forward(
-    u, dt, A, B, C, y, states, length, d, n,
-    channels: tl.constexpr, wide: tl.constexpr, chunk: tl.constexpr,
-):  # fmt: skip
+    u,
+    dt,
+    A,
+    B,
+    C,
+    y,
+    states,
+    length,
+    d,
+    n,
+    channels: tl.constexpr,
+    wide: tl.constexpr,
+    chunk: tl.constexpr,
+):
     b = tl.program_id(0).to(tl.int64)
     at_d, at_n = tl.program_id(1) * channels + tl.arange(0, channels), tl.arange(0, wide)
     some_d, some_n = at_d < d, at_n < n
@@ -69,16 +85,34 @@ def _forward(
             push = step * tl.load(u + row * d + at_d, mask=some_d, other=0.0)
             into = tl.load(B + row * n + at_n, mask=some_n, other=0.0)
             out = tl.load(C + row * n + at_n, mask=some_n, other=0.0)
-            h, missed = _add(h, missed, _lost(step[:, None] * rate) * h + push[:, None] * into[None, :])
+            h, missed = _add(
+                h, missed, _lost(step[:, None] * rate) * h + push[:, None] * into[None, :]
+            )
             tl.store(y + row * d + at_d, tl.sum(h * out[None, :], 1), mask=some_d)
 
 
 @triton.jit
 def _backward(
-    u, dt, A, B, C, dy, states, room,
-    du, ddt, dA, dB, dC, length, d, n,
-    channels: tl.constexpr, wide: tl.constexpr, chunk: tl.constexpr,
-):  # fmt: skip
+    u,
+    dt,
+    A,
+    B,
+    C,
+    dy,
+    states,
+    room,
+    du,
+    ddt,
+    dA,
+    dB,
+    dC,
+    length,
+    d,
+    n,
+    channels: tl.constexpr,
+    wide: tl.constexpr,
+    chunk: tl.constexpr,
+):
     b, block = tl.program_id(0).to(tl.int64), tl.program_id(1).to(tl.int64)
     at_d, at_n = block * channels + tl.arange(0, channels), tl.arange(0, wide)
     some_d, some_n = at_d < d, at_n < n
@@ -101,7 +135,9 @@ def _backward(
             step = tl.load(dt + row * d + at_d, mask=some_d, other=0.0)
             push = step * tl.load(u + row * d + at_d, mask=some_d, other=0.0)
             into = tl.load(B + row * n + at_n, mask=some_n, other=0.0)
-            h, missed = _add(h, missed, _lost(step[:, None] * rate) * h + push[:, None] * into[None, :])
+            h, missed = _add(
+                h, missed, _lost(step[:, None] * rate) * h + push[:, None] * into[None, :]
+            )
         tl.debug_barrier()  # a thread may load numbers that another thread stored
         here = tl.zeros([channels, wide], tl.float32)
         for turn in range(0, steps):
@@ -131,12 +167,16 @@ def _backward(
 
 @functools.cache
 def _wide(n: int) -> int:
-    """Return the least power of 2 that is at least ``n``; the sizes of Triton tensors are powers of 2."""
+    """Return the least power of 2 that is at least ``n``; the sizes of Triton tensors are powers
+    of 2.
+    """
     return 1 << (n - 1).bit_length()
 
 
 def _sizes(u: Tensor, rate: Tensor) -> tuple[int, int, int, int, int, int]:
-    """Return the sizes that the Triton kernels take: batch, length, d, n, blocks of channels, and chunks."""
+    """Return the sizes that the Triton kernels take: batch, length, d, n, blocks of channels,
+    and chunks.
+    """
     (batch, length, d), n = u.shape, rate.shape[1]
     return batch, length, d, n, -(-d // CHANNELS), -(-length // CHUNK)
 
@@ -153,7 +193,9 @@ class Scan(torch.autograd.Function):
         u, rate = given[0], given[2]
         batch, length, d, n, blocks, chunks = _sizes(u, rate)
         y, states = torch.empty_like(u), u.new_empty(batch, chunks, d, n)
-        _forward[(batch, blocks)](*given, y, states, length, d, n, CHANNELS, _wide(n), CHUNK, num_warps=WARPS)
+        _forward[(batch, blocks)](
+            *given, y, states, length, d, n, CHANNELS, _wide(n), CHUNK, num_warps=WARPS
+        )
         ctx.save_for_backward(*given, states)
         return y
 
@@ -168,6 +210,17 @@ class Scan(torch.autograd.Function):
         room = u.new_empty(batch, blocks, CHUNK, CHANNELS, _wide(n))
         found = (du, ddt, dA, dB, dC)
         _backward[(batch, blocks)](
-            *given, seen[0].contiguous(), states, room, *found, length, d, n, CHANNELS, _wide(n), CHUNK, num_warps=WARPS
+            *given,
+            seen[0].contiguous(),
+            states,
+            room,
+            *found,
+            length,
+            d,
+            n,
+            CHANNELS,
+            _wide(n),
+            CHUNK,
+            num_warps=WARPS,
         )
         return du, ddt, dA.sum(0), dB.sum(0), dC.sum(0)

@@ -1,1 +1,3 @@
-"""How a smooth field of transmission, that of dirt and lens, is told from the scenes of several frames."""
+"""How a smooth field of transmission, that of dirt and lens, is told from the scenes of several
+frames.
+"""

@@ -10,7 +10,8 @@ from torch import Tensor
 MOST = 12  #: cells along the longer side of a frame
 _PIXELS = 2  #: least pixels of a cell along a side
 _SEEN = 0.5  #: least share of a cell's pixels that are not clipped
-_DARK = 5.0  #: standard deviations of noise, below which the light of a cell has no logarithm to trust
+#: standard deviations of noise, below which the light of a cell has no logarithm to trust
+_DARK = 5.0
 
 
 class Cells(NamedTuple):
@@ -28,7 +29,8 @@ def grid(shape: tuple[int, int]) -> tuple[int, int]:
 
 
 def cells_of(electrons: Tensor, clipped: Tensor, read_noise: float) -> Cells:
-    """Return the logarithm of the mean light in each cell of a frame; a field that is smooth adds its own logarithm.
+    """Return the logarithm of the mean light in each cell of a frame; a field that is smooth adds
+    its own logarithm.
 
     Shapes: electrons (channel, y, x), clipped (y, x) bool. Units: e-.
     """
@@ -55,18 +57,26 @@ def _numbers(pixels: int, cells: int, like: Tensor) -> Tensor:
 
 
 def at_pixels(values: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Interpolate values (y, x) at the centres of the cells to all pixels, by cubic splines through these values."""
+    """Interpolate values (y, x) at the centres of the cells to all pixels, by cubic splines
+    through these values.
+    """
     for axis, pixels in enumerate(shape):
-        values = torch.tensordot(_spline(values.shape[axis], pixels), values.movedim(axis, 0), 1).movedim(0, axis)
+        values = torch.tensordot(
+            _spline(values.shape[axis], pixels), values.movedim(axis, 0), 1
+        ).movedim(0, axis)
     return values
 
 
 def _spline(cells: int, pixels: int) -> Tensor:
-    """Return the matrix (pixel, cell) of the cubic spline through the centres of cells, constant beyond the ends."""
+    """Return the matrix (pixel, cell) of the cubic spline through the centres of cells, constant
+    beyond the ends.
+    """
     from scipy.interpolate import CubicSpline
 
     edges = torch.arange(cells + 1, dtype=torch.float64) * pixels / cells
     centres = (edges.ceil()[1:] + edges.ceil()[:-1] - 1) / 2
     places = torch.arange(pixels, dtype=torch.float64).clamp(centres[0], centres[-1])
-    found = CubicSpline(centres.numpy(), torch.eye(cells, dtype=torch.float64).numpy(), bc_type="clamped")(places)
+    found = CubicSpline(
+        centres.numpy(), torch.eye(cells, dtype=torch.float64).numpy(), bc_type="clamped"
+    )(places)
     return torch.from_numpy(found)

@@ -1,4 +1,6 @@
-"""How the light of scenes varies over a coarse grid: spectra that a scene may have, and what frames share."""
+"""How the light of scenes varies over a coarse grid: spectra that a scene may have, and what
+frames share.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +16,18 @@ from neusee.nodes.restore._shading._frame_cells import Cells
 
 EXPONENTS = (1.0, 1.5, 2.0, 2.5, 3.0)  #: b of a power spectrum 1 / f^b
 STRETCHES = (0.5, 1.0, 2.0)  #: of frequencies along y: a horizon has more power there
-HABIT = 0.12  #: share of the power of the modes of a horizon and of a bright centre that scenes have in common
-CHANCE = 0.01  #: the same of all other modes; the mean log-frame of 200 photographs (BSDS500) has 0.08 and 0.005
+#: share of the power of the modes of a horizon and of a bright centre that scenes have in common
+HABIT = 0.12
+#: the same of all other modes; the mean log-frame of 200 photographs (BSDS500) has 0.08 and 0.005
+CHANCE = 0.01
 _FREE = 1e6  #: variance of the unknown level of a frame, relative to that of its scene
 
 
 class Likelihood(NamedTuple):
     """The law of a scene for each spectrum that it may have, but for its strength."""
 
-    precision: Tensor  #: (spectrum, cell, cell) float64; 0 for a cell that is not seen, and for a constant
+    #: (spectrum, cell, cell) float64; 0 for a cell that is not seen, and for a constant
+    precision: Tensor
     log_root: Tensor  #: (spectrum,) float64: half the logarithm of the determinant of the precision
 
 
@@ -34,12 +39,16 @@ def cosines(grid: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
         base = torch.cos(math.pi * number * (place[:, None] + 0.5) / n)
         bases.append(base / base.norm(dim=0))
     longest = max(grid)
-    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) * longest / n for n in grid), indexing="ij")
+    y, x = torch.meshgrid(
+        *(torch.arange(n, dtype=torch.float64) * longest / n for n in grid), indexing="ij"
+    )
     return torch.kron(bases[0], bases[1]), y.flatten(), x.flatten()
 
 
 def likelihoods(frame: Cells, grid: tuple[int, int]) -> Likelihood:
-    """Return the law of the log-scene of a frame whose level is unknown, for each exponent and stretch."""
+    """Return the law of the log-scene of a frame whose level is unknown, for each exponent and
+    stretch.
+    """
     base, y, x = cosines(grid)
     seen = frame.seen
     precisions, roots = [], []
@@ -77,7 +86,8 @@ def shared_detail(logs: Sequence[Tensor], seen: Sequence[Tensor], grid: tuple[in
 
 
 def habits(precision: Tensor, frames: float, grid: tuple[int, int]) -> Tensor:
-    """Return the covariance (cell, cell) of what scenes have in common, from the summed precision of the frames.
+    """Return the covariance (cell, cell) of what scenes have in common, from the summed precision
+    of the frames.
 
     Photographs are brighter at the centre and above: their mean does not go to a constant.
     """

@@ -40,32 +40,41 @@ def shading(
     read_noise: Electrons,
     curve: Curve | None = None,
 ) -> Shading:
-    """Estimate the smooth transmission, such as dirt on a window, that frames of different scenes share.
+    """Estimate the smooth transmission, such as dirt on a window, that frames of different scenes
+    share.
 
-    The logarithm of a frame on a coarse grid is the sum of an unknown level, the field, and a scene. Each scene has a
-    power spectrum 1 / f^b whose strength, exponent and stretch along y are fitted to its frame. The field is a Gaussian
-    process of unknown deviation (0.05 to 0.5) and length (0.12 to 0.35 of the longer side). Scenes also share habits of
-    photographers, such as a bright centre, which count as unknown. With fewer than 8 different scenes, or if the frames
-    tell less than half of the variance of the field, or if there is none with more than 5 % probability, the
-    transmission is 1 and the frame stays as it is. Clipped pixels, and cells whose light is within noise, are left out.
+    The logarithm of a frame on a coarse grid is the sum of an unknown level, the field, and a
+    scene. Each scene has a power spectrum 1 / f^b whose strength, exponent and stretch along y are
+    fitted to its frame. The field is a Gaussian process of unknown deviation (0.05 to 0.5) and
+    length (0.12 to 0.35 of the longer side). Scenes also share habits of photographers, such as a
+    bright centre, which count as unknown. With fewer than 8 different scenes, or if the frames tell
+    less than half of the variance of the field, or if there is none with more than 5 % probability,
+    the transmission is 1 and the frame stays as it is. Clipped pixels, and cells whose light is
+    within noise, are left out.
 
     Shapes: responses (channel, band), of which only the number of channels counts
             -> Shading of (y, x), with knots on a grid of up to 12 x 12 cells.
-    Units:  gain DN/e-; offset, full_well and read_noise e-; transmission relative to its geometric mean.
-    Error:  the posterior deviation of each knot, under the model. A constant factor, and what all scenes have in
-            common, cannot be told from dirt. Frames of one scene count as few frames, by the correlation of their
-            details. The transmission is the same for all channels and frames. Light that dirt scatters (a veil) is not
-            estimated.
-    Raises: ParameterError before the run for a file that is no frame of the sensor, and for more than 400 files.
-    Source: Gaussian process with fixed spectra, Rasmussen and Williams, Gaussian Processes for Machine Learning, ch. 2;
-            spectra of scenes: Field, J. Opt. Soc. Am. A 4, 2379 (1987); variational Bayes: Bishop, Pattern
-            Recognition and Machine Learning, ch. 10.
+    Units:  gain DN/e-; offset, full_well and read_noise e-; transmission relative to its geometric
+            mean.
+    Error:  the posterior deviation of each knot, under the model. A constant factor, and what all
+            scenes have in common, cannot be told from dirt. Frames of one scene count as few
+            frames, by the correlation of their details. The transmission is the same for all
+            channels and frames. Light that dirt scatters (a veil) is not estimated.
+    Raises: ParameterError before the run for a file that is no frame of the sensor, and for more
+            than 400 files.
+    Source: Gaussian process with fixed spectra, Rasmussen and Williams, Gaussian Processes for
+            Machine Learning, ch. 2; spectra of scenes: Field, J. Opt. Soc. Am. A 4, 2379 (1987);
+            variational Bayes: Bishop, Pattern Recognition and Machine Learning, ch. 10.
     """
     frames = []
     for file in files:
         raw = frame(responses, file=file, shape=shape, bits=bits, curve=curve)
         light = raw.double() / gain - (offset if offset_subtracted else 0.0)
-        frames.append(cells_of(light, clipped(raw, full_well=full_well, gain=gain, bits=bits).any(0), read_noise))
+        frames.append(
+            cells_of(
+                light, clipped(raw, full_well=full_well, gain=gain, bits=bits).any(0), read_noise
+            )
+        )
     return _estimated(frames, (shape[0], shape[1]))
 
 
@@ -93,12 +102,21 @@ def _estimated(frames: Sequence[Cells], shape: tuple[int, int]) -> Shading:
 
 @shading.preflight
 def _(
-    *, responses: Tensor | None = None, files: Sequence[Path], shape: Shape, bits: int = 16,
-    curve: Curve | None = None, **params: Any,
-) -> list[str]:  # fmt: skip
+    *,
+    responses: Tensor | None = None,
+    files: Sequence[Path],
+    shape: Shape,
+    bits: int = 16,
+    curve: Curve | None = None,
+    **params: Any,
+) -> list[str]:
     if len(files) > MOST:
-        raise ParameterError("files", f"{len(files)} frames are more than {MOST}: give fewer, of different scenes")
-    refuse_without_room(params["full_well"], offset=params["offset"], read_noise=params["read_noise"])
+        raise ParameterError(
+            "files", f"{len(files)} frames are more than {MOST}: give fewer, of different scenes"
+        )
+    refuse_without_room(
+        params["full_well"], offset=params["offset"], read_noise=params["read_noise"]
+    )
     refuse_without_steps(params["full_well"], gain=params["gain"], bits=bits)
     channels = None if responses is None else len(responses)
     for file in files:
@@ -112,6 +130,10 @@ def _(result: Shading, *inputs: Any, **params: Any) -> list[Check]:
     count, told = int(result.frames), float(result.told)
     frames = "one frame" if count == 1 else f"{count} frames"
     low, high = (float(x) for x in torch.aminmax(result.transmission))
-    found = f"transmission from {low:.3g} to {high:.3g}" if bool(result.identifiable) else "not identifiable"
+    found = (
+        f"transmission from {low:.3g} to {high:.3g}"
+        if bool(result.identifiable)
+        else "not identifiable"
+    )
     text = f"{found}: {frames} tell {told:.0%} of the field"
     return [Check(text, bool(result.transmission.isfinite().all()) and low > 0)]

@@ -1,4 +1,6 @@
-"""A device that fails in the middle of a command: no wrong result, nothing finished is lost, one clear sentence."""
+"""A device that fails in the middle of a command: no wrong result, nothing finished is lost, one
+clear sentence.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,9 @@ def neusee(folder, *words, **variables):
     """Call the program in a process of its own."""
     environment = os.environ | {"NEUSEE_CACHE": str(folder / "cache"), **variables}
     command = [sys.executable, "-m", "neusee", *words]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE)
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE
+    )
     assert "Traceback" not in done.stderr, done.stderr
     return done
 
@@ -71,7 +75,10 @@ def first(library, tmp_path_factory):
     """A folder with a recipe and a cache that has its results, and the bytes of its outputs."""
     folder = tmp_path_factory.mktemp("first")
     (folder / "mine.yaml").write_text(RECIPE)
-    np.save(folder / "cube.npy", np.random.default_rng(1).uniform(10, 200, (96, 96, 4)).astype(np.float32))
+    np.save(
+        folder / "cube.npy",
+        np.random.default_rng(1).uniform(10, 200, (96, 96, 4)).astype(np.float32),
+    )
     right = outputs(neusee(folder, "run", "mine.yaml", "--json", "--out", str(folder / "runs")))
     shutil.rmtree(folder / "cache" / "answers", ignore_errors=True)  # or no later run would be one
     return folder, right
@@ -79,20 +86,27 @@ def first(library, tmp_path_factory):
 
 @pytest.fixture
 def run(library, first, tmp_path):
-    """Run the recipe with a cache that has its results and a device that fails; the process that has ended."""
+    """Run the recipe with a cache that has its results and a device that fails; the process that
+    has ended.
+    """
     shutil.copytree(first[0], tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("runs"))
 
     def run(folder=None, calls="", after=0, error=errno.EIO, name=""):
         device = {"FOLDER": folder, "CALLS": calls, "AFTER": after, "ERROR": error, "NAME": name}
-        variables = {f"DEVICE_{name}": str(value) for name, value in device.items()} if folder else {}
+        variables = (
+            {f"DEVICE_{name}": str(value) for name, value in device.items()} if folder else {}
+        )
         variables |= {"LD_PRELOAD": str(library)} if folder else {}
-        return neusee(tmp_path, "run", "mine.yaml", "--json", "--out", str(tmp_path / "runs"), **variables)
+        return neusee(
+            tmp_path, "run", "mine.yaml", "--json", "--out", str(tmp_path / "runs"), **variables
+        )
 
     return run
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in ON_CACHE]
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in ON_CACHE],
 )
 def test_a_cache_whose_device_fails_in_the_middle_costs_one_warning(name, run, first, tmp_path):
     calls, after, error = ON_CACHE[name]
@@ -102,7 +116,9 @@ def test_a_cache_whose_device_fails_in_the_middle_costs_one_warning(name, run, f
     assert outputs(done) == first[1]
     lines = [line for line in done.stderr.splitlines() if line]
     assert len(lines) <= 1
-    assert all(line.startswith("warning: the cache ") and os.strerror(error) in line for line in lines)
+    assert all(
+        line.startswith("warning: the cache ") and os.strerror(error) in line for line in lines
+    )
     assert lines or name in ("leases", "reads from the middle on")
     again = run()
     assert outputs(again) == first[1]  # nothing wrong was left behind
@@ -110,19 +126,28 @@ def test_a_cache_whose_device_fails_in_the_middle_costs_one_warning(name, run, f
 
 
 def test_a_map_of_a_device_that_fails_is_not_looked_into(run, first, tmp_path):
-    """A look into a map without pages ends the process by SIGBUS: the read before it fails as an error instead."""
-    shutil.rmtree(tmp_path / "cache" / "files")  # so that the results are loaded, to be written again
+    """A look into a map without pages ends the process by SIGBUS: the read before it fails as an
+    error instead.
+    """
+    # so that the results are loaded, to be written again
+    shutil.rmtree(tmp_path / "cache" / "files")
     done = run(tmp_path / "cache", "read,mmap", name=".safetensors")
     assert outputs(done) == first[1]
     assert done.stderr.startswith("warning: the cache ")
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize(("calls", "after"), [("read", 0), pytest.param("read", 3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("calls", "after"), [("read", 0), pytest.param("read", 3, marks=pytest.mark.slow)]
+)
 def test_an_input_file_whose_device_fails_is_named(run, tmp_path, calls, after):
     done = run(tmp_path / "cube.npy", calls, after)
     assert done.returncode in (1, 2), done.stdout
-    assert [line for line in done.stderr.splitlines() if "cube.npy" in line and "Input/output error" in line]
+    assert [
+        line
+        for line in done.stderr.splitlines()
+        if "cube.npy" in line and "Input/output error" in line
+    ]
     assert not list((tmp_path / "runs").glob("[!.l]*"))
 
 
@@ -136,5 +161,7 @@ def test_results_whose_device_fails_end_with_a_sentence_and_lose_nothing(run, fi
     again = run()
     assert outputs(again) == first[1]
     assert "run" not in {
-        step["state"] for step in json.loads(again.stdout)["steps"] if step["step"] in ("raw", "small")
+        step["state"]
+        for step in json.loads(again.stdout)["steps"]
+        if step["step"] in ("raw", "small")
     }

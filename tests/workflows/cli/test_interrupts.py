@@ -1,4 +1,6 @@
-"""Ctrl-C at any moment ends any command with exit code 130 and one sentence, and keeps what is finished."""
+"""Ctrl-C at any moment ends any command with exit code 130 and one sentence, and keeps what is
+finished.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ import pytest
 
 LONGEST = 600.0  #: s after which a command counts as hanging
 
-#: presses Ctrl-C once, for the whole group of processes as a terminal does, at an event of Python's audit
+#: presses Ctrl-C once, for the whole group of processes as a terminal does, at an event of Python's
+#: audit
 PRESSING = """
 import os, signal, sys
 
@@ -98,8 +101,14 @@ def command(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 def stopped(done: subprocess.CompletedProcess[str]) -> None:
-    """Check that a command ended as after Ctrl-C: with its exit code, one sentence and no traceback."""
-    said = [line for line in done.stderr.splitlines() if line.strip() and line not in ("pressed", "never pressed")]
+    """Check that a command ended as after Ctrl-C: with its exit code, one sentence and no
+    traceback.
+    """
+    said = [
+        line
+        for line in done.stderr.splitlines()
+        if line.strip() and line not in ("pressed", "never pressed")
+    ]
     assert "never pressed" not in done.stderr
     assert done.returncode == 130, done.stderr
     assert "Traceback" not in done.stderr + done.stdout
@@ -111,20 +120,46 @@ QUICK = {
     "validate, while a recipe is read": (["validate", "laser_free"], "open", "laser_free.yaml"),
 }
 #: settings with which a safety estimate takes seconds
-SMALL = ["safety.draws=100", "optics.samples=640", "wide.window=[401, 401]", "safety.sensor.shape=[101, 101]",
-         "safety.protection.mask=null", "safety.protection.stop=null"]  # fmt: skip
+SMALL = [
+    "safety.draws=100",
+    "optics.samples=640",
+    "wide.window=[401, 401]",
+    "safety.sensor.shape=[101, 101]",
+    "safety.protection.mask=null",
+    "safety.protection.stop=null",
+]
 SLOW = {
     "run, at the import of torch": (["run", "laser_free"], "import", "torch"),
-    "run, while the report is written": (["run", "laser_free", "outputs=[lsr]"], "open", "provenance.json"),
-    "sweep": (["sweep", "laser_free", "optics.bands=3,4", "outputs=[lsr]"], "import", "neusee.workflows.sweeps"),
+    "run, while the report is written": (
+        ["run", "laser_free", "outputs=[lsr]"],
+        "open",
+        "provenance.json",
+    ),
+    "sweep": (
+        ["sweep", "laser_free", "optics.bands=3,4", "outputs=[lsr]"],
+        "import",
+        "neusee.workflows.sweeps",
+    ),
     "train": (["train", "train_small"], "import", "neusee.workflows.training.run_training"),
     "study": (["study", "stability", "laser_free"], "import", "neusee.workflows.studies.stability"),
     "safety": (["safety", "safety_pointer"], "import", "neusee.workflows.safety.run_safety"),
     "safety, while it writes": (["safety", "safety_pointer", *SMALL], "open", "provenance.json"),
-    "calibrate": (["calibrate", "calibrate"], "import", "neusee.workflows.calibration.run_calibration"),
-    "restore": (["restore", "frame.png", "--camera", "first_light"], "import", "neusee.workflows.recipe.loading"),
+    "calibrate": (
+        ["calibrate", "calibrate"],
+        "import",
+        "neusee.workflows.calibration.run_calibration",
+    ),
+    "restore": (
+        ["restore", "frame.png", "--camera", "first_light"],
+        "import",
+        "neusee.workflows.recipe.loading",
+    ),
     "handbook": (["handbook"], "import", "neusee.workflows.handbook"),
-    "evaluate": (["evaluate", "first_light"], "import", "neusee.workflows.evaluation.run_evaluation"),
+    "evaluate": (
+        ["evaluate", "first_light"],
+        "import",
+        "neusee.workflows.evaluation.run_evaluation",
+    ),
     "nodes": (["nodes"], "import", "neusee.nodes.optics"),
     "cache": (["cache", "list"], "import", "neusee.workflows.store.result_store"),
 }
@@ -156,7 +191,11 @@ def test_ctrl_c_in_a_step_keeps_the_finished_steps(here):
     stopped(command(here, "-c", LISTENING, "run", "pressing.yaml"))
     again = command(here, "-c", LISTENING, "run", "pressing.yaml")
     assert again.returncode == 0, again.stderr
-    rows = {line.split()[0]: line for line in again.stdout.splitlines() if line.startswith("  ") and line.split()}
+    rows = {
+        line.split()[0]: line
+        for line in again.stdout.splitlines()
+        if line.startswith("  ") and line.split()
+    }
     assert "cached" in rows["light"]
     assert "run" in rows["pressed"]
 
@@ -216,13 +255,16 @@ def test_ctrl_c_ends_a_check_whose_node_hangs_and_its_processes(tmp_path):
     (tmp_path / "hanging.py").write_text(HANGING)
     words = [sys.executable, "-c", LISTENING, "check", "hanging.py"]
     pipe = subprocess.PIPE
-    with subprocess.Popen(words, cwd=tmp_path, stdout=pipe, stderr=pipe, text=True, start_new_session=True) as checking:
+    with subprocess.Popen(
+        words, cwd=tmp_path, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    ) as checking:
         called = tmp_path / "hanging.pid"
         until = time.monotonic() + LONGEST
         while not called.exists() and checking.poll() is None and time.monotonic() < until:
             time.sleep(0.05)
         elsewhere = int(called.read_text())
-        assert elsewhere != checking.pid  # a node that would end or stop the check is called in another process first
+        # a node that would end or stop the check is called in another process first
+        assert elsewhere != checking.pid
         os.killpg(checking.pid, signal.SIGINT)
         out, err = checking.communicate(timeout=LONGEST)
     stopped(subprocess.CompletedProcess(words, checking.returncode, out, err))

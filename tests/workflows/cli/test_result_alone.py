@@ -1,4 +1,6 @@
-"""With --json and --quiet stdout holds the result alone, whatever own code prints and the terminal can show."""
+"""With --json and --quiet stdout holds the result alone, whatever own code prints and the
+terminal can show.
+"""
 
 import json
 import os
@@ -31,7 +33,9 @@ def plain(*, by: float = 2.0) -> Tensor:
     print("printed beside")
     return torch.full((2, 3, 4), by)
 '''
-RECIPE = "# Prints µ.\nnodes: [own_prints.py]\nsteps:\n  a: {node: own_prints.printed}\noutputs: [a]\n"
+RECIPE = (
+    "# Prints µ.\nnodes: [own_prints.py]\nsteps:\n  a: {node: own_prints.printed}\noutputs: [a]\n"
+)
 
 
 @pytest.fixture
@@ -50,7 +54,11 @@ def called(tmp_path):
 
 @pytest.mark.parametrize(
     "variables",
-    [{}, {"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}],
+    [
+        {},
+        {"PYTHONIOENCODING": "ascii"},
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+    ],
     ids=["usual", "ascii", "C"],
 )
 def test_json_is_all_that_stdout_has(called, variables):
@@ -71,7 +79,9 @@ def test_quiet_prints_one_path(called, tmp_path):
 def test_code_that_changes_nothing_prints_beside_the_result_too(called, tmp_path):
     (tmp_path / "r.yaml").write_text(RECIPE.replace("printed}", "plain}"), encoding="utf-8")
     own = tmp_path / "own_prints.py"
-    own.write_text(OWN.replace("import ctypes\n", "").replace("ctypes.CDLL(None)", "object"), encoding="utf-8")
+    own.write_text(
+        OWN.replace("import ctypes\n", "").replace("ctypes.CDLL(None)", "object"), encoding="utf-8"
+    )
     done = called("run", "r.yaml", "--json")
     json.loads(done.stdout)
     assert b"printed beside" in done.stderr
@@ -91,14 +101,18 @@ def printed(*, by: float = 2.0) -> Tensor:
 """
 
 
-@pytest.mark.parametrize("imports", ["", "import decimal"], ids=["changes nothing", "may change something"])
+@pytest.mark.parametrize(
+    "imports", ["", "import decimal"], ids=["changes nothing", "may change something"]
+)
 def test_beside_the_table_of_a_terminal_a_step_has_its_process_and_its_words(imports, tmp_path):
     (tmp_path / "own_prints.py").write_text(imports + ON_TERMINAL, encoding="utf-8")
     (tmp_path / "r.yaml").write_text(RECIPE, encoding="utf-8")
     mine, theirs = pty.openpty()
     env = {**os.environ, "NEUSEE_CACHE": str(tmp_path / "cache"), "TERM": "xterm"}
     command = [sys.executable, "-m", "neusee", "run", "r.yaml", "--out", str(tmp_path / "out")]
-    with subprocess.Popen(command, env=env, cwd=tmp_path, stdin=theirs, stdout=theirs, stderr=theirs) as program:
+    with subprocess.Popen(
+        command, env=env, cwd=tmp_path, stdin=theirs, stdout=theirs, stderr=theirs
+    ) as program:
         os.close(theirs)
         shown = b"".join(iter(lambda: _read(mine), b""))
     os.close(mine)

@@ -1,4 +1,6 @@
-"""Real processes for the tests of clusters: a recipe of long steps, the command that runs it, and what it printed."""
+"""Real processes for the tests of clusters: a recipe of long steps, the command that runs it,
+and what it printed.
+"""
 
 from __future__ import annotations
 
@@ -57,17 +59,25 @@ def write_lab(folder: Path, steps: int = 4, rounds: int = 300) -> None:
         for number in range(steps):
             above = f"{chain}{number - 1}" if number else "first"
             values = f"{{rounds: {rounds}, add: {number + (chain == 'b')}}}"
-            lines.append(f"  {chain}{number}: {{node: slow_lab.work, from: {{x: {above}}}, with: {values}}}")
+            lines.append(
+                f"  {chain}{number}: {{node: slow_lab.work, from: {{x: {above}}}, with: {values}}}"
+            )
     lines.append(f"  last: {{node: slow_lab.both, from: {{x: a{steps - 1}, y: b{steps - 1}}}}}")
-    all_steps = ", ".join(f"{chain}{number}" for chain in "ab" for number in range(steps))  # each a task of its own
-    head = f"# Long steps.\nnodes: [slow_lab.py]\nseed: 1\ntolerance: 0\noutputs: [last, {all_steps}]\nsteps:\n"
+    # each a task of its own
+    all_steps = ", ".join(f"{chain}{number}" for chain in "ab" for number in range(steps))
+    head = (
+        "# Long steps.\nnodes: [slow_lab.py]\nseed: 1\ntolerance: 0\noutputs: [last,"
+        f" {all_steps}]\nsteps:\n"
+    )
     (folder / "lab.yaml").write_text(head + "\n".join(lines) + "\n")
 
 
 class Command:
     """A command of neusee that runs in a process, whose lines are read as they come."""
 
-    def __init__(self, folder: Path, *words: str, within: tuple[str, ...] = (), **environment: str) -> None:
+    def __init__(
+        self, folder: Path, *words: str, within: tuple[str, ...] = (), **environment: str
+    ) -> None:
         path = f"{ROOT / '.src'}:{os.environ.get('PYTHONPATH', '')}"
         own = {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "NEUSEE_CACHE": str(folder / "cache")}
         own["DASK_CONFIG"] = str(folder / "dask")  # else dask-jobqueue writes into the home folder
@@ -87,7 +97,9 @@ class Command:
     def waits_for(self, pattern: str) -> None:
         """Wait until the command has printed a text."""
         with self._more:
-            found = self._more.wait_for(lambda: self._ended() or re.search(pattern, self.text), PATIENCE)
+            found = self._more.wait_for(
+                lambda: self._ended() or re.search(pattern, self.text), PATIENCE
+            )
         assert found, self.text
         assert re.search(pattern, self.text), self.text
 
@@ -140,5 +152,11 @@ def expected(steps: int = 4) -> list[float]:
 
 def no_page_of_errors(text: str) -> None:
     """Assert that a command printed sentences: no traceback, and no log of dask."""
-    for word in ("Traceback", "distributed.", "Exception ignored", "was never retrieved", "tornado"):
+    for word in (
+        "Traceback",
+        "distributed.",
+        "Exception ignored",
+        "was never retrieved",
+        "tornado",
+    ):
         assert word not in text, text

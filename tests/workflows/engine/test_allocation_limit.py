@@ -1,4 +1,6 @@
-"""An own node that allocates at once what nothing foretold: the process stays within 1.3 of its limit."""
+"""An own node that allocates at once what nothing foretold: the process stays within 1.3 of its
+limit.
+"""
 
 import os
 import re
@@ -18,12 +20,15 @@ ROOT = Path(__file__).parents[3]
 GB = 10**9
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the limit is one of Linux")
 
-#: how an own node takes 12 GB: in one call of torch or NumPy, in pieces, in threads, or through a list of Python
+#: how an own node takes 12 GB: in one call of torch or NumPy, in pieces, in threads, or through a
+#: list of Python
 TAKES = {
     "torch": "torch.ones(3_000_000_000).sum()",
     "numpy": "float(numpy.ones(1_500_000_000).sum())",
     "pieces": "sum(float(each[0]) for each in [torch.ones(2_500_000) for _ in range(1200)])",
-    "threads": "sum(ThreadPoolExecutor(4).map(lambda _: float(numpy.ones(375_000_000).sum()), range(4)))",
+    "threads": (
+        "sum(ThreadPoolExecutor(4).map(lambda _: float(numpy.ones(375_000_000).sum()), range(4)))"
+    ),
     "python": "len([0] * 1_500_000_000)",
 }
 NODE = """
@@ -63,10 +68,14 @@ def test_an_own_node_stays_within_1_3_of_the_limit(name, tmp_path):
     command = [sys.executable, "-m", "neusee", "run", "lab.yaml", "--memory", "1.5 GB"]
     own = {"PYTHONPATH": path, "NEUSEE_CACHE": str(tmp_path / "cache"), "OMP_NUM_THREADS": "1"}
     watch = [sys.executable, "-c", PEAK, *command]
-    done = subprocess.run(watch, cwd=tmp_path, env={**os.environ, **own}, capture_output=True, text=True)
+    done = subprocess.run(
+        watch, cwd=tmp_path, env={**os.environ, **own}, capture_output=True, text=True
+    )
     code, peak = re.findall(r"(\d+) (\d+)$", done.stdout.strip())[0]
     assert code == "1", done.stdout + done.stderr
-    assert re.search(r"taken \(hoard_\w+\.take\): MemoryLimit: .*the limit is 1\.5 GB", done.stderr), done.stderr
+    assert re.search(
+        r"taken \(hoard_\w+\.take\): MemoryLimit: .*the limit is 1\.5 GB", done.stderr
+    ), done.stderr
     assert "Traceback" not in done.stderr
     assert int(peak) < 1.3 * 1.5 * GB
 

@@ -1,4 +1,6 @@
-"""A killed scheduler, killed workers and a cut network: one sentence, or the run goes on; nothing finished is lost."""
+"""A killed scheduler, killed workers and a cut network: one sentence, or the run goes on;
+nothing finished is lost.
+"""
 
 from __future__ import annotations
 
@@ -27,13 +29,19 @@ from tests.workflows.engine.cluster_processes import (
 pytest.importorskip("distributed", reason="distributed is not installed")
 pytestmark = pytest.mark.slow
 
-#: timeouts of dask that are shorter than in use, so that a cut beyond them takes seconds; 11 s is the least
-SHORT = {"DASK_DISTRIBUTED__COMM__TIMEOUTS__TCP": "12s", "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "5s"}
+#: timeouts of dask that are shorter than in use, so that a cut beyond them takes seconds; 11 s is
+#: the least
+SHORT = {
+    "DASK_DISTRIBUTED__COMM__TIMEOUTS__TCP": "12s",
+    "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "5s",
+}
 STEPS = 12
 
 
 class Machine:
-    """The processes of a cluster, started with the commands of dask, in a namespace or in this one."""
+    """The processes of a cluster, started with the commands of dask, in a namespace or in this
+    one.
+    """
 
     def __init__(self, folder, host="127.0.0.1", within=()):
         self.folder, self.host, self.within = folder, host, within
@@ -45,7 +53,12 @@ class Machine:
 
     def start(self, *words):
         path = f"{ROOT / '.src'}:{os.environ.get('PYTHONPATH', '')}"
-        own = {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "NEUSEE_CACHE": str(self.folder / "cache"), **SHORT}
+        own = {
+            "PYTHONPATH": path,
+            "OMP_NUM_THREADS": "1",
+            "NEUSEE_CACHE": str(self.folder / "cache"),
+            **SHORT,
+        }
         log = (self.folder / f"log{len(self.processes)}").open("w")
         command = [*self.within, sys.executable, "-m", *words]
         with log:
@@ -110,7 +123,9 @@ def begin(lab):
 
 
 def goes_on(lab, text):
-    """Run again on this machine: what was finished is not computed again, and the picture is right."""
+    """Run again on this machine: what was finished is not computed again, and the picture is
+    right.
+    """
     done = set(re.findall(r"^ +(\w+) +cpu +run ", text, re.MULTILINE))
     assert done, text
     code, again = Command(lab, "run", "lab.yaml").end()
@@ -129,7 +144,9 @@ def test_a_killed_scheduler(lab, machine, begin):
     code, text = command.end()
     assert code == 1, text
     assert f"warning: the scheduler {machine.address} does not answer: waiting up to 60 s" in text
-    assert f"the scheduler {machine.address} has ended, or the network to it is cut\nfailed: " in text
+    assert (
+        f"the scheduler {machine.address} has ended, or the network to it is cut\nfailed: " in text
+    )
     no_page_of_errors(text)
     goes_on(lab, text)
 
@@ -142,7 +159,9 @@ def test_a_scheduler_that_takes_leave(lab, machine, begin):
     scheduler.terminate()
     code, text = command.end()
     assert code == 1, text
-    assert f"the scheduler {machine.address} has ended, or the network to it is cut\nfailed: " in text
+    assert (
+        f"the scheduler {machine.address} has ended, or the network to it is cut\nfailed: " in text
+    )
     no_page_of_errors(text)
     goes_on(lab, text)
 
@@ -224,7 +243,10 @@ class Network:
         ip("link", "add", self.wire, "type", "veth", "peer", "name", self.there, "netns", self.name)
         ip("addr", "add", f"{self.here_address}/24", "dev", self.wire)
         ip("link", "set", self.wire, "up")
-        for words in (("addr", "add", f"{self.address}/24", "dev", self.there), ("link", "set", self.there, "up")):
+        for words in (
+            ("addr", "add", f"{self.address}/24", "dev", self.there),
+            ("link", "set", self.there, "up"),
+        ):
             ip("-n", self.name, *words)
         ip("-n", self.name, "link", "set", "lo", "up")
 

@@ -35,7 +35,9 @@ def _():
 
 @node()
 def hoard(x: torch.Tensor) -> torch.Tensor:
-    """Take far more memory than the rule of its shape tells, one piece after each look at it, until told to stop."""
+    """Take far more memory than the rule of its shape tells, one piece after each look at it,
+    until told to stop.
+    """
     held = []
     for _ in range(150):
         held.append(torch.ones(5_000_000))
@@ -55,18 +57,23 @@ def recipe():
     return Recipe("t", "", 1, 0.0, ("b",), steps)
 
 
-def test_a_step_that_takes_more_than_the_limit_is_stopped_by_name_and_the_finished_work_stays(tmp_path, monkeypatch):
+def test_a_step_that_takes_more_than_the_limit_is_stopped_by_name_and_the_finished_work_stays(
+    tmp_path, monkeypatch
+):
     seen = []
 
     def look():
-        seen.append(process_memory())  # not the peak of the process: an earlier test may have held more
+        # not the peak of the process: an earlier test may have held more
+        seen.append(process_memory())
         LOOKED.set()
         return seen[-1]
 
     monkeypatch.setattr(memory_watch, "process_memory", look)
     store = Store(tmp_path)
     limit = program_memory() + 300 * MB
-    with pytest.raises(RunError, match=r"b \(.*hoard\): MemoryLimit: the process holds .* the limit is ") as caught:
+    with pytest.raises(
+        RunError, match=r"b \(.*hoard\): MemoryLimit: the process holds .* the limit is "
+    ) as caught:
         run(recipe(), store, memory=limit)
     assert caught.value.step == "b"
     assert limit < max(seen) < limit + 100 * MB  # of pieces of 20 MB
@@ -118,13 +125,18 @@ except MemoryLimit:
 
 
 def test_nothing_is_left_to_be_delivered_to_a_thread_that_was_told_too_late():
-    """What is left makes every call of CPython 3.11 slow, and hangs a program that is traced, as by a debugger."""
-    found = subprocess.run([sys.executable, "-c", TRACED], capture_output=True, text=True, check=True, timeout=300)
+    """What is left makes every call of CPython 3.11 slow, and hangs a program that is traced, as
+    by a debugger.
+    """
+    found = subprocess.run(
+        [sys.executable, "-c", TRACED], capture_output=True, text=True, check=True, timeout=300
+    )
     assert found.stdout == "went on\n"
 
 
 def test_the_peak_of_the_process_is_not_forgotten_when_a_step_is_measured():
-    block = mmap.mmap(-1, process_peak() - process_memory() + 200 * MB)  # returned at once when it is closed
+    # returned at once when it is closed
+    block = mmap.mmap(-1, process_peak() - process_memory() + 200 * MB)
     for _ in range(len(block) // MB):
         block.write(b"1" * MB)
     before = process_peak()

@@ -1,4 +1,6 @@
-"""Many runs in one process leave nothing behind: no memory, files, threads, handlers, filters or figures."""
+"""Many runs in one process leave nothing behind: no memory, files, threads, handlers, filters or
+figures.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,9 @@ def grown(tmp_path_factory):
 
 
 def steady(seen: list[int]) -> int:
-    """The least growth in a window: what is kept on purpose comes once, in one of them; a leak is in all."""
+    """The least growth in a window: what is kept on purpose comes once, in one of them; a leak
+    is in all.
+    """
     return min(after - before for before, after in itertools.pairwise(seen))
 
 

@@ -1,4 +1,6 @@
-"""Own nodes on a worker: their code has the digest of the caller, whatever else each of both has imported."""
+"""Own nodes on a worker: their code has the digest of the caller, whatever else each of both has
+imported.
+"""
 
 import os
 import pickle
@@ -82,7 +84,9 @@ def on_a_worker(job, *modules):
     """Return the name of the node of a job in a new process, or that its code differs there."""
     path = f"{ROOT / '.src'}:{job.parent}"
     words = [sys.executable, "-c", WORKER, str(job), str(job.parent / "store"), *modules]
-    done = subprocess.run(words, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path})
+    done = subprocess.run(
+        words, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}
+    )
     return done.stdout.strip() or done.stderr
 
 
@@ -96,7 +100,9 @@ def test_a_worker_lacks_modules_that_the_caller_imported(lab, tmp_path):
 
 
 def test_a_worker_that_served_other_recipes_has_modules_that_the_caller_lacks(lab, tmp_path):
-    (tmp_path / "mine.yaml").write_text(RECIPE.format(nodes=f"other: {lab}.two", family="other", name="two"))
+    (tmp_path / "mine.yaml").write_text(
+        RECIPE.format(nodes=f"other: {lab}.two", family="other", name="two")
+    )
     job = job_of(load("mine.yaml", (), tmp_path), tmp_path)
     assert f"{lab}.one" not in sys.modules
     assert on_a_worker(job, f"{lab}.one", "neusee.nodes.metrics") == "other.two"

@@ -18,13 +18,31 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 #: changes of a recipe to two small sizes, none of them square
 SIZES = {
-    "small": ["scene.shape=[72,80]", "sensor.shape=[56,48]", "optics.samples=120", "optics.window=[64,72]"],
-    "larger": ["scene.shape=[120,96]", "sensor.shape=[88,64]", "optics.samples=180", "optics.window=[97,96]"],
+    "small": [
+        "scene.shape=[72,80]",
+        "sensor.shape=[56,48]",
+        "optics.samples=120",
+        "optics.window=[64,72]",
+    ],
+    "larger": [
+        "scene.shape=[120,96]",
+        "sensor.shape=[88,64]",
+        "optics.samples=180",
+        "optics.window=[97,96]",
+    ],
 }
 PITCH = {"small": "optics.pitch=60 um", "larger": "optics.pitch=40 um"}
-#: every recipe of the camera whose sizes may be changed freely: the others read maps and networks of one size, and the
-#: grey scene of `axicon` needs one plane of the three that are predicted, which its values alone tell
-CAMERA = ("dirty_windshield", "five_half_rings", "half_ring", "hdr_night", "laser_free", "paper_table1")
+#: every recipe of the camera whose sizes may be changed freely: the others read maps and networks
+#: of one size, and the grey scene of `axicon` needs one plane of the three that are predicted,
+#: which its values alone tell
+CAMERA = (
+    "dirty_windshield",
+    "five_half_rings",
+    "half_ring",
+    "hdr_night",
+    "laser_free",
+    "paper_table1",
+)
 LEARNT = ("train_small", "train")
 
 
@@ -50,7 +68,10 @@ def compare(recipe, outputs, store):
         assert bytes_of(forms[name]) == bytes_of(value) == sizes[name].result
         assert sizes[name].known
         wires = (step.wires.get(i) for i in step.node.inputs)
-        inputs = [w and (result.value(w) if isinstance(w, str) else [result.value(n) for n in w]) for w in wires]
+        inputs = [
+            w and (result.value(w) if isinstance(w, str) else [result.value(n) for n in w])
+            for w in wires
+        ]
         assert measured_size(step.node, inputs, step.params, value) == list(sizes[name][:4]), name
 
 
@@ -63,7 +84,8 @@ def test_the_shapes_of_the_first_recipe_are_those_of_its_run(tmp_path):
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", ["first_light", *CAMERA])
 def test_the_shapes_of_a_recipe_are_those_of_its_run(name, size, tmp_path):
-    exact = name == "hdr_night" or (name, size) == ("first_light", "larger")  # whose values ask for a second attempt
+    # whose values ask for a second attempt
+    exact = name == "hdr_night" or (name, size) == ("first_light", "larger")
     recipe = load(name, [*SIZES[size], PITCH[size], "tolerance=0" if exact else "seed=7"])
     compare(recipe, wanted(recipe), Store(tmp_path))
 
@@ -81,10 +103,13 @@ def test_the_shapes_of_a_learnt_mask_are_those_of_its_run(size, tmp_path):
     compare(recipe, ("height", "psf[mask]", "truth"), Store(tmp_path))
 
 
-CALIBRATED = ["calibrate", "calibrate_camera", "train_lift"]  #: with nodes whose results have a shape by their values
+#: with nodes whose results have a shape by their values
+CALIBRATED = ["calibrate", "calibrate_camera", "train_lift"]
 
 
-@pytest.mark.parametrize("name", ["first_light", "demonstration", "six_lasers", *CAMERA, *LEARNT, *CALIBRATED])
+@pytest.mark.parametrize(
+    "name", ["first_light", "demonstration", "six_lasers", *CAMERA, *LEARNT, *CALIBRATED]
+)
 def test_every_step_of_a_shipped_recipe_has_a_shape_and_a_measured_law(name):
     recipe = load(name, [])
     recipe = with_substitutions(recipe, wanted(recipe))
@@ -98,14 +123,21 @@ def countless() -> Bands:
     raise AssertionError("no node runs before the run")
 
 
-countless.shape(lambda: Bands(*(torch.empty(10**8, dtype=torch.float64, device="meta") for _ in Bands._fields)))
+countless.shape(
+    lambda: Bands(*(torch.empty(10**8, dtype=torch.float64, device="meta") for _ in Bands._fields))
+)
 
 
 def test_more_bands_than_memory_can_hold_have_a_size_at_once():
-    """The check of a recipe refuses so many bands, so the parameters are changed after it; bands of the user's own."""
+    """The check of a recipe refuses so many bands, so the parameters are changed after it; bands
+    of the user's own.
+    """
     recipe = load("first_light", ["optics.bands=3"])
     steps = {**recipe.steps, "bands": replace(recipe.steps["bands"], node=countless, params={})}
-    sizes = sizes_of(replace(recipe, steps=steps), ["bands", "stop", "flat", "index", "pupil[plain]", "psf[plain]"])
+    sizes = sizes_of(
+        replace(recipe, steps=steps),
+        ["bands", "stop", "flat", "index", "pupil[plain]", "psf[plain]"],
+    )
     assert sizes["psf[plain]"].result == 1e8 * (512 * 512 * 4 + 3 * 8)
     assert sizes["psf[plain]"].bands == 10**8
 
@@ -136,7 +168,9 @@ def test_a_rule_that_fails_leaves_the_error_to_the_step():
 
 
 def test_a_rule_that_does_not_need_an_unknown_input_tells_the_shape():
-    """A mask of the user's own has no rule; the pupil function, and with it the check of the PSF window, is known."""
+    """A mask of the user's own has no rule; the pupil function, and with it the check of the PSF
+    window, is known.
+    """
     from neusee.nodes.optics import pupil, stop
     from neusee.nodes.spectra import bands
 
@@ -157,7 +191,11 @@ def test_a_rule_knows_what_the_header_of_a_picture_says(tmp_path):
     orientation[0x0112] = 6
     Image.new("RGB", (40, 24)).save(tmp_path / "a.jpg", exif=orientation)
     params = {"file": tmp_path / "a.jpg", "shape": None}
-    assert told(form_of(photograph, [], params)) == told(photograph(**params)) == ((3, 40, 24), torch.float32)
+    assert (
+        told(form_of(photograph, [], params))
+        == told(photograph(**params))
+        == ((3, 40, 24), torch.float32)
+    )
 
 
 def test_the_direction_of_a_laser_is_known_with_its_values():

@@ -1,4 +1,6 @@
-"""The digest of the program: it follows the code of all that is imported, and raises where it cannot."""
+"""The digest of the program: it follows the code of all that is imported, and raises where it
+cannot.
+"""
 
 from pathlib import Path
 
@@ -13,7 +15,9 @@ TEXTS = {
     "room.__init__": "",
     "room.aside": "y = 1\n",
 }
-MODULES = sorted(".".join(path.relative_to(ROOT).with_suffix("").parts) for path in ROOT.rglob("*.py"))
+MODULES = sorted(
+    ".".join(path.relative_to(ROOT).with_suffix("").parts) for path in ROOT.rglob("*.py")
+)
 
 
 @pytest.fixture
@@ -38,13 +42,17 @@ def test_the_digest_follows_the_code_of_what_is_imported_and_nothing_else(digest
     assert digest_with({"room.deep": "x = 2\n"}) != first
 
 
-@pytest.mark.parametrize("line", ["import neusee.workflows.room.deep", "from neusee.workflows.room import deep"])
+@pytest.mark.parametrize(
+    "line", ["import neusee.workflows.room.deep", "from neusee.workflows.room import deep"]
+)
 def test_every_way_to_import_a_module_counts(digest_with, line):
     first = digest_with({"engine.runner": f"{line}\n"})
     assert digest_with({"engine.runner": f"{line}\n", "room.deep": "x = 3\n"}) != first
 
 
-@pytest.mark.parametrize("line", ["from neusee.workflows.gone import x", "import neusee.workflows.room.gone"])
+@pytest.mark.parametrize(
+    "line", ["from neusee.workflows.gone import x", "import neusee.workflows.room.gone"]
+)
 def test_a_module_without_a_file_is_an_error(digest_with, line):
     with pytest.raises(LookupError, match=r"gone has no source file"):
         digest_with({"engine.runner": f"{line}\n"})

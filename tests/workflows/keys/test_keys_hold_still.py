@@ -1,4 +1,6 @@
-"""Keys stay equal while nothing changes: whatever else a process imports, computes, draws or trains."""
+"""Keys stay equal while nothing changes: whatever else a process imports, computes, draws or
+trains.
+"""
 
 import abc
 import importlib
@@ -79,7 +81,14 @@ def fail():
 
 
 def import_libraries():
-    for name in ("scipy.signal", "scipy.sparse.csgraph", "PIL.Image", "xxhash", "decimal", "locale"):
+    for name in (
+        "scipy.signal",
+        "scipy.sparse.csgraph",
+        "PIL.Image",
+        "xxhash",
+        "decimal",
+        "locale",
+    ):
         importlib.import_module(name)
 
 
@@ -157,8 +166,12 @@ def keys_of_a_process(memo, folder, hash_seed, *modules, flags=()):
 
 @pytest.mark.slow
 def test_processes_agree_whatever_they_import_first_and_wherever_they_start(before, tmp_path):
-    one = keys_of_a_process(tmp_path / "a.json", tmp_path, "1", "neusee.nodes.restore", "matplotlib.pyplot", "kornia")
-    two = keys_of_a_process(tmp_path / "b.json", "/", "2", "neusee.workflows.cli.app", "neusee.nodes.metrics")
+    one = keys_of_a_process(
+        tmp_path / "a.json", tmp_path, "1", "neusee.nodes.restore", "matplotlib.pyplot", "kornia"
+    )
+    two = keys_of_a_process(
+        tmp_path / "b.json", "/", "2", "neusee.workflows.cli.app", "neusee.nodes.metrics"
+    )
     assert one == two == before[0]
 
 

@@ -1,4 +1,6 @@
-"""Objects of installed packages in an own module: whatever their methods do, the key is made, and is the same again."""
+"""Objects of installed packages in an own module: whatever their methods do, the key is made,
+and is the same again.
+"""
 
 import os
 import re
@@ -53,7 +55,14 @@ class Unplaced:
 
 Unplaced.__module__ = 3
 """
-OBJECTS = ("Hostile", "Hostile()", "Number(2)", "Answering()", "Unplaced()", "[Number(2), {1: Hostile()}]")
+OBJECTS = (
+    "Hostile",
+    "Hostile()",
+    "Number(2)",
+    "Answering()",
+    "Unplaced()",
+    "[Number(2), {1: Hostile()}]",
+)
 QUANTITIES = {
     "a constant": "from astropy.constants import c as held",
     "a unit": "from astropy.units import nm as held",
@@ -73,7 +82,9 @@ def told(folder):
     path = os.pathsep.join([str(folder), str(ROOT / ".src")])
     env = {**os.environ, "PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
     env.pop("PYTHONHASHSEED", None)
-    done = subprocess.run([sys.executable, "-c", KEY], env=env, cwd=folder, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", KEY], env=env, cwd=folder, capture_output=True, text=True
+    )
     return done.stdout.strip() if done.returncode == 0 else done.stderr.strip().splitlines()[-1]
 
 
@@ -89,7 +100,9 @@ def is_key(text):
 def package(tmp_path):
     """A folder with an installed package of hostile classes."""
     (tmp_path / "hostile-1.0.dist-info").mkdir()
-    (tmp_path / "hostile-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: hostile\nVersion: 1.0\n")
+    (tmp_path / "hostile-1.0.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: hostile\nVersion: 1.0\n"
+    )
     (tmp_path / "hostile-1.0.dist-info" / "RECORD").write_text("hostile/__init__.py,,\n")
     (tmp_path / "hostile").mkdir()
     (tmp_path / "hostile" / "__init__.py").write_text(HOSTILE)
@@ -99,7 +112,10 @@ def package(tmp_path):
 def test_objects_whose_methods_all_fail_count_by_their_class(package):
     imports = "from hostile import Answering, Hostile, Number, Unplaced\n"
     held = "".join(f"held_{n} = {text}\n" for n, text in enumerate(OBJECTS))
-    lines = f"{imports}{held}\n\ndef held():\n    return [{', '.join(f'held_{n}' for n in range(len(OBJECTS)))}]\n"
+    lines = (
+        f"{imports}{held}\n\ndef held():\n    return"
+        f" [{', '.join(f'held_{n}' for n in range(len(OBJECTS)))}]\n"
+    )
     write(package, lines, "len(held())")
     first = told(package)
     assert is_key(first), first
@@ -117,7 +133,9 @@ def test_a_key_of_quantities_and_units_is_the_same_in_each_process(kind, tmp_pat
 
 def test_an_array_of_objects_counts_by_what_it_holds(tmp_path):
     def key(line, fill="2.0"):
-        (tmp_path / "held_table.py").write_text(f"import numpy as np\n\n\ndef part(x):\n    return x\n\n\n{line}\n")
+        (tmp_path / "held_table.py").write_text(
+            f"import numpy as np\n\n\ndef part(x):\n    return x\n\n\n{line}\n"
+        )
         write(tmp_path, f"import numpy as np\nfrom held_table import T\nT[0] = {fill}", "str(T)")
         return told(tmp_path)
 
@@ -131,10 +149,15 @@ def test_an_array_of_objects_counts_by_what_it_holds(tmp_path):
 
 
 def test_own_objects_whose_parts_cannot_be_read_are_refused_with_place_and_fix(tmp_path):
-    before = "class Part(dict):\n    def items(self):\n        raise OSError('not now')\n\n\nheld = {}"
+    before = (
+        "class Part(dict):\n    def items(self):\n        raise OSError('not now')\n\n\nheld = {}"
+    )
     write(tmp_path, before.format("[Part()]"))
     found = told(tmp_path)
-    assert "mine.py: held is or holds a Part, which could not be read (OSError: not now), and a cache key" in found
+    assert (
+        "mine.py: held is or holds a Part, which could not be read (OSError: not now), and a"
+        " cache key" in found
+    )
     assert 'depends=["unaffected:held"]' in found
     write(tmp_path, "held = []\nfor _ in range(100_000):\n    held = [held]", "len(held)")
     assert "mine.py: held is or holds a list, which is nested too deeply" in told(tmp_path)

@@ -9,7 +9,11 @@ from neusee.workflows.recipe.text.option_groups import packaged
 
 def test_no_node_that_ships_is_one_of_the_user(monkeypatch):
     monkeypatch.setattr(module_owner, "PROVEN", ("neusee.",))
-    modules = {name: node.fn.__module__ for name, node in all_nodes() if node.fn.__module__.startswith("neusee")}
+    modules = {
+        name: node.fn.__module__
+        for name, node in all_nodes()
+        if node.fn.__module__.startswith("neusee")
+    }
     assert len(modules) > 100
     assert [name for name, module in modules.items() if module_owner.is_own(module)] == []
     assert module_owner.is_own("neusee_of_another")

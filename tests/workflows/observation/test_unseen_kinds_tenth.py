@@ -1,4 +1,6 @@
-"""A tenth of the kinds of own nodes of the benchmark: none is served stale, and honest ones come from the cache."""
+"""A tenth of the kinds of own nodes of the benchmark: none is served stale, and honest ones come
+from the cache.
+"""
 
 import json
 import subprocess
@@ -46,12 +48,16 @@ TENTH = [
 ]
 GOOD = {"right", "told", "unreached", "kept", "skipped"}
 KNOWN = {
-    "honest.linear_of_module": "the first weights of a layer of the module are drawn, though they are set afterwards",
+    "honest.linear_of_module": (
+        "the first weights of a layer of the module are drawn, though they are set afterwards"
+    ),
 }
 
 
 def _called(*words: str) -> str:
-    return subprocess.run([sys.executable, str(BENCHMARK), *words], capture_output=True, text=True, check=True).stdout
+    return subprocess.run(
+        [sys.executable, str(BENCHMARK), *words], capture_output=True, text=True, check=True
+    ).stdout
 
 
 def _case(name: str) -> object:

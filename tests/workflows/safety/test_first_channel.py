@@ -1,4 +1,6 @@
-"""Saturation by the channel that saturates first: a run and an estimate of safety count the same pixels."""
+"""Saturation by the channel that saturates first: a run and an estimate of safety count the same
+pixels.
+"""
 
 import math
 
@@ -30,7 +32,13 @@ def words(folder, camera, nanometres, *more):
     if camera in CAMERAS:
         (folder / camera).write_text(CAMERAS[camera])
     mono = ["camera=mono"] if camera == "mono.csv" else []
-    return [*SMALL, *mono, f"sensor.camera={camera}", f"lasers.pointer.wavelength={nanometres} nm", *more]
+    return [
+        *SMALL,
+        *mono,
+        f"sensor.camera={camera}",
+        f"lasers.pointer.wavelength={nanometres} nm",
+        *more,
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -52,16 +60,24 @@ def counted(folder, store, changes):
      ("Nikon 5100", 532, "0.01 mW"), ("Nikon 5100", 680, "1 mW"), ("Sigma SDMerill", 470, "0.02 mW"),
      ("own.csv", 532, "0.02 mW"), ("own.csv", 690, "0.02 mW"), ("mono.csv", 600, "0.02 mW")],
 )  # fmt: skip
-def test_a_run_and_an_estimate_count_the_same_saturated_pixels(tmp_path, store, camera, nanometres, power):
-    """In a dark scene; with the quantum efficiency of the sensor alone they differ by 20 to 1000 %."""
-    run, estimated = counted(tmp_path, store, words(tmp_path, camera, nanometres, f"lasers.pointer.power={power}"))
+def test_a_run_and_an_estimate_count_the_same_saturated_pixels(
+    tmp_path, store, camera, nanometres, power
+):
+    """In a dark scene; with the quantum efficiency of the sensor alone they differ by 20 to 1000
+    %.
+    """
+    run, estimated = counted(
+        tmp_path, store, words(tmp_path, camera, nanometres, f"lasers.pointer.power={power}")
+    )
     assert 300 < run < 12000
     assert estimated == pytest.approx(run, rel=0.01)
 
 
 @pytest.mark.parametrize("bits", [8, 12, 16])
 def test_the_end_of_the_converter_counts_in_both(tmp_path, store, bits):
-    """A converter of 8 bits that ends at a half, and one of 12 bits that ends at a tenth of the well."""
+    """A converter of 8 bits that ends at a half, and one of 12 bits that ends at a tenth of the
+    well.
+    """
     gain = {8: "50 e-/DN", 12: "0.62 e-/DN", 16: "0.5 e-/DN"}[bits]
     more = ["lasers.pointer.power=0.02 mW", f"sensor.bits={bits}", f"sensor.gain={gain}"]
     run, estimated = counted(tmp_path, store, words(tmp_path, "CIE 1931", 532, *more))
@@ -75,27 +91,40 @@ def efficiency(nanometres):
 
 
 def filled(nanometres, electrons, exposure=EXPOSURE):
-    """Return the irradiance in W/m2 that frees a number of electrons in a pixel of the best channel."""
+    """Return the irradiance in W/m2 that frees a number of electrons in a pixel of the best
+    channel.
+    """
     joules = PLANCK * LIGHT / (nanometres * 1e-9)
     return electrons / efficiency(nanometres) * joules / (exposure * PITCH**2)
 
 
 @pytest.mark.parametrize("nanometres", [430, 532, 560, 640])
-def test_the_saturation_irradiance_is_that_of_the_best_channel_of_an_absolute_table(tmp_path, nanometres):
-    changes = words(tmp_path, "own.csv", nanometres, "lasers.pointer.fwhm=0.01 nm", "sensor.gain=0.5 e-/DN")
+def test_the_saturation_irradiance_is_that_of_the_best_channel_of_an_absolute_table(
+    tmp_path, nanometres
+):
+    changes = words(
+        tmp_path, "own.csv", nanometres, "lasers.pointer.fwhm=0.01 nm", "sensor.gain=0.5 e-/DN"
+    )
     prepared = prepare(load("first_light", changes, tmp_path), None)
     found = saturating(prepared.safety, prepared.draws)
     assert found[0] == pytest.approx(filled(nanometres, WELL - OFFSET), rel=1e-4)
 
 
 def test_what_is_drawn_stays_drawn(tmp_path):
-    """The table of absolute efficiencies does not change with that of the sensor; relative responses do."""
-    laws = ["sensor.quantum_efficiency=lognormal(0.4, 1.2)", "sensor.exposure=lognormal(0.1 s, 1.1)",
-            "lasers.pointer.wavelength=normal(532 nm, 5 nm)"]  # fmt: skip
+    """The table of absolute efficiencies does not change with that of the sensor; relative
+    responses do.
+    """
+    laws = [
+        "sensor.quantum_efficiency=lognormal(0.4, 1.2)",
+        "sensor.exposure=lognormal(0.1 s, 1.1)",
+        "lasers.pointer.wavelength=normal(532 nm, 5 nm)",
+    ]
     found = {}
     for camera in ("own.csv", "CIE 1931"):
         for law in laws:
-            prepared = prepare(load("first_light", [*words(tmp_path, camera, 532), law], tmp_path), None)
+            prepared = prepare(
+                load("first_light", [*words(tmp_path, camera, 532), law], tmp_path), None
+            )
             (drawn,) = prepared.draws.values.values()
             limits = saturating(prepared.safety, prepared.draws)[1:]
             found[camera, law] = drawn, limits
@@ -129,7 +158,9 @@ def test_a_step_of_another_kind_is_refused(tmp_path, change, message):
 
 
 def test_without_a_step_of_responses_the_efficiency_is_that_of_the_settings(tmp_path):
-    recipe = load("safety_pointer", ["safety.draws=100", "safety.protection.mask=null", "optics.samples=256"])
+    recipe = load(
+        "safety_pointer", ["safety.draws=100", "safety.protection.mask=null", "optics.samples=256"]
+    )
     prepared = prepare(recipe, None)
     joules = PLANCK * LIGHT / 532e-9
     wanted = 10500 / 0.65 * joules / (10e-3 * 3.45e-6**2)

@@ -1,4 +1,6 @@
-"""The picture of the spot on the sensor over a limit of damage: never one colour, and white at the limit."""
+"""The picture of the spot on the sensor over a limit of damage: never one colour, and white at
+the limit.
+"""
 
 import numpy as np
 import pytest

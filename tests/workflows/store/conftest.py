@@ -27,10 +27,16 @@ def cache(place):
     if not (shutil.which("unshare") and shutil.which("setpriv")):
         pytest.skip("there is no unshare and setpriv of util-linux")
     tried = subprocess.run(
-        command_of(place, STRANGER, "", 0o022, "import neusee"), capture_output=True, text=True, cwd="/"
+        command_of(place, STRANGER, "", 0o022, "import neusee"),
+        capture_output=True,
+        text=True,
+        cwd="/",
     )
     if tried.returncode:
-        pytest.skip(f"other users cannot read this Python, and mounts are not allowed: {tried.stderr[-200:]}")
+        pytest.skip(
+            "other users cannot read this Python, and mounts are not allowed:"
+            f" {tried.stderr[-200:]}"
+        )
     folder = place / "cache"
     folder.mkdir()
     os.chown(folder, FIRST, GROUP)

@@ -10,7 +10,9 @@ from pathlib import Path
 GROUP = 60_001
 FIRST, SECOND, STRANGER = 60_011, 60_012, 60_013  #: numbers of users; no account is needed
 #: what a user must read, and what the home folder of root may hide
-NEEDED = tuple(dict.fromkeys(map(os.path.realpath, (sys.base_prefix, sys.prefix, Path(__file__).parents[3]))))
+NEEDED = tuple(
+    dict.fromkeys(map(os.path.realpath, (sys.base_prefix, sys.prefix, Path(__file__).parents[3])))
+)
 
 
 def hidden_above(path):
@@ -20,7 +22,9 @@ def hidden_above(path):
 
 
 def opened(place):
-    """Lines of a shell that, in a mount namespace of their own, let every user enter what Python needs."""
+    """Lines of a shell that, in a mount namespace of their own, let every user enter what Python
+    needs.
+    """
     lines, known = ["set -e", "mount --make-rprivate /"], {}
     for path in NEEDED:
         top = hidden_above(path)
@@ -40,6 +44,11 @@ def opened(place):
 
 def command_of(place, user, groups, umask, *words):
     """The command that runs Python as a user; in a test, ``words`` are its arguments."""
-    who = ["setpriv", f"--reuid={user}", f"--regid={user}", f"--groups={groups}" if groups else "--clear-groups"]
+    who = [
+        "setpriv",
+        f"--reuid={user}",
+        f"--regid={user}",
+        f"--groups={groups}" if groups else "--clear-groups",
+    ]
     script = "; ".join([*opened(tempfile.mkdtemp(dir=place)), f"umask {umask:04o}", 'exec "$@"'])
     return ["unshare", "--mount", "sh", "-c", script, "sh", *who, sys.executable, "-c", *words]

@@ -1,4 +1,6 @@
-"""A cache of a group: real users of one group store and load, and a user without rights harms nothing."""
+"""A cache of a group: real users of one group store and load, and a user without rights harms
+nothing.
+"""
 
 import json
 import os
@@ -36,11 +38,18 @@ def as_user(user, cache, *words, groups=str(GROUP), umask=0o022):
     if not home.exists():
         home.mkdir()
         os.chown(home, user, user)
-    environment = {**os.environ, "HOME": str(home), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = {
+        **os.environ,
+        "HOME": str(home),
+        "OMP_NUM_THREADS": "1",
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
     environment["CXX"] = "/bin/false"  # a new user has no compiled code
     environment.pop("NEUSEE_CACHE", None)
     command = command_of(cache.parent, user, groups, umask, RUN, str(cache), *words)
-    done = subprocess.run(command, env=environment, cwd=home, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, env=environment, cwd=home, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -74,17 +83,25 @@ def test_two_users_of_a_group_store_and_load(cache, mode, umask):
 def test_a_user_without_rights_reads_and_harms_nothing(cache):
     cache.chmod(0o2775)
     as_user(FIRST, cache)
-    before = {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in cache.rglob("*") if path.is_file()}
+    before = {
+        path: (path.stat().st_mtime_ns, path.stat().st_size)
+        for path in cache.rglob("*")
+        if path.is_file()
+    }
     stranger = as_user(STRANGER, cache, groups="")
     assert set(stranger["states"].values()) <= {"cached", "not needed", "left out"}
     changed = as_user(STRANGER, cache, "sensor.read_noise=20 e-", groups="")
     assert "run" in changed["states"].values()
     assert {
-        path: (path.stat().st_mtime_ns, path.stat().st_size) for path in cache.rglob("*") if path.is_file()
+        path: (path.stat().st_mtime_ns, path.stat().st_size)
+        for path in cache.rglob("*")
+        if path.is_file()
     } == before
     hidden = cache.parent / "hidden"
     hidden.mkdir(mode=0o700)
-    assert "run" in as_user(STRANGER, hidden, groups="")["states"].values(), "a cache that cannot be read stops no run"
+    assert "run" in as_user(STRANGER, hidden, groups="")["states"].values(), (
+        "a cache that cannot be read stops no run"
+    )
 
 
 @pytest.mark.slow

@@ -1,4 +1,6 @@
-"""Small results in one file: what is lost of it is computed again, and nothing wrong is ever served."""
+"""Small results in one file: what is lost of it is computed again, and nothing wrong is ever
+served.
+"""
 
 import os
 import subprocess
@@ -23,7 +25,9 @@ def key(i):
 def jotted(root, count, start=0):
     store = Store(root)
     for i in range(start, start + count):
-        assert store.put_small(key(i), torch.full((3,), float(i)), {"step": f"s{i}", "seconds": 1e-4})
+        assert store.put_small(
+            key(i), torch.full((3,), float(i)), {"step": f"s{i}", "seconds": 1e-4}
+        )
     return store
 
 
@@ -90,7 +94,9 @@ def test_where_no_line_can_be_written_there_is_one_warning(tmp_path, monkeypatch
 
     monkeypatch.setattr(os, "write", full)
     with pytest.warns(UserWarning, match="cannot be written") as seen:
-        assert [store.put_small(key(i), torch.zeros(2), {"step": "s"}) for i in range(3)] == [False] * 3
+        assert [store.put_small(key(i), torch.zeros(2), {"step": "s"}) for i in range(3)] == [
+            False
+        ] * 3
     assert len(seen) == 1
 
 

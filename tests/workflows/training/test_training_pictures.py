@@ -1,4 +1,6 @@
-"""The resize and the crop of training pictures beside those of kornia, and what a picture does not compute."""
+"""The resize and the crop of training pictures beside those of kornia, and what a picture does
+not compute.
+"""
 
 import pytest
 import torch

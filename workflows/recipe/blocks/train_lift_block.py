@@ -1,4 +1,6 @@
-"""Settings of the block ``train_lift`` of a recipe: the training of a network that estimates spectra from RGB."""
+"""Settings of the block ``train_lift`` of a recipe: the training of a network that estimates
+spectra from RGB.
+"""
 
 from __future__ import annotations
 
@@ -34,21 +36,34 @@ class LiftTraining(SettingsBlock):
     rate: LearningRate = 4e-4
     min_rate: Weight = 1e-6
     betas: tuple[Beta, Beta] = (0.9, 0.999)
-    warmup: Annotated[int, Field(ge=0, le=10**9)] = 200  #: iterations in which the rate rises evenly
+    #: iterations in which the rate rises evenly
+    warmup: Annotated[int, Field(ge=0, le=10**9)] = 200
     floor: Annotated[float, Field(gt=0, le=1)] = 0.02
     clip: GradientNorm = 10.0  #: largest norm of the gradient of all weights
     ema_decay: Beta = 0.998  #: of the moving average of the weights; 0: no average
-    validation_batches: Number = 32  #: number of pictures with which the network is validated at the end
+    #: number of pictures with which the network is validated at the end
+    validation_batches: Number = 32
     keep: Number = 100
     show: Number = 1000
 
     def rate_at(self, iteration: int) -> float:
-        """Return the learning rate at an iteration: a linear warm-up, then half a cosine from `rate` to `min_rate`."""
-        least, rising = min(self.min_rate, self.rate), min(1.0, (iteration + 1) / max(self.warmup, 1))
-        return rising * (least + (self.rate - least) * half_cosine(math.pi * iteration / self.iterations))
+        """Return the learning rate at an iteration: a linear warm-up, then half a cosine from
+        `rate` to `min_rate`.
+        """
+        least, rising = (
+            min(self.min_rate, self.rate),
+            min(1.0, (iteration + 1) / max(self.warmup, 1)),
+        )
+        return rising * (
+            least + (self.rate - least) * half_cosine(math.pi * iteration / self.iterations)
+        )
 
 
 def read_lift_training(composed: Composed) -> tuple[Composed, LiftTraining | None]:
-    """Return a recipe without its block ``train_lift``, and the settings from the block; report mistakes."""
+    """Return a recipe without its block ``train_lift``, and the settings from the block; report
+    mistakes.
+    """
     block = composed.root.items.get(KEY)
-    return (composed, None) if block is None else read_block(composed, KEY, LiftTraining, block.plain)
+    return (
+        (composed, None) if block is None else read_block(composed, KEY, LiftTraining, block.plain)
+    )

@@ -1,4 +1,5 @@
-"""Text of a probability distribution in place of a value of a recipe, such as ``normal(10.5 e-, 0.5 e-)``.
+"""Text of a probability distribution in place of a value of a recipe, such as ``normal(10.5 e-, 0.5
+e-)``.
 
 A distribution of samples names a file, whose path is relative to the folder of the recipe.
 """
@@ -16,7 +17,12 @@ import numpy as np
 
 from neusee.nodes.units import read_written
 from neusee.workflows.graph.diagnostics import Location, nearest
-from neusee.workflows.recipe.distributions.sample_table import read_columns, require_samples, si_unit, with_units
+from neusee.workflows.recipe.distributions.sample_table import (
+    read_columns,
+    require_samples,
+    si_unit,
+    with_units,
+)
 from neusee.workflows.recipe.distributions.scalar import Law
 from neusee.workflows.recipe.distributions.shapes import (
     Beta,
@@ -37,7 +43,10 @@ KINDS = {
     "uniform": ("uniform(1 um, 2 um)", "least and largest value"),
     "loguniform": ("loguniform(1, 1e6)", "least and largest value, uniform in the logarithm"),
     "triangular": ("triangular(9 e-, 10 e-, 12 e-)", "least, most probable and largest value"),
-    "beta": ("beta(2, 5, 0 e-, 20 e-)", "two shape parameters, then least and largest value, which may be left out"),
+    "beta": (
+        "beta(2, 5, 0 e-, 20 e-)",
+        "two shape parameters, then least and largest value, which may be left out",
+    ),
     "truncated": (
         "truncated(normal(2 e-, 1 e-), 0 e-, inf)",
         "a distribution, its lower bound or -inf, and its upper bound or inf",
@@ -70,19 +79,25 @@ class _Numbers:
 
 
 def is_law(text: Any) -> bool:
-    """Return True if a recipe value is a text that begins with the name of a distribution, such as ``normal(``."""
+    """Return True if a recipe value is a text that begins with the name of a distribution, such
+    as ``normal(``.
+    """
     return isinstance(text, str) and _BEGIN.match(text) is not None
 
 
 def read_law(text: str, folder: Path = Path(), mark: Location | None = None) -> Law:
-    """Return the probability distribution in a text; raise ValueError with the correct form for an invalid text.
+    """Return the probability distribution in a text; raise ValueError with the correct form for an
+    invalid text.
 
-    Args: folder: folder of the recipe, to which the path of a file of samples is relative. mark: place of the text.
+    Args: folder: folder of the recipe, to which the path of a file of samples is relative. mark:
+            place of the text.
     """
     text = text.strip()
     match = _CALL.fullmatch(text)
     if match is None or not _is_closed(match[2]):
-        raise ValueError("the text is not a complete distribution: write kind(…, …), in quotes inside [ ] or { }")
+        raise ValueError(
+            "the text is not a complete distribution: write kind(…, …), in quotes inside [ ] or { }"
+        )
     kind, arguments = match[1], _arguments(match[2])
     if not all(arguments):
         raise ValueError(_form(kind))
@@ -99,7 +114,9 @@ def _form(kind: str) -> str:
 
 
 def _is_closed(text: str) -> bool:
-    """Return True if no parenthesis closes before it opens, as in ``normal(1, 2) + normal(3, 4)``."""
+    """Return True if no parenthesis closes before it opens, as in ``normal(1, 2) + normal(3,
+    4)``.
+    """
     depth = 0
     for sign in text:
         depth += (sign == "(") - (sign == ")")
@@ -109,7 +126,9 @@ def _is_closed(text: str) -> bool:
 
 
 def _arguments(text: str) -> list[str]:
-    """Return the arguments between the outer commas of a text; a comma in quotes or parentheses separates nothing."""
+    """Return the arguments between the outer commas of a text; a comma in quotes or parentheses
+    separates nothing.
+    """
     parts, depth, quote = [""], 0, ""
     for sign in text:
         if quote or sign in "\"'":
@@ -178,7 +197,9 @@ def _triangular(kind: str, text: str, arguments: Sequence[str]) -> Law:
     numbers = _numbers(arguments)
     low, mode, high = numbers.values
     if not (low <= mode <= high and low < high):
-        raise ValueError("the least, the most probable and the largest value must stand in this order")
+        raise ValueError(
+            "the least, the most probable and the largest value must stand in this order"
+        )
     return _law(kind, text, Triangular(low, mode, high), numbers)
 
 
@@ -199,7 +220,12 @@ def _beta(kind: str, text: str, arguments: Sequence[str]) -> Law:
 
 def _discrete(kind: str, text: str, arguments: Sequence[str]) -> Law:
     matches = [_WEIGHTED.fullmatch(argument) for argument in arguments]
-    numbers = _numbers([match[1] if match else argument for match, argument in zip(matches, arguments, strict=True)])
+    numbers = _numbers(
+        [
+            match[1] if match else argument
+            for match, argument in zip(matches, arguments, strict=True)
+        ]
+    )
     if len(set(numbers.values)) < len(arguments) or len(arguments) < 2:
         raise ValueError("a discrete distribution needs two or more values, all different")
     weights = _weights([match[2] for match in matches if match], len(arguments))
@@ -226,7 +252,10 @@ def _truncated(text: str, arguments: Sequence[str], folder: Path, mark: Location
         raise ValueError(_form("truncated"))
     law = read_law(arguments[0], folder, mark)
     if law.kind == "truncated":
-        raise ValueError("a truncated distribution cannot be truncated again: write one distribution with both bounds")
+        raise ValueError(
+            "a truncated distribution cannot be truncated again: write one distribution with both"
+            " bounds"
+        )
     low, high = (_bound(argument, law) for argument in arguments[1:])
     if math.isinf(low) and math.isinf(high):
         raise ValueError("a truncated distribution needs a bound: " + KINDS["truncated"][0])
@@ -282,14 +311,19 @@ def _column(path: Path, names: Sequence[str], name: str | None) -> str:
     if name is None and len(names) == 1:
         return names[0]
     if name is None:
-        raise ValueError(f"{path.name} has the columns {', '.join(names)}: write empirical({path.name}, column NAME)")
+        raise ValueError(
+            f"{path.name} has the columns {', '.join(names)}: write empirical({path.name}, column"
+            " NAME)"
+        )
     if name not in names:
         raise ValueError(f"{path.name} has no column {name}; {nearest(name, names)}")
     return name
 
 
 def _unit(unit: str) -> tuple[float, str]:
-    """Return the factor of a unit and its SI unit; raise ValueError for a unit that no value of a recipe has."""
+    """Return the factor of a unit and its SI unit; raise ValueError for a unit that no value of
+    a recipe has.
+    """
     read_written(f"1 {unit}")
     return si_unit(unit)
 

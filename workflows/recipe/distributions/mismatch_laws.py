@@ -1,7 +1,8 @@
-"""Laws of how a camera differs from what a recipe says of it: a training draws them, and the restorer is not told.
+"""Laws of how a camera differs from what a recipe says of it: a training draws them, and the
+restorer is not told.
 
-A ``lognormal`` or ``loguniform`` law multiplies the value of the recipe; any other law, or a single value, is added
-to it.
+A ``lognormal`` or ``loguniform`` law multiplies the value of the recipe; any other law, or a single
+value, is added to it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from neusee.workflows.recipe.distributions.scalar import Law
 from neusee.workflows.recipe.distributions.shapes import Moved, Normal, Shape
 from neusee.workflows.recipe.text.yaml_values import Value
 
-_NARROW = 1e-3  #: standard deviation of a true value that is certain, relative to the value of the recipe
+#: standard deviation of a true value that is certain, relative to the value of the recipe
+_NARROW = 1e-3
 _NARROWEST = 1e-9  #: standard deviation in SI if the value of the recipe is 0
 ANGLE = "angle"  #: key of the direction of a laser, of which y and x differ independently
 
@@ -45,8 +47,12 @@ class Difference:
         return replace(self.law, shape=Moved(shape, offset=self.own))
 
 
-def read_mismatch(block: Value, root: Value, diagnostics: list[Diagnostic]) -> dict[str, Difference]:
-    """Return the differences that ``train.mismatch`` states, by the path of the value in the recipe ``root``."""
+def read_mismatch(
+    block: Value, root: Value, diagnostics: list[Diagnostic]
+) -> dict[str, Difference]:
+    """Return the differences that ``train.mismatch`` states, by the path of the value in the
+    recipe ``root``.
+    """
     found = {}
     for path, leaf in _laws(block):
         try:
@@ -67,23 +73,40 @@ def _laws(block: Value, above: str = "") -> Iterator[tuple[str, Value]]:
 def _difference(path: str, leaf: Value, root: Value) -> Difference:
     own = root.below(path.split("."))
     if own is None:
-        raise ValueError(f"the recipe has no value {path}; {nearest(path, [each.name for each in root.leaves()])}")
+        raise ValueError(
+            f"the recipe has no value {path};"
+            f" {nearest(path, [each.name for each in root.leaves()])}"
+        )
     value, unit = _own(path, own)
-    law = read_law(leaf.data, Path(leaf.mark.folder), leaf.mark) if is_law(leaf.data) else _single(leaf)
+    law = (
+        read_law(leaf.data, Path(leaf.mark.folder), leaf.mark)
+        if is_law(leaf.data)
+        else _single(leaf)
+    )
     if law.reciprocal:
-        raise ValueError(f"a gain in e-/DN has no difference that is added: write lognormal(1, …), not {law.text}")
+        raise ValueError(
+            "a gain in e-/DN has no difference that is added: write lognormal(1, …), not"
+            f" {law.text}"
+        )
     if law.multiplies:
         if law.unit:
             raise ValueError(f"{law.kind} multiplies {path}: write it without the unit {law.unit}")
         if not value:
-            raise ValueError(f"{path} is 0, which {law.text} would multiply: write normal(…, …) or uniform(…, …)")
+            raise ValueError(
+                f"{path} is 0, which {law.text} would multiply: write normal(…, …) or uniform(…, …)"
+            )
     elif law.unit != unit:
-        raise ValueError(f"{law.text} is added to {path}, whose unit is {unit or 'none'}, not {law.unit or 'none'}")
+        raise ValueError(
+            f"{law.text} is added to {path}, whose unit is {unit or 'none'}, not"
+            f" {law.unit or 'none'}"
+        )
     return Difference(replace(law, unit=unit), value, leaf.mark)
 
 
 def _own(path: str, own: Value) -> tuple[float, str]:
-    """Return the value of the recipe and its unit; a direction counts as 0 rad, because it may be drawn."""
+    """Return the value of the recipe and its unit; a direction counts as 0 rad, because it may
+    be drawn.
+    """
     if path.rpartition(".")[2] == ANGLE:
         return 0.0, "rad"
     if own.data is None:

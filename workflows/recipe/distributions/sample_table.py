@@ -1,4 +1,6 @@
-"""Files of samples: columns of numbers in .csv, .txt, .npy and .npz files, with names and units from their headings."""
+"""Files of samples: columns of numbers in .csv, .txt, .npy and .npz files, with names and units
+from their headings.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ def read_columns(path: Path) -> dict[str, FloatArray]:
     """
     suffix = path.suffix.lower()
     if suffix not in _SUFFIXES:
-        raise ValueError(f"{path.name} is not a table of samples: give a file in .csv, .txt, .npy or .npz")
+        raise ValueError(
+            f"{path.name} is not a table of samples: give a file in .csv, .txt, .npy or .npz"
+        )
     refuse_other_than_file(path)
     if not path.is_file():
         raise ValueError(f"there is no file {path}")
@@ -56,7 +60,10 @@ def _arrays(path: Path) -> dict[str, FloatArray]:
 
 def _one_column(path: Path, array: FloatArray) -> FloatArray:
     if array.ndim != 1 or array.dtype.kind not in "fiu":
-        raise ValueError(f"{path.name} must contain one row of real numbers, not {array.dtype} of shape {array.shape}")
+        raise ValueError(
+            f"{path.name} must contain one row of real numbers, not {array.dtype} of shape"
+            f" {array.shape}"
+        )
     return np.asarray(array, np.float64)
 
 
@@ -73,12 +80,16 @@ def _text_columns(path: Path) -> dict[str, FloatArray]:
 
 
 def _take_headings(path: Path, rows: list[Line]) -> tuple[list[str], list[Line]]:
-    """Return the headings of a table and the lines below; a table of one column may have no heading."""
+    """Return the headings of a table and the lines below; a table of one column may have no
+    heading.
+    """
     headings = [cell.strip() for cell in rows[0][1]]
     if not all(map(_is_number, headings)):
         return headings, rows[1:]
     if len(headings) > 1:
-        raise ValueError(f"the first line of {path.name} must have a heading for each of its columns")
+        raise ValueError(
+            f"the first line of {path.name} must have a heading for each of its columns"
+        )
     return [""], rows
 
 
@@ -88,7 +99,9 @@ def _refuse_line(path: Path, line: int, row: Sequence[str], count: int) -> None:
         raise ValueError(f"line {line} of {path.name} must have {count} values like the first line")
     for cell in row:
         if not _is_number(cell):
-            raise ValueError(f"line {line} of {path.name} must contain numbers, not {cell.strip()!r}")
+            raise ValueError(
+                f"line {line} of {path.name} must contain numbers, not {cell.strip()!r}"
+            )
 
 
 def _is_number(cell: str) -> bool:
@@ -100,10 +113,11 @@ def _is_number(cell: str) -> bool:
 
 
 def with_units(columns: Mapping[str, FloatArray]) -> tuple[dict[str, FloatArray], dict[str, str]]:
-    """Return the columns by name in SI units, and their units by name, from headings such as ``exposure [ms]``.
+    """Return the columns by name in SI units, and their units by name, from headings such as
+    ``exposure [ms]``.
 
-    Values in ``e-/DN`` stay as they are, with this unit. A unit that no recipe has, such as that of a dark current
-    ``e- in 1 s``, stays as text. Raises ValueError for a name that stands twice.
+    Values in ``e-/DN`` stay as they are, with this unit. A unit that no recipe has, such as that of
+    a dark current ``e- in 1 s``, stays as text. Raises ValueError for a name that stands twice.
     """
     values: dict[str, FloatArray] = {}
     units: dict[str, str] = {}
@@ -120,7 +134,9 @@ def with_units(columns: Mapping[str, FloatArray]) -> tuple[dict[str, FloatArray]
 
 
 def si_unit(unit: str) -> tuple[float, str]:
-    """Return the factor from a unit to SI and the SI unit; ``e-/DN`` and unknown units stay, with the factor 1."""
+    """Return the factor from a unit to SI and the SI unit; ``e-/DN`` and unknown units stay,
+    with the factor 1.
+    """
     try:
         scale, si, reciprocal = read_written(f"1 {unit}".strip())
     except ValueError:
@@ -129,11 +145,15 @@ def si_unit(unit: str) -> tuple[float, str]:
 
 
 def require_samples(samples: FloatArray, name: str) -> None:
-    """Raise ValueError for samples that do not stand for a distribution: too few, not finite, or all equal."""
+    """Raise ValueError for samples that do not stand for a distribution: too few, not finite, or
+    all equal.
+    """
     if not np.isfinite(samples).all():
         row = int(np.argmin(np.isfinite(samples))) + 1
         raise ValueError(f"sample {row} of {name} is {samples[row - 1]}: remove this sample")
     if len(samples) < FEWEST:
-        raise ValueError(f"{name} has {len(samples)} samples, which are too few: give {FEWEST} or more")
+        raise ValueError(
+            f"{name} has {len(samples)} samples, which are too few: give {FEWEST} or more"
+        )
     if np.ptp(samples) == 0:
         raise ValueError(f"all samples of {name} are equal: write the value itself")

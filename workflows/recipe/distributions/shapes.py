@@ -1,7 +1,9 @@
-"""Probability distributions of a number: quantiles at standard normal numbers, and measures for integrals.
+"""Probability distributions of a number: quantiles at standard normal numbers, and measures for
+integrals.
 
-Every quantile is a function of a standard normal number ``z``, whose cumulative probability is that of the value.
-Two tails are then equally accurate, and a draw needs one normal number, whatever the distribution is.
+Every quantile is a function of a standard normal number ``z``, whose cumulative probability is that
+of the value. Two tails are then equally accurate, and a draw needs one normal number, whatever the
+distribution is.
 """
 
 from __future__ import annotations
@@ -27,18 +29,24 @@ class Shape(ABC):
 
     @abstractmethod
     def at(self, z: FloatArray) -> FloatArray:
-        """Return the values of the distribution at the cumulative probabilities of standard normal numbers ``z``."""
+        """Return the values of the distribution at the cumulative probabilities of standard
+        normal numbers ``z``.
+        """
 
     @abstractmethod
     def score(self, x: float) -> float:
         """Return the standard normal number at which the distribution has the value ``x``."""
 
     def coordinate(self, z: FloatArray) -> FloatArray:
-        """Return the coordinate in which outputs are expected to be smooth; here the value itself."""
+        """Return the coordinate in which outputs are expected to be smooth; here the value
+        itself.
+        """
         return self.at(z)
 
     def measure(self) -> tuple[FloatArray, FloatArray]:
-        """Return points of `coordinate` and their probabilities, for means of functions of the coordinate."""
+        """Return points of `coordinate` and their probabilities, for means of functions of the
+        coordinate.
+        """
         z, weights = _normal_measure()
         return self.coordinate(z), weights
 
@@ -50,12 +58,15 @@ class Shape(ABC):
         return mean, math.sqrt(float(weights @ (x - mean) ** 2))
 
     def truncated(self, low: float, high: float) -> Shape:
-        """Return the distribution under the condition that the value is between ``low`` and ``high``.
+        """Return the distribution under the condition that the value is between ``low`` and
+        ``high``.
 
         Raises ValueError if less than 1e-9 of the distribution lies there.
         """
         if not low < high:
-            raise ValueError(f"the lower bound {low:g} must be smaller than the upper bound {high:g}")
+            raise ValueError(
+                f"the lower bound {low:g} must be smaller than the upper bound {high:g}"
+            )
         cut = Truncated(self, low, high)
         if not cut.share > _SMALLEST_SHARE:
             raise ValueError("less than 1e-9 of the distribution lies between the two bounds")
@@ -129,7 +140,9 @@ class LogUniform(Shape):
         return np.asarray(self.low * np.exp(np.log(self.high / self.low) * ndtr(z)), np.float64)
 
     def score(self, x: float) -> float:
-        return _score(math.log(x / self.low) / math.log(self.high / self.low)) if x > 0 else -math.inf
+        return (
+            _score(math.log(x / self.low) / math.log(self.high / self.low)) if x > 0 else -math.inf
+        )
 
     def coordinate(self, z: FloatArray) -> FloatArray:
         from scipy.special import ndtr
@@ -152,7 +165,9 @@ class Triangular(Shape):
         below, above = ndtr(z), ndtr(-z)
         rising = self.low + np.sqrt(below * width * (self.mode - self.low))
         falling = self.high - np.sqrt(above * width * (self.high - self.mode))
-        return np.asarray(np.where(below * width < self.mode - self.low, rising, falling), np.float64)
+        return np.asarray(
+            np.where(below * width < self.mode - self.low, rising, falling), np.float64
+        )
 
     def score(self, x: float) -> float:
         x, width = min(max(x, self.low), self.high), self.high - self.low
@@ -185,7 +200,9 @@ class Beta(Shape):
 
         share = min(max((x - self.low) / (self.high - self.low), 0.0), 1.0)
         below = float(betainc(self.a, self.b, share))
-        return _score(below) if below < 0.5 else -_score(float(betainc(self.b, self.a, 1.0 - share)))
+        return (
+            _score(below) if below < 0.5 else -_score(float(betainc(self.b, self.a, 1.0 - share)))
+        )
 
 
 @dataclass(frozen=True)
@@ -223,7 +240,9 @@ class Discrete(Shape):
 
     def truncated(self, low: float, high: float) -> Shape:
         if not low < high:
-            raise ValueError(f"the lower bound {low:g} must be smaller than the upper bound {high:g}")
+            raise ValueError(
+                f"the lower bound {low:g} must be smaller than the upper bound {high:g}"
+            )
         inside = (self.values >= low) & (self.values <= high)
         if inside.sum() < 2:
             raise ValueError("fewer than two values of the distribution lie between the two bounds")
@@ -291,7 +310,8 @@ def share_between(low: float, high: float) -> float:
 
 
 def scores_between(z: FloatArray, low: float, high: float) -> FloatArray:
-    """Map standard normal numbers to those of the normal distribution truncated to ``low`` … ``high``.
+    """Map standard normal numbers to those of the normal distribution truncated to ``low`` …
+    ``high``.
 
     The map keeps the order, and both tails keep their accuracy.
     """
@@ -312,7 +332,9 @@ def _score(probability: float) -> float:
 
 
 def _normal_measure() -> tuple[FloatArray, FloatArray]:
-    """Return standard normal numbers and their probabilities; the rule is exact to rounding for smooth functions."""
+    """Return standard normal numbers and their probabilities; the rule is exact to rounding for
+    smooth functions.
+    """
     z = np.linspace(-_REACH, _REACH, _NODES)
     weights = np.exp(-(z**2) / 2)
     return z, weights / weights.sum()

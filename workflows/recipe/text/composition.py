@@ -1,4 +1,6 @@
-"""Composition of a recipe from the options of its groups, its own file and the arguments, in this order."""
+"""Composition of a recipe from the options of its groups, its own file and the arguments, in
+this order.
+"""
 
 from __future__ import annotations
 
@@ -24,14 +26,17 @@ from neusee.workflows.recipe.text.yaml_values import Value, Where, read
 
 @dataclass(frozen=True, slots=True)
 class Composed:
-    """A recipe composed from its files and the arguments of the user, with values that are not yet checked."""
+    """A recipe composed from its files and the arguments of the user, with values that are not
+    yet checked.
+    """
 
     name: str
     title: str
     root: Value
     diagnostics: tuple[Diagnostic, ...]
     whole: bool = True  #: whether every named group could be read
-    #: paths of the values in options that arguments replaced, each with the argument, such as ``scene=siemens``
+    #: paths of the values in options that arguments replaced, each with the argument, such as
+    #: ``scene=siemens``
     replaced: tuple[tuple[Where, str], ...] = ()
     notes: tuple[str, ...] = ()  #: on options that hide others of the same name
 
@@ -45,35 +50,60 @@ class Composed:
 
 
 def locate(recipe: str | Path, folder: Path) -> Path:
-    """Return the path of a recipe file from a name, such as that of a packaged recipe, or from a path to ``.yaml``."""
+    """Return the path of a recipe file from a name, such as that of a packaged recipe, or from a
+    path to ``.yaml``.
+    """
     if str(recipe).endswith((".yaml", ".yml")):
         path = folder / Path(recipe).expanduser()
         if path.exists() and not path.is_dir():
             return path
-        there = [str(p.relative_to(folder)) for p in path.parent.glob("*.yaml") if p.is_relative_to(folder)]
-        raise RecipeError([Diagnostic(Location("recipe"), str(recipe), f"no such file; {nearest(str(recipe), there)}")])
+        there = [
+            str(p.relative_to(folder))
+            for p in path.parent.glob("*.yaml")
+            if p.is_relative_to(folder)
+        ]
+        raise RecipeError(
+            [
+                Diagnostic(
+                    Location("recipe"), str(recipe), f"no such file; {nearest(str(recipe), there)}"
+                )
+            ]
+        )
     shared = shared_folders()
     if NAME.fullmatch(str(recipe)):
         for above in shared:
             if (path := above / f"{recipe}.yaml").is_file():
                 return path
     names = [p.stem for above in shared for p in above.glob("*.yaml")]
-    raise RecipeError([Diagnostic(Location("recipe"), str(recipe), f"no such recipe; {nearest(str(recipe), names)}")])
+    raise RecipeError(
+        [
+            Diagnostic(
+                Location("recipe"), str(recipe), f"no such recipe; {nearest(str(recipe), names)}"
+            )
+        ]
+    )
 
 
-def compose(recipe: str | Path, arguments: Sequence[str | Override], folder: Path, first: int = 1) -> Composed:
-    """Return a recipe composed from its files and arguments; messages number the arguments from ``first``."""
+def compose(
+    recipe: str | Path, arguments: Sequence[str | Override], folder: Path, first: int = 1
+) -> Composed:
+    """Return a recipe composed from its files and arguments; messages number the arguments from
+    ``first``.
+    """
     return Composer(recipe, folder).compose(arguments, first)
 
 
 class Composer:
-    """A recipe that is composed with several lists of arguments, such as the points of a sweep; a file is read once."""
+    """A recipe that is composed with several lists of arguments, such as the points of a sweep;
+    a file is read once.
+    """
 
     def __init__(self, recipe: str | Path, folder: Path) -> None:
         self._path, self._folder = locate(recipe, folder), folder
         self._document = read(self._path, shown(self._path, folder))
         self._hides = _hiding(self._path, recipe)
-        self._known: dict[tuple[Choice, ...], Composed] = {}  # before the arguments that set single values
+        # before the arguments that set single values
+        self._known: dict[tuple[Choice, ...], Composed] = {}
 
     def compose(self, arguments: Sequence[str | Override], first: int = 1) -> Composed:
         """Return the recipe with arguments; messages number the arguments from ``first``."""
@@ -82,7 +112,9 @@ class Composer:
         for number, argument in enumerate(arguments, first):
             mark = Location(f"argument {number}", folder=str(self._folder))
             try:
-                overrides.append(argument if isinstance(argument, Override) else read_override(argument, mark))
+                overrides.append(
+                    argument if isinstance(argument, Override) else read_override(argument, mark)
+                )
             except RecipeError as error:
                 diagnostics += error.diagnostics
         choices, rest = _choose(self._document.root, overrides, self._groups(diagnostics))
@@ -105,24 +137,34 @@ class Composer:
         root = _merged((*(option for option in options if option is not None), document.root))
         replaced = tuple(_replaced(document.root, choices, groups))
         told, notes = tuple(groups.diagnostics), (*self._hides, *groups.notes)
-        return Composed(self._path.stem, document.title, root, told, None not in options, replaced, notes)
+        return Composed(
+            self._path.stem, document.title, root, told, None not in options, replaced, notes
+        )
 
 
 def _hiding(path: Path, recipe: str | Path) -> list[str]:
-    """Return a note if the name of a recipe means a file of the user, which hides a packaged recipe."""
-    hides = path.parent != packaged() and path.stem == str(recipe) and (packaged() / path.name).is_file()
+    """Return a note if the name of a recipe means a file of the user, which hides a packaged
+    recipe.
+    """
+    hides = (
+        path.parent != packaged()
+        and path.stem == str(recipe)
+        and (packaged() / path.name).is_file()
+    )
     return [f"{recipe} is {path}, which hides the packaged recipe"] if hides else []
 
 
 def merge(below: Value, above: Value) -> Value:
     """Merge the recipe value ``above`` into the recipe value ``below``, and return the result.
 
-    Mappings are merged key by key; a list, a scalar or a step with ``node`` replaces the value in ``below``. The lists
-    ``nodes`` are joined, because each file names the code of its own steps.
+    Mappings are merged key by key; a list, a scalar or a step with ``node`` replaces the value in
+    ``below``. The lists ``nodes`` are joined, because each file names the code of its own steps.
     """
     if above.path == ("nodes",) and isinstance(below.data, list) and isinstance(above.data, list):
         joined = [*below.data, *above.data]
-        return replace(above, data=[replace(part, path=("nodes", i)) for i, part in enumerate(joined)])
+        return replace(
+            above, data=[replace(part, path=("nodes", i)) for i, part in enumerate(joined)]
+        )
     if not isinstance(below.data, dict) or not isinstance(above.data, dict) or _new_step(above):
         return above
     data = dict(below.data)
@@ -133,20 +175,28 @@ def merge(below: Value, above: Value) -> Value:
 
 @functools.lru_cache(maxsize=16)
 def _merged(parts: tuple[Value, ...]) -> Value:
-    """Merge the options of the groups and the recipe in order; return the cached object if the parts are the same."""
+    """Merge the options of the groups and the recipe in order; return the cached object if the
+    parts are the same.
+    """
     mark = parts[-1].mark
-    return functools.reduce(merge, (part.without("defaults") for part in parts), Value({}, mark, mark, ()))
+    return functools.reduce(
+        merge, (part.without("defaults") for part in parts), Value({}, mark, mark, ())
+    )
 
 
 def _new_step(value: Value) -> bool:
     return len(value.path) == 2 and value.path[0] == "steps" and "node" in value.items
 
 
-# --- groups ---------------------------------------------------------------------------------------------------------
+# --- groups ---------------------------------------------------------------------------------------
 
 
-def _choose(root: Value, overrides: list[Override], groups: Groups) -> tuple[list[Choice], list[Override]]:
-    """Return the option of each group after overrides such as ``laser=six``, and the overrides of single values."""
+def _choose(
+    root: Value, overrides: list[Override], groups: Groups
+) -> tuple[list[Choice], list[Override]]:
+    """Return the option of each group after overrides such as ``laser=six``, and the overrides
+    of single values.
+    """
     choices = {choice.group: choice for choice in choices_of(root, groups.diagnostics)}
     names, rest = functools.cache(groups.names), []
     for o in overrides:
@@ -163,8 +213,12 @@ def _choose(root: Value, overrides: list[Override], groups: Groups) -> tuple[lis
     return list(choices.values()), rest
 
 
-def _replaced(root: Value, choices: Iterable[Choice], groups: Groups) -> Iterator[tuple[Where, str]]:
-    """Yield the path of each value in an option that the recipe names and an argument replaces or removes."""
+def _replaced(
+    root: Value, choices: Iterable[Choice], groups: Groups
+) -> Iterator[tuple[Where, str]]:
+    """Yield the path of each value in an option that the recipe names and an argument replaces
+    or removes.
+    """
     chosen = {choice.group: choice for choice in choices}
     silent = replace(groups, diagnostics=[], notes=[])
     for written in choices_of(root, []):
@@ -179,7 +233,11 @@ def _replaced(root: Value, choices: Iterable[Choice], groups: Groups) -> Iterato
 def _group_fault(o: Override, choices: Mapping[str, Choice]) -> str:
     group = o.path[0]
     if group in choices:
-        return f"{group} is already set to {choices[group].option}: remove the +" if o.sign == "+" else ""
+        return (
+            f"{group} is already set to {choices[group].option}: remove the +"
+            if o.sign == "+"
+            else ""
+        )
     if o.sign == "~":
         return f"is not a group of this recipe; {nearest(group, choices)}"
     return "" if o.sign else f"this recipe has no group {group}; to add the group, write +{o.text}"

@@ -1,7 +1,8 @@
-"""Groups of a recipe, such as ``sensor``: where the files of their options are, and options that extend others.
+"""Groups of a recipe, such as ``sensor``: where the files of their options are, and options that
+extend others.
 
-A group is a folder, and each YAML file in it is an option. Folders are searched in order: beside the recipe, those of
-the variable ``NEUSEE_RECIPES``, the folder of the user, the packaged recipes.
+A group is a folder, and each YAML file in it is an option. Folders are searched in order: beside
+the recipe, those of the variable ``NEUSEE_RECIPES``, the folder of the user, the packaged recipes.
 """
 
 from __future__ import annotations
@@ -43,7 +44,9 @@ def packaged() -> Path:
 
 
 def user_folder() -> Path:
-    """Return the folder of the user for recipes and groups, as his system places the configuration of programs."""
+    """Return the folder of the user for recipes and groups, as his system places the
+    configuration of programs.
+    """
     home = Path.home()
     if sys.platform == "win32":
         base = Path(os.environ.get("APPDATA") or home / "AppData" / "Roaming")
@@ -55,19 +58,29 @@ def user_folder() -> Path:
 
 
 def shared_folders() -> tuple[Path, ...]:
-    """Return the folders that every recipe searches: those of ``NEUSEE_RECIPES``, of the user, and the packaged one."""
-    named = (Path(name).expanduser().absolute() for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name)
+    """Return the folders that every recipe searches: those of ``NEUSEE_RECIPES``, of the user,
+    and the packaged one.
+    """
+    named = (
+        Path(name).expanduser().absolute()
+        for name in os.environ.get(VARIABLE, "").split(os.pathsep)
+        if name
+    )
     return tuple(dict.fromkeys((*named, user_folder(), packaged())))
 
 
 def search_folders(recipe: Path, folder: Path) -> tuple[Path, ...]:
-    """Return the folders in which the groups of a recipe are searched; beside a packaged recipe is ``folder``."""
+    """Return the folders in which the groups of a recipe are searched; beside a packaged recipe
+    is ``folder``.
+    """
     beside = folder if recipe.parent == packaged() else recipe.parent
     return tuple(dict.fromkeys((beside, *shared_folders())))
 
 
 def shown(path: Path, folder: Path) -> str:
-    """Return the path of a file relative to the packaged recipes or to ``folder``, or else the full path."""
+    """Return the path of a file relative to the packaged recipes or to ``folder``, or else the
+    full path.
+    """
     for above in (packaged(), folder):
         if path.is_relative_to(above):
             return path.relative_to(above).as_posix()
@@ -75,7 +88,9 @@ def shown(path: Path, folder: Path) -> str:
 
 
 def groups_of(*folders: Path) -> dict[str, list[str]]:
-    """Return the names of the options of each group; a group is a folder of YAML files in one of ``folders``."""
+    """Return the names of the options of each group; a group is a folder of YAML files in one of
+    ``folders``.
+    """
     options: dict[str, set[str]] = {}
     for folder in folders:
         for path in folder.glob("*/*.yaml"):
@@ -87,7 +102,9 @@ def option_file(group: str, option: str, folders: tuple[Path, ...]) -> Path | No
     """Return the first file of an option in ``folders``, or None."""
     if not NAME.fullmatch(group) or not NAME.fullmatch(option):
         return None
-    return next((path for above in folders if (path := above / group / f"{option}.yaml").is_file()), None)
+    return next(
+        (path for above in folders if (path := above / group / f"{option}.yaml").is_file()), None
+    )
 
 
 @dataclass
@@ -105,10 +122,11 @@ class Groups:
         return groups_of(*self.folders)
 
     def option(self, choice: Choice, open_: tuple[Path, ...] = ()) -> Value | None:
-        """Return the values of an option with those of the options that it extends, or None for a mistake.
+        """Return the values of an option with those of the options that it extends, or None for a
+        mistake.
 
-        ``open_``: the files of options that are being read. An option that extends its own name extends that of the
-        next folder.
+        ``open_``: the files of options that are being read. An option that extends its own name
+        extends that of the next folder.
         """
         group, name = choice.group, str(choice.option)
         folders = self.folders
@@ -119,8 +137,15 @@ class Groups:
         if file is None:
             self._report(choice, self._absent(choice, open_))
             return None
-        if is_strange() and file.parent.parent not in shared_folders() and not is_inside(file, file.parent.parent):
-            message = f"{shown(file, self.folder)} is a link to another folder, which {NO_CODE} or --no-code refuses"
+        if (
+            is_strange()
+            and file.parent.parent not in shared_folders()
+            and not is_inside(file, file.parent.parent)
+        ):
+            message = (
+                f"{shown(file, self.folder)} is a link to another folder, which {NO_CODE} or"
+                " --no-code refuses"
+            )
             self._report(choice, message)
             return None
         if not open_ and file.parent.parent != packaged():
@@ -134,7 +159,11 @@ class Groups:
             self.diagnostics += error.diagnostics
             return None
         before = len(self.diagnostics)
-        choices = [choice for choice in choices_of(root, self.diagnostics, file.parent.name) if choice.option]
+        choices = [
+            choice
+            for choice in choices_of(root, self.diagnostics, file.parent.name)
+            if choice.option
+        ]
         below = [self.option(choice, (*open_, file)) for choice in choices]
         if None in below or len(self.diagnostics) > before:
             return None
@@ -142,7 +171,9 @@ class Groups:
         return self.merge(parts) if len(parts) > 1 else root
 
     def _absent(self, choice: Choice, open_: tuple[Path, ...]) -> str:
-        """Return the message for an option without a file, or with the files of all folders in use."""
+        """Return the message for an option without a file, or with the files of all folders in
+        use.
+        """
         group, name = choice.group, str(choice.option)
         known = self.names()
         if group not in known:
@@ -166,13 +197,17 @@ class Groups:
 
 
 def choices_of(root: Value, diagnostics: list[Diagnostic], group: str = "") -> Iterator[Choice]:
-    """Yield the entries in the list ``defaults`` of a recipe, or of an option of ``group``; report wrong entries."""
+    """Yield the entries in the list ``defaults`` of a recipe, or of an option of ``group``;
+    report wrong entries.
+    """
     given = root.items.get("defaults")
     if given is None:
         return
     if not isinstance(given.data, list):
         form = "options of this group, such as `[small]`" if group else "`group: option`"
-        diagnostics.append(Diagnostic(given.mark, "defaults", f"must be a list of {form}, not {kind(given)}"))
+        diagnostics.append(
+            Diagnostic(given.mark, "defaults", f"must be a list of {form}, not {kind(given)}")
+        )
         return
     lines: dict[tuple[str, str], int] = {}
     for entry in given.data:
@@ -187,7 +222,12 @@ def choices_of(root: Value, diagnostics: list[Diagnostic], group: str = "") -> I
             diagnostics.append(Diagnostic(entry.mark, f"defaults.{name}", message))
             continue
         lines[again] = entry.mark.line
-        yield Choice(name, None if option.data is None else str(option.data), option.mark, f"{name}: {option.data}")
+        yield Choice(
+            name,
+            None if option.data is None else str(option.data),
+            option.mark,
+            f"{name}: {option.data}",
+        )
 
 
 def _pair(entry: Value, group: str) -> tuple[str, Value] | None:

@@ -1,4 +1,6 @@
-"""Overrides of a recipe by arguments: ``a.b=1`` changes a value, ``+a.b=1`` adds a value, ``~a.b`` removes a value."""
+"""Overrides of a recipe by arguments: ``a.b=1`` changes a value, ``+a.b=1`` adds a value,
+``~a.b`` removes a value.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +14,26 @@ from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value, parse
 
 #: recipe keys that are not blocks of parameters
-_WHOLE = {"steps", "seed", "tolerance", "estimates", "outputs", "exports", "expect", "posterior", "nodes"}
+_WHOLE = {
+    "steps",
+    "seed",
+    "tolerance",
+    "estimates",
+    "outputs",
+    "exports",
+    "expect",
+    "posterior",
+    "nodes",
+}
 RESERVED = frozenset(_WHOLE | {"safety", "traceability"})
-_OPEN = ("expect", "posterior", "safety", "traceability")  #: keys below which an override may set a missing path
+#: keys below which an override may set a missing path
+_OPEN = ("expect", "posterior", "safety", "traceability")
 
 Trail = list[tuple[Value, str | int]]  #: values along a path, each with the key of the next value
 
-_SYNTAX = re.compile(r"(?P<sign>[+~]?)(?P<path>[^\s=+~.]+(?:\.[^\s=.]+)*)(?:=(?P<value>.*))?", re.DOTALL)
+_SYNTAX = re.compile(
+    r"(?P<sign>[+~]?)(?P<path>[^\s=+~.]+(?:\.[^\s=.]+)*)(?:=(?P<value>.*))?", re.DOTALL
+)
 _HELP = "is not an override: write path=value, +path=value, ~path or group=option"
 
 
@@ -34,27 +49,47 @@ class Override:
 
 
 def read_override(text: str, mark: Location) -> Override:
-    """Return the override in an argument such as ``a.b=1``; read its value as YAML: ``20 e-`` is a string."""
+    """Return the override in an argument such as ``a.b=1``; read its value as YAML: ``20 e-`` is
+    a string.
+    """
     match = _SYNTAX.fullmatch(text)
     if match is None:
         raise RecipeError([Diagnostic(mark, text, _HELP)])
     sign, path, value = match["sign"], tuple(match["path"].split(".")), match["value"]
     if sign == "~":
         if value is not None:
-            raise RecipeError([Diagnostic(mark, text, f"~ removes a value and cannot set one: write ~{match['path']}")])
+            raise RecipeError(
+                [
+                    Diagnostic(
+                        mark, text, f"~ removes a value and cannot set one: write ~{match['path']}"
+                    )
+                ]
+            )
         return Override(text, sign, path, None, mark)
     if value is None:
-        raise RecipeError([Diagnostic(mark, text, f"the argument has no value: write {text}=VALUE")])
+        raise RecipeError(
+            [Diagnostic(mark, text, f"the argument has no value: write {text}=VALUE")]
+        )
     if not value.strip():
-        raise RecipeError([Diagnostic(mark, text, f"the value is empty: write {text}VALUE, or {text}null for none")])
+        raise RecipeError(
+            [
+                Diagnostic(
+                    mark, text, f"the value is empty: write {text}VALUE, or {text}null for none"
+                )
+            ]
+        )
     try:
         return Override(text, sign, path, parse(value, mark, path), mark)
     except RecipeError as error:
         raise RecipeError([Diagnostic(mark, text, p.message) for p in error.diagnostics]) from None
 
 
-def apply(root: Value, override: Override, diagnostics: list[Diagnostic], groups: Iterable[str] = ()) -> Value:
-    """Return a recipe after an override; for a mistake, add a diagnostic and return the recipe unchanged."""
+def apply(
+    root: Value, override: Override, diagnostics: list[Diagnostic], groups: Iterable[str] = ()
+) -> Value:
+    """Return a recipe after an override; for a mistake, add a diagnostic and return the recipe
+    unchanged.
+    """
     trail, missing = _follow(root, override.path)
     fault = _fault(root, override, trail, missing, groups)
     if fault:
@@ -64,12 +99,16 @@ def apply(root: Value, override: Override, diagnostics: list[Diagnostic], groups
 
 
 def _follow(root: Value, path: tuple[str, ...]) -> tuple[Trail, tuple[str, ...]]:
-    """Return the recipe values along a path with their keys, and the part of the path that does not exist."""
+    """Return the recipe values along a path with their keys, and the part of the path that does
+    not exist.
+    """
     trail: Trail = []
     here = root
     for n, part in enumerate(path):
         items = here.items
-        key: str | int = int(part) if part not in items and part.isdecimal() and int(part) in items else part
+        key: str | int = (
+            int(part) if part not in items and part.isdecimal() and int(part) in items else part
+        )
         if key not in items:
             return [*trail, (here, part)], path[n:]
         trail.append((here, key))
@@ -77,7 +116,9 @@ def _follow(root: Value, path: tuple[str, ...]) -> tuple[Trail, tuple[str, ...]]
     return trail, ()
 
 
-def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], groups: Iterable[str]) -> str | None:
+def _fault(
+    root: Value, o: Override, trail: Trail, missing: tuple[str, ...], groups: Iterable[str]
+) -> str | None:
     """Return the message for an invalid override of a recipe, or None for a valid override."""
     here = trail[-1][0]
     if not missing:
@@ -87,12 +128,18 @@ def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], gro
             return None
         return f"{here.name} has {len(here.data)} values: 0 to {len(here.data) - 1}"
     if o.sign == "+" or (o.sign == "" and _implied(root, o.path)):
-        return None if isinstance(here.data, dict | None) else f"{here.name} is a single value, not a mapping"
+        return (
+            None
+            if isinstance(here.data, dict | None)
+            else f"{here.name} is a single value, not a mapping"
+        )
     return instead(".".join(o.path)) or f"unknown; {_suggest(root, o.path, groups)}"
 
 
 def _implied(root: Value, path: tuple[str, ...]) -> bool:
-    """Return True if an override may set a missing path without a ``+``, as for a global key or a key of a step."""
+    """Return True if an override may set a missing path without a ``+``, as for a global key or
+    a key of a step.
+    """
     if path[0] != "steps":
         return path[0] in RESERVED and (len(path) == 1 or path[0] in _OPEN)
     steps = root.items.get("steps")
@@ -100,7 +147,9 @@ def _implied(root: Value, path: tuple[str, ...]) -> bool:
 
 
 def _suggest(root: Value, path: tuple[str, ...], groups: Iterable[str]) -> str:
-    """Return a hint with the most similar path in the recipe, because an unknown path is often a typing error."""
+    """Return a hint with the most similar path in the recipe, because an unknown path is often a
+    typing error.
+    """
     here, similar = root, list[str]()
     for part in path:
         names = {*map(str, here.items), *((*RESERVED, *groups) if here is root else ())}
@@ -112,30 +161,48 @@ def _suggest(root: Value, path: tuple[str, ...], groups: Iterable[str]) -> str:
     if len(similar) == len(path):
         return f"did you mean {'.'.join(similar)}?"
     leaves = [leaf for leaf in root.leaves() if leaf.path[0] not in RESERVED]
-    same = {leaf.name for leaf in leaves if difflib.get_close_matches(path[-1], [str(leaf.path[-1])], 1, 0.75)}
+    same = {
+        leaf.name
+        for leaf in leaves
+        if difflib.get_close_matches(path[-1], [str(leaf.path[-1])], 1, 0.75)
+    }
     if same:
         return f"did you mean {' or '.join(sorted(same)[:3])}?"
     return f"{here.name or 'the recipe'} has {', '.join(map(str, here.items)) or 'no such value'}"
 
 
 def _rebuild(trail: Trail, missing: tuple[str, ...], o: Override) -> Value:
-    """Return the recipe after an override; each value along the path is rebuilt, from the innermost value outwards."""
+    """Return the recipe after an override; each value along the path is rebuilt, from the
+    innermost value outwards.
+    """
     value = _parsed_again(trail, missing, o)
     for n in range(len(missing) - 1, 0, -1):
         assert value is not None
-        value = Value({_key(missing[n]): value}, o.mark, o.mark, o.path[: len(o.path) - len(missing) + n])
+        value = Value(
+            {_key(missing[n]): value}, o.mark, o.mark, o.path[: len(o.path) - len(missing) + n]
+        )
     for here, key in reversed(trail):
         key = _key(key) if missing and here is trail[-1][0] else key
-        value = Value({key: value}, o.mark, here.key, here.path) if here.data is None else here.replaced(key, value)
+        value = (
+            Value({key: value}, o.mark, here.key, here.path)
+            if here.data is None
+            else here.replaced(key, value)
+        )
     assert value is not None
     return value
 
 
 def _parsed_again(trail: Trail, missing: tuple[str, ...], o: Override) -> Value | None:
-    """Return the value of an override; parse the value again if the path of the override has integer keys."""
+    """Return the value of an override; parse the value again if the path of the override has
+    integer keys.
+    """
     keys = tuple(key for _, key in trail)
     path = (*keys[:-1], *map(_key, missing)) if missing else keys
-    return o.value if o.value is None or path == o.path else parse(o.text.partition("=")[2], o.mark, path)
+    return (
+        o.value
+        if o.value is None or path == o.path
+        else parse(o.text.partition("=")[2], o.mark, path)
+    )
 
 
 def _key(part: str | int) -> str | int:
@@ -143,7 +210,9 @@ def _key(part: str | int) -> str | int:
 
 
 def arguments_in(value: Value) -> Iterator[Location]:
-    """Yield the location of each argument that changed a value within a list or a mapping of a recipe."""
+    """Yield the location of each argument that changed a value within a list or a mapping of a
+    recipe.
+    """
     for child in value.items.values():
         if not child.mark.line:
             yield child.mark

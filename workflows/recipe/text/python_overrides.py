@@ -1,7 +1,8 @@
-"""Overrides of a recipe by Python values: ``sensor={"read_noise": "20 e-"}`` means ``sensor.read_noise=20 e-``.
+"""Overrides of a recipe by Python values: ``sensor={"read_noise": "20 e-"}`` means
+``sensor.read_noise=20 e-``.
 
-A mapping changes only the values that it names, but an empty mapping or a step with ``node`` replaces the whole value.
-A string is not read as YAML.
+A mapping changes only the values that it names, but an empty mapping or a step with ``node``
+replaces the whole value. A string is not read as YAML.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ _LONGEST = 40  #: largest number of characters of a value in a message
 
 
 def overrides_of(values: Mapping[str, Any], folder: Path) -> list[Override]:
-    """Return the overrides that keyword arguments contain; raise one `RecipeError` for all invalid values."""
+    """Return the overrides that keyword arguments contain; raise one `RecipeError` for all
+    invalid values.
+    """
     overrides: list[Override] = []
     diagnostics: list[Diagnostic] = []
     for key, value in values.items():
@@ -37,9 +40,17 @@ def overrides_of(values: Mapping[str, Any], folder: Path) -> list[Override]:
 
 
 def _read(key: str, given: Any, mark: Location) -> Iterator[Override]:
-    """Yield the overrides that one keyword argument contains: one override for each value in a mapping."""
+    """Yield the overrides that one keyword argument contains: one override for each value in a
+    mapping.
+    """
     if key.startswith("~") and given is not None:
-        raise RecipeError([Diagnostic(mark, key, f"~ removes a value and cannot set one: write {{{key!r}: None}}")])
+        raise RecipeError(
+            [
+                Diagnostic(
+                    mark, key, f"~ removes a value and cannot set one: write {{{key!r}: None}}"
+                )
+            ]
+        )
     try:
         named = read_override(key if key.startswith("~") else f"{key}=null", mark)
     except RecipeError as error:
@@ -51,7 +62,10 @@ def _read(key: str, given: Any, mark: Location) -> Iterator[Override]:
     while stack:
         path, value = stack.pop()
         if isinstance(value, Mapping) and value and not _whole_step(path, value):
-            stack += [((*path, str(_key(name, mark, path))), below) for name, below in reversed(list(value.items()))]
+            stack += [
+                ((*path, str(_key(name, mark, path))), below)
+                for name, below in reversed(list(value.items()))
+            ]
         else:
             yield _override(named, path, value)
 
@@ -70,17 +84,25 @@ def _override(named: Override, path: tuple[str, ...], given: Any) -> Override:
 
 
 def _value(given: Any, mark: Location, path: Where) -> Value:
-    """Return a recipe `Value` with the data of a Python value and the location of the argument that contains it."""
+    """Return a recipe `Value` with the data of a Python value and the location of the argument
+    that contains it.
+    """
     if isinstance(given, Mapping):
-        data = {_key(key, mark, path): _value(item, mark, (*path, str(key))) for key, item in given.items()}
+        data = {
+            _key(key, mark, path): _value(item, mark, (*path, str(key)))
+            for key, item in given.items()
+        }
         return Value(data, mark, mark, path)
     if isinstance(given, list | tuple | range):
-        return Value([_value(item, mark, (*path, i)) for i, item in enumerate(given)], mark, mark, path)
+        return Value(
+            [_value(item, mark, (*path, i)) for i, item in enumerate(given)], mark, mark, path
+        )
     if isinstance(given, os.PathLike):
         return Value(os.fspath(given), mark, mark, path)
     if given is None or isinstance(given, bool | int | float | str):
         return Value(given, mark, mark, path)
-    listed = given.tolist() if hasattr(given, "tolist") else given  # a number or an array of numpy or torch
+    # a number or an array of numpy or torch
+    listed = given.tolist() if hasattr(given, "tolist") else given
     if not isinstance(listed, bool | int | float | str | list):
         message = f"a recipe cannot contain a value of type {type(given).__name__}: {_ALLOWED}"
         raise RecipeError([Diagnostic(mark, dotted(path), message)])
@@ -90,4 +112,10 @@ def _value(given: Any, mark: Location, path: Where) -> Value:
 def _key(key: Any, mark: Location, path: Where) -> str | int:
     if isinstance(key, str | int) and not isinstance(key, bool) and key != "":
         return key
-    raise RecipeError([Diagnostic(mark, dotted(path), f"a mapping's key must be a name or an integer, not {key!r}")])
+    raise RecipeError(
+        [
+            Diagnostic(
+                mark, dotted(path), f"a mapping's key must be a name or an integer, not {key!r}"
+            )
+        ]
+    )

@@ -1,4 +1,6 @@
-"""References such as ``${sensor.gain}``, by which a value of a recipe copies another value of the recipe."""
+"""References such as ``${sensor.gain}``, by which a value of a recipe copies another value of
+the recipe.
+"""
 
 from __future__ import annotations
 
@@ -23,13 +25,16 @@ _MOST_CHARACTERS = 100_000  #: characters to which references may expand one tex
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """The items, such as a laser, of one copy of a step; ``${item.x}`` and ``${each.lasers.x}`` refer to them."""
+    """The items, such as a laser, of one copy of a step; ``${item.x}`` and ``${each.lasers.x}``
+    refer to them.
+    """
 
     items: Mapping[str, Value]  #: by the name of the list of items
     step: str
 
     def find(self, parts: list[str]) -> tuple[Value | None, list[str], str]:
-        """Return the item to which a reference such as ``${item.x}`` refers, and the path below the item.
+        """Return the item to which a reference such as ``${item.x}`` refers, and the path below the
+        item.
 
         If no item fits, return None, an empty path and a message.
         """
@@ -47,30 +52,45 @@ class Scope:
 class References:
     """Resolver of the references in a recipe, with a record of the values that the steps use."""
 
-    def __init__(self, root: Value, diagnostics: list[Diagnostic], replaced: Mapping[Where, str] | None = None) -> None:
+    def __init__(
+        self,
+        root: Value,
+        diagnostics: list[Diagnostic],
+        replaced: Mapping[Where, str] | None = None,
+    ) -> None:
         self.root, self.diagnostics = root, diagnostics
-        self.replaced = replaced or {}  #: the argument that replaced an option, by the path of a value of the option
+        #: the argument that replaced an option, by the path of a value of the option
+        self.replaced = replaced or {}
         self.notes: list[str] = []  #: on values of the user's recipe that the arguments make unused
         self.used: set[Where] = set()
         self.known: dict[Where, Value] = {}  #: resolved values
-        self.trace: list[tuple[Where, Value | None]] = []  #: each path that was looked up, with the value there
+        #: each path that was looked up, with the value there
+        self.trace: list[tuple[Where, Value | None]] = []
         self._traces: dict[Where, list[tuple[Where, Value | None]]] = {}  #: by resolved value
         self.open: list[Where] = []  #: values that are being resolved
         self.lacking: list[tuple[Where, Diagnostic]] = []  #: targets that do not exist
         self.spare: set[Where] = set()  #: unused values of packaged options
-        self.offered: set[Where] = set()  #: values to which an optional reference refers and that nobody gave
+        #: values to which an optional reference refers and that nobody gave
+        self.offered: set[Where] = set()
         self.followed = 0  #: references followed since the last value of a step was begun
-        self.weights: dict[int, tuple[int, Any]] = {}  #: number of values in each list or mapping, by identity
+        #: number of values in each list or mapping, by identity
+        self.weights: dict[int, tuple[int, Any]] = {}
 
     def resolve(self, value: Value, scope: Scope) -> Value:
-        """Return a recipe value with its references resolved; report a failed reference and return `BROKEN` for it.
+        """Return a recipe value with its references resolved; report a failed reference and return
+        `BROKEN` for it.
 
-        An optional reference, ``${scene.illuminance?}``, leaves its key out of the mapping if the value does not exist.
+        An optional reference, ``${scene.illuminance?}``, leaves its key out of the mapping if the
+        value does not exist.
         """
         if isinstance(value.data, dict):
-            children = [(key, child, self.resolve(child, scope)) for key, child in value.data.items()]
+            children = [
+                (key, child, self.resolve(child, scope)) for key, child in value.data.items()
+            ]
             kept = [each for each in children if each[2].data is not ABSENT]
-            return replace(value, data={key: replace(resolved, key=child.key) for key, child, resolved in kept})
+            return replace(
+                value, data={key: replace(resolved, key=child.key) for key, child, resolved in kept}
+            )
         if isinstance(value.data, list):
             items = (self.resolve(child, scope) for child in value.data)
             return replace(value, data=[item for item in items if item.data is not ABSENT])
@@ -79,7 +99,9 @@ class References:
         return self._text(value, scope)
 
     def _text(self, value: Value, scope: Scope) -> Value:
-        """Return a string of a recipe with its references resolved, beginning with the innermost reference."""
+        """Return a string of a recipe with its references resolved, beginning with the innermost
+        reference.
+        """
         text = value.data
         while match := _REFERENCE.search(text):
             target = self._target(match[1], value, scope)
@@ -88,16 +110,24 @@ class References:
             if match[0] == text:
                 return target
             if target.data is ABSENT:
-                return self._fail(value, f"the optional reference ${{{match[1]}}} must be the whole value")
+                return self._fail(
+                    value, f"the optional reference ${{{match[1]}}} must be the whole value"
+                )
             if target.data is BROKEN:
                 return target
             if isinstance(target.data, dict | list):
-                return self._fail(value, f"${{{match[1]}}} is a list or a mapping: it cannot be part of a string")
+                return self._fail(
+                    value, f"${{{match[1]}}} is a list or a mapping: it cannot be part of a string"
+                )
             text = text[: match.start()] + _pasted(target.data) + text[match.end() :]
             if len(text) > _MOST_CHARACTERS:
-                return self._fail(value, f"references expand this text to more than {_MOST_CHARACTERS} characters")
+                return self._fail(
+                    value, f"references expand this text to more than {_MOST_CHARACTERS} characters"
+                )
         if "${" in text:
-            return self._fail(value, "the reference is incomplete: write a reference as ${block.name}")
+            return self._fail(
+                value, "the reference is incomplete: write a reference as ${block.name}"
+            )
         return replace(value, data=text)
 
     def _target(self, text: str, origin: Value, scope: Scope) -> Value | None:
@@ -121,7 +151,9 @@ class References:
         return self._followed(target, scope, origin)
 
     def _followed(self, target: Value, scope: Scope, origin: Value) -> Value | None:
-        """Return the target value of a reference, with its own references resolved; report a cycle of references."""
+        """Return the target value of a reference, with its own references resolved; report a
+        cycle of references.
+        """
         if target.path in self.known:
             self.trace += self._traces[target.path]
             return self.known[target.path]
@@ -138,28 +170,38 @@ class References:
             return None
         self.open.append(target.path)
         first = len(self.trace)
-        value = self.resolve(target, scope if target.path[0] == "steps" else Scope({}, dotted(target.path)))
+        value = self.resolve(
+            target, scope if target.path[0] == "steps" else Scope({}, dotted(target.path))
+        )
         self.open.pop()
         if self._weight(value) > _MOST_VALUES:
-            value = self._fail(target, f"references expand this value to more than {_MOST_VALUES} values")
+            value = self._fail(
+                target, f"references expand this value to more than {_MOST_VALUES} values"
+            )
         elif any(child.data is BROKEN for child in value.items.values()):
             value = replace(value, data=BROKEN)
         if target.path[0] != "steps":
-            self.trace[first:] = dict(self.trace[first:]).items()  # each once: nested lists would grow it
+            # each once: nested lists would grow it
+            self.trace[first:] = dict(self.trace[first:]).items()
             self.known[target.path], self._traces[target.path] = value, self.trace[first:]
         return value
 
     def _weight(self, value: Value) -> int:
-        """Return the number of values in a resolved value, in which references may repeat the same list many times."""
+        """Return the number of values in a resolved value, in which references may repeat the
+        same list many times.
+        """
         if not isinstance(value.data, dict | list):
             return 1
         if id(value.data) not in self.weights:
             weight = 1 + sum(map(self._weight, value.items.values()))
-            self.weights[id(value.data)] = weight, value.data  # kept alive, so that its identity stays its own
+            # kept alive, so that its identity stays its own
+            self.weights[id(value.data)] = weight, value.data
         return self.weights[id(value.data)][0]
 
     def _missing(self, start: Value, parts: list[str], origin: Value, scope: Scope) -> None:
-        """Report a reference to a missing value: at the item if other items have the value, else at the reference."""
+        """Report a reference to a missing value: at the item if other items have the value, else
+        at the reference.
+        """
         path = (*start.path, *parts)
         name = dotted(path)
         siblings = self.root.items[str(start.path[0])].items.values() if start.path else ()
@@ -167,7 +209,9 @@ class References:
             message = f"has no {'.'.join(parts)}; steps.{scope.step} needs this value"
             self.lacking.append((path, Diagnostic(start.key, start.name, message)))
             return
-        near = _nearest(path, {leaf.path for leaf in self.root.leaves() if leaf.path[0] not in RESERVED})
+        near = _nearest(
+            path, {leaf.path for leaf in self.root.leaves() if leaf.path[0] not in RESERVED}
+        )
         hint = f" is unknown; did you mean {dotted(near)}?" if near else " is unknown"
         if now := instead(name):
             hint = f": {now}" if new_name(name) is None else f" {now}"
@@ -180,7 +224,9 @@ class References:
         return replace(origin, data=BROKEN)
 
     def touch(self, value: Value, dims: Sequence[str]) -> None:
-        """Mark the values to which a step without copies refers as used, so that they are not reported as unused."""
+        """Mark the values to which a step without copies refers as used, so that they are not
+        reported as unused.
+        """
         for text in _texts(value):
             for match in _REFERENCE.finditer(text.data):
                 parts = match[1].strip().removesuffix("?").split(".")
@@ -192,10 +238,11 @@ class References:
                 self.used |= {(dim, name, *rest) for dim, block in blocks for name in block}
 
     def finish(self) -> None:
-        """Report values of the recipe that no step uses, and references to values that do not exist.
+        """Report values of the recipe that no step uses, and references to values that do not
+        exist.
 
-        An unused value with a name similar to a missing target is one mistake. A packaged option may set more values
-        than a recipe uses: a camera needs the pixel pitch, a bench does not.
+        An unused value with a name similar to a missing target is one mistake. A packaged option
+        may set more values than a recipe uses: a camera needs the pixel pitch, a bench does not.
         """
         targets = dict(self.lacking)
         misspelt = set()
@@ -204,9 +251,16 @@ class References:
             if _is_packaged(leaf) and meant not in targets:
                 self.spare.add(leaf.path)
                 continue
-            if leaf.path in self.replaced and meant not in targets and leaf.mark.line and leaf.key.line:
+            if (
+                leaf.path in self.replaced
+                and meant not in targets
+                and leaf.mark.line
+                and leaf.key.line
+            ):
                 self.spare.add(leaf.path)
-                self.notes.append(f"{leaf.name} ({leaf.mark}) is not used with {self.replaced[leaf.path]}")
+                self.notes.append(
+                    f"{leaf.name} ({leaf.mark}) is not used with {self.replaced[leaf.path]}"
+                )
                 continue
             misspelt.add(meant)
             if now := instead(leaf.name):
@@ -220,14 +274,25 @@ class References:
         lacking = [(path, problem) for path, problem in self.lacking if path not in misspelt]
         whole = dict(self._incomplete({path for path, _ in lacking}))
         self.diagnostics += whole.values()
-        self.diagnostics += [problem for path, problem in lacking if path[0] not in whole or len(path) != 2]
+        self.diagnostics += [
+            problem for path, problem in lacking if path[0] not in whole or len(path) != 2
+        ]
 
     def _incomplete(self, lacking: set[Where]) -> Iterator[tuple[str | int, Diagnostic]]:
-        """Yield one diagnostic for each block of the user that lacks values, at the block instead of at each step."""
+        """Yield one diagnostic for each block of the user that lacks values, at the block
+        instead of at each step.
+        """
         for key in dict.fromkeys(path[0] for path in sorted(lacking, key=str)):
             block = self.root.items.get(str(key))
-            paths = sorted(dotted(path[1:]) for path in lacking if path[0] == key and len(path) == 2)
-            if block is None or not block.mark.line or _place(block) == "packaged" or not isinstance(block.data, dict):
+            paths = sorted(
+                dotted(path[1:]) for path in lacking if path[0] == key and len(path) == 2
+            )
+            if (
+                block is None
+                or not block.mark.line
+                or _place(block) == "packaged"
+                or not isinstance(block.data, dict)
+            ):
                 continue
             if len(paths) < (3 if _place(block) == "recipe" else 1):
                 continue
@@ -241,10 +306,14 @@ class References:
     def _unused(self) -> list[Value]:
         blocks = (block for key, block in self.root.items.items() if key not in RESERVED)
         leaves = (leaf for block in blocks for leaf in block.leaves() if leaf.data != {})
-        return [v for v in leaves if not any(v.path[:n] in self.used for n in range(1, len(v.path) + 1))]
+        return [
+            v for v in leaves if not any(v.path[:n] in self.used for n in range(1, len(v.path) + 1))
+        ]
 
     def _meant(self, leaf: Value) -> Where | None:
-        """Return the path that a user probably meant by an unused path: its new name, or a similar path in use."""
+        """Return the path that a user probably meant by an unused path: its new name, or a
+        similar path in use.
+        """
         if now := new_name(leaf.name):
             return tuple(now.split("."))
         known = {*self.used, *self.offered, *(path for path, _ in self.lacking)}
@@ -253,7 +322,9 @@ class References:
 
 
 def _place(block: Value) -> Literal["packaged", "option", "recipe"]:
-    """Return where a block of a recipe is from: a packaged file, an option of a group of the user, or his recipe."""
+    """Return where a block of a recipe is from: a packaged file, an option of a group of the
+    user, or his recipe.
+    """
     folder = Path(block.mark.folder)
     if packaged() in (folder, folder.parent):
         return "packaged"
@@ -261,12 +332,16 @@ def _place(block: Value) -> Literal["packaged", "option", "recipe"]:
 
 
 def _is_packaged(leaf: Value) -> bool:
-    """Return True if a value comes from a packaged option of a group, and not from a user's recipe or an argument."""
+    """Return True if a value comes from a packaged option of a group, and not from a user's
+    recipe or an argument.
+    """
     return leaf.key.line > 0 and leaf.mark.line > 0 and Path(leaf.mark.folder).parent == packaged()
 
 
 def _nearest(path: Where, known: set[Where]) -> Where | None:
-    """Return the path in ``known`` with the last name most similar to that of ``path``, if possible in its block."""
+    """Return the path in ``known`` with the last name most similar to that of ``path``, if
+    possible in its block.
+    """
     paths_by_name = {str(other[-1]): other for other in sorted(known, key=str)}
     beside = {str(other[-1]): other for other in known if other[:-1] == path[:-1]}
     for paths in (beside, paths_by_name):
@@ -276,12 +351,20 @@ def _nearest(path: Where, known: set[Where]) -> Where | None:
     return None
 
 
-BROKEN = type("Broken", (), {"__repr__": lambda self: "?", "__doc__": "Value of a failed reference."})()
-ABSENT = type("Absent", (), {"__repr__": lambda self: "-", "__doc__": "Value of an optional reference to nothing."})()
+BROKEN = type(
+    "Broken", (), {"__repr__": lambda self: "?", "__doc__": "Value of a failed reference."}
+)()
+ABSENT = type(
+    "Absent",
+    (),
+    {"__repr__": lambda self: "-", "__doc__": "Value of an optional reference to nothing."},
+)()
 
 
 def broken(value: Value) -> bool:
-    """Return True if a value of a recipe, or a value within it, is `BROKEN` because a reference failed."""
+    """Return True if a value of a recipe, or a value within it, is `BROKEN` because a reference
+    failed.
+    """
     return value.data is BROKEN or any(map(broken, value.items.values()))
 
 

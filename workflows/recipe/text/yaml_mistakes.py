@@ -1,4 +1,6 @@
-"""Sentences and places for a text that is not YAML, where a reader finds the mistake and not where the parser stops."""
+"""Sentences and places for a text that is not YAML, where a reader finds the mistake and not
+where the parser stops.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,11 @@ class YamlMistake:
 
 
 def directive_mistake(text: str) -> YamlMistake | None:
-    """Return the mistake of a directive before the document, or None; a recipe is YAML 1.2, and has no tags.
+    """Return the mistake of a directive before the document, or None; a recipe is YAML 1.2, and has
+    no tags.
 
-    A parser of YAML 1.1 reads ``on`` as true and ``010`` as eight, so that a version is never ignored.
+    A parser of YAML 1.1 reads ``on`` as true and ``010`` as eight, so that a version is never
+    ignored.
     """
     for number, line in enumerate(text.removeprefix("\ufeff").splitlines()):
         if not line.startswith("%"):
@@ -36,10 +40,17 @@ def directive_mistake(text: str) -> YamlMistake | None:
         version = _VERSION.fullmatch(line.rstrip())
         if version is None:
             name = line.split()[0]
-            return YamlMistake(number, 0, f"the directive {name} has no meaning in a recipe: remove this line")
+            return YamlMistake(
+                number, 0, f"the directive {name} has no meaning in a recipe: remove this line"
+            )
         if version[1] != "1.2":
-            fix = "remove this line, and see that the file means the same in YAML 1.2 (on is a word, 010 is ten)"
-            return YamlMistake(number, version.start(1), f"recipes are YAML 1.2, not {version[1]}: {fix}")
+            fix = (
+                "remove this line, and see that the file means the same in YAML 1.2 (on is a word,"
+                " 010 is ten)"
+            )
+            return YamlMistake(
+                number, version.start(1), f"recipes are YAML 1.2, not {version[1]}: {fix}"
+            )
     return None
 
 
@@ -64,14 +75,29 @@ def _problem_place(error: MarkedYAMLError, text: str) -> tuple[int, int]:
 
 def _open_quote(error: MarkedYAMLError, text: str) -> YamlMistake | None:
     """Return the mistake of a quote that is not closed in its line, at the place where it opens."""
-    if "quoted scalar" in str(error.context) and error.context_mark and "end of stream" in str(error.problem):
-        return YamlMistake(error.context_mark.line, error.context_mark.column, "a quote opens here and never closes")
+    if (
+        "quoted scalar" in str(error.context)
+        and error.context_mark
+        and "end of stream" in str(error.problem)
+    ):
+        return YamlMistake(
+            error.context_mark.line,
+            error.context_mark.column,
+            "a quote opens here and never closes",
+        )
     stop = _problem_place(error, text)[0]
-    long = [token for token in _tokens(text) if _is_quoted_over_lines(token) and token.end_mark.line <= stop]
+    long = [
+        token
+        for token in _tokens(text)
+        if _is_quoted_over_lines(token) and token.end_mark.line <= stop
+    ]
     if not long or long[-1].end_mark.line != stop:
         return None
     start = long[-1].start_mark
-    message = f"the quote that opens here closes only in line {long[-1].end_mark.line + 1}: close it in its line"
+    message = (
+        f"the quote that opens here closes only in line {long[-1].end_mark.line + 1}: close it in"
+        " its line"
+    )
     return YamlMistake(start.line, start.column, message)
 
 
@@ -89,7 +115,9 @@ def _tokens(text: str) -> Iterator[Any]:
 
 
 def _missing_space(error: MarkedYAMLError, text: str) -> YamlMistake | None:
-    """Return the mistake of a key without a space behind its colon, or of a line that is neither key nor value."""
+    """Return the mistake of a key without a space behind its colon, or of a line that is neither
+    key nor value.
+    """
     if "could not find expected ':'" not in str(error.problem) or not error.context_mark:
         return None
     return _unfinished_key(text, error.context_mark.line, error.context_mark.column)
@@ -105,10 +133,11 @@ def _unfinished_key(text: str, line: int, column: int) -> YamlMistake:
 
 
 def _text_goes_on(error: MarkedYAMLError, text: str) -> YamlMistake | None:
-    """Return the mistake of a key that YAML reads as more of the text before it, which began on an earlier line.
+    """Return the mistake of a key that YAML reads as more of the text before it, which began on an
+    earlier line.
 
-    The text before is a key without a space behind its colon, such as ``seed:7``, or a value, and then the indent of
-    the later key is wrong.
+    The text before is a key without a space behind its colon, such as ``seed:7``, or a value, and
+    then the indent of the later key is wrong.
     """
     if "mapping values are not allowed" not in str(error.problem):
         return None
@@ -121,19 +150,25 @@ def _text_goes_on(error: MarkedYAMLError, text: str) -> YamlMistake | None:
     if not text.splitlines()[start.line][: start.column].strip(" -"):
         return _unfinished_key(text, start.line, start.column)
     indent = column - len(text.splitlines()[line][:column].lstrip())
-    message = f"a wrong indent: as it stands, this line is more of the value in line {start.line + 1}"
+    message = (
+        f"a wrong indent: as it stands, this line is more of the value in line {start.line + 1}"
+    )
     return YamlMistake(line, indent, message)
 
 
 def _open_bracket(error: MarkedYAMLError, text: str) -> YamlMistake | None:
-    """Return the mistake of a list or mapping in brackets that goes on past its line, where the bracket opens."""
+    """Return the mistake of a list or mapping in brackets that goes on past its line, where the
+    bracket opens.
+    """
     mark = error.context_mark
     if mark is None or not str(error.context).startswith("while parsing a flow"):
         return None
     if _problem_place(error, text)[0] == mark.line:
         return None
     bracket = (text.splitlines() or [""])[mark.line][mark.column : mark.column + 1]
-    return YamlMistake(mark.line, mark.column, f"the {bracket} that opens here is not closed, or lacks a comma")
+    return YamlMistake(
+        mark.line, mark.column, f"the {bracket} that opens here is not closed, or lacks a comma"
+    )
 
 
 def _sentence(problem: str, here: str, column: int) -> str:
@@ -160,11 +195,16 @@ def _sentence(problem: str, here: str, column: int) -> str:
 
 
 def _wrong_indent(problem: str, here: str) -> str:
-    """Return the sentence for a line that belongs to no mapping or list that is open, because of its indent."""
+    """Return the sentence for a line that belongs to no mapping or list that is open, because of
+    its indent.
+    """
     indent = len(here) - len(here.lstrip(" "))
     if problem.endswith(("'<scalar>'", "'<alias>'", "'<tag>'")):
         return "text after the end of a value: quote the whole value, or begin a new line"
-    return f"a wrong indent: the {indent} spaces before this line are those of no line above in the same block"
+    return (
+        f"a wrong indent: the {indent} spaces before this line are those of no line above in the"
+        " same block"
+    )
 
 
 def _short(text: str) -> str:

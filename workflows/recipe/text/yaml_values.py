@@ -1,4 +1,6 @@
-"""Values of YAML 1.2 with their locations: ``1e3`` is a number, ``on`` is a string, and ``010`` is the number ten."""
+"""Values of YAML 1.2 with their locations: ``1e3`` is a number, ``on`` is a string, and ``010``
+is the number ten.
+"""
 
 from __future__ import annotations
 
@@ -53,36 +55,52 @@ class Value:
 
     @property
     def items(self) -> dict[Any, Value]:
-        """Return the values in a YAML mapping or list by key or index; return an empty dict for a scalar."""
+        """Return the values in a YAML mapping or list by key or index; return an empty dict for
+        a scalar.
+        """
         if isinstance(self.data, dict):
             return self.data
         return dict(enumerate(self.data)) if isinstance(self.data, list) else {}
 
     def child(self, name: str | int) -> Value | None:
-        """Return the value at a key or an index of a mapping or a list; an index may be written as a string."""
+        """Return the value at a key or an index of a mapping or a list; an index may be written
+        as a string.
+        """
         items = self.items
         if name not in items and isinstance(name, str) and name.isdecimal():
             name = int(name)
-        return items[name] if name in items else next((v for key, v in items.items() if str(key) == str(name)), None)
+        return (
+            items[name]
+            if name in items
+            else next((v for key, v in items.items() if str(key) == str(name)), None)
+        )
 
     def below(self, path: Iterable[str | int]) -> Value | None:
-        """Return the value at a path of keys below this YAML value, or None if the path does not exist."""
+        """Return the value at a path of keys below this YAML value, or None if the path does not
+        exist.
+        """
         value: Value | None = self
         for name in path:
             value = value.child(name) if value else None
         return value
 
     def replaced(self, key: str | int, child: Value | None) -> Value:
-        """Return a copy of a mapping or a list with ``child`` at a key, or without the key if ``child`` is None."""
+        """Return a copy of a mapping or a list with ``child`` at a key, or without the key if
+        ``child`` is None.
+        """
         items = {k: v for k, v in self.items.items() if child is not None or k != key}
         if child is not None:
             items[key] = child
         if isinstance(self.data, list):
-            return replace(self, data=[replace(v, path=(*self.path, i)) for i, v in enumerate(items.values())])
+            return replace(
+                self, data=[replace(v, path=(*self.path, i)) for i, v in enumerate(items.values())]
+            )
         return replace(self, data=items)
 
     def without(self, key: str) -> Value:
-        """Return a copy of a mapping without ``key``, or the mapping itself if it does not have the key."""
+        """Return a copy of a mapping without ``key``, or the mapping itself if it does not have
+        the key.
+        """
         return self.replaced(key, None) if key in self.items else self
 
     def leaves(self) -> Iterator[Value]:
@@ -115,7 +133,10 @@ def read(path: Path, shown: str) -> Document:
         with opened(path) as file:
             size = os.fstat(file.fileno()).st_size
             if size > _LARGEST:
-                message = f"the file has {size} bytes, more than the limit of {_LARGEST}: split the recipe into groups"
+                message = (
+                    f"the file has {size} bytes, more than the limit of {_LARGEST}: split the"
+                    " recipe into groups"
+                )
                 raise RecipeError([Diagnostic(Location(shown), "", message)])
             text = file.read(_LARGEST).decode("utf-8-sig")
     except NotRegular as error:
@@ -123,9 +144,13 @@ def read(path: Path, shown: str) -> Document:
     except UnicodeDecodeError as error:
         before = error.object[: error.start].decode("utf-8", "replace")
         mark = Location(shown, before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1)
-        raise RecipeError([Diagnostic(mark, "", f"the byte 0x{error.object[error.start]:02x} is not UTF-8")]) from None
+        raise RecipeError(
+            [Diagnostic(mark, "", f"the byte 0x{error.object[error.start]:02x} is not UTF-8")]
+        ) from None
     except OSError as error:
-        raise RecipeError([Diagnostic(Location(shown), "", f"the file cannot be read: {error.strerror}")]) from None
+        raise RecipeError(
+            [Diagnostic(Location(shown), "", f"the file cannot be read: {error.strerror}")]
+        ) from None
     return _document(text, shown, str(path.parent))
 
 
@@ -134,21 +159,29 @@ def _document(text: str, shown: str, folder: str) -> Document:
     root = parse(text, Location(shown, 1, 1, folder))
     if not isinstance(root.data, dict):
         what = "the file is empty" if root.data is None else f"the file contains {kind(root)}"
-        raise RecipeError([Diagnostic(Location(shown, 1, 1), "", f"{what}: write a mapping, `key: value`")])
+        raise RecipeError(
+            [Diagnostic(Location(shown, 1, 1), "", f"{what}: write a mapping, `key: value`")]
+        )
     first = text.lstrip().partition("\n")[0].strip()
     return Document(root, visible(first.lstrip("# ")) if first.startswith("#") else "")
 
 
 def parse(text: str, start: Location, path: Where = ()) -> Value:
-    """Return the values in a YAML text; ``start`` is the location of the text in a file, or an argument."""
+    """Return the values in a YAML text; ``start`` is the location of the text in a file, or an
+    argument.
+    """
     builder = _Builder(start)
     if mistake := directive_mistake(text):
         raise RecipeError([_diagnostic(mistake, start, path)])
     try:
         node = YAML(typ="safe", pure=True).compose(text)
-        value = Value(None, start, start, path) if node is None else builder.value(node, path, start)
+        value = (
+            Value(None, start, start, path) if node is None else builder.value(node, path, start)
+        )
     except RecursionError:
-        raise RecipeError([Diagnostic(start, dotted(path), "the YAML text is nested too deeply")]) from None
+        raise RecipeError(
+            [Diagnostic(start, dotted(path), "the YAML text is nested too deeply")]
+        ) from None
     except (YAMLError, YAMLStreamError) as error:
         raise RecipeError([_diagnostic(explained(error, text), start, path)]) from None
     if builder.diagnostics:
@@ -158,18 +191,30 @@ def parse(text: str, start: Location, path: Where = ()) -> Value:
 
 def _diagnostic(mistake: YamlMistake, start: Location, path: Where) -> Diagnostic:
     """Return the diagnostic for a mistake in a YAML text that begins at ``start``."""
-    mark = Location(start.file, mistake.line + 1, mistake.column + 1, start.folder) if start.line else start
+    mark = (
+        Location(start.file, mistake.line + 1, mistake.column + 1, start.folder)
+        if start.line
+        else start
+    )
     return Diagnostic(mark, dotted(path), mistake.message)
 
 
 def kind(value: Value) -> str:
     """Return the kind of a YAML value in words, such as ``a list``."""
-    names = {dict: "a mapping", list: "a list", str: "a string", bool: "true or false", type(None): "nothing"}
+    names = {
+        dict: "a mapping",
+        list: "a list",
+        str: "a string",
+        bool: "true or false",
+        type(None): "nothing",
+    }
     return names.get(type(value.data), "a number")
 
 
 class _Builder:
-    """Builder of the values in one YAML text; an alias becomes a copy of the value to which it refers."""
+    """Builder of the values in one YAML text; an alias becomes a copy of the value to which it
+    refers.
+    """
 
     def __init__(self, start: Location) -> None:
         self.start = start
@@ -185,15 +230,21 @@ class _Builder:
             return self._refuse(mark, path, f"unknown YAML tag {tag}: remove the tag")
         if isinstance(node, ScalarNode):
             fault = _fault(str(node.value))
-            return self._refuse(mark, path, fault) if fault else Value(_scalar(node), mark, key, path)
+            return (
+                self._refuse(mark, path, fault) if fault else Value(_scalar(node), mark, key, path)
+            )
         if id(node) in self.built:
             self.aliased += self.size[id(node)]
             self._refuse_many(self.aliased, _MOST_ALIASED, mark, path)
             return replace(_moved(self.built[id(node)], path), key=key)
         if id(node) in self.open:
-            return self._refuse(mark, path, "a YAML alias refers to the value that contains the alias")
+            return self._refuse(
+                mark, path, "a YAML alias refers to the value that contains the alias"
+            )
         self.open.add(id(node))
-        data = self._mapping(node, path) if isinstance(node, MappingNode) else self._list(node, path)
+        data = (
+            self._mapping(node, path) if isinstance(node, MappingNode) else self._list(node, path)
+        )
         self.open.discard(id(node))
         value = self.built[id(node)] = Value(data, mark, key, path)
         self._weigh(node, value)
@@ -208,36 +259,62 @@ class _Builder:
                 continue
             key = _key(key_node)
             if key == "<<":
-                self._refuse(mark, path, "merge keys (<<) are not part of YAML 1.2: refer to values with ${…}")
+                self._refuse(
+                    mark,
+                    path,
+                    "merge keys (<<) are not part of YAML 1.2: refer to values with ${…}",
+                )
             elif key is None:
                 self._refuse(mark, path, "the key of a mapping must be a name or a whole number")
             elif isinstance(key, str) and _LACKS_SPACE.fullmatch(key) and _is_empty(value_node):
                 name, _, text = key.partition(":")
-                self._refuse(mark, (*path, name), f"needs a space after the colon: write `{name}: {text}`")
+                self._refuse(
+                    mark, (*path, name), f"needs a space after the colon: write `{name}: {text}`"
+                )
             elif key in data:
                 line = data[key].key.line
-                self._refuse(mark, (*path, key), f"given twice, first in line {line}" if line else "given twice")
+                self._refuse(
+                    mark,
+                    (*path, key),
+                    f"given twice, first in line {line}" if line else "given twice",
+                )
             else:
                 data[key] = self.value(value_node, (*path, key), mark)
         return data
 
     def _list(self, node: Node, path: Where) -> list[Value]:
-        return [self.value(child, (*path, i), self._mark(child)) for i, child in enumerate(node.value)]
+        return [
+            self.value(child, (*path, i), self._mark(child)) for i, child in enumerate(node.value)
+        ]
 
     def _weigh(self, node: Node, value: Value) -> None:
-        """Count the values in a YAML list or mapping; raise `RecipeError` if aliases produce too many values."""
-        children = [v for pair in node.value for v in pair] if isinstance(node, MappingNode) else node.value
+        """Count the values in a YAML list or mapping; raise `RecipeError` if aliases produce too
+        many values.
+        """
+        children = (
+            [v for pair in node.value for v in pair]
+            if isinstance(node, MappingNode)
+            else node.value
+        )
         self.size[id(node)] = 1 + sum(self.size.get(id(child), 1) for child in children)
         self._refuse_many(self.size[id(node)], _MOST, value.mark, value.path)
 
     def _refuse_many(self, count: int, most: int, mark: Location, path: Where) -> None:
         if count > most:
-            raise RecipeError([Diagnostic(mark, dotted(path), f"aliases expand this value to more than {most} values")])
+            raise RecipeError(
+                [
+                    Diagnostic(
+                        mark, dotted(path), f"aliases expand this value to more than {most} values"
+                    )
+                ]
+            )
 
     def _mark(self, node: Node) -> Location:
         if not self.start.line:
             return self.start
-        return Location(self.start.file, node.start_mark.line + 1, node.start_mark.column + 1, self.start.folder)
+        return Location(
+            self.start.file, node.start_mark.line + 1, node.start_mark.column + 1, self.start.folder
+        )
 
     def _refuse(self, mark: Location, path: Where, message: str) -> Value:
         self.diagnostics.append(Diagnostic(mark, dotted(path), message))
@@ -254,11 +331,16 @@ def _moved(value: Value, path: Where) -> Value:
     return replace(value, data=data, path=path)
 
 
-_KNOWN = {f"!!{name}" for name in ("str", "int", "float", "bool", "null", "map", "seq", "timestamp", "merge", "value")}
+_KNOWN = {
+    f"!!{name}"
+    for name in ("str", "int", "float", "bool", "null", "map", "seq", "timestamp", "merge", "value")
+}
 
 
 def _fault(text: str) -> str:
-    """Return what is wrong with the text of a scalar that would harm a reader or the program, or an empty text."""
+    """Return what is wrong with the text of a scalar that would harm a reader or the program, or
+    an empty text.
+    """
     if found := CONTROL.search(text):
         return f"has the control character {visible(found[0])}: remove it"
     if len(text) > _DIGITS and _INT.fullmatch(text):
@@ -276,7 +358,9 @@ def _scalar(node: ScalarNode) -> Any:
 
 
 def number(text: str) -> int | float | str:
-    """Return the number that a text represents in YAML 1.2, or the text itself if it is not a number."""
+    """Return the number that a text represents in YAML 1.2, or the text itself if it is not a
+    number.
+    """
     if _INT.fullmatch(text):
         return int(text, 0 if text[:2] in ("0o", "0x") else 10)
     if _FLOAT.fullmatch(text):
@@ -293,7 +377,9 @@ def _is_empty(node: Node) -> bool:
 
 
 def _key(node: Node) -> str | int | None:
-    """Return the key of a YAML mapping as a name or a whole number, or None for another kind of key."""
+    """Return the key of a YAML mapping as a name or a whole number, or None for another kind of
+    key.
+    """
     if not isinstance(node, ScalarNode):
         return None
     key = _scalar(node)

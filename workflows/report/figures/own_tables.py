@@ -1,4 +1,6 @@
-"""Figure of the tables of the user: camera, glass, light, lasers and height map, each as its file holds it."""
+"""Figure of the tables of the user: camera, glass, light, lasers and height map, each as its
+file holds it.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from neusee.nodes import doe, spectra
-from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn, nanometres
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    VERMILION,
+    canvas,
+    drawn,
+    nanometres,
+)
 
 _WIDTH = 4.6  #: inches of a panel
 _COLOURS = (VERMILION, GREEN, BLUE)
@@ -29,7 +40,8 @@ def tables(
     unit: float | None = None,
     pitch: float | None = None,
 ) -> Any:
-    """Draw each table of the user in a panel of its own; an argument that is no file or coefficients is left out.
+    """Draw each table of the user in a panel of its own; an argument that is no file or
+    coefficients is left out.
 
     Raises: ValueError if no argument is a table.
     """
@@ -52,7 +64,9 @@ def tables(
 
 def _filled(panels: Sequence[Draw]) -> Any:
     columns = min(3, len(panels))
-    figure, axes = canvas(_WIDTH * columns, 4.2 * -(-len(panels) // columns), -(-len(panels) // columns), columns)
+    figure, axes = canvas(
+        _WIDTH * columns, 4.2 * -(-len(panels) // columns), -(-len(panels) // columns), columns
+    )
     for ax in axes.ravel()[len(panels) :]:
         ax.remove()
     for draw, ax in zip(panels, axes.ravel(), strict=False):
@@ -66,7 +80,9 @@ def _camera(ax: Any, file: Path) -> None:
     colours = _COLOURS if not mono else (BLACK,)
     for column, values, colour in zip(curves.columns, table.values, colours, strict=True):
         shown = 100 * values if absolute else values / table.values.max()
-        ax.plot(nanometres(table.wavelengths), shown.numpy(), ".-", color=colour, label=column.quantity)
+        ax.plot(
+            nanometres(table.wavelengths), shown.numpy(), ".-", color=colour, label=column.quantity
+        )
     ax.set(title=file.name, ylabel="quantum efficiency (%)" if absolute else "relative sensitivity")
     _spectral(ax)
 
@@ -90,16 +106,28 @@ def _light(ax: Any, file: Path) -> None:
 
 
 def _lasers(ax: Any, files: Mapping[str, Path]) -> None:
-    """Draw each laser: separate lines as bars from 0, a spectrum as a curve, both relative to the largest value."""
+    """Draw each laser: separate lines as bars from 0, a spectrum as a curve, both relative to
+    the largest value.
+    """
     for number, (name, file) in enumerate(files.items()):
         laser = spectra.laser_table(file)
         table = laser.power.table()
-        look = {"color": _LASERS[number % len(_LASERS)], "linestyle": _STYLES[number % len(_STYLES)]}
+        look = {
+            "color": _LASERS[number % len(_LASERS)],
+            "linestyle": _STYLES[number % len(_STYLES)],
+        }
         nm, power = nanometres(table.wavelengths), (table.values[0] / table.values.max()).numpy()
         if laser.widths is None:
             ax.plot(nm, power, label=f"{name}, {file.name}", **look)
         else:
-            ax.vlines(nm, 0, power, label=f"{name}, {file.name}", colors=look["color"], linestyles=look["linestyle"])
+            ax.vlines(
+                nm,
+                0,
+                power,
+                label=f"{name}, {file.name}",
+                colors=look["color"],
+                linestyles=look["linestyle"],
+            )
     ax.set(title="lasers", ylabel="power / largest")
     _spectral(ax)
 
@@ -112,7 +140,9 @@ def _spectral(ax: Any) -> None:
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
 
 
-def _height(figure: Any, ax: Any, file: Path, depth: float | None, unit: float | None, pitch: float | None) -> None:
+def _height(
+    figure: Any, ax: Any, file: Path, depth: float | None, unit: float | None, pitch: float | None
+) -> None:
     heights, own = doe.height_map(file, depth=depth, unit=unit, pitch=pitch)
     step = max(1, max(heights.shape) // 540)
     half = [n * (own * 1e3 if own else 1.0) / 2 for n in heights.shape]

@@ -1,4 +1,6 @@
-"""Figure of the graph of a recipe: one box for each step, in the colour of its state: run, cached or left out."""
+"""Figure of the graph of a recipe: one box for each step, in the colour of its state: run,
+cached or left out.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ _LETTER = 5.7  #: points, mean width of a letter in a box
 
 @drawn
 def graph(*, sources: Mapping[str, Iterable[str]], states: Mapping[str, str]) -> Any:
-    """Draw the graph of a recipe: a box for each step, below the boxes of the steps whose results the step reads."""
+    """Draw the graph of a recipe: a box for each step, below the boxes of the steps whose
+    results the step reads.
+    """
     wires, looks, counts = grouped(sources, states)
     places = layout(wires)
     columns = max((x for x, _ in places.values()), default=0.0) + 1
@@ -46,7 +50,8 @@ def graph(*, sources: Mapping[str, Iterable[str]], states: Mapping[str, str]) ->
 def grouped(
     sources: Mapping[str, Iterable[str]], states: Mapping[str, str]
 ) -> tuple[dict[str, list[str]], dict[str, str], Counter[str]]:
-    """Return the sources, the state and the number of copies (such as ``psf[mask]``) of each step of a recipe.
+    """Return the sources, the state and the number of copies (such as ``psf[mask]``) of each step
+    of a recipe.
 
     The state is ``run`` if any copy of the step ran.
     """
@@ -55,14 +60,18 @@ def grouped(
     looks: dict[str, str] = {}
     for name, befores in sources.items():
         mine = family[name]
-        wires[mine] += [f for f in dict.fromkeys(family[b] for b in befores) if f not in (*wires[mine], mine)]
+        wires[mine] += [
+            f for f in dict.fromkeys(family[b] for b in befores) if f not in (*wires[mine], mine)
+        ]
         state = states[name] if states.get(name) in LOOKS else "cached"
         looks[mine] = "run" if "run" in (state, looks.get(mine)) else state
     return wires, looks, Counter(family.values())
 
 
 def layout(wires: Mapping[str, list[str]]) -> dict[str, tuple[float, int]]:
-    """Return the position (x, row) of each step in the figure of a graph, below and near the sources of the step."""
+    """Return the position (x, row) of each step in the figure of a graph, below and near the
+    sources of the step.
+    """
     depth = _depths(wires)
     rows: dict[int, list[str]] = {}
     for name, row in depth.items():
@@ -70,15 +79,22 @@ def layout(wires: Mapping[str, list[str]]) -> dict[str, tuple[float, int]]:
     widest = max((len(r) for r in rows.values()), default=1)
     places: dict[str, tuple[float, int]] = {}
     for row in sorted(rows):
-        wish = {n: _mean([places[b][0] for b in wires[n] if b in places], (widest - 1) / 2) for n in rows[row]}
+        wish = {
+            n: _mean([places[b][0] for b in wires[n] if b in places], (widest - 1) / 2)
+            for n in rows[row]
+        }
         names = sorted(rows[row], key=lambda n: wish[n])
-        start = min(max(_mean(list(wish.values()), 0.0) - (len(names) - 1) / 2, 0.0), widest - len(names))
+        start = min(
+            max(_mean(list(wish.values()), 0.0) - (len(names) - 1) / 2, 0.0), widest - len(names)
+        )
         places |= {name: (start + i, row) for i, name in enumerate(names)}
     return places
 
 
 def _depths(wires: Mapping[str, list[str]]) -> dict[str, int]:
-    """Return the row of each step in the figure of a graph, just above the first step that reads the result."""
+    """Return the row of each step in the figure of a graph, just above the first step that reads
+    the result.
+    """
     order = in_order(wires, wires)
     depth: dict[str, int] = {}
     for name in order:
@@ -99,31 +115,49 @@ def _edge(ax: Any, start: tuple[float, int], end: tuple[float, int]) -> None:
     from matplotlib.patches import FancyArrowPatch
 
     bend = 0.0 if end[1] - start[1] == 1 else 0.12 if end[0] <= start[0] else -0.12
-    path: dict[str, Any] = {"connectionstyle": f"arc3,rad={bend}", "arrowstyle": "-|>", "mutation_scale": 9}
+    path: dict[str, Any] = {
+        "connectionstyle": f"arc3,rad={bend}",
+        "arrowstyle": "-|>",
+        "mutation_scale": 9,
+    }
     a, b = (start[0], start[1] + 0.27), (end[0], end[1] - 0.27)
-    ax.add_artist(FancyArrowPatch(a, b, color="#8a8a8a", linewidth=0.9, shrinkA=0, shrinkB=0, zorder=1, **path))
+    ax.add_artist(
+        FancyArrowPatch(
+            a, b, color="#8a8a8a", linewidth=0.9, shrinkA=0, shrinkB=0, zorder=1, **path
+        )
+    )
 
 
 def _box(ax: Any, x: float, y: float, text: str, look: str) -> None:
     from matplotlib.patches import FancyBboxPatch
 
-    style: dict[str, Any] = {"boxstyle": "round,pad=0.0,rounding_size=0.08", "mutation_aspect": 1.6, "zorder": 2}
-    style |= {"facecolor": LOOKS[look][0], "edgecolor": "#444444", "linestyle": "--" if look == "left out" else "-"}
+    style: dict[str, Any] = {
+        "boxstyle": "round,pad=0.0,rounding_size=0.08",
+        "mutation_aspect": 1.6,
+        "zorder": 2,
+    }
+    style |= {
+        "facecolor": LOOKS[look][0],
+        "edgecolor": "#444444",
+        "linestyle": "--" if look == "left out" else "-",
+    }
     ax.add_artist(FancyBboxPatch((x - _INSIDE / 2, y - 0.26), _INSIDE, 0.52, **style))
     ax.text(x, y, text, ha="center", va="center", fontsize=9.5, zorder=3, linespacing=1.15)
 
 
 def broken(name: str, letters: int, copies: str = "") -> str:
-    """Return the name of a step on at most two lines of ``letters``, shortened in the middle if it is still longer."""
+    """Return the name of a step on at most two lines of ``letters``, shortened in the middle if
+    it is still longer.
+    """
     if len(name + copies) <= letters:
         return name + copies
     cuts = [i + 1 for i, sign in enumerate(name[:-1]) if sign in "_. " and i < letters]
     at = cuts[-1] if cuts else letters
     room = max(letters - len(copies), 3)
     first, rest = name[:at].rstrip(), name[at:]
-    return (
-        f"{first}\n{rest if len(rest) <= room else rest[: room // 2] + '…' + rest[-(room - room // 2 - 1) :]}{copies}"
-    )
+    if len(rest) > room:
+        rest = f"{rest[: room // 2]}…{rest[-(room - room // 2 - 1) :]}"
+    return f"{first}\n{rest}{copies}"
 
 
 def _legend(figure: Any, looks: Iterable[str]) -> None:

@@ -1,4 +1,6 @@
-"""Figure of the spectra of three scene pixels, and of the RGB values from which these spectra are reconstructed."""
+"""Figure of the spectra of three scene pixels, and of the RGB values from which these spectra
+are reconstructed.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ def spectra(
     responses: Tensor,
     lines: Mapping[str, Bands] | None = None,
 ) -> Any:
-    """Draw the spectra of three scene pixels, the illuminant, and the spectral responses of the sensor channels."""
+    """Draw the spectra of three scene pixels, the illuminant, and the spectral responses of the
+    sensor channels.
+    """
     figure, axes = canvas(13.0, 4.4, 1, 3, width_ratios=(1.0, 1.35, 1.35))
     points = _points(scene)
     _scene(axes[0, 0], scene, points)
@@ -56,8 +60,14 @@ def spectra(
 
 
 def _points(scene: Tensor) -> list[tuple[int, int]]:
-    """Return (y, x) of the reddest, the greenest and the bluest pixel of the scene that is neither dark nor clipped."""
-    inner = torch.nn.functional.avg_pool2d(scene[None].float(), 5, 1, 2)[0] if min(scene.shape[-2:]) >= 5 else scene
+    """Return (y, x) of the reddest, the greenest and the bluest pixel of the scene that is
+    neither dark nor clipped.
+    """
+    inner = (
+        torch.nn.functional.avg_pool2d(scene[None].float(), 5, 1, 2)[0]
+        if min(scene.shape[-2:]) >= 5
+        else scene
+    )
     lit, white = inner.amax(0), high(scene)
     usable = (lit > 0.2 * white) & (lit < 0.9 * white)
     share = inner / inner.sum(0).clamp_min(1e-9)
@@ -71,11 +81,16 @@ def _scene(ax: Any, scene: Tensor, points: list[tuple[int, int]]) -> None:
             ax.plot(x, y, "o", mfc="none", mec=colour, markersize=9, mew=width)
 
 
-def _spectra(ax: Any, scene: Tensor, radiance: Tensor, bands: Bands, points: list[tuple[int, int]]) -> None:
+def _spectra(
+    ax: Any, scene: Tensor, radiance: Tensor, bands: Bands, points: list[tuple[int, int]]
+) -> None:
     nm = nanometres(bands.centres)
     for name, (y, x), style in zip(_POINTS, points, ("-", "--", "-."), strict=True):
         rgb = scene[:, y, x].tolist()
-        row, column = (p * r // s for p, r, s in zip((y, x), radiance.shape[-2:], scene.shape[-2:], strict=True))
+        row, column = (
+            p * r // s
+            for p, r, s in zip((y, x), radiance.shape[-2:], scene.shape[-2:], strict=True)
+        )
         label = f"{name}: RGB {rgb[0]:.2f} {rgb[1]:.2f} {rgb[2]:.2f}"
         colour = encoded(0.75 * scene[:, y : y + 1, x : x + 1] / max(*rgb, 1e-9))[0, 0]
         ax.plot(nm, radiance[:, row, column].cpu().numpy(), style, color=colour, label=label)
@@ -85,15 +100,25 @@ def _spectra(ax: Any, scene: Tensor, radiance: Tensor, bands: Bands, points: lis
 def _channels(ax: Any, illuminant: Tensor, responses: Tensor, bands: Bands) -> None:
     nm = nanometres(bands.centres)
     ax.plot(nm, illuminant.cpu().numpy(), color="black", linestyle="--", label="illuminant")
-    for channel, (colour, name) in zip(responses, CHANNELS if len(responses) > 1 else MONO, strict=True):
+    for channel, (colour, name) in zip(
+        responses, CHANNELS if len(responses) > 1 else MONO, strict=True
+    ):
         ax.plot(nm, channel.cpu().numpy(), color=colour, label=name)
     ax.set(title="illuminant and channels", ylabel="relative")
 
 
 def _lasers(ax: Any, lines: Mapping[str, Bands]) -> None:
-    """Draw a vertical line at the wavelength of each laser; one label stands for three or more lasers."""
+    """Draw a vertical line at the wavelength of each laser; one label stands for three or more
+    lasers.
+    """
     for number, (name, line) in enumerate(lines.items()):
         nm = mean_wavelength(line) * 1e9
-        label = f"laser {name}, {nm:.0f} nm" if len(lines) < 3 else f"{len(lines)} lasers" if number == 0 else None
+        label = (
+            f"laser {name}, {nm:.0f} nm"
+            if len(lines) < 3
+            else f"{len(lines)} lasers"
+            if number == 0
+            else None
+        )
         style = "-." if len(lines) == 2 and number == 1 else ":"
         ax.axvline(nm, color="#555555", linewidth=1.2, linestyle=style, label=label)

@@ -15,7 +15,11 @@ def transmission(*, shading: Shading) -> Any:
     """Draw the estimated transmission at each knot, and half the width of its 90 % interval."""
     figure, axes = canvas(8.0, 4.0, 1, 2)
     wide = NORMAL * shading.deviation
-    applied = "frame divided by it" if bool(shading.identifiable) else "not identifiable: frame left as it is"
+    applied = (
+        "frame divided by it"
+        if bool(shading.identifiable)
+        else "not identifiable: frame left as it is"
+    )
     fields = (
         (shading.estimate.exp(), f"transmission, {applied}"),
         (shading.estimate.exp() * wide.sinh(), "90 % interval, ±"),

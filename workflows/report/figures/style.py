@@ -1,4 +1,6 @@
-"""Style of all figures: colours for colour-blind readers, light background, text of at least 9 points, PNG format."""
+"""Style of all figures: colours for colour-blind readers, light background, text of at least 9
+points, PNG format.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from torch import Tensor
 
 P = ParamSpec("P")
 
-#: Colours of the palette of Okabe and Ito, which people with any common kind of colour vision can tell apart.
+#: Colours of the palette of Okabe and Ito, which people with any common kind of colour vision can
+#: tell apart.
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 BLACK = "#000000"
 
@@ -45,7 +48,9 @@ def canvas(
     layout: Literal["constrained"] | None = "constrained",
     **options: Any,
 ) -> tuple[Any, Any]:
-    """Return a new matplotlib figure of ``width`` by ``height`` inches, and the array of its axes."""
+    """Return a new matplotlib figure of ``width`` by ``height`` inches, and the array of its
+    axes.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -55,7 +60,9 @@ def canvas(
 
 
 def drawn(draw: Callable[P, Any]) -> Callable[P, bytes]:
-    """Decorate a drawing function, so that the function uses the common style and returns the bytes of a PNG file."""
+    """Decorate a drawing function, so that the function uses the common style and returns the
+    bytes of a PNG file.
+    """
 
     @functools.wraps(draw)
     def inner(*args: P.args, **kwargs: P.kwargs) -> bytes:
@@ -90,7 +97,9 @@ def png_of(figure: Any) -> bytes:
 
 
 def warm() -> None:
-    """Import what figures need and find the font, so that the first picture takes no longer than others."""
+    """Import what figures need and find the font, so that the first picture takes no longer than
+    others.
+    """
     with styled():
         figure, axes = canvas(1.0, 1.0)
         axes[0, 0].set_title("a")
@@ -98,7 +107,9 @@ def warm() -> None:
 
 
 def picture(axes: Any, image: Any, title: str, **options: Any) -> Any:
-    """Show an image without axis ticks; pass ``options``, such as the colour scale, to ``imshow``."""
+    """Show an image without axis ticks; pass ``options``, such as the colour scale, to
+    ``imshow``.
+    """
     shown = axes.imshow(image, **options)
     axes.set(title=title, xticks=[], yticks=[])
     axes.grid(False)
@@ -108,7 +119,9 @@ def picture(axes: Any, image: Any, title: str, **options: Any) -> Any:
 
 
 def encoded(linear: Tensor) -> Any:
-    """Return linear sRGB (3, y, x) as gamma-encoded values (y, x, 3), clipped to [0, 1]; NaN becomes 0."""
+    """Return linear sRGB (3, y, x) as gamma-encoded values (y, x, 3), clipped to [0, 1]; NaN
+    becomes 0.
+    """
     from kornia.color import linear_rgb_to_rgb
 
     rgb = torch.nan_to_num(linear.detach().to("cpu", torch.float32)).clamp(0.0, 1.0)
@@ -121,6 +134,8 @@ def nanometres(metres: Tensor) -> Any:
 
 
 def nearest(centres: Tensor, metres: float) -> tuple[int, str]:
-    """Return the index of the spectral band nearest to a wavelength, and its centre as text, such as ``550 nm``."""
+    """Return the index of the spectral band nearest to a wavelength, and its centre as text,
+    such as ``550 nm``.
+    """
     band = int((centres - metres).abs().argmin())
     return band, f"{float(centres[band]) * 1e9:.0f} nm"

@@ -1,4 +1,6 @@
-"""The Pareto front of error and run time, and the engine's choices compared with the quickest settings."""
+"""The Pareto front of error and run time, and the engine's choices compared with the quickest
+settings.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ Points = Sequence[WorkPrecisionPoint]
 
 @dataclass(frozen=True)
 class ToleranceChoice:
-    """The engine's choice for a tolerance, and the quickest measured setting within the tolerance."""
+    """The engine's choice for a tolerance, and the quickest measured setting within the
+    tolerance.
+    """
 
     tolerance: float
     chosen: WorkPrecisionPoint
@@ -26,12 +30,16 @@ class ToleranceChoice:
 
     @property
     def ratio(self) -> float | None:
-        """Return the run time of the engine's choice divided by the run time of the quickest setting."""
+        """Return the run time of the engine's choice divided by the run time of the quickest
+        setting.
+        """
         return None if self.cheapest is None else self.chosen.seconds / self.cheapest.seconds
 
 
 def pareto_front(points: Points) -> list[WorkPrecisionPoint]:
-    """Return the Pareto front: settings that no other setting beats in both run time and error, the quickest first."""
+    """Return the Pareto front: settings that no other setting beats in both run time and error,
+    the quickest first.
+    """
     line: list[WorkPrecisionPoint] = []
     for point in sorted(points, key=lambda p: (p.seconds, p.most)):
         if not line or point.most < line[-1].most:
@@ -40,11 +48,15 @@ def pareto_front(points: Points) -> list[WorkPrecisionPoint]:
 
 
 def cheapest(points: Points, tolerance: float) -> WorkPrecisionPoint | None:
-    """Return the quickest setting whose largest error is within ``tolerance``, or None if there is no such setting."""
+    """Return the quickest setting whose largest error is within ``tolerance``, or None if there
+    is no such setting.
+    """
     return min((p for p in points if p.most <= tolerance), key=lambda p: p.seconds, default=None)
 
 
 def median_ratio(choices: Iterable[ToleranceChoice]) -> float | None:
-    """Return the median over all tolerances of the engine's run time divided by the quickest run time."""
+    """Return the median over all tolerances of the engine's run time divided by the quickest run
+    time.
+    """
     ratios = [c.ratio for c in choices if c.ratio is not None]
     return median(ratios) if ratios else None

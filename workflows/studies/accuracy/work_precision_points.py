@@ -1,4 +1,6 @@
-"""Points of a diagram of error against run time: the time of a cold run and the errors of the outputs."""
+"""Points of a diagram of error against run time: the time of a cold run and the errors of the
+outputs.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ _ABOUT = {"step": "study accuracy"}
 
 @dataclass(frozen=True)
 class Trial:
-    """A setting to measure, as a changed recipe or as the reason why the setting is not possible."""
+    """A setting to measure, as a changed recipe or as the reason why the setting is not
+    possible.
+    """
 
     line: str  #: the parameter that is set
     label: str
@@ -53,14 +57,17 @@ class PointMeasurement:
     seconds: list[float] = field(default_factory=list)  #: of the engine, one for each cold run
     computing: float = 0.0  #: s in the steps of the first cold run
     load: float = 0.0  #: runnable processes for each core before the run, this process included
-    bound: float | None = None  #: largest error that the run states for its outputs; None if one is unknown
+    #: largest error that the run states for its outputs; None if one is unknown
+    bound: float | None = None
     steps: dict[str, float] = field(default_factory=dict)  #: s by step, in the first cold run
     refused: str = ""
 
 
 @dataclass(frozen=True)
 class WorkPrecisionPoint:
-    """A point of a diagram of error against run time: a setting of the recipe and its measurement."""
+    """A point of a diagram of error against run time: a setting of the recipe and its
+    measurement.
+    """
 
     trial: Trial
     found: PointMeasurement
@@ -81,7 +88,9 @@ class WorkPrecisionPoint:
 
     @property
     def most(self) -> float:
-        """Return the largest error over all outputs and random seeds, which must be within the tolerance."""
+        """Return the largest error over all outputs and random seeds, which must be within the
+        tolerance.
+        """
         return max(self.by_seed, default=float("inf"))
 
     @property
@@ -91,31 +100,43 @@ class WorkPrecisionPoint:
 
 
 class PointCache:
-    """A cache of measured points: a recipe that was once compared with the reference is not run again."""
+    """A cache of measured points: a recipe that was once compared with the reference is not run
+    again.
+    """
 
     def __init__(self, reference: Recipe, store: Store, seeds: int, device: str = "cpu") -> None:
         self.reference, self.store, self.device = reference, store, device
-        random = any(reference.steps[name].node.random for name in needed(reference, reference.outputs))
+        random = any(
+            reference.steps[name].node.random for name in needed(reference, reference.outputs)
+        )
         self.seeds = seeds if random else 1
         self._truth: dict[int, dict[str, Any]] = {}
         self._code = Code(store.code_memo)
         self._warm = False
 
     def point(self, trial: Trial) -> WorkPrecisionPoint:
-        """Return the errors and run times of a setting; measure the setting if the store has no measurement of it."""
+        """Return the errors and run times of a setting; measure the setting if the store has no
+        measurement of it.
+        """
         recipe = trial.recipe
         if recipe is None:
             return WorkPrecisionPoint(trial, PointMeasurement(refused=trial.refused))
         key = self.key(recipe)
-        found = compute_once(self.store, key, PointMeasurement, lambda: self._measure(recipe), _ABOUT)
+        found = compute_once(
+            self.store, key, PointMeasurement, lambda: self._measure(recipe), _ABOUT
+        )
         return WorkPrecisionPoint(trial, found)
 
     def time_again(self, point: WorkPrecisionPoint, number: int) -> WorkPrecisionPoint:
-        """Return a measurement with the time of cold run ``number`` added, or unchanged if the first run was slow."""
+        """Return a measurement with the time of cold run ``number`` added, or unchanged if the
+        first run was slow.
+        """
         recipe, seconds = point.trial.recipe, point.found.seconds
         if recipe is None or not seconds or seconds[0] >= _QUICK:
             return point
-        one = compute_once(self.store, digest(self.key(recipe), number), list, lambda: [self._time(recipe)], _ABOUT)
+        one = compute_once(
+            self.store, digest(self.key(recipe), number), list, lambda: [self._time(recipe)], _ABOUT
+        )
         return WorkPrecisionPoint(point.trial, replace(point.found, seconds=[*seconds, *one]))
 
     def _time(self, recipe: Recipe) -> float:
@@ -123,17 +144,23 @@ class PointCache:
         return run_cold(recipe, self.store, self.device).seconds
 
     def key(self, recipe: Recipe) -> str:
-        """Return the store key of a measurement: a digest of recipe, reference, engine, seeds, device and machine."""
+        """Return the store key of a measurement: a digest of recipe, reference, engine, seeds,
+        device and machine.
+        """
         both = [key_parts(r, self._code, self.device) for r in (recipe, self.reference)]
         return digest("accuracy", both, self.seeds, self.device, engine(), machine())
 
     def truth(self, seed: int) -> dict[str, Any]:
-        """Return the outputs of the reference with the noise of ``seed``, from the store or computed now."""
+        """Return the outputs of the reference with the noise of ``seed``, from the store or
+        computed now.
+        """
         if seed not in self._truth:
             recipe = replace(self.reference, seed=self.reference.seed + seed)
             result = run(recipe, self.store, device=self.device)
             self._truth[seed] = result.values
-            self._warm |= sum(done.state == "run" for done in result.done.values()) > len(result.done) / 2
+            self._warm |= (
+                sum(done.state == "run" for done in result.done.values()) > len(result.done) / 2
+            )
         return self._truth[seed]
 
     def _measure(self, recipe: Recipe) -> PointMeasurement:
@@ -152,11 +179,18 @@ class PointCache:
         except RunError as error:
             return PointMeasurement(refused=f"{error.step}: {error.cause}")
         return PointMeasurement(
-            errors, [result.seconds], sum(ran.values()), load, result.proof.worst_stated(result.values), ran
+            errors,
+            [result.seconds],
+            sum(ran.values()),
+            load,
+            result.proof.worst_stated(result.values),
+            ran,
         )
 
     def _warm_up(self, recipe: Recipe) -> None:
-        """Run the recipe once without timing, because the first run of a process imports libraries and reads code."""
+        """Run the recipe once without timing, because the first run of a process imports
+        libraries and reads code.
+        """
         self.truth(0)
         for step in with_substitutions(recipe, recipe.outputs).steps.values():
             self._code.digest(step.node.fn.__module__)
@@ -165,8 +199,12 @@ class PointCache:
             run_cold(recipe, self.store, self.device)
             self._warm = True
 
-    def _errors(self, recipe: Recipe, values: Mapping[str, Any], store: Store) -> dict[str, list[float]]:
-        """Return the errors of each output for all seeds, without outputs whose shape differs from the reference."""
+    def _errors(
+        self, recipe: Recipe, values: Mapping[str, Any], store: Store
+    ) -> dict[str, list[float]]:
+        """Return the errors of each output for all seeds, without outputs whose shape differs
+        from the reference.
+        """
         found = compare_outputs(values, self.truth(0))
         for seed in range(1, self.seeds):
             again = run(replace(recipe, seed=recipe.seed + seed), store, device=self.device)
@@ -176,7 +214,9 @@ class PointCache:
 
 
 def compare_outputs(values: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, list[float]]:
-    """Return the error of each output by name, without outputs whose shape differs from the reference."""
+    """Return the error of each output by name, without outputs whose shape differs from the
+    reference.
+    """
     found: dict[str, list[float]] = {}
     for name, value in values.items():
         with suppress(ValueError):

@@ -15,10 +15,13 @@ from neusee.workflows.calibration.posterior_mode import LaplaceFit
 
 FloatArray = NDArray[np.float64]
 WALKERS, DRAWS = 64, 99
-_FIRST, _GROWTH, _LONGEST = 320, 1.5, 4000  #: steps of the first round, growth for each round, and most steps
+#: steps of the first round, growth for each round, and most steps
+_FIRST, _GROWTH, _LONGEST = 320, 1.5, 4000
 _APART = 6.0  #: least length of a chain in autocorrelation times; its first half is discarded
-_ALIKE = 1.25  #: ratio of two standard deviations that chance rarely exceeds, for 64 walkers and three tau each
-_NOT_KEPT = Path("/dev/null/not kept")  #: a file that never exists, because a simulation is too short to be resumed
+#: ratio of two standard deviations that chance rarely exceeds, for 64 walkers and three tau each
+_ALIKE = 1.25
+#: a file that never exists, because a simulation is too short to be resumed
+_NOT_KEPT = Path("/dev/null/not kept")
 
 
 @dataclass(frozen=True)
@@ -34,11 +37,15 @@ class PosteriorDraws:
 def walk_draws(
     problem: SensorPosterior, mode: LaplaceFit, seed: int, how: str = "de", count: int = DRAWS
 ) -> PosteriorDraws:
-    """Return ``count`` posterior draws from a Markov chain that is thinned to one step per autocorrelation time.
+    """Return ``count`` posterior draws from a Markov chain that is thinned to one step per
+    autocorrelation time.
 
-    The chain starts and walks as in `emcee_sampler.sample`. It ends sooner, because a simulation needs few draws.
+    The chain starts and walks as in `emcee_sampler.sample`. It ends sooner, because a simulation
+    needs few draws.
     """
-    run = emcee_sampler.start_ensemble(problem, mode, _NOT_KEPT, 0, seed, WALKERS, emcee_sampler.move(how))
+    run = emcee_sampler.start_ensemble(
+        problem, mode, _NOT_KEPT, 0, seed, WALKERS, emcee_sampler.move(how)
+    )
     steps = _FIRST
     while True:
         walk_until([run], steps, problem.log_posterior)
@@ -52,10 +59,14 @@ def walk_draws(
         steps = int(_GROWTH * steps)
     rng = np.random.default_rng([seed, 2])
     taken = seen[rng.choice(len(seen), min(count, len(seen)), replace=False)]
-    return PosteriorDraws(taken, tau, enough, emcee_sampler.stranded(run.backend.get_log_prob(discard=steps // 2)))
+    return PosteriorDraws(
+        taken, tau, enough, emcee_sampler.stranded(run.backend.get_log_prob(discard=steps // 2))
+    )
 
 
 def _steady(chain: FloatArray) -> bool:
-    """Return True if both halves of a Markov chain (step, walker, free parameter) have similar standard deviations."""
+    """Return True if both halves of a Markov chain (step, walker, free parameter) have similar
+    standard deviations.
+    """
     early, late = (half.reshape(-1, half.shape[-1]).std(0) for half in np.array_split(chain, 2))
     return bool(((late < _ALIKE * early) & (early < _ALIKE * late)).all())

@@ -1,4 +1,6 @@
-"""Sensitivity of a posterior to its prior, by reweighting of draws to a prior that is twice as wide."""
+"""Sensitivity of a posterior to its prior, by reweighting of draws to a prior that is twice as
+wide.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +12,24 @@ import numpy as np
 from neusee.workflows.calibration.log_posterior import SensorPosterior
 from neusee.workflows.studies.calibration.independent_draws import FloatArray
 
-ENOUGH = 0.5  #: least effective sample fraction; a parameter that only its prior constrains has a quarter or less
+#: least effective sample fraction; a parameter that only its prior constrains has a quarter or less
+ENOUGH = 0.5
 _TAIL = 0.05  #: probability beyond a limit
 
 
 @dataclass(frozen=True)
 class ParameterSensitivity:
-    """The estimate of one parameter, and its estimates after the prior of each parameter is made twice as wide."""
+    """The estimate of one parameter, and its estimates after the prior of each parameter is made
+    twice as wide.
+    """
 
     name: str
-    kind: str  #: one of `identifiability.KINDS`; for `upper` and `lower` the value is a limit of 95 %
+    #: one of `identifiability.KINDS`; for `upper` and `lower` the value is a limit of 95 %
+    kind: str
     value: float
     sd: float
-    doubled: Mapping[str, float | None]  #: by the prior that is twice as wide; None where reweighting is unreliable
+    #: by the prior that is twice as wide; None where reweighting is unreliable
+    doubled: Mapping[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -33,8 +40,12 @@ class Sensitivity:
     left: Mapping[str, float]  #: effective sample fraction with each prior twice as wide
 
 
-def sensitivity(problem: SensorPosterior, samples: FloatArray, kinds: Mapping[str, str]) -> Sensitivity:
-    """Return the sensitivity of each parameter to each prior, from draws ``samples`` (draw, free parameter)."""
+def sensitivity(
+    problem: SensorPosterior, samples: FloatArray, kinds: Mapping[str, str]
+) -> Sensitivity:
+    """Return the sensitivity of each parameter to each prior, from draws ``samples`` (draw, free
+    parameter).
+    """
     values = {name: x.numpy() for name, x in problem.parameters(samples).items()}
     z = problem.whitened(samples)
     weights = {name: _weights(z[:, i]) for i, name in enumerate(problem.names)}
@@ -43,14 +54,18 @@ def sensitivity(problem: SensorPosterior, samples: FloatArray, kinds: Mapping[st
 
     def of(name: str) -> ParameterSensitivity:
         x, kind = values[name], kinds[name]
-        again = {by: _value(x, w, kind) if left[by] >= ENOUGH else None for by, w in weights.items()}
+        again = {
+            by: _value(x, w, kind) if left[by] >= ENOUGH else None for by, w in weights.items()
+        }
         return ParameterSensitivity(name, kind, _value(x, even, kind), float(x.std(ddof=1)), again)
 
     return Sensitivity([of(name) for name in problem.names], left)
 
 
 def _weights(z: FloatArray) -> FloatArray:
-    """Return normalised importance weights of draws ``z`` for a normal prior of standard deviation 2 instead of 1."""
+    """Return normalised importance weights of draws ``z`` for a normal prior of standard
+    deviation 2 instead of 1.
+    """
     log = 0.5 * (1.0 - 0.25) * z**2
     ratios = np.exp(log - log.max())
     weights: FloatArray = ratios / ratios.sum()
@@ -58,7 +73,9 @@ def _weights(z: FloatArray) -> FloatArray:
 
 
 def _value(x: FloatArray, weights: FloatArray, kind: str) -> float:
-    """Return the weighted mean of the draws ``x``, or their 95 % limit if the frames only limit the parameter."""
+    """Return the weighted mean of the draws ``x``, or their 95 % limit if the frames only limit
+    the parameter.
+    """
     if kind not in ("upper", "lower"):
         return float(weights @ x)
     order = np.argsort(x)

@@ -1,4 +1,6 @@
-"""Tests of a posterior: uniformity of the ranks of true parameters, and coverage of 90 % intervals."""
+"""Tests of a posterior: uniformity of the ranks of true parameters, and coverage of 90 %
+intervals.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ _CHANCE = 0.01  #: probability of a false alarm by the ranks, over all parameter
 _DRAWN = 0.99  #: share of the bins of uniform ranks inside the drawn band
 _GREY = "#777777"
 _CERTAIN = 0.999  #: probability that the coverage of a correct posterior is within its limits
-#: limits of the coverage by number of simulations, rounded; the exact limits for 1000 are 0.868 and 0.930
+#: limits of the coverage by number of simulations, rounded; the exact limits for 1000 are 0.868 and
+#: 0.930
 _ROUNDED = {200: (0.825, 0.960), 1000: (0.870, 0.930)}
 
 
@@ -49,10 +52,15 @@ class RankTest:
 
 
 def rank_tests(simulations: Sequence[SensorSimulation]) -> list[RankTest]:
-    """Return the rank test and coverage test of each parameter, from all simulations that have a posterior."""
+    """Return the rank test and coverage test of each parameter, from all simulations that have a
+    posterior.
+    """
     sound = [s for s in simulations if not s.refused]
     if not sound:
-        raise ValueError(f"no simulation has a posterior; reason of the first simulation: {simulations[0].refused}")
+        raise ValueError(
+            "no simulation has a posterior; reason of the first simulation:"
+            f" {simulations[0].refused}"
+        )
     return [_rank_test(name, sound, len(sound[0].rank)) for name in sound[0].rank]
 
 
@@ -74,7 +82,9 @@ def _rank_test(name: str, sound: Sequence[SensorSimulation], parameters: int) ->
 
 
 def coverage_limits(count: int) -> tuple[float, float]:
-    """Return limits for the coverage of intervals, which a correct posterior exceeds in 1 of 1000 studies."""
+    """Return limits for the coverage of intervals, which a correct posterior exceeds in 1 of
+    1000 studies.
+    """
     if count in _ROUNDED:
         return _ROUNDED[count]
     low, high = chance_band(count, SHARE, _CERTAIN)
@@ -82,7 +92,9 @@ def coverage_limits(count: int) -> tuple[float, float]:
 
 
 def chance_band(count: int, share: float, certain: float) -> tuple[float, float]:
-    """Return the central interval of a binomial distribution that contains the probability ``certain``."""
+    """Return the central interval of a binomial distribution that contains the probability
+    ``certain``.
+    """
     from scipy.stats import binom
 
     low, high = binom.interval(certain, count, share)
@@ -91,7 +103,9 @@ def chance_band(count: int, share: float, certain: float) -> tuple[float, float]
 
 @drawn
 def ranks(rank_tests: Sequence[RankTest]) -> Any:
-    """Draw a histogram of the ranks of each parameter's true values, with the 99 % band of uniform ranks."""
+    """Draw a histogram of the ranks of each parameter's true values, with the 99 % band of
+    uniform ranks.
+    """
     columns = min(3, len(rank_tests))
     rows = -(-len(rank_tests) // columns)
     figure, axes = canvas(3.4 * columns, 2.4 * rows + 0.4, rows, columns, sharex=True)
@@ -110,7 +124,13 @@ def _histogram(ax: Any, test: RankTest) -> None:
     ax.axhspan(low, high, color="#cccccc", alpha=0.6, linewidth=0)
     ax.axhline(total / BINS, color=_GREY, linewidth=0.8)
     colour = BLUE if test.uniform else VERMILION
-    ax.bar([(i + 0.5) * width for i in range(BINS)], test.counts, 0.92 * width, color=colour, alpha=0.85)
+    ax.bar(
+        [(i + 0.5) * width for i in range(BINS)],
+        test.counts,
+        0.92 * width,
+        color=colour,
+        alpha=0.85,
+    )
     ax.set_title(f"{test.name.replace('_', ' ')}: p = {test.p:.2g}")
     ax.set_ylim(0, 1.15 * max(high, *test.counts))
     ax.grid(False, axis="x")

@@ -1,8 +1,9 @@
-"""Comparison of a recipe with and without left-out steps: error bound, measured error and saved run time.
+"""Comparison of a recipe with and without left-out steps: error bound, measured error and saved run
+time.
 
-The full computation is the recipe without omissions. It is compared with the recipe with all omissions that the engine
-chooses, and with one omission alone. The recipe with the chosen omissions is also compared with the same recipe after
-one of the omissions is undone.
+The full computation is the recipe without omissions. It is compared with the recipe with all
+omissions that the engine chooses, and with one omission alone. The recipe with the chosen omissions
+is also compared with the same recipe after one of the omissions is undone.
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ _ROUNDING = 2e-7  #: rounding error of a sum in float32, relative to its largest
 
 @dataclass(frozen=True)
 class OmissionRow:
-    """The effect of left-out steps: error bound, errors relative to the largest element, and saved run time."""
+    """The effect of left-out steps: error bound, errors relative to the largest element, and
+    saved run time.
+    """
 
     name: str
     kind: str
@@ -52,7 +55,9 @@ class OmissionRow:
 
 @dataclass(frozen=True)
 class OutputError:
-    """The error of one output after the engine has left out steps, relative to the full computation."""
+    """The error of one output after the engine has left out steps, relative to the full
+    computation.
+    """
 
     output: str
     bound: float | None  #: error that the run states, as its page does; None if it is unknown
@@ -63,7 +68,9 @@ class OutputError:
 
 
 class OmissionComparison:
-    """The runs to compare: all steps computed, the engine's choice of steps left out, and each step left out alone."""
+    """The runs to compare: all steps computed, the engine's choice of steps left out, and each
+    step left out alone.
+    """
 
     def __init__(self, recipe: Recipe, store: Store) -> None:
         self.recipe, self.store = recipe, store
@@ -73,8 +80,12 @@ class OmissionComparison:
         self.found = list(omissions(self.full, self.chosen, self.facts))
 
     def facts(self, step: str) -> TensorStats | None:
-        """Return statistics of a step's result in the full computation, from the store's metadata if possible."""
-        return facts_in(self.store.about(self.truth.keys[step])) or TensorStats.of(self.truth.value(step))
+        """Return statistics of a step's result in the full computation, from the store's
+        metadata if possible.
+        """
+        return facts_in(self.store.about(self.truth.keys[step])) or TensorStats.of(
+            self.truth.value(step)
+        )
 
     def output_errors(self) -> list[OutputError]:
         """Return the error of each output after the engine has left out its choice of steps."""
@@ -83,13 +94,20 @@ class OmissionComparison:
             value, reference = self.chosen.values[name], self.truth.values[name]
             rms, proved = error_of(value, reference), self.chosen.proof
             bound, kind = proved.stated_of(name), proved.kind_of(name)
-            # beyond the tolerance only by what noise and rounding add, which the stated error counts
-            holds = rms <= (self.recipe.tolerance if bound is None or self.chosen.recipe.exact else bound)
-            errors.append(OutputError(name, bound, kind, rms, largest_error(value, reference), holds))
+            # beyond the tolerance only by what noise and rounding add, which the stated error
+            # counts
+            holds = rms <= (
+                self.recipe.tolerance if bound is None or self.chosen.recipe.exact else bound
+            )
+            errors.append(
+                OutputError(name, bound, kind, rms, largest_error(value, reference), holds)
+            )
         return errors
 
     def rows(self) -> Iterator[OmissionRow]:
-        """Yield the errors and saved run time of each omission of steps; measure the omissions that are not stored."""
+        """Yield the errors and saved run time of each omission of steps; measure the omissions
+        that are not stored.
+        """
         for omission in self.found:
             alone = omission.applied_to(self.full)
             key, compute = self._key(omission, alone), partial(self._row, omission, alone)
@@ -98,7 +116,10 @@ class OmissionComparison:
     def _row(self, omission: Omission, alone: Recipe) -> OmissionRow:
         seen = run(alone, self.store, tuple(omission.value_of(name) for name in omission.at))
         bounds = _bounds(omission, seen)
-        pairs = {name: (seen.values[omission.value_of(name)], self.truth.value(name)) for name in omission.at}
+        pairs = {
+            name: (seen.values[omission.value_of(name)], self.truth.value(name))
+            for name in omission.at
+        }
         largest = max(largest_error(*pair) for pair in pairs.values())
         return OmissionRow(
             omission.name,
@@ -113,15 +134,23 @@ class OmissionComparison:
             all(self._holds(omission, bound, pairs[name], seen) for name, bound in bounds.items()),
         )
 
-    def _reached(self, omission: Omission, alone: Recipe, changed: bool) -> tuple[dict[str, float], float | None]:
-        """Return the error of each output with one omission of steps, and the change when this omission is undone."""
+    def _reached(
+        self, omission: Omission, alone: Recipe, changed: bool
+    ) -> tuple[dict[str, float], float | None]:
+        """Return the error of each output with one omission of steps, and the change when this
+        omission is undone.
+        """
         if not changed:
             return dict.fromkeys(self.recipe.outputs, 0.0), 0.0 if omission.taken else None
         outputs = _errors(self.recipe.outputs, alone.outputs, run(alone, self.store), self.truth)
         return outputs, self._back(omission) if omission.taken else None
 
-    def _holds(self, omission: Omission, bound: float, pair: tuple[Any, Any], result: Result) -> bool:
-        """Return True if the bound holds for the rms error (noise and band sums) or the largest error (all others)."""
+    def _holds(
+        self, omission: Omission, bound: float, pair: tuple[Any, Any], result: Result
+    ) -> bool:
+        """Return True if the bound holds for the rms error (noise and band sums) or the largest
+        error (all others).
+        """
         if omission.kind == "stands in":  # both computations have a documented error of their own
             steps = [self.full.steps[name] for name in omission.exchange]
             cheaper = [result.recipe.steps[name] for name in omission.exchange.values()]
@@ -133,52 +162,73 @@ class OmissionComparison:
         return largest_error(*pair) <= bound * (1 + 1e-5) + (_ROUNDING if bound else 0.0)
 
     def _back(self, omission: Omission) -> float:
-        """Return the largest change of an output when one of the engine's omissions of steps is undone."""
+        """Return the largest change of an output when one of the engine's omissions of steps is
+        undone.
+        """
         recipe = self.full
-        for other in reversed(self.found):  # from the last, because the input that is handed on may be left out too
+        # from the last, because the input that is handed on may be left out too
+        for other in reversed(self.found):
             if other.taken and other is not omission:
                 recipe = other.applied_to(recipe)
-        return max(_errors(self.recipe.outputs, recipe.outputs, run(recipe, self.store), self.chosen).values())
+        return max(
+            _errors(
+                self.recipe.outputs, recipe.outputs, run(recipe, self.store), self.chosen
+            ).values()
+        )
 
     def _seconds(self, one: Recipe, other: Recipe) -> float:
-        """Return the run time of the steps that recipe ``one`` needs and recipe ``other`` does not need."""
+        """Return the run time of the steps that recipe ``one`` needs and recipe ``other`` does
+        not need.
+        """
         keys = resolve(one, order := needed(one, one.outputs), self.store).keys
         only = [keys[name] for name in order if name not in set(needed(other, other.outputs))]
         return sum(float((self.store.about(key) or {}).get("seconds", 0.0)) for key in only)
 
     def _key(self, omission: Omission, alone: Recipe) -> Key:
         outputs = [
-            [resolve(r, needed(r, r.outputs), self.store).keys[n] for n in r.outputs] for r in (self.full, alone)
+            [resolve(r, needed(r, r.outputs), self.store).keys[n] for n in r.outputs]
+            for r in (self.full, alone)
         ]
         chosen = [[name, self.chosen.keys[name]] for name in self.recipe.outputs]
         details = [omission.name, omission.kind, repr(omission.bound), omission.why, omission.taken]
-        return digest("leave-out", outputs, chosen, details, engine("studies.leave_out.omission_rows"))
+        return digest(
+            "leave-out", outputs, chosen, details, engine("studies.leave_out.omission_rows")
+        )
 
 
-def _errors(names: Sequence[str], others: Sequence[str], result: Result, truth: Result) -> dict[str, float]:
-    """Return the error of each output in ``names``; ``others`` are the names of the same outputs in ``result``."""
+def _errors(
+    names: Sequence[str], others: Sequence[str], result: Result, truth: Result
+) -> dict[str, float]:
+    """Return the error of each output in ``names``; ``others`` are the names of the same outputs
+    in ``result``.
+    """
     pairs = zip(names, others, strict=True)
     return {name: error_of(result.values[other], truth.values[name]) for name, other in pairs}
 
 
 def _bounds(omission: Omission, result: Result) -> dict[str, float]:
-    """Return the error bound of each compared step: the bound that its node states, or that the engine proves."""
+    """Return the error bound of each compared step: the bound that its node states, or that the
+    engine proves.
+    """
     if omission.kind != "stands in":
         return dict.fromkeys(omission.at, omission.bound)
     return {name: bound for name in omission.at if (bound := result.proof.of(name)) is not None}
 
 
 def least_error(value: Tensor, reference: Tensor) -> float:
-    """Return a lower limit of the relative root mean square error over all noise, estimated from one noisy result.
+    """Return a lower limit of the relative root mean square error over all noise, estimated from
+    one noisy result.
 
-    Each pixel counts as a draw. If a few large pixels dominate the mean square error, the standard error of the mean is
-    as large as the mean. The largest element is random too, so four standard
+    Each pixel counts as a draw. If a few large pixels dominate the mean square error, the standard
+    error of the mean is as large as the mean. The largest element is random too, so four standard
     deviations are added to it.
     """
     change = value.double() - reference.double()
     squares, count = change.square(), change.numel()
     mean = float(squares.mean())
     error = float(squares.std()) / math.sqrt(count) if count > 1 else mean
-    top = float(reference.double().abs().max()) + _SURE * (float(change.std()) if count > 1 else 0.0)
+    top = float(reference.double().abs().max()) + _SURE * (
+        float(change.std()) if count > 1 else 0.0
+    )
     least = math.sqrt(max(mean - _SURE * error, 0.0))
     return least / top if top > 0 else least

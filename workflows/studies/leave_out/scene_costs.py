@@ -1,4 +1,6 @@
-"""Run times of simpler scenes: the recipe without a laser, at one wavelength, or behind a clean window."""
+"""Run times of simpler scenes: the recipe without a laser, at one wavelength, or behind a clean
+window.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ from neusee.workflows.studies.cold_run import key_parts, run_cold
 _TIMES = 3  #: cold runs of a scene; the median of their times counts
 _QUICK = 5.0  #: s; a scene that takes longer is run once
 _WINDOW = ("flare.dirt", "flare.ghosts")
-_LIFT = "steps.cube={node: spectra.lift_mallett, from: {rgb: scene, bands: bands}}"  #: works even with one band
+#: works even with one band
+_LIFT = "steps.cube={node: spectra.lift_mallett, from: {rgb: scene, bands: bands}}"
 _GREY = "steps.scene={node: scene.targets, with: {kind: siemens, shape: '${scene.shape}'}}"
 
 
@@ -37,8 +40,12 @@ class SceneCost:
     refused: str = ""
 
 
-def measure_scenes(recipe: Recipe, store: Store, progress: Callable[[str], None]) -> Iterator[SceneCost]:
-    """Yield the run time of ``recipe`` with each simpler scene; measure the time if the store does not have it."""
+def measure_scenes(
+    recipe: Recipe, store: Store, progress: Callable[[str], None]
+) -> Iterator[SceneCost]:
+    """Yield the run time of ``recipe`` with each simpler scene; measure the time if the store
+    does not have it.
+    """
     code, warm = Code(store.code_memo), list[Result]()
     for scene, changed_recipe in scenes(recipe).items():
         if isinstance(changed_recipe, str):
@@ -52,13 +59,17 @@ def measure_scenes(recipe: Recipe, store: Store, progress: Callable[[str], None]
 
         decided = engine("studies.leave_out.scene_costs", "engine.runner"), machine()
         key = digest("content", key_parts(changed_recipe, code), *decided)
-        cost = replace(compute_once(store, key, SceneCost, compute, {"step": "study leave-out"}), scene=scene)
+        cost = replace(
+            compute_once(store, key, SceneCost, compute, {"step": "study leave-out"}), scene=scene
+        )
         progress(f"{scene}: {cost.refused or f'{cost.seconds:.3g} s'}")
         yield cost
 
 
 def scenes(recipe: Recipe) -> dict[str, Recipe | str]:
-    """Return the recipe with each simpler scene by name, or the reason why the recipe cannot have the scene."""
+    """Return the recipe with each simpler scene by name, or the reason why the recipe cannot
+    have the scene.
+    """
     found: dict[str, Recipe | str] = {"everything in full": replace(recipe, exact=True)}
     found["as the recipe chooses"] = recipe
     for scene, overrides in _overrides(recipe).items():
@@ -89,17 +100,28 @@ def _overrides(recipe: Recipe) -> Mapping[str, Sequence[str]]:
         "clean window": [f"steps.{name}=null" for name in window],
         "grey scene": [_GREY] if "scene" in recipe.steps and "scene.shape" in settings else [],
         "narrow band, 540 to 560 nm": _bands(recipe, "540 nm", "560 nm", 3),
-        "one wavelength": [*_bands(recipe, "549 nm", "551 nm", 1), *([_LIFT] if "cube" in recipe.steps else [])],
+        "one wavelength": [
+            *_bands(recipe, "549 nm", "551 nm", 1),
+            *([_LIFT] if "cube" in recipe.steps else []),
+        ],
     }
     least = [o for name in ("no laser", "clean window", "one wavelength") for o in every[name]]
-    return {name: o for name, o in {**every, "one wavelength, no laser, clean window": least}.items() if o}
+    return {
+        name: o
+        for name, o in {**every, "one wavelength, no laser, clean window": least}.items()
+        if o
+    }
 
 
 def _window_steps(recipe: Recipe) -> set[str]:
-    """Return the names of the steps that compute window dirt or ghosts, and of steps that require these results."""
+    """Return the names of the steps that compute window dirt or ghosts, and of steps that
+    require these results.
+    """
     window = {name for name, step in recipe.steps.items() if step.node.path in _WINDOW}
     for name, step in recipe.steps.items():
-        needs = {w for i, w in step.wires.items() if isinstance(w, str) and i not in step.node.optional}
+        needs = {
+            w for i, w in step.wires.items() if isinstance(w, str) and i not in step.node.optional
+        }
         if name in window or not needs.isdisjoint(window):
             window.add(name)
     return window

@@ -1,4 +1,6 @@
-"""The recipe of one extreme case: a small recipe with the changes of the case, and the inputs of each step."""
+"""The recipe of one extreme case: a small recipe with the changes of the case, and the inputs of
+each step.
+"""
 
 from __future__ import annotations
 
@@ -16,34 +18,57 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.node_families import find_node
 from neusee.workflows.studies.stability.extreme_cases import Case, Size
 
-_COMPARES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {  # by node: nodes for the same inputs
+# by node: nodes for the same inputs
+_COMPARES: dict[str, tuple[tuple[str, dict[str, Any]], ...]] = {
     "metrics.lsr": (("losses.suppression_loss", {}), ("losses.suppression_loss", {"log": True})),
     "metrics.bsr": (("losses.background_loss", {}),),
     "metrics.mtf": (("losses.contrast", {}), ("metrics.limits", {})),
     "doe.fabricate": (("doe.smooth", {"feature": "400 um"}),),  # three samples of the small pupil
-    "metrics.quality": (("losses.charbonnier", {}), ("losses.fft_l1", {}), ("losses.gradient_penalty", {})),
+    "metrics.quality": (
+        ("losses.charbonnier", {}),
+        ("losses.fft_l1", {}),
+        ("losses.gradient_penalty", {}),
+    ),
 }
-_SMALLER = {"pixels": 256, "levels": 6, "grid": 16, "width": 4}  #: limits of other parameters that make a step slow
+#: limits of other parameters that make a step slow
+_SMALLER = {"pixels": 256, "levels": 6, "grid": 16, "width": 4}
 
 
 def with_losses(recipe: Recipe) -> dict[str, Step]:
-    """Return the steps of the recipe, and extra steps that compute losses and related results from the same inputs."""
+    """Return the steps of the recipe, and extra steps that compute losses and related results
+    from the same inputs.
+    """
     steps = dict(recipe.steps)
     for name, step in recipe.steps.items():
         for path, params in _COMPARES.get(step.node.path, ()):
             node = find_node(path)
-            wires = {to: step.wires[source] for to, source in zip(node.inputs, step.node.inputs, strict=False)}
+            wires = {
+                to: step.wires[source]
+                for to, source in zip(node.inputs, step.node.inputs, strict=False)
+            }
             if "stop" in node.inputs:  # from the mask that this step reads
                 wires["stop"] = recipe.steps[step.sources[0]].wires["stop"]
             family, _, title = path.partition(".")
-            label = f"{'loss ' if family == 'losses' else ''}{title}{' log' if 'log' in params else ''} of {name}"
-            steps[label] = Step(label, node, node.params(**params).model_dump(), wires, step.mark, {})
+            label = (
+                f"{'loss ' if family == 'losses' else ''}{title}{' log' if 'log' in params else ''}"
+                f" of {name}"
+            )
+            steps[label] = Step(
+                label, node, node.params(**params).model_dump(), wires, step.mark, {}
+            )
     return steps
 
 
 def with_size(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:
-    """Reduce the pixels, pupil samples and spectral bands of the steps, and keep the pupil diameters."""
-    sides = [side for step in steps.values() for name in ("shape",) for side in step.params.get(name) or ()]
+    """Reduce the pixels, pupil samples and spectral bands of the steps, and keep the pupil
+    diameters.
+    """
+    sides = [
+        side
+        for step in steps.values()
+        for name in ("shape",)
+        for side in step.params.get(name) or ()
+    ]
     part = size.pixels / max(sides, default=size.pixels)
     return {name: replace(step, params=_smaller(step, size, part)) for name, step in steps.items()}
 
@@ -59,11 +84,15 @@ def _smaller(step: Step, size: Size, part: float) -> dict[str, Any]:
         params["count"] = size.bands
     if step.node.path == "doe.pixelwise":
         params["file"] = (
-            None  # its samples do not fit the small pupil: a random height map of its depth takes its place
+            # its samples do not fit the small pupil: a random height map of its depth takes its
+            # place
+            None
         )
     if params.get("angle"):
         params["angle"] = tuple(a * min(part, 1.0) for a in params["angle"])
-    return params | {k: min(v, params[k]) for k, v in _SMALLER.items() if step.node.random and k in params}
+    return params | {
+        k: min(v, params[k]) for k, v in _SMALLER.items() if step.node.random and k in params
+    }
 
 
 def with_parameters(steps: Mapping[str, Step], case: Case) -> dict[str, Step]:
@@ -92,11 +121,16 @@ class CaseRecipe:
     keys: dict[str, Key] = field(default_factory=dict)
     values: dict[str, Any] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)  #: reasons of steps that gave no value
-    usual: CaseRecipe | None = None  #: the recipe without changes, for results that the case leaves alone
+    #: the recipe without changes, for results that the case leaves alone
+    usual: CaseRecipe | None = None
 
     @classmethod
-    def of(cls, recipe: Recipe, case: Case, code: Code, usual: CaseRecipe | None = None) -> CaseRecipe:
-        """Return the recipe of an extreme case and the store key of each step; changed results have other keys."""
+    def of(
+        cls, recipe: Recipe, case: Case, code: Code, usual: CaseRecipe | None = None
+    ) -> CaseRecipe:
+        """Return the recipe of an extreme case and the store key of each step; changed results
+        have other keys.
+        """
         steps = with_parameters(with_size(with_losses(recipe), case.size), case)
         chain = cls(recipe, case, steps, usual=usual)
         for name in in_order({n: s.sources for n, s in steps.items()}, steps):
@@ -148,11 +182,15 @@ class CaseRecipe:
 
 
 def _put(step: Step, case: Case) -> Any:
-    return next((change for path, change in case.values.items() if step.node.path.startswith(path)), None)
+    return next(
+        (change for path, change in case.values.items() if step.node.path.startswith(path)), None
+    )
 
 
 def unchanged_steps(chain: CaseRecipe, usual: CaseRecipe) -> Iterator[str]:
-    """Yield the steps with the same inputs and parameters in an extreme case as in the recipe without changes."""
+    """Yield the steps with the same inputs and parameters in an extreme case as in the recipe
+    without changes.
+    """
     if chain.case is usual.case or chain.case.inputs or chain.case.alike:
         return
     for name, step in chain.steps.items():

@@ -1,4 +1,6 @@
-"""The runs of one step of the stability study: as a recipe uses the step, and in float64 as the reference."""
+"""The runs of one step of the stability study: as a recipe uses the step, and in float64 as the
+reference.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ class Refused(Exception):
 
 
 class _CountedInSingle(TorchFunctionMode):
-    """A PyTorch function mode that samples float64 Poisson counts with the mean rounded to single precision."""
+    """A PyTorch function mode that samples float64 Poisson counts with the mean rounded to
+    single precision.
+    """
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func is torch.poisson and args[0].dtype == torch.float64:
@@ -39,12 +43,18 @@ def pictures_in(values: Sequence[Any]) -> list[Tensor]:
 
 
 def run(step: Step, fn: Any, inputs: Sequence[Any], seed: int, **params: Any) -> Any:
-    rng = {"rng": torch.Generator().manual_seed(stream_seed(seed, step.name))} if step.node.random else {}
+    rng = (
+        {"rng": torch.Generator().manual_seed(stream_seed(seed, step.name))}
+        if step.node.random
+        else {}
+    )
     return fn(*inputs, **{**step.params, **params}, **rng)
 
 
 def as_used(step: Step, inputs: Sequence[Any], seed: int) -> Any:
-    """Compute a step with its own parameters and return its result; raise `Refused` for a `ValueError`."""
+    """Compute a step with its own parameters and return its result; raise `Refused` for a
+    `ValueError`.
+    """
     try:
         return run(step, step.node.fn, inputs, seed)
     except ValueError as error:
@@ -59,7 +69,9 @@ def in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
 
 
 def rounded(inputs: Sequence[Any], draw: int, unit: float) -> list[Any]:
-    """Return a step's inputs in float64, each element moved at random by up to four roundings of ``unit``."""
+    """Return a step's inputs in float64, each element moved at random by up to four roundings of
+    ``unit``.
+    """
     rng = torch.Generator().manual_seed(draw)
 
     def move(x: Tensor) -> Tensor:

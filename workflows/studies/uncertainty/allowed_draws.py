@@ -1,6 +1,8 @@
-"""The draws of a study whose values the recipe allows together; other draws are left out, and their number is stated.
+"""The draws of a study whose values the recipe allows together; other draws are left out, and their
+number is stated.
 
-A value alone may be allowed, and two values may exclude each other, such as a full well below the offset.
+A value alone may be allowed, and two values may exclude each other, such as a full well below the
+offset.
 """
 
 from __future__ import annotations
@@ -15,7 +17,8 @@ class AllowedDraws:
 
     def __init__(self, inputs: Inputs, draws: InputDraws, sequences: int) -> None:
         self._inputs, self._draws = inputs, draws
-        self._block = max(1, sequences)  #: draws that are left out together, so that Sobol sequences stay equally long
+        #: draws that are left out together, so that Sobol sequences stay equally long
+        self._block = max(1, sequences)
         self._allowed: list[int] = []
         self.tried = 0
         self.left_out = 0
@@ -56,7 +59,8 @@ class AllowedDraws:
 
 
 def refuse_combinations(inputs: Inputs, ends: FloatArray, draws: AllowedDraws) -> None:
-    """Raise `RecipeError` if values of ``ends`` (run, input), or of a draw, are not allowed together.
+    """Raise `RecipeError` if values of ``ends`` (run, input), or of a draw, are not allowed
+    together.
 
     The draws are those that have been tried before anything runs.
     """
@@ -64,11 +68,16 @@ def refuse_combinations(inputs: Inputs, ends: FloatArray, draws: AllowedDraws) -
     if problems:
         raise RecipeError(problems)
     if draws.left_out:
-        what = f"{draws.left_out} of the first {draws.tried} draws have values that are not allowed together"
+        what = (
+            f"{draws.left_out} of the first {draws.tried} draws have values that are not allowed"
+            " together"
+        )
         value = inputs.uncertain.composed.root.below(inputs.names[0].split("."))
         assert value is not None
         advice = "give narrower or truncated distributions"
-        raise RecipeError([Diagnostic(value.mark, ", ".join(inputs.names), f"{what} ({draws.reason}): {advice}")])
+        raise RecipeError(
+            [Diagnostic(value.mark, ", ".join(inputs.names), f"{what} ({draws.reason}): {advice}")]
+        )
 
 
 def _text(problem: Diagnostic) -> str:

@@ -1,4 +1,6 @@
-"""The outputs of a recipe for random values of its uncertain inputs; steps without these inputs run only once."""
+"""The outputs of a recipe for random values of its uncertain inputs; steps without these inputs
+run only once.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +32,16 @@ from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray
 
 Numbers = dict[str, list[float]]  #: elements of each quantity, such as ``restored_quality.psnr``
-_ARENAS, _MAPPED, _TRIM = -8, -4, -1  #: M_ARENA_MAX, M_MMAP_MAX and M_TRIM_THRESHOLD of glibc's mallopt
+#: M_ARENA_MAX, M_MMAP_MAX and M_TRIM_THRESHOLD of glibc's mallopt
+_ARENAS, _MAPPED, _TRIM = -8, -4, -1
 _ABOUT = {"step": "study uncertainty"}
 _NARROW = 8  #: a tensor of two axes counts as a picture if both are longer
 
 
 class OutputDraws:
-    """The outputs of a recipe for random values of its uncertain inputs; the store keeps the numbers of each draw."""
+    """The outputs of a recipe for random values of its uncertain inputs; the store keeps the
+    numbers of each draw.
+    """
 
     def __init__(self, inputs: Inputs, store: Store, device: str = "cpu", workers: int = 0) -> None:
         self.inputs, self.store, self.device = inputs, store, device
@@ -53,18 +58,26 @@ class OutputDraws:
 
     @cached_property
     def _function(self) -> Any:
-        """Compute the steps that depend on no uncertain input, and return the recipe as a function of the inputs."""
+        """Compute the steps that depend on no uncertain input, and return the recipe as a
+        function of the inputs.
+        """
         free = tuple(self.inputs.readers)
-        return as_function(self.inputs.recipe, *free, outputs=self.outputs, store=self.store, device=self.device)
+        return as_function(
+            self.inputs.recipe, *free, outputs=self.outputs, store=self.store, device=self.device
+        )
 
     def ready(self) -> float:
-        """Compute the steps that depend on no uncertain input, and return the run time in seconds."""
+        """Compute the steps that depend on no uncertain input, and return the run time in
+        seconds.
+        """
         began = time.perf_counter()
         _ = self._function
         return time.perf_counter() - began
 
     def numbers(self, values: FloatArray) -> list[Numbers]:
-        """Return all numbers in the outputs for each draw of the inputs; compute draws that the store does not have."""
+        """Return all numbers in the outputs for each draw of the inputs; compute draws that the
+        store does not have.
+        """
         keys = [self.key(row) for row in values]
         found = [kept and kept["numbers"] for kept in map(self._kept, keys)]
         lacking = [i for i, numbers in enumerate(found) if numbers is None]
@@ -73,7 +86,9 @@ class OutputDraws:
         return [numbers for numbers in found if numbers is not None]
 
     def pictures(self, values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
-        """Return mean and standard deviation of each output picture over the draws, and store each draw's numbers."""
+        """Return mean and standard deviation of each output picture over the draws, and store
+        each draw's numbers.
+        """
         keys = [self.key(row) for row in values]
         whole = digest("uncertainty pictures", keys)
         if (first := self._kept(keys[0])) is not None and not first["pictures"]:
@@ -92,15 +107,21 @@ class OutputDraws:
         return {name: (total.mean, total.sd) for name, total in sums.items()}
 
     def key(self, row: FloatArray) -> str:
-        """Return the store key of one draw: a digest of the output keys of a run with the sampled input values."""
+        """Return the store key of one draw: a digest of the output keys of a run with the
+        sampled input values.
+        """
         recipe = self.inputs.recipe
         keys = self._keys(self.inputs.theta(self._named(row)))
         outputs = [[name, keys[name]] for name in self.outputs]
         within = [recipe.tolerance, recipe.exact, recipe.estimates, device_kind(self.device)]
-        return digest("uncertainty draw", engine("studies.uncertainty.output_draws"), outputs, within)
+        return digest(
+            "uncertainty draw", engine("studies.uncertainty.output_draws"), outputs, within
+        )
 
     def _keys(self, theta: Mapping[str, Any]) -> dict[str, str]:
-        """Return the store keys of steps that depend on the inputs ``theta``; if ``theta`` is empty, of other steps."""
+        """Return the store keys of steps that depend on the inputs ``theta``; if ``theta`` is
+        empty, of other steps.
+        """
         recipe, keys = self.inputs.recipe, dict(self._fixed) if theta else {}
         by_step: dict[str, dict[str, Any]] = {}
         for reader, value in theta.items():
@@ -129,7 +150,9 @@ class OutputDraws:
         return numbers
 
     def _results(self, rows: Sequence[FloatArray]) -> Iterator[dict[str, Any]]:
-        """Yield the outputs for each draw of the inputs, in order; worker processes compute in parallel."""
+        """Yield the outputs for each draw of the inputs, in order; worker processes compute in
+        parallel.
+        """
         if not rows:
             return
         self.ready()
@@ -137,7 +160,9 @@ class OutputDraws:
         _keep_memory()
         workers = workers_for(len(rows), self.workers) if self.device == "cpu" else 1
         with one_thread():
-            for result in shared_in_order(lambda number: self._result(rows[number]), len(rows), workers):
+            for result in shared_in_order(
+                lambda number: self._result(rows[number]), len(rows), workers
+            ):
                 self.computed += 1
                 self.seconds += time.perf_counter() - began
                 yield result
@@ -175,7 +200,9 @@ def _reached_steps(inputs: Inputs, order: Sequence[str]) -> set[str]:
 
 
 def _is_picture(value: Any) -> bool:
-    return isinstance(value, Tensor) and (value.ndim > 2 or (value.ndim == 2 and min(value.shape) > _NARROW))
+    return isinstance(value, Tensor) and (
+        value.ndim > 2 or (value.ndim == 2 and min(value.shape) > _NARROW)
+    )
 
 
 class _Sum:

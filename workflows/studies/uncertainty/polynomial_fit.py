@@ -1,10 +1,13 @@
-"""A sparse polynomial of independent inputs, fitted to draws of an output, and how well it predicts other draws.
+"""A sparse polynomial of independent inputs, fitted to draws of an output, and how well it predicts
+other draws.
 
-Each input has polynomials that are orthonormal under its own distribution, so that the variance of the fitted
-polynomial is the sum of its squared coefficients. Terms are added one after another, each the one that explains most of
-what is left (orthogonal matching pursuit), until the error of prediction without the predicted draw no longer falls.
+Each input has polynomials that are orthonormal under its own distribution, so that the variance of
+the fitted polynomial is the sum of its squared coefficients. Terms are added one after another,
+each the one that explains most of what is left (orthogonal matching pursuit), until the error of
+prediction without the predicted draw no longer falls.
 
-Source: Blatman and Sudret, J. Comput. Phys. 230 (2011) 2345, for sparse polynomials and the corrected error.
+Source: Blatman and Sudret, J. Comput. Phys. 230 (2011) 2345, for sparse polynomials and the
+        corrected error.
 """
 
 from __future__ import annotations
@@ -26,7 +29,8 @@ _DEGREE = 10  #: largest degree of a term
 _TOGETHER = 3  #: largest number of inputs in a term
 _CANDIDATES = 400  #: largest number of terms from which a fit selects
 _HYPERBOLIC = 0.75  #: exponent of the norm of degrees, below 1 to prefer terms of few inputs
-_NORMS = (2.6, 5.0)  #: norms of the terms of low degree: squares and products of two inputs; and somewhat more
+#: norms of the terms of low degree: squares and products of two inputs; and somewhat more
+_NORMS = (2.6, 5.0)
 _BY_TERM = 3  #: smallest number of draws for each selected term
 _PATIENCE = 12  #: terms after the best number of terms that are tried without a gain
 _EXACT = 1e-13  #: share of the variance that may be left where a polynomial is exact
@@ -35,7 +39,9 @@ _SMALLEST = 1e-7  #: norm of a term beside the selected terms, below which it de
 
 @dataclass(frozen=True)
 class OrthonormalPolynomials:
-    """Polynomials of one input that are orthonormal under its distribution, by their three-term recurrence."""
+    """Polynomials of one input that are orthonormal under its distribution, by their three-term
+    recurrence.
+    """
 
     shape: Shape
     centres: FloatArray  #: (degree,) coefficients of the recurrence
@@ -43,7 +49,9 @@ class OrthonormalPolynomials:
 
     @classmethod
     def of(cls, shape: Shape, degree: int = _DEGREE) -> OrthonormalPolynomials:
-        """Compute the recurrence for a distribution (Stieltjes); the degree is lower for a few separate values."""
+        """Compute the recurrence for a distribution (Stieltjes); the degree is lower for a few
+        separate values.
+        """
         x, weights = shape.measure()
         centres, norms = list[float](), [1.0]
         before, now = np.zeros_like(x), np.ones_like(x)
@@ -83,7 +91,9 @@ class Candidates:
 
     @classmethod
     def of(cls, shapes: Sequence[Shape], z: FloatArray) -> Candidates:
-        """Return products of the inputs' polynomials at draws ``z`` (draw, input), those of low degree first."""
+        """Return products of the inputs' polynomials at draws ``z`` (draw, input), those of low
+        degree first.
+        """
         bases = [OrthonormalPolynomials.of(shape) for shape in shapes]
         values = [basis.at(z[:, i]) for i, basis in enumerate(bases)]
         powers = _low_degrees([basis.degree for basis in bases])
@@ -150,22 +160,31 @@ class PolynomialFit:
         return np.asarray(self.constant + columns[:, self.terms] @ self.coefficients, np.float64)
 
 
-def fit_polynomial(candidates: Candidates, y: FloatArray, draws: FloatArray | None = None) -> PolynomialFit:
+def fit_polynomial(
+    candidates: Candidates, y: FloatArray, draws: FloatArray | None = None
+) -> PolynomialFit:
     """Fit a sparse polynomial to ``y`` (draw,).
 
-    Terms are selected among those of low degree, among more, and among all; the selection with the least error of
-    prediction counts. Args: draws: booleans (draw,) that select the draws of the fit; None for all.
+    Terms are selected among those of low degree, among more, and among all; the selection with the
+    least error of prediction counts. Args: draws: booleans (draw,) that select the draws of the
+    fit; None for all.
     """
-    columns, values = (candidates.columns, y) if draws is None else (candidates.columns[draws], y[draws])
+    columns, values = (
+        (candidates.columns, y) if draws is None else (candidates.columns[draws], y[draws])
+    )
     selections = [_select_terms(columns[:, :count], values) for count in candidates.sizes]
     _, terms = min(selections, key=lambda selection: selection[0])
     matrix = np.concatenate([np.ones((len(values), 1)), columns[:, terms]], 1)
     solution = np.linalg.lstsq(matrix, values, rcond=None)[0]
-    return PolynomialFit(float(solution[0]), np.array(terms, np.int64), np.asarray(solution[1:], np.float64))
+    return PolynomialFit(
+        float(solution[0]), np.array(terms, np.int64), np.asarray(solution[1:], np.float64)
+    )
 
 
 def _select_terms(columns: FloatArray, y: FloatArray) -> tuple[float, list[int]]:
-    """Return the terms of a sparse polynomial by orthogonal matching pursuit, with their error of prediction."""
+    """Return the terms of a sparse polynomial by orthogonal matching pursuit, with their error
+    of prediction.
+    """
     count, exact = len(y), _EXACT * len(y) * float(y.var())
     limit = min(columns.shape[1], max(1, count // _BY_TERM) - 1)
     basis = [np.full(count, count**-0.5)]
@@ -193,12 +212,16 @@ def _select_terms(columns: FloatArray, y: FloatArray) -> tuple[float, list[int]]
 
 
 def _next_term(columns: FloatArray, left: FloatArray, lengths: FloatArray) -> int:
-    """Return the term that is most parallel to what is left; a term of infinite length does not count."""
+    """Return the term that is most parallel to what is left; a term of infinite length does not
+    count.
+    """
     return int((np.abs(columns.T @ left) / lengths).argmax())
 
 
 def _apart(column: FloatArray, basis: Sequence[FloatArray]) -> FloatArray:
-    """Return the part of a column that is orthogonal to an orthonormal basis; twice is enough for rounding."""
+    """Return the part of a column that is orthogonal to an orthonormal basis; twice is enough
+    for rounding.
+    """
     matrix = np.stack(basis)
     for _ in range(2):
         column = column - (matrix @ column) @ matrix
@@ -206,7 +229,9 @@ def _apart(column: FloatArray, basis: Sequence[FloatArray]) -> FloatArray:
 
 
 def _error_of_prediction(left: FloatArray, leverage: FloatArray, terms: int) -> float:
-    """Return the mean squared error of draws predicted without them, corrected for the number of terms."""
+    """Return the mean squared error of draws predicted without them, corrected for the number of
+    terms.
+    """
     count = len(left)
     alone = (left / (1.0 - leverage).clip(1e-9)) ** 2
     return float(alone.mean()) * count / max(1, count - terms)

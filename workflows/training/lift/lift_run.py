@@ -1,4 +1,6 @@
-"""The complete training of a network that estimates spectra from RGB, up to the file of its weights."""
+"""The complete training of a network that estimates spectra from RGB, up to the file of its
+weights.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,13 @@ from neusee.workflows.training.loop import resumable_loop
 from neusee.workflows.training.loop.changed_inputs import prepare_folder
 from neusee.workflows.training.loop.checkpoint import export
 from neusee.workflows.training.loop.recorded_inputs import CameraInputs, RecordedInputs, folder_of
-from neusee.workflows.training.loop.resumable_loop import DOCUMENT, Losses, Progress, ResumableLoop, Watch
+from neusee.workflows.training.loop.resumable_loop import (
+    DOCUMENT,
+    Losses,
+    Progress,
+    ResumableLoop,
+    Watch,
+)
 
 _COLUMNS = ("iteration", "MRAE", "RMSE", "slope", "rate", "seconds")
 #: files of the program that decide the pairs and the steps of the optimiser
@@ -38,16 +46,20 @@ def train_lift(
     device: str = "cpu",
     watch: Watch | None = None,
 ) -> Path:
-    """Train the network MST++ to estimate spectra from RGB, or continue a stopped training; return the result folder.
+    """Train the network MST++ to estimate spectra from RGB, or continue a stopped training; return
+    the result folder.
 
     ``mst_plus_plus.safetensors`` holds the weights for `spectra.lift_mst_plus_plus`.
 
-    Raises ValueError for a recipe without the block or the steps that the block names; ArithmeticError for a loss that
-    is NaN or infinite, after the weights and picture numbers that led to the loss are written to a file.
+    Raises ValueError for a recipe without the block or the steps that the block names;
+    ArithmeticError for a loss that is NaN or infinite, after the weights and picture numbers that
+    led to the loss are written to a file.
     """
     settings = recipe.lifting
     if settings is None:
-        raise ValueError(f"{recipe.name} has no block `train_lift`: start from the recipe train_lift")
+        raise ValueError(
+            f"{recipe.name} has no block `train_lift`: start from the recipe train_lift"
+        )
     pairs = Pairs(recipe, settings, store, device)
     code = Code(store.code_memo)
     inputs = lift_inputs(recipe, settings, code)
@@ -55,7 +67,9 @@ def train_lift(
     folder = folder_of(runs, recipe.name, inputs)
     prepare_folder(folder, inputs, recipe, store, progress)
     learner = LiftLearner(settings, pairs, recipe.seed, device)
-    _LiftLoop(settings, learner, inputs, folder, progress, device, watch).run_to_end(recipe, command)
+    _LiftLoop(settings, learner, inputs, folder, progress, device, watch).run_to_end(
+        recipe, command
+    )
     return folder
 
 
@@ -63,12 +77,18 @@ def lift_inputs(recipe: Recipe, settings: LiftTraining, code: Code) -> RecordedI
     """Return everything that can change the trained weights."""
     camera = CameraInputs.of(recipe, [settings.measured, settings.picture, settings.cube], code)
     block = settings.model_dump(mode="json", exclude={"keep", "show", "validation_batches"})
-    nodes = {f"neusee.nodes.{name}": code.digest(f"neusee.nodes.{name}") for name in ("losses", "spectra")}
+    nodes = {
+        f"neusee.nodes.{name}": code.digest(f"neusee.nodes.{name}")
+        for name in ("losses", "spectra")
+    }
     program = {name: Path(file).read_bytes() for name, file in _PROGRAM.items()}
     return RecordedInputs(
         kind="lift",
         recipe=recipe.name,
-        settings={**camera.settings, **{f"train_lift.{name}": value for name, value in block.items()}},
+        settings={
+            **camera.settings,
+            **{f"train_lift.{name}": value for name, value in block.items()},
+        },
         steps=camera.steps,
         laws=camera.laws,
         code={**nodes, **{name: outline(source).digest for name, source in program.items()}},
@@ -77,15 +97,25 @@ def lift_inputs(recipe: Recipe, settings: LiftTraining, code: Code) -> RecordedI
 
 class _LiftLoop(ResumableLoop[LiftLearner]):
     def __init__(
-        self, settings: LiftTraining, learner: LiftLearner, inputs: RecordedInputs, folder: Path, progress: Progress,
-        device: str, watch: Watch | None,
-    ) -> None:  # fmt: skip
-        super().__init__(folder, settings, learner, _COLUMNS, progress, device, watch, inputs=inputs.digest)
+        self,
+        settings: LiftTraining,
+        learner: LiftLearner,
+        inputs: RecordedInputs,
+        folder: Path,
+        progress: Progress,
+        device: str,
+        watch: Watch | None,
+    ) -> None:
+        super().__init__(
+            folder, settings, learner, _COLUMNS, progress, device, watch, inputs=inputs.digest
+        )
         self.settings = settings
         self.resume()
 
     def run_to_end(self, recipe: Recipe, command: Sequence[str]) -> None:
-        """Train the network to the last iteration, and write the results; do nothing if the training is finished."""
+        """Train the network to the last iteration, and write the results; do nothing if the
+        training is finished.
+        """
         if self.iteration == self.settings.iterations and (self.folder / DOCUMENT).is_file():
             return
         if self.iteration < self.settings.iterations:
@@ -110,5 +140,6 @@ class _LiftLoop(ResumableLoop[LiftLearner]):
         picture, cube = self.learner.pairs("show", 0)
         centres = self.learner.pairs.bands.centres
         self.write_picture(
-            f"{self.iteration:06d}", lifted_spectra(picture, cube, self.learner.estimates(picture), centres)
+            f"{self.iteration:06d}",
+            lifted_spectra(picture, cube, self.learner.estimates(picture), centres),
         )

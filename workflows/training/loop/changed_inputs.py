@@ -1,4 +1,6 @@
-"""What changed since an earlier training of a recipe, in words: the reason why a training begins anew."""
+"""What changed since an earlier training of a recipe, in words: the reason why a training begins
+anew.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.loop.recorded_inputs import FILE, RecordedFile, RecordedInputs
 
 _SHOWN = 12  #: changes that are listed
-_FAR = 40  #: changes above which a training of a recipe with another name is no earlier version of this one
+#: changes above which a training of a recipe with another name is no earlier version of this one
+_FAR = 40
 _CHECKPOINTS = ("state.pt", "mask.state", "mask.json")  #: files of a training that has begun
 CAMERA = "camera "  #: first letters of the names of what a further camera contributes
 
@@ -31,14 +34,23 @@ class EarlierTraining:
         listed = [f"  {change}" for change in self.changes[:_SHOWN]]
         hidden = len(self.changes) - _SHOWN
         more = [f"  and {hidden} more"] if hidden > 0 else []
-        head = f"begins anew, because its inputs are not those of {self.folder.name}, which stays as it is:"
+        head = (
+            f"begins anew, because its inputs are not those of {self.folder.name}, which stays as"
+            " it is:"
+        )
         return "\n".join([head, *listed, *more])
 
 
 def prepare_folder(
-    folder: Path, inputs: RecordedInputs, recipe: Recipe, store: Store, progress: Callable[[str], None]
+    folder: Path,
+    inputs: RecordedInputs,
+    recipe: Recipe,
+    store: Store,
+    progress: Callable[[str], None],
 ) -> None:
-    """Make the folder of a training with its inputs; say why a training begins anew although there are earlier ones."""
+    """Make the folder of a training with its inputs; say why a training begins anew although
+    there are earlier ones.
+    """
     if any((folder / name).is_file() for name in _CHECKPOINTS):
         record = RecordedInputs.read(folder)
         if record is not None and record.digest == inputs.digest:
@@ -51,7 +63,9 @@ def prepare_folder(
     inputs.write(folder)
 
 
-def why_anew(folder: Path, inputs: RecordedInputs, recipe: Recipe, store: Store) -> EarlierTraining | str | None:
+def why_anew(
+    folder: Path, inputs: RecordedInputs, recipe: Recipe, store: Store
+) -> EarlierTraining | str | None:
     """Return the earlier training whose inputs differ least, or None if there is no earlier one.
 
     An earlier training without inputs, as earlier versions wrote it, gives a line of text.
@@ -63,11 +77,16 @@ def why_anew(folder: Path, inputs: RecordedInputs, recipe: Recipe, store: Store)
     silent = next((path.parent for path in sorted(runs.glob(f"{stem}_*/state.pt"))), None)
     if silent is None:
         return None
-    text = "an earlier version of neusee wrote it without its inputs, so that nobody can say whether they are these"
+    text = (
+        "an earlier version of neusee wrote it without its inputs, so that nobody can say whether"
+        " they are these"
+    )
     return f"begins anew, and does not go on with {silent.name}: {text}"
 
 
-def _earlier(runs: Path, stem: str, inputs: RecordedInputs, recipe: Recipe, store: Store) -> Iterator[EarlierTraining]:
+def _earlier(
+    runs: Path, stem: str, inputs: RecordedInputs, recipe: Recipe, store: Store
+) -> Iterator[EarlierTraining]:
     for file in sorted(runs.glob(f"*/{FILE}")):
         begun = any((file.parent / name).is_file() for name in _CHECKPOINTS)
         record = RecordedInputs.read(file.parent) if begun else None
@@ -82,7 +101,9 @@ def _began(folder: Path) -> float:
     return (folder / FILE).stat().st_mtime
 
 
-def changes_since(old: RecordedInputs, new: RecordedInputs, recipe: Recipe, store: Store) -> list[str]:
+def changes_since(
+    old: RecordedInputs, new: RecordedInputs, recipe: Recipe, store: Store
+) -> list[str]:
     """Return a clause for each input that differs between two trainings."""
     words = [
         *_values(old.settings, new.settings),
@@ -118,7 +139,9 @@ def _laws(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
         yield f"the laws stand in another order: {', '.join(new)}"
     for path in _differing(_draws(old), _draws(new)):
         before, after = (laws[path]["text"] if path in laws else "no law" for laws in (old, new))
-        yield f"{path}: other draws of {after}" if before == after else f"{path} {before} -> {after}"
+        yield (
+            f"{path}: other draws of {after}" if before == after else f"{path} {before} -> {after}"
+        )
 
 
 def _draws(laws: Mapping[str, Any]) -> dict[str, Any]:
@@ -138,7 +161,9 @@ def _contents(files: Mapping[str, RecordedFile]) -> dict[str, str]:
 
 
 def _photographs(old: RecordedInputs, new: RecordedInputs) -> Iterator[str]:
-    """Yield a clause for each photograph that came, went or changed; a new name of an equal file is no change."""
+    """Yield a clause for each photograph that came, went or changed; a new name of an equal file
+    is no change.
+    """
     before, after = [*old.photographs, *old.held_out], [*new.photographs, *new.held_out]
     came = [photograph.name for photograph in _beyond(after, before)]
     went = [photograph.name for photograph in _beyond(before, after)]
@@ -157,7 +182,9 @@ def _came_and_went(came: Sequence[str], went: Sequence[str]) -> Iterator[str]:
 
 
 def _beyond(files: Sequence[RecordedFile], others: Sequence[RecordedFile]) -> list[RecordedFile]:
-    """Return the files whose content the others do not have, each as often as it is missing there."""
+    """Return the files whose content the others do not have, each as often as it is missing
+    there.
+    """
     unmatched = Counter(file.content for file in others)
     beyond = []
     for file in files:
@@ -168,7 +195,10 @@ def _beyond(files: Sequence[RecordedFile], others: Sequence[RecordedFile]) -> li
 
 
 def _steps(
-    old: Mapping[str, Mapping[str, Any]], new: Mapping[str, Mapping[str, Any]], recipe: Recipe, store: Store
+    old: Mapping[str, Mapping[str, Any]],
+    new: Mapping[str, Mapping[str, Any]],
+    recipe: Recipe,
+    store: Store,
 ) -> Iterator[str]:
     for label in _differing(old, new):
         camera, step = _camera_of(label)
@@ -184,7 +214,9 @@ def _steps(
 
 
 def _camera_of(label: str) -> tuple[str, str]:
-    """Return the camera and the step in a name such as ``camera 2: psf[mask]``; the first camera has no name."""
+    """Return the camera and the step in a name such as ``camera 2: psf[mask]``; the first camera
+    has no name.
+    """
     camera, colon, step = label.partition(": ")
     return (camera, step) if colon else ("", label)
 
@@ -197,7 +229,11 @@ def _recipe_of(camera: str, recipe: Recipe) -> Recipe:
 
 
 def _read(origin: Mapping[str, Any]) -> str:
-    names = [name for source in origin["inputs"] for name in ([source] if isinstance(source, str) else source or [])]
+    names = [
+        name
+        for source in origin["inputs"]
+        for name in ([source] if isinstance(source, str) else source or [])
+    ]
     return ", ".join(names) or "nothing"
 
 

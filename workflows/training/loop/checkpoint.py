@@ -37,7 +37,9 @@ def write_whole(path: Path, data: bytes) -> None:
 
 @dataclass(frozen=True)
 class StateFile:
-    """The checkpoint file of a training, which is always complete because it is replaced atomically."""
+    """The checkpoint file of a training, which is always complete because it is replaced
+    atomically.
+    """
 
     path: Path
 
@@ -49,10 +51,11 @@ class StateFile:
         write_whole(self.path, memory.getvalue())
 
     def read(self, device: str = "cpu", strict: bool = True) -> dict[str, Any]:
-        """Return the training state from the checkpoint file, or an empty dictionary if there is no file.
+        """Return the training state from the checkpoint file, or an empty dictionary if there is no
+        file.
 
-        Raises ValueError for a file that cannot be read, or that needs more memory than is left; if not ``strict``,
-        an unreadable file counts as absent.
+        Raises ValueError for a file that cannot be read, or that needs more memory than is left; if
+        not ``strict``, an unreadable file counts as absent.
         """
         if not self.path.exists():
             return {}
@@ -62,11 +65,23 @@ class StateFile:
             if state.get("edition", _FORMAT) != _FORMAT:
                 raise ValueError(f"the training state has format {state['edition']}, not {_FORMAT}")
             if "parts" in state:
-                state["parts"] = {_NAMES.get(name, name): part for name, part in state["parts"].items()}
-        except (RuntimeError, KeyError, EOFError, OSError, ValueError, TypeError, AttributeError) as error:
+                state["parts"] = {
+                    _NAMES.get(name, name): part for name, part in state["parts"].items()
+                }
+        except (
+            RuntimeError,
+            KeyError,
+            EOFError,
+            OSError,
+            ValueError,
+            TypeError,
+            AttributeError,
+        ) as error:
             if not strict:
                 return {}
-            raise ValueError(f"{self.path} cannot be read ({error}): remove its folder to start again") from error
+            raise ValueError(
+                f"{self.path} cannot be read ({error}): remove its folder to start again"
+            ) from error
         return state
 
 
@@ -79,7 +94,9 @@ class Rows:
         self._kept = 0
 
     def cut(self, stage: int, iteration: int, write: bool = True) -> None:
-        """Read the loss table from its file, and discard the rows of the given iteration and of later iterations."""
+        """Read the loss table from its file, and discard the rows of the given iteration and of
+        later iterations.
+        """
         if self._path.exists():
             lines = csv.DictReader(lines_of(self._path, _CELLS))
             self.rows = [row for row in lines if _place(row) < (stage, iteration)]
@@ -88,12 +105,20 @@ class Rows:
             self.keep()
 
     def add(self, stage: int, iteration: int, losses: Mapping[str, float]) -> None:
-        """Append the losses of an iteration to the loss table in memory; the method `keep` writes the table to disk."""
-        row = {"stage": stage, "iteration": iteration, **{name: f"{x:.6g}" for name, x in losses.items()}}
+        """Append the losses of an iteration to the loss table in memory; the method `keep`
+        writes the table to disk.
+        """
+        row = {
+            "stage": stage,
+            "iteration": iteration,
+            **{name: f"{x:.6g}" for name, x in losses.items()},
+        }
         self.rows.append({name: str(row.get(name, "")) for name in self._columns})
 
     def keep(self) -> None:
-        """Append the new rows of the loss table to its file; the first call writes the whole file."""
+        """Append the new rows of the loss table to its file; the first call writes the whole
+        file.
+        """
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, self._columns)
         if self._kept == 0:
@@ -108,14 +133,21 @@ class Rows:
 
 
 def _place(row: Mapping[str, str | None]) -> tuple[int, int]:
-    """Return stage and iteration of a row of the loss table for sorting; an incomplete row comes last."""
+    """Return stage and iteration of a row of the loss table for sorting; an incomplete row comes
+    last.
+    """
     with suppress(ValueError, TypeError, KeyError):
         if None not in row.values():
             return int(row.get("stage") or 0), int(row["iteration"] or 0)
     return 1 << 62, 0
 
 
-def export(folder: Path, name: str, tensors: Mapping[str, torch.Tensor], about: dict[str, str] | None = None) -> None:
+def export(
+    folder: Path,
+    name: str,
+    tensors: Mapping[str, torch.Tensor],
+    about: dict[str, str] | None = None,
+) -> None:
     """Write tensors and metadata to the file ``<name>.safetensors`` in a folder."""
     from safetensors.torch import save
 

@@ -1,7 +1,8 @@
 """What decides a training: content of files, code and settings, as a folder of results keeps them.
 
-No name of a file, no path and no time counts, so that a training with files that were renamed or moved is the same, and
-one with other content is another. The names are kept beside the digests, for the words that say what changed.
+No name of a file, no path and no time counts, so that a training with files that were renamed or
+moved is the same, and one with other content is another. The names are kept beside the digests, for
+the words that say what changed.
 """
 
 from __future__ import annotations
@@ -50,10 +51,13 @@ class RecordedInputs:
     kind: str  #: training, lift or mask
     recipe: str  #: its name, which decides nothing
     settings: Mapping[str, Any] = field(default_factory=dict)  #: by path
-    steps: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  #: node, code, parameters and inputs by step
-    laws: Mapping[str, Any] = field(default_factory=dict)  #: by path: how it is written, and what decides its draws
+    #: node, code, parameters and inputs by step
+    steps: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    #: by path: how it is written, and what decides its draws
+    laws: Mapping[str, Any] = field(default_factory=dict)
     code: Mapping[str, str] = field(default_factory=dict)  #: digests by what the code is
-    files: Mapping[str, RecordedFile] = field(default_factory=dict)  #: by the setting that names the file
+    #: by the setting that names the file
+    files: Mapping[str, RecordedFile] = field(default_factory=dict)
     photographs: Sequence[RecordedFile] = ()  #: that are trained on
     held_out: Sequence[RecordedFile] = ()
 
@@ -65,7 +69,8 @@ class RecordedInputs:
             self.kind,
             dict(self.settings),
             {name: dict(step) for name, step in self.steps.items()},
-            [[path, law["draws"]] for path, law in self.laws.items()],  # in order, because each takes its own column
+            # in order, because each takes its own column
+            [[path, law["draws"]] for path, law in self.laws.items()],
             dict(self.code),
             {setting: file.content for setting, file in self.files.items()},
             sorted(photograph.content for photograph in self.photographs),
@@ -79,13 +84,17 @@ class RecordedInputs:
 
     def write(self, folder: Path) -> None:
         """Write the inputs into the folder of a training, unless they stand there already."""
-        text = json.dumps({"format": _FORMAT, "digest": self.digest, **asdict(self)}, indent=1, ensure_ascii=False)
+        text = json.dumps(
+            {"format": _FORMAT, "digest": self.digest, **asdict(self)}, indent=1, ensure_ascii=False
+        )
         if self.read(folder) != self:
             write_whole(folder / FILE, text.encode())
 
     @classmethod
     def read(cls, folder: Path) -> RecordedInputs | None:
-        """Return the inputs that the folder of a training keeps, or None for a folder without them."""
+        """Return the inputs that the folder of a training keeps, or None for a folder without
+        them.
+        """
         try:
             written = json.loads(text_of(folder / FILE))
             if written.pop("format") != _FORMAT:
@@ -93,7 +102,9 @@ class RecordedInputs:
             stated = written.pop("digest")
             for name in ("photographs", "held_out"):
                 written[name] = tuple(RecordedFile(**each) for each in written[name])
-            written["files"] = {setting: RecordedFile(**each) for setting, each in written["files"].items()}
+            written["files"] = {
+                setting: RecordedFile(**each) for setting, each in written["files"].items()
+            }
             record = cls(**written)
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
@@ -101,7 +112,9 @@ class RecordedInputs:
 
 
 def folder_of(runs: Path, stem: str, inputs: RecordedInputs) -> Path:
-    """Return the folder of a training: one with equal inputs, whatever its recipe was called, or a new one."""
+    """Return the folder of a training: one with equal inputs, whatever its recipe was called, or
+    a new one.
+    """
     own = runs / f"{stem}_{inputs.key}"
     if own.exists():
         return own
@@ -123,10 +136,14 @@ class CameraInputs:
     laws: Mapping[str, Any]
 
     @classmethod
-    def of(cls, recipe: Recipe, outputs: Iterable[str], code: Code, given: Sequence[str] = ()) -> CameraInputs:
-        """Return what decides the ``outputs`` of a recipe; the caller computes the steps ``given``, which do not count.
+    def of(
+        cls, recipe: Recipe, outputs: Iterable[str], code: Code, given: Sequence[str] = ()
+    ) -> CameraInputs:
+        """Return what decides the ``outputs`` of a recipe; the caller computes the steps ``given``,
+        which do not count.
 
-        Raises ValueError with place and fix for code of the user that reads what cannot be followed.
+        Raises ValueError with place and fix for code of the user that reads what cannot be
+        followed.
         """
         order = [name for name in needed(recipe, outputs) if name not in given]
         steps = {name: _origin(recipe.steps[name], recipe.seed, code) for name in order}
@@ -135,7 +152,12 @@ class CameraInputs:
 
     def named(self, prefix: str) -> CameraInputs:
         """Return the same with a prefix before each name, such as that of another camera."""
-        return CameraInputs(*({f"{prefix}{name}": x for name, x in vars(self)[f.name].items()} for f in fields(self)))
+        return CameraInputs(
+            *(
+                {f"{prefix}{name}": x for name, x in vars(self)[f.name].items()}
+                for f in fields(self)
+            )
+        )
 
     def joined(self, other: CameraInputs) -> CameraInputs:
         """Return the inputs of two cameras, whose names differ."""
@@ -143,7 +165,9 @@ class CameraInputs:
 
 
 def _origin(step: Step, seed: int, code: Code) -> dict[str, Any]:
-    """Return what decides a step but for the results that it reads, as `keys.cache_key.key_of` does."""
+    """Return what decides a step but for the results that it reads, as `keys.cache_key.key_of`
+    does.
+    """
     try:
         code_digest = code_of(step, code)
     except LookupError as error:
@@ -164,21 +188,39 @@ def _laws(recipe: Recipe) -> dict[str, Any]:
     uncertain = recipe.uncertain
     if uncertain is None:
         return {}
-    laws = {path: {"text": law.text, "draws": identity(law)} for path, law in uncertain.laws.items()}
+    laws = {
+        path: {"text": law.text, "draws": identity(law)} for path, law in uncertain.laws.items()
+    }
     if uncertain.joint is not None:
-        laws["posterior"] = {"text": f"posterior {uncertain.source}", "draws": identity(uncertain.joint)}
+        laws["posterior"] = {
+            "text": f"posterior {uncertain.source}",
+            "draws": identity(uncertain.joint),
+        }
     for path, difference in uncertain.mismatch.items():
-        laws[f"train.mismatch.{path}"] = {"text": difference.law.text, "draws": identity(difference)}
+        laws[f"train.mismatch.{path}"] = {
+            "text": difference.law.text,
+            "draws": identity(difference),
+        }
     return laws
 
 
 def identity(value: Any) -> Any:
-    """Return JSON values that are equal for equal values: an array is its digest, a file that of its content."""
+    """Return JSON values that are equal for equal values: an array is its digest, a file that of
+    its content.
+    """
     if isinstance(value, np.ndarray):
         content = np.ascontiguousarray(value)
-        return [str(content.dtype), list(content.shape), hashlib.sha256(content.tobytes()).hexdigest()]
+        return [
+            str(content.dtype),
+            list(content.shape),
+            hashlib.sha256(content.tobytes()).hexdigest(),
+        ]
     if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: identity(getattr(value, f.name)) for f in fields(value) if f.name not in _WORDS_ONLY}
+        return {
+            f.name: identity(getattr(value, f.name))
+            for f in fields(value)
+            if f.name not in _WORDS_ONLY
+        }
     if isinstance(value, tuple | list):
         return [identity(part) for part in value]
     return plain(value)

@@ -1,4 +1,6 @@
-"""The loop of every training; a stopped training continues from its last checkpoint with bit-identical results."""
+"""The loop of every training; a stopped training continues from its last checkpoint with
+bit-identical results.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ from neusee.workflows.training.loop.checkpoint import Rows, StateFile, write_who
 
 Losses = dict[str, float]
 Progress = Callable[[str], None]  #: takes one line of text about the progress of a training
-Watch = Callable[[int, int, Mapping[str, float]], None]  #: takes the stage, its iterations so far, and the losses
+#: takes the stage, its iterations so far, and the losses
+Watch = Callable[[int, int, Mapping[str, float]], None]
 DOCUMENT = "training.json"  #: the file that a training writes last
 
 
@@ -39,34 +42,55 @@ L = TypeVar("L", bound=Learns)
 
 
 class ResumableLoop(ABC, Generic[L]):
-    """A training loop that writes a checkpoint, a table of losses, pictures and a final document into a folder.
+    """A training loop that writes a checkpoint, a table of losses, pictures and a final document
+    into a folder.
 
-    Among several processes, only the process with ``writes`` writes files. A training without stages is in stage 0.
+    Among several processes, only the process with ``writes`` writes files. A training without
+    stages is in stage 0.
     """
 
     def __init__(
-        self, folder: Path, settings: Training | LiftTraining, learner: L, columns: Sequence[str],
-        progress: Progress, device: str, watch: Watch | None, writes: bool = True, inputs: str = "",
-    ) -> None:  # fmt: skip
+        self,
+        folder: Path,
+        settings: Training | LiftTraining,
+        learner: L,
+        columns: Sequence[str],
+        progress: Progress,
+        device: str,
+        watch: Watch | None,
+        writes: bool = True,
+        inputs: str = "",
+    ) -> None:
         self.folder, self.learner, self.progress, self.device = folder, learner, progress, device
-        self.keep_every, self.show_every, self.watch, self.writes = settings.keep, settings.show, watch, writes
+        self.keep_every, self.show_every, self.watch, self.writes = (
+            settings.keep,
+            settings.show,
+            watch,
+            writes,
+        )
         self.rows, self.state = Rows(folder / "losses.csv", columns), StateFile(folder / "state.pt")
         self.stage, self.iteration, self.batch, self.began = 0, 0, 1, timestamp()
         self.inputs = inputs  #: digest of all that decides the training
 
     @abstractmethod
     def iterate(self) -> Losses:
-        """Compute one training iteration and return the losses; raise `NotFinite` if a loss is NaN or infinite.
+        """Compute one training iteration and return the losses; raise `NotFinite` if a loss is NaN
+        or infinite.
 
-        `NotFinite` is raised for a gradient too, and always before the optimiser changes the weights.
+        `NotFinite` is raised for a gradient too, and always before the optimiser changes the
+        weights.
         """
 
     @abstractmethod
     def show(self) -> None:
-        """Write a picture that shows the output of the networks at the present iteration of the training."""
+        """Write a picture that shows the output of the networks at the present iteration of the
+        training.
+        """
 
     def validate(self, iterations: int) -> Losses:
-        """Return further numbers for the loss table after a number of iterations of the stage; most have none."""
+        """Return further numbers for the loss table after a number of iterations of the stage;
+        most have none.
+        """
         return {}
 
     @property
@@ -75,7 +99,9 @@ class ResumableLoop(ABC, Generic[L]):
         return False
 
     def facts(self) -> dict[str, Any]:
-        """Return what a checkpoint keeps beside stage, iteration, inputs and the learner; most trainings have none."""
+        """Return what a checkpoint keeps beside stage, iteration, inputs and the learner; most
+        trainings have none.
+        """
         return {}
 
     def recall(self, facts: Mapping[str, Any]) -> None:
@@ -85,10 +111,15 @@ class ResumableLoop(ABC, Generic[L]):
         """Prepare networks and optimisers for the present stage of the training."""
 
     def resume(self) -> None:
-        """Continue a training from its checkpoint file, or begin at the first iteration if there is no checkpoint."""
+        """Continue a training from its checkpoint file, or begin at the first iteration if there
+        is no checkpoint.
+        """
         state = self.state.read(self.device)
         if state and state.get("inputs", self.inputs) != self.inputs:
-            text = "was written for other inputs than those of this training, although its folder has their name"
+            text = (
+                "was written for other inputs than those of this training, although its folder has"
+                " their name"
+            )
             raise ValueError(f"{self.state.path} {text}: remove the folder to start again")
         self.stage, self.iteration = state.get("stage", self.stage), state.get("iteration", 0)
         self.begin_stage()
@@ -98,11 +129,14 @@ class ResumableLoop(ABC, Generic[L]):
                 part.load_state_dict(state["parts"][name])
             self.rows.cut(self.stage, self.iteration, self.writes)
             self.progress(
-                f"continues {f'in stage {self.stage} ' if self.stage else ''}after {self.iteration} iterations"
+                f"continues {f'in stage {self.stage} ' if self.stage else ''}after {self.iteration}"
+                " iterations"
             )
 
     def run(self, iterations: int, batch: int) -> None:
-        """Compute the remaining iterations of the present training stage; the caller saves the state at the end."""
+        """Compute the remaining iterations of the present training stage; the caller saves the
+        state at the end.
+        """
         self.batch = batch
         if self.writes and self.iteration < iterations:
             remove_crate(self.folder)
@@ -131,7 +165,8 @@ class ResumableLoop(ABC, Generic[L]):
     def keep(self) -> None:
         """Write the loss table of a training to disk, and then the checkpoint.
 
-        In this order a killed process can leave surplus rows, which `resume` removes, but no missing rows.
+        In this order a killed process can leave surplus rows, which `resume` removes, but no
+        missing rows.
         """
         if self.writes:
             self.rows.keep()
@@ -143,22 +178,38 @@ class ResumableLoop(ABC, Generic[L]):
         write_whole(self.folder / "pictures" / f"{name}.png", picture)
 
     def close(self, curves: bytes, recipe: str, command: Sequence[str], **facts: Any) -> None:
-        """Write the loss curves, and then the document with the settings and the results of the training."""
+        """Write the loss curves, and then the document with the settings and the results of the
+        training.
+        """
         remove_crate(self.folder)
         write_whole(self.folder / "curves.png", curves)
         seconds = sum(float(row["seconds"]) for row in self.rows.rows)
-        about = {"command": list(command), "recipe": recipe, **facts, "seconds": seconds, "versions": versions()}
+        about = {
+            "command": list(command),
+            "recipe": recipe,
+            **facts,
+            "seconds": seconds,
+            "versions": versions(),
+        }
         text = json.dumps(about, indent=1, ensure_ascii=False) + "\n"
         write_whole(self.folder / DOCUMENT, text.encode())
         write_crate(self.folder, self.folder.name, about | {"began": self.began})
 
     def _packed(self, **about: Any) -> dict[str, Any]:
         parts = {name: part.state_dict() for name, part in self.learner.parts().items()}
-        return {"stage": self.stage, "iteration": self.iteration, "inputs": self.inputs, **self.facts(), **about,
-                "parts": parts}  # fmt: skip
+        return {
+            "stage": self.stage,
+            "iteration": self.iteration,
+            "inputs": self.inputs,
+            **self.facts(),
+            **about,
+            "parts": parts,
+        }
 
     def _dumped(self, error: NotFinite) -> ArithmeticError:
-        """Write the weights and the picture numbers that led to a NaN or infinite loss, and return the error."""
+        """Write the weights and the picture numbers that led to a NaN or infinite loss, and
+        return the error.
+        """
         place = [self.stage, self.iteration] if self.stage else [self.iteration]
         dump = StateFile(self.folder / f"not_finite_{'_'.join(map(str, place))}.pt")
         first, count = self.iteration * self.batch, self.batch
@@ -167,18 +218,25 @@ class ResumableLoop(ABC, Generic[L]):
             self.rows.keep()
         stage = f"stage {self.stage}, " if self.stage else ""
         pictures = f"pictures {first} to {first + count - 1}" if count > 1 else f"picture {first}"
-        text = f"{stage}iteration {self.iteration}, {pictures}: {error}; the weights are in {dump.path}"
+        text = (
+            f"{stage}iteration {self.iteration}, {pictures}: {error}; the weights are in"
+            f" {dump.path}"
+        )
         return ArithmeticError(text)
 
 
 def require_finite(numbers: Mapping[str, float]) -> None:
-    """Raise `NotFinite` if a loss or another named number is NaN or infinite; the message gives its name."""
+    """Raise `NotFinite` if a loss or another named number is NaN or infinite; the message gives
+    its name.
+    """
     wrong = [name for name, x in numbers.items() if not abs(x) < float("inf")]
     if wrong:
         raise NotFinite(f"these numbers are NaN or infinite: {', '.join(wrong)}")
 
 
 def averaged(net: nn.Module, decay: float) -> AveragedModel | None:
-    """Return an exponential moving average of the weights of a network, or None if ``decay`` is 0."""
+    """Return an exponential moving average of the weights of a network, or None if ``decay`` is
+    0.
+    """
     mean = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
     return AveragedModel(net, multi_avg_fn=mean) if decay else None

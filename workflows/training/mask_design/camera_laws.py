@@ -1,4 +1,6 @@
-"""What a mask design does not know for certain: laws of defocus, wavelength and direction, and how they are drawn."""
+"""What a mask design does not know for certain: laws of defocus, wavelength and direction, and
+how they are drawn.
+"""
 
 from __future__ import annotations
 
@@ -15,17 +17,21 @@ from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTr
 _PRIME = 1_000_003
 _FAR = 3**0.5  #: standard deviations at which the outer points of a law lie
 
-State = tuple[float, float, float, float]  #: defocus, wavelength, direction on y and on x, in standard deviations
+#: defocus, wavelength, direction on y and on x, in standard deviations
+State = tuple[float, float, float, float]
 NOMINAL: State = (0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class CameraLaws:
-    """Normal laws of defocus, wavelength and direction around the values of the recipe, each independent."""
+    """Normal laws of defocus, wavelength and direction around the values of the recipe, each
+    independent.
+    """
 
     spreads: State  #: standard deviations in waves, m, rad and rad
     defocus: Mapping[str, float]  #: the parameter of the pupil and its value in the recipe
-    angle: Mapping[str, tuple[float, float]]  #: the parameter of the PSF and its value in the recipe
+    #: the parameter of the PSF and its value in the recipe
+    angle: Mapping[str, tuple[float, float]]
     seed: int
 
     @classmethod
@@ -42,10 +48,17 @@ class CameraLaws:
                 raise DesignError(f"defocus_spread: {text}")
             defocus = {f"{pupil}.defocus": float(recipe.steps[pupil].params["defocus"])}
         if direction and "angle" not in step.params:
-            raise DesignError(f"direction_spread: {settings.psf} has no angle: remove it, or name an optics.psf step")
+            raise DesignError(
+                f"direction_spread: {settings.psf} has no angle: remove it, or name an optics.psf"
+                " step"
+            )
         angle = {f"{settings.psf}.angle": step.params["angle"]} if direction else {}
-        return cls((settings.defocus_spread, settings.wavelength_spread, direction, direction), defocus, angle,
-                   settings.seed)  # fmt: skip
+        return cls(
+            (settings.defocus_spread, settings.wavelength_spread, direction, direction),
+            defocus,
+            angle,
+            settings.seed,
+        )
 
     @property
     def certain(self) -> bool:
@@ -61,7 +74,10 @@ class CameraLaws:
         """Return the parameters of the recipe in a state."""
         defocus, _, *turns = (spread * x for spread, x in zip(self.spreads, state, strict=True))
         found: dict[str, Any] = {name: at + defocus for name, at in self.defocus.items()}
-        return found | {name: tuple(a + b for a, b in zip(at, turns, strict=True)) for name, at in self.angle.items()}
+        return found | {
+            name: tuple(a + b for a, b in zip(at, turns, strict=True))
+            for name, at in self.angle.items()
+        }
 
     def moved(self, bands: Bands, state: State) -> Bands:
         """Return the bands with all their wavelengths moved together."""
@@ -74,7 +90,8 @@ class CameraLaws:
         return defocus, wavelength, y, x
 
     def points(self) -> list[tuple[State, float]]:
-        """Return 2 d + 1 states with their weights, for d uncertain numbers: exact for polynomials of degree 3.
+        """Return 2 d + 1 states with their weights, for d uncertain numbers: exact for polynomials
+        of degree 3.
 
         For d = 1 these are the points of Gauss-Hermite quadrature.
         """

@@ -1,4 +1,6 @@
-"""Optimisation of a mask of half-rings by differential evolution, which can continue after an interruption."""
+"""Optimisation of a mask of half-rings by differential evolution, which can continue after an
+interruption.
+"""
 
 from __future__ import annotations
 
@@ -17,16 +19,21 @@ from neusee.workflows.training.loop.resumable_loop import Progress
 from neusee.workflows.training.mask_design.design_terms import Terms
 from neusee.workflows.training.mask_design.learnt_mask import LearntMask
 
-_USUAL = (12.0, 18.0, 24.0, 30.0, 36.0, 1.0, 0.0)  #: parameters of a hand-designed mask of half-rings
+#: parameters of a hand-designed mask of half-rings
+_USUAL = (12.0, 18.0, 24.0, 30.0, 36.0, 1.0, 0.0)
 
 
 def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Tensor]:
-    """Return a function that computes the height map of a mask of half-rings from a vector of its parameters."""
+    """Return a function that computes the height map of a mask of half-rings from a vector of
+    its parameters.
+    """
     *slopes, side, turn = (float(gene) for gene in genes)
     given = {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": turn}
 
     def height(stop: Stop) -> Tensor:
-        made: Tensor = half_rings(stop, **given, wavelength=settings.wavelength, material=settings.material)
+        made: Tensor = half_rings(
+            stop, **given, wavelength=settings.wavelength, material=settings.material
+        )
         return made
 
     return height if settings.feature is None else Written(height, settings.feature)
@@ -49,10 +56,14 @@ class _LossOfGenes:
         if self.asked == len(self.known):
             with torch.no_grad():
                 height = half_ring_height(genes, self.terms.settings)(self.terms.stop)
-                loss = float(self.terms.total(self.terms.parts(height.to(self.terms.device), self.chosen)))
+                loss = float(
+                    self.terms.total(self.terms.parts(height.to(self.terms.device), self.chosen))
+                )
             if not math.isfinite(loss):
                 slopes = [float(gene) for gene in genes[:-2]]
-                raise DesignError(f"mask number {self.asked}: the loss at slopes {slopes} is NaN or infinite")
+                raise DesignError(
+                    f"mask number {self.asked}: the loss at slopes {slopes} is NaN or infinite"
+                )
             self.known.append(loss)
             if len(self.known) % (self.terms.settings.save_every * 10) == 0:
                 self.state.write({"values": self.known})
@@ -65,7 +76,10 @@ def evolve(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
 
     settings = terms.settings
     if (most := _steepest(terms)) < settings.slopes[1]:
-        progress(f"slopes above {most:.3g} waves are too steep for the samples of the pupil: use more samples")
+        progress(
+            f"slopes above {most:.3g} waves are too steep for the samples of the pupil: use more"
+            " samples"
+        )
     loss, history = _LossOfGenes(terms, state, progress), list[dict[str, float]]()
     populations: list[tuple[float, Any]] = []
     bounds = np.array([settings.slopes] * 5 + [(0.0, 1.0), (0.0, math.pi)])
@@ -84,7 +98,8 @@ def evolve(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
 def _population(
     loss: _LossOfGenes, bounds: Any, start: int, history: list[dict[str, float]], progress: Progress
 ) -> tuple[float, Any]:
-    """Optimise a mask of half-rings by differential evolution; return the lowest loss and the best parameter vector.
+    """Optimise a mask of half-rings by differential evolution; return the lowest loss and the best
+    parameter vector.
 
     ``history`` gets a row for each generation.
     """
@@ -92,12 +107,18 @@ def _population(
     from scipy.optimize import differential_evolution, minimize
 
     settings = loss.terms.settings
-    rng, first, loss.chosen = np.random.default_rng((settings.seed, start)), loss.asked, loss.terms.even()
+    rng, first, loss.chosen = (
+        np.random.default_rng((settings.seed, start)),
+        loss.asked,
+        loss.terms.even(),
+    )
     low, high = bounds.T
 
     def note_generation(genes: Any, convergence: float) -> None:
         number = sum(row["start"] == start for row in history)
-        history.append({"start": start, "iteration": number, "loss": min(loss.known[first : loss.asked])})
+        history.append(
+            {"start": start, "iteration": number, "loss": min(loss.known[first : loss.asked])}
+        )
         if (number + 1) % settings.save_every == 0:
             progress(f"generation {number + 1} of {settings.iterations}: {history[-1]['loss']:.5g}")
 
@@ -115,7 +136,9 @@ def _population(
         )
         if settings.polish:  # on all bands, because a tenth of a wave changes the peak
             loss.chosen = None
-            simplex = found.x + np.concatenate([np.zeros((1, len(low))), 0.01 * np.diag(high - low)])
+            simplex = found.x + np.concatenate(
+                [np.zeros((1, len(low))), 0.01 * np.diag(high - low)]
+            )
             fine = {"maxfev": settings.polish, "initial_simplex": np.clip(simplex, low, high)}
             found = minimize(loss, found.x, method="Nelder-Mead", bounds=bounds, options=fine)
     except RuntimeError as error:  # scipy raises this for any error of the loss
@@ -124,12 +147,18 @@ def _population(
 
 
 def _steepest(terms: Terms) -> float:
-    """Return the steepest mask slope that the pupil grid can sample (Nyquist limit), in waves at the rim."""
+    """Return the steepest mask slope that the pupil grid can sample (Nyquist limit), in waves at
+    the rim.
+    """
     material, wavelength = terms.settings.material, terms.settings.wavelength
-    turned = wave_height(material, wavelength) / wave_height(material, float(terms.bands.centres.min()))
+    turned = wave_height(material, wavelength) / wave_height(
+        material, float(terms.bands.centres.min())
+    )
     return float(terms.stop.diameter / (4 * terms.stop.pitch * turned))
 
 
 def _holds_usual(settings: MaskTraining) -> bool:
-    """Return True if the allowed range of mask slopes includes the slopes of the hand-designed mask."""
+    """Return True if the allowed range of mask slopes includes the slopes of the hand-designed
+    mask.
+    """
     return settings.slopes[0] <= min(_USUAL[:5]) and settings.slopes[1] >= max(_USUAL[:5])

@@ -33,7 +33,9 @@ _APART = 7919  #: difference of the seeds of successive starts
 
 
 def shape_of(terms: Terms, start: int) -> nn.Module:
-    """Return a trainable mask with the random initial parameters of the optimisation number ``start``."""
+    """Return a trainable mask with the random initial parameters of the optimisation number
+    ``start``.
+    """
     settings = terms.settings
     shape = _free(terms, torch.Generator().manual_seed(settings.seed + _APART * start))
     if settings.feature is not None:
@@ -58,7 +60,9 @@ def _free(terms: Terms, rng: torch.Generator) -> nn.Module:
     settings, step = terms.settings, terms.mask_step
     if settings.kind == "recipe_mask":
         if step.node.path not in PARAMETRISATIONS:
-            raise DesignError(f"kind: the step {step.name} ({step.node.path}) has no trainable parameters")
+            raise DesignError(
+                f"kind: the step {step.name} ({step.node.path}) has no trainable parameters"
+            )
         return PARAMETRISATIONS[step.node.path](terms.stop, step.params, rng)
     if settings.kind == "pixelwise":
         return Pixels(settings.grid, settings.max_height, settings.scale, rng, _start(settings))
@@ -70,17 +74,29 @@ def _free(terms: Terms, rng: torch.Generator) -> nn.Module:
     if settings.kind == "streak":
         return Streak(*few)
     if settings.kind == "rings":
-        return Rings(settings.rings, settings.sided, settings.noise, settings.wavelength, settings.material, rng)
+        return Rings(
+            settings.rings,
+            settings.sided,
+            settings.noise,
+            settings.wavelength,
+            settings.material,
+            rng,
+        )
     return Drawn(settings.width, settings.grid, settings.max_height, rng)
 
 
 def _start(settings: MaskTraining) -> Tensor | None:
-    """Read the height map from which the optimisation of a pixelwise mask begins, or return None if no file is set."""
+    """Read the height map from which the optimisation of a pixelwise mask begins, or return None
+    if no file is set.
+    """
     if settings.start is None:
         return None
     height = read_height_map(settings.start, settings.max_height)
     if (deepest := float(height.max())) > settings.max_height:
-        raise DesignError(f"start: mask {settings.start.name} is {deepest * 1e6:.3g} um deep: set a larger max_height")
+        raise DesignError(
+            f"start: mask {settings.start.name} is {deepest * 1e6:.3g} um deep: set a larger"
+            " max_height"
+        )
     return height
 
 
@@ -93,9 +109,14 @@ def rate(settings: MaskTraining, number: int) -> float:
 
 
 def descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
-    state, settings = file.read(strict=False) or {"start": 0, "history": [], "best": None}, terms.settings
+    state, settings = (
+        file.read(strict=False) or {"start": 0, "history": [], "best": None},
+        terms.settings,
+    )
     if state["start"] or "shape" in state:
-        progress(f"continues from start {state['start'] + 1}, iteration {state.get('iteration', 0)}")
+        progress(
+            f"continues from start {state['start'] + 1}, iteration {state.get('iteration', 0)}"
+        )
     for start in range(state["start"], settings.starts):
         shape = shape_of(terms, start).to(terms.device)
         _one_start(terms, shape, start, state, file, progress)
@@ -103,7 +124,10 @@ def descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
             loss = float(terms.total(_parts(terms, shape)))
         progress(f"start {start + 1} of {settings.starts}: {loss:.5g} on all bands")
         if not math.isfinite(loss):
-            raise DesignError(f"start {start + 1}: the loss on all bands is NaN or infinite: lower the learning rate")
+            raise DesignError(
+                f"start {start + 1}: the loss on all bands is NaN or infinite: lower the learning"
+                " rate"
+            )
         if state["best"] is None or loss < state["best"]["loss"]:
             state["best"] = {"loss": loss, "start": start, "shape": deepcopy(shape.state_dict())}
         for name in ("shape", "adam", "iteration"):
@@ -117,9 +141,16 @@ def descend(terms: Terms, file: StateFile, progress: Progress) -> LearntMask:
 
 
 def _one_start(
-    terms: Terms, shape: nn.Module, start: int, state: dict[str, Any], file: StateFile, progress: Progress
+    terms: Terms,
+    shape: nn.Module,
+    start: int,
+    state: dict[str, Any],
+    file: StateFile,
+    progress: Progress,
 ) -> None:
-    """Optimise a mask by Adam from one set of initial parameters, with a checkpoint every ``save_every`` iterations."""
+    """Optimise a mask by Adam from one set of initial parameters, with a checkpoint every
+    ``save_every`` iterations.
+    """
     settings = terms.settings
     adam = torch.optim.Adam(shape.parameters(), lr=settings.rate)
     if "shape" in state:
@@ -132,18 +163,27 @@ def _one_start(
         state["history"].append(row)
         if (number + 1) % settings.save_every == 0:
             progress(f"{number + 1}/{settings.iterations}  {_losses_line(row)}")
-            state |= {"shape": shape.state_dict(), "adam": adam.state_dict(), "iteration": number + 1}
+            state |= {
+                "shape": shape.state_dict(),
+                "adam": adam.state_dict(),
+                "iteration": number + 1,
+            }
             file.write(state)
 
 
-def _step(terms: Terms, shape: nn.Module, adam: torch.optim.Adam, start: int, number: int) -> dict[str, float]:
+def _step(
+    terms: Terms, shape: nn.Module, adam: torch.optim.Adam, start: int, number: int
+) -> dict[str, float]:
     adam.zero_grad()
     parts = _parts(terms, shape, terms.drawn(number), number)
     loss = terms.total(parts)
     row = {"start": start, "iteration": number, "loss": float(loss.detach())}
     row |= {name: float(term.detach()) for name, term in parts.items()}
     if not math.isfinite(row["loss"]):
-        raise DesignError(f"start {start + 1}, iteration {number}: the loss is NaN or infinite ({_losses_line(row)})")
+        raise DesignError(
+            f"start {start + 1}, iteration {number}: the loss is NaN or infinite"
+            f" ({_losses_line(row)})"
+        )
     loss.backward()  # type: ignore[no-untyped-call]
     for name, parameter in shape.named_parameters():
         if parameter.grad is not None and not bool(parameter.grad.isfinite().all()):
@@ -162,11 +202,15 @@ def _parts(
 
 
 def _losses_line(row: dict[str, float]) -> str:
-    return ", ".join(f"{name} {value:.5g}" for name, value in row.items() if name not in ("start", "iteration"))
+    return ", ".join(
+        f"{name} {value:.5g}" for name, value in row.items() if name not in ("start", "iteration")
+    )
 
 
 def _few(shape: nn.Module) -> dict[str, Any]:
-    """Return the parameters of a mask as lists by name, without matrices and vectors of more than 1000 numbers."""
+    """Return the parameters of a mask as lists by name, without matrices and vectors of more
+    than 1000 numbers.
+    """
     inner: Any = shape
     while isinstance(inner, (Stopped, Written)):
         inner = inner.shape

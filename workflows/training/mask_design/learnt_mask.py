@@ -13,7 +13,9 @@ from neusee.nodes.values import Stop
 
 @dataclass
 class LearntMask:
-    """The best mask that an optimisation found, with its parameters, and the losses at all iterations."""
+    """The best mask that an optimisation found, with its parameters, and the losses at all
+    iterations.
+    """
 
     height: Callable[[Stop], Tensor]
     loss: float

@@ -1,4 +1,6 @@
-"""Results that depend on the mask but on no picture, computed once for all pictures of a training iteration."""
+"""Results that depend on the mask but on no picture, computed once for all pictures of a
+training iteration.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ from neusee.workflows.training.parallel.collectives import gathered_back
 
 @dataclass(frozen=True)
 class Shared:
-    """Results that depend on the mask but on no picture, with detached copies that add up gradients of all pictures."""
+    """Results that depend on the mask but on no picture, with detached copies that add up
+    gradients of all pictures.
+    """
 
     made: Mapping[str, Any]  #: results with their autograd graph, at the bands of this process
     values: Mapping[str, Any]  #: detached copies
@@ -24,8 +28,12 @@ class Shared:
     shards: Shards | None = None
 
     @classmethod
-    def of(cls, made: Mapping[str, Any], shards: Shards | None = None, whole: Sequence[str] = ()) -> Shared:
-        """Detach results from the autograd graph, and gather all spectral bands of the results named in ``whole``."""
+    def of(
+        cls, made: Mapping[str, Any], shards: Shards | None = None, whole: Sequence[str] = ()
+    ) -> Shared:
+        """Detach results from the autograd graph, and gather all spectral bands of the results
+        named in ``whole``.
+        """
         leaves: dict[str, Any] = each_tensor(leaf, dict(made))  # two results may be one tensor
         if shards is None or not leaves:
             return cls(made, leaves)
@@ -34,7 +42,9 @@ class Shared:
 
     @property
     def seen(self) -> Mapping[str, Any]:
-        """Return the detached copies that later steps read; those in ``whole`` have all spectral bands."""
+        """Return the detached copies that later steps read; those in ``whole`` have all spectral
+        bands.
+        """
         return {**self.values, **self.whole}
 
     def back(self) -> None:
@@ -48,7 +58,9 @@ class Shared:
             torch.autograd.backward([x for x, _ in roots], [grad for _, grad in roots])
 
     def _to_own(self, name: str, own: Tensor, whole: Tensor) -> None:
-        """Sum a gradient over all processes, and keep the part for the spectral bands of this process."""
+        """Sum a gradient over all processes, and keep the part for the spectral bands of this
+        process.
+        """
         if not own.requires_grad:
             return
         assert self.shards is not None

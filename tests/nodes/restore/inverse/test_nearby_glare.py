@@ -1,4 +1,6 @@
-"""Patterns that a laser may have: each is the PSF of its own direction, wavelength and focus, drawn by the laws."""
+"""Patterns that a laser may have: each is the PSF of its own direction, wavelength and focus,
+drawn by the laws.
+"""
 
 import pytest
 import torch

@@ -1,4 +1,6 @@
-"""Files that a recipe of a stranger names: those in its own folder alone, unless the reader names them."""
+"""Files that a recipe of a stranger names: those in its own folder alone, unless the reader
+names them.
+"""
 
 import pytest
 
@@ -26,9 +28,13 @@ def mark(folder, file="r.yaml", line=3):
     return Location(file, line, 1, str(folder))
 
 
-@pytest.mark.parametrize("name", ["../mine.csv", "link.csv", "/etc/passwd", "../his/../mine.csv", ".."])
+@pytest.mark.parametrize(
+    "name", ["../mine.csv", "link.csv", "/etc/passwd", "../his/../mine.csv", ".."]
+)
 def test_a_file_outside_is_refused(place, name):
-    with pytest.raises(ValueError, match=OUTSIDE + "r.yaml, and with NEUSEE_NO_CODE or --no-code a recipe reads no"):
+    with pytest.raises(
+        ValueError, match=OUTSIDE + "r.yaml, and with NEUSEE_NO_CODE or --no-code a recipe reads no"
+    ):
         refuse_outside(place / name, mark(place))
 
 
@@ -65,16 +71,22 @@ def test_a_training_of_a_stranger_reads_his_files_alone(place, change, path):
     (place / "linked").mkdir()
     (place / "linked" / "a.png").symlink_to(place.parent / "mine.csv")
     text = (packaged() / "train_small.yaml").read_text(encoding="utf-8")
-    (place / "r.yaml").write_text(text.replace("train:\n", f"train:\n  {change}\n", 1), encoding="utf-8")
+    (place / "r.yaml").write_text(
+        text.replace("train:\n", f"train:\n  {change}\n", 1), encoding="utf-8"
+    )
     with pytest.raises(RecipeError) as refused:
         load(place / "r.yaml", (), place)
     assert [each.path for each in refused.value.diagnostics if OUTSIDE in each.message] == [path]
 
 
 def test_pipelines_of_a_recipe_name_its_files_alone(place):
-    with pytest.raises(EvaluationRefused, match=r"pixelwise@\.\./mine\.csv\+none: mine\.csv " + OUTSIDE):
+    with pytest.raises(
+        EvaluationRefused, match=r"pixelwise@\.\./mine\.csv\+none: mine\.csv " + OUTSIDE
+    ):
         read_pipelines("pixelwise@../mine.csv+none", place, mark(place, "evaluate.pipelines"))
-    assert read_pipelines("pixelwise@../mine.csv+none", place)[0].height_file == place / "../mine.csv"
+    assert (
+        read_pipelines("pixelwise@../mine.csv+none", place)[0].height_file == place / "../mine.csv"
+    )
 
 
 def test_a_pattern_is_judged_by_the_files_that_it_means(place):
